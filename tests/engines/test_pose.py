@@ -17,7 +17,10 @@ from calibray.tracing.mounting import Mounting, Pose, mount
 from calibray.tracing.settings import Antenna
 
 NAMES = ("tx:a.azimuth", "tx:a.downtilt", "tx:b.gain", "tx:*.azimuth")
-ANTENNAS = (Antenna("tr38901", "cross"), Antenna("hw_dipole", "VH", (0.0, 0.3, 0.2)))
+ANTENNAS = (
+    Antenna("tr38901", "cross", rows=4, columns=2, spacing=(0.5, 0.7)),
+    Antenna("hw_dipole", "VH", (0.0, 0.3, 0.2)),
+)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +34,9 @@ def mounting(paths: Paths) -> Mounting:
     """Links in two halves, each with its own antenna in its own direction."""
     index = (np.arange(paths.num_links) % 2).astype(int)
     yaw, tilt = np.where(index, 0.4, -0.3), np.where(index, 0.0, 0.1)
-    return Mounting(ANTENNAS, index, Pose(yaw, tilt, np.full(paths.num_links, 0.05)))
+    return Mounting(
+        ANTENNAS, index, Pose(yaw, tilt, np.full(paths.num_links, 0.05), np.where(index, 0.0, 0.2))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +73,7 @@ def test_errors_are_those_of_antennas_mounted_otherwise(
         yaw = mounting.pose.yaw - np.radians(named["tx:*.azimuth"])
         yaw = yaw - np.radians(named["tx:a.azimuth"]) * (labels == "a")
         tilt = mounting.pose.downtilt + np.radians(named["tx:a.downtilt"]) * (labels == "a")
-        pose = Pose(yaw, tilt, mounting.pose.electrical_downtilt)
+        pose = mounting.pose._replace(yaw=yaw, downtilt=tilt)
         turned = mount(paths, {"tx": replace(mounting, pose=pose)})
         materials = engine.parameters.materials(value, paths.materials)
         expected = path_loss(turned, materials, combining=engine._combining.kind)

@@ -19,6 +19,7 @@ from calibray.engines.rays.export import Exporting
 from calibray.fitting.cheap_replay import CheapReplay, make_cheap_replay
 from calibray.fitting.fidelity_loop import retrace
 from calibray.fitting.methods import check_fit, check_method, choose
+from calibray.fitting.population_spread import estimate_spreads
 from calibray.fitting.preliminary_fits import estimate_noise, leave_out_near_floor
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_search import maps_rays, search_rays
@@ -109,6 +110,7 @@ def calibrate(
     enclosed = setup.enclosed if can_trace else None
     traced = time.perf_counter()
     problem = estimate_noise(leave_out_near_floor(problem, progress), progress)
+    problem = estimate_spreads(problem, progress)
     # Making the cheap model does not count as time of the search.
     paused = time.perf_counter()
     cheap, of_rays = CheapReplay(), ()

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -13,60 +14,95 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.fields import GroupedProgram
+from calibray.fields.arithmetic import cosine_and_sine, materialize
 from calibray.parameters import Parameter
 from calibray.paths import Paths
 from calibray.tracing.antennas import AntennaPattern
-from calibray.tracing.mounting import EVERY, FIELDS, POSE, Mounting, Pose, in_frame, jones_vectors, theta_axis
+from calibray.tracing.mounting import (
+    FIELDS,
+    POSE,
+    Mounting,
+    Pose,
+    antenna_response,
+    concerned,
+    in_frame,
+    of_ports,
+    theta_axis,
+    turns,
+    wave_basis,
+)
 from calibray.tracing.settings import Antenna
+
+XP: Final = SimpleNamespace(
+    **vars(jnp)
+    | {
+        "cos": lambda angle: cosine_and_sine(angle)[0],
+        "sin": lambda angle: cosine_and_sine(angle)[1],
+        "power": lambda base, exponent: jnp.exp(np.log(base) * exponent),
+    }
+)
+"""`jax.numpy` with functions that XLA vectorizes on CPU."""
 
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["angles", "axis", "pose", "antenna", "transmitter", "weights"],
+    data_fields=["basis", "axis", "pose", "mounted", "of_antenna", "transmitter", "weights"],
     meta_fields=["antennas"],
 )
 @dataclass(frozen=True, eq=False)
 class PoseError:
-    """Transmit antennas that point, and radiate, otherwise than stated; P paths, T transmitters, e parameters.
+    """Transmit antennas that point, and radiate, otherwise than stated; P paths, M poses, e parameters.
 
     Attributes:
-        angles: Zenith and azimuth of departure [P, 2], [rad].
+        basis: Directions of departure with their basis vectors [3, 3, P], see `wave_basis`.
         axis: Theta vector of every path in the frame of its first interaction [P, 2].
-        pose: Stated directions of the antennas [P].
-        antenna: Antenna of every path [P].
-        transmitter: Transmitter of every path [P].
+        pose: Stated directions that paths share [M].
+        mounted: Number of the pose of every path [P].
+        of_antenna: Paths of each of the antennas.
+        transmitter: Transmitter of every pose [M].
         weights: What is added to yaw [rad], downtilt [rad] and gain [dB] of a transmitter, per unit of each effect
             parameter [3, T, e].
         antennas: The different antennas.
     """
 
-    angles: Any
+    basis: Any
     axis: Any
     pose: Pose
-    antenna: Any
+    mounted: Any
+    of_antenna: tuple[Any, ...]
     transmitter: Any
     weights: Any
     antennas: tuple[Antenna, ...]
 
     def ordered(self, order: NDArray[np.int64]) -> PoseError:
         """See `Effect.ordered`."""
-        arrays = {name: getattr(self, name)[order] for name in ("angles", "axis", "antenna", "transmitter")}
-        return replace(self, **arrays, pose=Pose(*(angle[order] for angle in self.pose)))
+        place = np.argsort(order)
+        return replace(
+            self,
+            basis=self.basis[..., order],
+            axis=self.axis[order],
+            mounted=self.mounted[order],
+            of_antenna=tuple(np.sort(place[paths]) for paths in self.of_antenna),
+        )
 
     def apply(self, program: GroupedProgram, values: jax.Array) -> GroupedProgram:
         """See `Effect.apply`."""
         yaw, downtilt, gain_db = (jnp.asarray(self.weights) @ values)[:, self.transmitter]
-        pose = Pose(self.pose.yaw + yaw, self.pose.downtilt + downtilt, self.pose.electrical_downtilt)
-        jones = sum(
-            jnp.where(
-                (jnp.asarray(self.antenna) == number)[:, None, None],
-                jones_vectors(AntennaPattern.of(antenna), jnp.asarray(self.angles), pose, jnp),
-                0.0,
-            )
-            for number, antenna in enumerate(self.antennas)
-        )
-        jones = jones * jnp.exp(np.log(10) / 20 * gain_db)[:, None, None]
-        field = jnp.moveaxis(in_frame(jones, jnp.asarray(self.axis), False, jnp), 0, -1)[None]
+        pose = self.pose._replace(yaw=self.pose.yaw + yaw, downtilt=self.pose.downtilt + downtilt)
+        amplitude = jnp.exp(np.log(10) / 20 * gain_db)
+        stored = partial(materialize, positive=program.wavelength)
+        basis, mounted = jnp.asarray(self.basis), jnp.asarray(self.mounted)
+        field = jnp.zeros(0)
+        for antenna, paths in zip(self.antennas, self.of_antenna, strict=True):
+            alone = len(self.antennas) == 1
+            part = (basis, mounted) if alone else (basis[..., paths], mounted[paths])
+            response = antenna_response(AntennaPattern.of(antenna), part[0], pose, XP, part[1], stored)
+            jones = of_ports(antenna, *stored(response), XP)
+            jones = jones * amplitude[part[1]][:, None, None]
+            whole = jnp.zeros((len(self.axis), *jones.shape[1:])) if not field.size else field
+            field = jones if alone else whole.at[paths].set(jones)
+        field = jnp.moveaxis(in_frame(field, jnp.asarray(self.axis), False, jnp), 0, -1)[None]
+        field = stored(field)
         groups, first = [], 0
         for group in program.groups:
             groups.append(replace(group, tx=field[..., first : first + group.size].astype(group.tx.dtype)))
@@ -95,19 +131,27 @@ def pose_error(
     unit = {"azimuth": -degree if from_north else degree, "downtilt": degree, "gain": 1.0}
     weights = np.zeros((len(FIELDS), len(names), len(effect_parameters)))
     for number, parameter in enumerate(effect_parameters):
-        if parameter.name.startswith(POSE):
-            label = parameter.material.removeprefix(POSE)
-            chosen = (names == label) | (label == EVERY)
+        if turns(parameter.name):
+            own = [
+                other.material.removeprefix(POSE)
+                for other in effect_parameters
+                if turns(other.name) and other.field == parameter.field
+            ]
+            chosen = concerned(names, parameter.material.removeprefix(POSE), own)
             weights[FIELDS.index(parameter.field), chosen, number] = unit[parameter.field]
     if not weights.any():
         return None
-    on_paths = mounting.of_paths(paths.link)
+    # Links of one transmitter share their pose, whose sines are then computed once.
+    keys = np.column_stack([*mounting.pose, transmitter.reshape(-1)])
+    shared, of_link = np.unique(keys, axis=0, return_inverse=True)
+    antenna = mounting.index[paths.link]
     return PoseError(
-        angles=paths.departure,
+        basis=wave_basis(paths.departure),
         axis=theta_axis(paths, mounting),
-        pose=on_paths.pose,
-        antenna=on_paths.index,
-        transmitter=transmitter.reshape(-1)[paths.link],
+        pose=Pose(*shared[:, :-1].T),
+        mounted=of_link.reshape(-1)[paths.link],
+        of_antenna=tuple(np.flatnonzero(antenna == number) for number in range(len(mounting.antennas))),
+        transmitter=shared[:, -1].astype(np.int64),
         weights=weights,
         antennas=mounting.antennas,
     )

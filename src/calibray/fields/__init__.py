@@ -9,7 +9,7 @@ Programs are in double precision by default, single on request. Functions comput
 
 from calibray.fields.coefficient_tables import FINEST, table_intervals
 from calibray.fields.combining import COMBINING, Combining, path_loss_of_gains
-from calibray.fields.effects import Effect, Effects, ExtraLoss, RoughSurfaces
+from calibray.fields.effects import DisplacementLoss, Effect, Effects, ExtraLoss, RoughSurfaces
 from calibray.fields.evaluation import (
     path_gains,
     path_loss,
@@ -30,6 +30,7 @@ __all__ = [
     "FINEST",
     "Channel",
     "Combining",
+    "DisplacementLoss",
     "Effect",
     "Effects",
     "ExtraLoss",

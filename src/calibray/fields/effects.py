@@ -38,6 +38,21 @@ def apply_effects(program: GroupedProgram, effects: Effects, values: jax.Array) 
     return reduce(lambda changed, effect: effect.apply(changed, values), effects, program)
 
 
+AntennaFields = tuple[jax.Array, jax.Array]
+"""Transmit and receive fields of a group of paths, which are all that effects change."""
+
+
+def antenna_fields(program: GroupedProgram) -> list[AntennaFields]:
+    """The antenna fields of every group of paths."""
+    return [(group.tx, group.rx) for group in program.groups]
+
+
+def with_antenna_fields(program: GroupedProgram, fields: list[AntennaFields]) -> GroupedProgram:
+    """The program with these antenna fields."""
+    pairs = zip(program.groups, fields, strict=True)
+    return replace(program, groups=tuple(replace(group, tx=tx, rx=rx) for group, (tx, rx) in pairs))
+
+
 @partial(
     jax.tree_util.register_dataclass, data_fields=["length", "maximum_db"], meta_fields=["index", "fixed"]
 )
@@ -101,6 +116,44 @@ class RoughSurfaces:
         # The mean field of heights with standard deviation s: exp(-8 (pi s cos theta / lambda)^2), W. S. Ament, Proc.
         # IRE 41(1), 1953; its square is the share of the power that stays in the specular direction.
         return scaled(program, jnp.exp(-jnp.asarray(self.exponent) @ heights**2))
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["link", "group", "weights", "origin", "slope", "curvature"],
+    meta_fields=[],
+)
+@dataclass(frozen=True, eq=False)
+class DisplacementLoss:
+    """Change of path loss by displacements of G groups of links along K axes, a polynomial of second order each.
+
+    Attributes:
+        link: Link of every path [P].
+        group: Group of every link [K, L].
+        weights: Displacement of every group per unit of each effect parameter, K of [G, e].
+        origin: Values of the effect parameters at which the paths were traced [e].
+        slope: First-order coefficient of every link [K, L], [dB/m].
+        curvature: Second-order coefficient of every link [K, L], [dB/m^2].
+    """
+
+    link: jax.Array | NDArray[np.integer]
+    group: tuple[NDArray[np.int64], ...]
+    weights: tuple[NDArray[np.float64], ...]
+    origin: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    curvature: NDArray[np.float64]
+
+    def ordered(self, order: NDArray[np.int64]) -> DisplacementLoss:
+        """See `Effect.ordered`."""
+        return replace(self, link=np.asarray(self.link)[order])
+
+    def apply(self, program: GroupedProgram, values: jax.Array) -> GroupedProgram:
+        """See `Effect.apply`."""
+        loss_db = jnp.zeros(self.slope[0].shape)
+        for axis, (group, weights) in enumerate(zip(self.group, self.weights, strict=True)):
+            displacement = (jnp.asarray(weights) @ (values - self.origin))[group]
+            loss_db += (self.slope[axis] + self.curvature[axis] * displacement) * displacement
+        return scaled(program, jnp.exp(-np.log(10) / 20 * loss_db)[self.link])
 
 
 def scaled(program: GroupedProgram, amplitude: jax.Array) -> GroupedProgram:

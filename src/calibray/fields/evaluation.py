@@ -27,7 +27,13 @@ from calibray.fields import coefficient_tables
 from calibray.fields.arithmetic import Pair, materialize, segment_sums
 from calibray.fields.coefficient_tables import CoefficientTables, TableLayout
 from calibray.fields.combining import POWER, Combining, decibel, link_power, path_power
-from calibray.fields.effects import Effects, apply_effects
+from calibray.fields.effects import (
+    AntennaFields,
+    Effects,
+    antenna_fields,
+    apply_effects,
+    with_antenna_fields,
+)
 from calibray.fields.grouping import COEFFICIENT
 from calibray.fields.jax_context import jax_settings
 from calibray.fields.material_response import (
@@ -285,6 +291,15 @@ def _contract(
     return -10 / np.log(10) * inverse[:, None, None] * contract(program, slope, derivatives, num_materials)
 
 
+def _by_path(by_field: list[AntennaFields], tangents: list[AntennaFields]) -> jax.Array:
+    """Derivatives of the power of every path by effect parameters [P, e], through the antenna fields."""
+    groups = []
+    for outer, inner in zip(by_field, tangents, strict=True):
+        # Fields are [2 or 1, ports, 2, n], their tangents [..., n, e].
+        groups.append(sum(jnp.einsum("abcn,abcne->ne", a, b) for a, b in zip(outer, inner, strict=True)))
+    return jnp.concatenate(groups)
+
+
 def _dot(a: object, b: object) -> jax.Array:
     """Sum of the products of two trees' arrays."""
     return reduce(add, (x * y for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)))
@@ -381,13 +396,22 @@ def _slopes_with_effects(
     stored = partial(materialize, positive=program.wavelength)
 
     def evaluate(index: jax.Array, results: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        changed = apply_effects(program, effects, values[index])
+        fields, push = jax.linearize(
+            lambda value: antenna_fields(apply_effects(program, effects, value)), values[index]
+        )
+        changed = with_antenna_fields(program, fields)
         response, derivatives = stored(response_and_derivatives(changed, tables[index], columns))
         responses = split_by_step(changed, response)
-        power, by_step = stored(_slope(changed, responses, combining))
-        by_effect = jax.jacfwd(
-            lambda value: _power(apply_effects(program, effects, value), responses, combining)
-        )(values[index])
+        power, pull = jax.vjp(
+            lambda responses, fields: _power(
+                with_antenna_fields(changed, fields), responses, combining, keep=True
+            ),
+            responses,
+            fields,
+        )
+        by_step, by_field = stored(pull(jnp.ones_like(power)))
+        tangents = jax.vmap(push, out_axes=-1)(jnp.eye(values.shape[1], dtype=values.dtype))
+        by_effect = jax.vmap(partial(segment_sums, program.by_link), -1, -1)(_by_path(by_field, tangents))
         inverse = jnp.where(power > 0, 1 / jnp.where(power > 0, power, 1.0), 0.0)
         slope = jnp.zeros((program.num_links, tables.shape[1], 0))
         if columns:

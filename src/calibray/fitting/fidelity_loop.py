@@ -1,4 +1,4 @@
-"""The fidelity loop: trace again with the calibrated materials, and calibrate again while the path loss changes."""
+"""The fidelity loop: trace again with calibrated materials and positions, and calibrate again if path loss changes."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from calibray.engines.protocol import Chunked
 from calibray.fitting.methods import AUTO, choose
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, search
+from calibray.study.displacement import displaces
 from calibray.support.progress import Progress, with_stage
 
 
@@ -20,9 +21,9 @@ def retrace(
 ) -> tuple[Problem, Trail, NDArray[np.float64] | None]:
     """Trace with the calibrated materials, and calibrate again while the path loss changes by more than the tolerance.
 
-    The tracer samples refraction and diffuse reflection by the materials, so the set of paths can depend on them. A
-    trace without both needs no check. Only the method `auto` calibrates again; other methods have a fixed budget of RT
-    calls.
+    The tracer samples refraction and diffuse reflection by the materials, so the set of paths can depend on them; and
+    path loss at displaced antennas is interpolated. A trace without all of these needs no check. Only the method `auto`
+    calibrates again; other methods have a fixed budget of RT calls.
 
     Args:
         problem: The problem.
@@ -34,13 +35,15 @@ def retrace(
         traced with the calibrated materials minus path loss on the paths of the calibration [L], [dB]; None if not
         checked.
     """
-    setup, section = problem.setup, problem.setup.study.engine
-    study, parameters = setup.study, problem.parameters
+    study, parameters = problem.setup.study, problem.parameters
+    section = study.engine
     sampled = study.trace.refraction or study.trace.diffuse_reflection
-    if not sampled or not study.fidelity.rounds or not isinstance(section, ReplaySection) or section.rays:
+    replayed = isinstance(section, ReplaySection) and not section.rays and study.fidelity.rounds > 0
+    if not replayed or not (sampled or any(displaces(name) for name in parameters.names)):
         return problem, trail, None
     gap = None
     for turn in range(study.fidelity.rounds):
+        setup = problem.setup.placed_at(parameters.named(trail.best), 0.5 ** (turn + 1))
         materials = parameters.materials(trail.best, problem.engine.materials)
         stage = with_stage(progress, "checking")
         if isinstance(problem.engine, Chunked):
@@ -55,7 +58,7 @@ def retrace(
         # Links without a path in the new trace are left out of the next calibration.
         if objective.ceiling_db is None:
             objective = replace(objective, weight=np.where(np.isfinite(gap), objective.weight, 0.0))
-        problem = replace(problem, engine=engine, objective=objective)
+        problem = replace(problem, setup=setup, engine=engine, objective=objective)
         trail = search(problem, choose(problem), progress)
     return problem, trail, gap
 

@@ -38,7 +38,9 @@ EFFECTS: Final[Mapping[str, Mapping[str, Bound]]] = MappingProxyType(
             "azimuth": Bound(-180.0, 180.0, "deg"),
             "downtilt": Bound(-90.0, 90.0, "deg"),
             "gain": Bound(-100.0, 100.0, "dB"),
+            "height": Bound(-1000.0, 1000.0, "m"),
         },
+        "rx": {"dx": Bound(-1000.0, 1000.0, "m"), "dy": Bound(-1000.0, 1000.0, "m")},
     }
 )
 """Kinds of things other than materials that have parameters, as in "region:trees.specific_attenuation", with the

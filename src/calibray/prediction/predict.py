@@ -32,6 +32,10 @@ from calibray.study.mounting import PORT_POWER, states_port_power
 from calibray.support.progress import Progress
 from calibray.validation.baselines import without_scene
 
+NEIGHBOURS: Final = 0.5
+"""Distance of the displaced antennas that are traced, as a share of the largest displacement, as in the first check of
+a calibration."""
+
 NEAR_SHARE: Final = 0.1
 """Share of the residual field's variance that measured links explain, above which a link is near measured links."""
 
@@ -134,7 +138,7 @@ def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs:
     Raises:
         InputError: The scene or the parameters cannot be used, or such a file changed.
     """
-    setup = Setup.open(result.study, links=links)
+    setup = Setup.open(result.study, links=links).placed_at(result.parameters, NEIGHBOURS)
     check_inputs(result, setup, allow_changed_inputs)
     return setup
 

@@ -32,7 +32,7 @@ from calibray.support.figure_style import (
 )
 from calibray.support.messages import shortened
 from calibray.tracing.antennas import AntennaPattern
-from calibray.tracing.mounting import Mounting, Pose, jones_vectors
+from calibray.tracing.mounting import Mounting, Pose, jones_vectors, wave_basis
 from calibray.validation.validation import Validation
 
 PARAMETERS: Final = 12
@@ -280,6 +280,6 @@ def _pattern_db(mounting: Mounting, link: int, bearing: NDArray[np.float64]) -> 
     on_link = mounting.of_paths(np.full(len(bearing), link))
     pose = Pose(*on_link.pose)
     angles = np.stack([np.full(len(bearing), np.pi / 2), np.pi / 2 - bearing], axis=1)
-    jones = jones_vectors(AntennaPattern.of(mounting.antennas[on_link.index[0]]), angles, pose)
+    jones = jones_vectors(AntennaPattern.of(mounting.antennas[on_link.index[0]]), wave_basis(angles), pose)
     power = (np.abs(jones) ** 2).sum(axis=(1, 2))
     return 10 * np.log10(np.maximum(power / max(float(power.max()), 1e-300), 1e-30))

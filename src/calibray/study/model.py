@@ -7,6 +7,7 @@ import json
 import os
 from abc import ABC
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -27,6 +28,7 @@ from calibray.parameters import (
 )
 from calibray.parameters.laws import ROUGHNESS, frequency_independent_law
 from calibray.parameters.parameter import check_material
+from calibray.study.displacement import RECEIVER, displaces
 from calibray.study.facades import FacadeSection
 from calibray.study.link_obstruction import CLUTTER, REGION
 from calibray.study.link_obstruction import COLUMNS as OBSTRUCTION
@@ -53,7 +55,7 @@ from calibray.study.validation_errors import dotted
 from calibray.support.messages import did_you_mean, shortened
 from calibray.support.output_files import exists
 from calibray.support.strict_models import Section, Text
-from calibray.tracing.mounting import POSE
+from calibray.tracing.mounting import EVERY, POSE, turns
 from calibray.tracing.settings import Antenna
 
 VERSION: Final = 1
@@ -200,13 +202,39 @@ class StudyModel(Section, ABC):
             )
 
     def _check_poses(self) -> None:
-        names = [name for name in self.parameters if name.startswith(POSE)]
+        self._check_displacements()
+        names = [name for name in self.parameters if turns(name)]
         if names and self.links.tx_antenna is None:
             raise InputError(
                 f"parameters: {names[0]!r} needs [links.tx_antenna], the stated directions of the transmit antennas"
             )
         if names and getattr(self.engine, "compress_db", None) is not None:
             raise InputError("engine.compress_db: few weighted paths have no direction; remove it")
+
+    def _check_displacements(self) -> None:
+        names, links = [name for name in self.parameters if displaces(name)], self.links
+        refused = {
+            "links.frequency": links.frequency is not None,
+            f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",
+            f"engine.name = {self.engine.name!r}": self.engine.name != "replay",
+            "engine.rays": getattr(self.engine, "rays", None) is not None,
+            "engine.compress_db": getattr(self.engine, "compress_db", None) is not None,
+            "engine.chunk_links": getattr(self.engine, "chunk_links", None) is not None,
+        }
+        for key, stated in refused.items():
+            if names and stated:
+                raise InputError(
+                    f"parameters: {names[0]!r}: path loss between traced positions is interpolated on replay, at one "
+                    f"carrier; it does not go with {key}"
+                )
+        own = [
+            name for name in names if name.startswith(RECEIVER) and not name.startswith(f"{RECEIVER}{EVERY}.")
+        ]
+        if own and links.device is None:
+            raise InputError(
+                f"parameters: {own[0]!r} needs links.device, the column of the devices' names; or displace all, as "
+                f"'{RECEIVER}{EVERY}.dx'"
+            )
 
     def _check_materials(self) -> None:
         for name, material in self.materials.items():
@@ -224,8 +252,13 @@ class StudyModel(Section, ABC):
             start = itu_start(name, entry.start, frequency) if isinstance(entry.start, str) else entry.start
             lower, upper = entry.bounds
             parameters.append(Parameter(name, lower, upper, lower if start is None else start, entry.scale))
+            if entry.spread is not None and not name.startswith(f"{POSE}{EVERY}."):
+                raise InputError(
+                    f"{name}: spread is that of a population of transmitters; give it to '{POSE}{EVERY}.azimuth' or "
+                    "another field, or leave it out"
+                )
             if entry.prior is not None and entry.prior.std is not None:
-                if not name.startswith(POSE):
+                if not name.startswith((POSE, RECEIVER)):
                     raise InputError(f"{name}: prior.std is for antennas; give itu or value, and spread")
             elif entry.prior is not None:
                 entry.centre(name, frequency)
@@ -325,7 +358,7 @@ class StudyModel(Section, ABC):
         if antenna.gain_file is None:
             return antenna
         file = self._resolve(f"antennas.{key}.pattern", antenna.pattern).resolve()
-        return Antenna(str(file), antenna.polarization, antenna.orientation)
+        return replace(antenna, pattern=str(file))
 
     @property
     def overrides(self) -> dict[str, dict[str, Any]]:

@@ -17,7 +17,7 @@ from calibray.study.model import StudyModel
 from calibray.study.sections import MountingSection
 from calibray.support.messages import did_you_mean
 from calibray.tracing.antennas import AntennaPattern
-from calibray.tracing.mounting import EVERY, POSE, Mounting, Pose, stated_jones
+from calibray.tracing.mounting import EVERY, POSE, Mounting, Pose, stated_jones, turns
 from calibray.tracing.settings import Antenna
 
 if TYPE_CHECKING:
@@ -34,7 +34,9 @@ LEAST_GAIN: Final = 1e-3
 def mounting_columns(study: StudyModel) -> tuple[str, ...]:
     """The columns that say which antenna a link has and where it points, and whose parameters change that."""
     columns = [name for section in study.links.mountings.values() for name in section.columns]
-    own = [name for name in study.parameters if name.startswith(POSE) and not name.startswith(POSE + EVERY)]
+    own = [
+        name for name in study.parameters if name.startswith(POSE) and not name.startswith(POSE + EVERY + ".")
+    ]
     return tuple(dict.fromkeys([*columns, *([study.links.transmitter] if own else [])]))
 
 
@@ -52,15 +54,23 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
     away = links.rx - links.tx if end == "tx" else links.tx - links.rx
     degrees = [
         np.radians(_degrees(links.table, f"links.{end}_antenna.{key}", getattr(section, key) or 0.0))
-        for key in ("azimuth_deg", "downtilt_deg", "electrical_downtilt_deg")
+        for key in ("azimuth_deg", "downtilt_deg", "electrical_downtilt_deg", "steering_deg")
     ]
-    yaw, downtilt, electrical = degrees
+    yaw, downtilt, electrical, steering = degrees
     if section.aim is not None:
         yaw = np.arctan2(away[:, 1], away[:, 0])
         downtilt = -np.arctan2(away[:, 2], np.hypot(away[:, 0], away[:, 1]))
     elif section.azimuth_deg is not None and section.azimuth_from == "north":
         yaw = np.pi / 2 - yaw
-    return Mounting(antennas, index, Pose(yaw, downtilt, electrical))
+    if section.azimuth_from == "north":
+        steering = -steering
+    single = np.array([not antenna.is_array for antenna in antennas])[index]
+    if (steering[single] != 0).any():
+        raise InputError(
+            f"{study.path}: links.{end}_antenna.steering_deg: the antenna is no array; give antennas.{end} rows and "
+            "columns, or leave the key out"
+        )
+    return Mounting(antennas, index, Pose(yaw, downtilt, electrical, steering))
 
 
 def direct_gain(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
@@ -75,9 +85,13 @@ def direct_gain(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
     away = (links.rx - links.tx) / links.distance[:, None]
     mountings = link_mountings(study, links)
     for end, antenna in study.stated_antennas.items():
-        if end not in mountings and antenna.pattern in ("iso", "dipole", "hw_dipole"):
+        if (
+            end not in mountings
+            and antenna.pattern in ("iso", "dipole", "hw_dipole")
+            and not antenna.is_array
+        ):
             continue
-        one = Mounting((antenna,), np.zeros(len(links), dtype=np.int64), Pose(*np.zeros((3, len(links)))))
+        one = Mounting((antenna,), np.zeros(len(links), dtype=np.int64), Pose(*np.zeros((4, len(links)))))
         jones = stated_jones(mountings.get(end, one), zenith_azimuth(away if end == "tx" else -away))
         gain_db += 10 * np.log10(np.maximum((jones[:, 0] ** 2).sum(axis=-1), LEAST_GAIN))
     return gain_db
@@ -106,7 +120,7 @@ def pose_effects(
     from calibray.engines.pose import pose_error
 
     items = [parameters.items[index] for index in parameters.of_effects]
-    if not any(item.name.startswith(POSE) for item in items):
+    if not any(turns(item.name) for item in items):
         return ()
     stored, chosen = paths
     section = study.links.mountings["tx"]
@@ -123,30 +137,9 @@ def transmitter_labels(study: StudyModel, table: SourceTable, items: Sequence[Pa
     Raises:
         InputError: The column of transmitters is missing.
     """
-    if all(item.material in (POSE + EVERY,) for item in items if item.name.startswith(POSE)):
+    if all(item.material in (POSE + EVERY,) for item in items if turns(item.name)):
         return np.full(len(table), "")
     return table.labels(study.links.transmitter)
-
-
-def check_poses(study: StudyModel, links: Measurements) -> None:
-    """Refuse parameters of transmitters that no link has.
-
-    Raises:
-        InputError: A transmitter is unknown, or the column of transmitters is missing.
-    """
-    stated = {
-        name.removeprefix(POSE).rpartition(".")[0]: name for name in study.parameters if name.startswith(POSE)
-    }
-    stated.pop(EVERY, None)
-    if not stated:
-        return
-    known = set(links.table.labels(study.links.transmitter).tolist())
-    for label, name in stated.items():
-        if label not in known:
-            raise InputError(
-                f"{study.path}: parameters: {name!r}: no link has the transmitter {label!r} in column "
-                f"{study.links.transmitter!r}; {did_you_mean(label, known)}"
-            )
 
 
 def link_antennas(

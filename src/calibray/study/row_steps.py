@@ -57,6 +57,7 @@ def row_steps(study: StudyModel) -> Preparation:
                     *study.offset_groups,
                     *([links.frequency] if links.frequency else []),
                     *mounting_columns(study),
+                    *([links.device] if links.device else []),
                 ]
             )
         ),

@@ -160,7 +160,10 @@ class MountingSection(Section):
         azimuth_deg: Azimuth [deg], a number or a column; along x if absent. It turns the antenna's own orientation.
         azimuth_from: "north" for compass bearings (clockwise from y), "east" for angles counter-clockwise from x.
         downtilt_deg: Mechanical downtilt [deg], a number or a column.
-        electrical_downtilt_deg: Shift of the pattern downwards in the antenna's frame [deg], a number or a column.
+        electrical_downtilt_deg: Shift of the pattern downwards in the antenna's frame [deg], a number or a column; of
+            the beam of an array.
+        steering_deg: Direction to which an array's beam is turned electrically, relative to the antenna [deg], a number
+            or a column; clockwise if azimuths are compass bearings.
         aim: "other end" points every antenna at the other end of its link, in place of azimuth and downtilt.
     """
 
@@ -169,6 +172,7 @@ class MountingSection(Section):
     azimuth_from: Literal["north", "east"] = "north"
     downtilt_deg: Coordinate = 0.0
     electrical_downtilt_deg: Coordinate = 0.0
+    steering_deg: Coordinate = 0.0
     aim: Literal["other end"] | None = None
 
     @model_validator(mode="after")
@@ -182,7 +186,13 @@ class MountingSection(Section):
     @property
     def columns(self) -> tuple[str, ...]:
         """The columns of the links that it names."""
-        stated = (self.type, self.azimuth_deg, self.downtilt_deg, self.electrical_downtilt_deg)
+        stated = (
+            self.type,
+            self.azimuth_deg,
+            self.downtilt_deg,
+            self.electrical_downtilt_deg,
+            self.steering_deg,
+        )
         return tuple(name for name in stated if isinstance(name, str))
 
 
@@ -203,11 +213,12 @@ class LinksSection(Section):
         where: Row filter.
         weight: Column of relative weights [1].
         std: Standard deviation [dB] of the values, a number or a column.
-        tx_power_dbm: Transmitted power [dBm], a number or a column, for received power.
         eirp_dbm: Radiated power [dBm] in the main direction, in place of the transmitted power.
         cable_loss_db: Loss between transmitter and antenna [dB], a number or a column, with a transmitted power.
         tx_antenna: Antennas of the transmitters, if they differ.
         rx_antenna: Antennas of the receivers, if they differ.
+        device: Column of the names of receiving devices, which parameters such as "rx:PHONE.dx" displace.
+        device: Column of the names of receiving devices, which parameters such as "rx:PHONE.dx" displace.
         position_error_m: Standard deviation of the receivers' positions along x and y [m], a number or a column.
         frequency: Column of carrier frequencies [Hz]; if absent, all links have the scene's carrier.
         wide: Name of the transmitter by column, for a table with one column per transmitter.
@@ -239,6 +250,7 @@ class LinksSection(Section):
     cable_loss_db: Coordinate | None = None
     tx_antenna: MountingSection | None = None
     rx_antenna: MountingSection | None = None
+    device: Text | None = None
     position_error_m: Coordinate | None = None
     frequency: Text | None = None
     wide: dict[str, Text] = Field(default_factory=dict)
@@ -357,6 +369,7 @@ class PriorSection(Section):
         like: Another parameter that this one scatters around, in place of `itu`: they are of one population.
         spread: Standard deviation of the logarithm: 0.3 is about 30 %.
         std: Standard deviation of a Gaussian prior around the start value, in the field's unit, in place of the others.
+        shared: Whether `std` is the spread of a population of transmitters, which is estimated if theirs is "auto".
     """
 
     itu: Text | None = None
@@ -364,6 +377,7 @@ class PriorSection(Section):
     like: Text | None = None
     spread: Annotated[float, Field(gt=0, le=10)] | None = None
     std: Annotated[float, Field(gt=0)] | None = None
+    shared: bool = False
 
     @model_validator(mode="after")
     def _one_centre(self) -> Self:
@@ -390,12 +404,15 @@ class ParameterSection(Section):
         start: Value before calibration, a number, "itu:NAME" or "itu:NAME@REVISION"; if absent, the scene's.
         scale: "linear" or "log".
         prior: Its prior; uniform within the bounds if absent.
+        spread: Standard deviation, in the field's unit, of the values of single transmitters around the common one of a
+            parameter such as "tx:*.azimuth", or "auto" to estimate it; if absent, only the common value is calibrated.
     """
 
     bounds: tuple[float, float]
     start: float | str | None = None
     scale: Scale = "linear"
     prior: PriorSection | None = None
+    spread: Literal["auto"] | Annotated[float, Field(gt=0)] | None = None
 
     def centre(self, name: str, frequency: float) -> float:
         """The value that the prior is centred on, in the field's unit; 1 if it is like another parameter.

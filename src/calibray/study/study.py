@@ -6,7 +6,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import mkdtemp
@@ -38,10 +38,19 @@ from calibray.paths import Paths, take_links
 from calibray.scenes import Scene, check_material_name, read_scene
 from calibray.scenes.regions import Region
 from calibray.scenes.scene_file import read_content as scene_content
+from calibray.study.displacement import (
+    RECEIVER,
+    Displacement,
+    check_labels,
+    displacement_loss,
+    displacements,
+    displaces,
+)
 from calibray.study.facades import with_facade_materials, with_facades, without_facade_materials
 from calibray.study.link_obstruction import with_obstruction
 from calibray.study.model import StudyModel
-from calibray.study.mounting import check_poses, link_mountings, pose_effects
+from calibray.study.mounting import link_mountings, pose_effects
+from calibray.study.population import with_population
 from calibray.study.position_errors import averaged, displaced, mounted_at_displaced, spread_db
 from calibray.study.regions import region_effects
 from calibray.study.roughness import roughness_effects
@@ -61,7 +70,7 @@ from calibray.support.progress import Progress
 from calibray.tables import display
 from calibray.tracing import cache
 from calibray.tracing.default_tracer import SIONNA
-from calibray.tracing.mounting import Mounting, mount
+from calibray.tracing.mounting import POSE, Mounting, mount
 from calibray.tracing.positions import EnclosedAntennas
 from calibray.tracing.protocol import Tracer, TracerFactory
 from calibray.tracing.settings import Antenna, TraceSettings
@@ -267,6 +276,8 @@ class Setup:
         parameters: The parameters that a candidate gives values to.
         held_out: Mask of the held-out links [L].
         factory: Opens the scene in a ray tracer.
+        placed: Values of the parameters at which paths are traced, if some displace antennas; start values if absent.
+        share: Distance of the neighbouring positions that are traced, as a share of the largest displacement.
     """
 
     study: Study
@@ -275,6 +286,8 @@ class Setup:
     parameters: Parameters
     held_out: NDArray[np.bool_]
     factory: TracerFactory
+    placed: Mapping[str, float] = field(default_factory=dict)
+    share: float = 1.0
 
     @classmethod
     def open(cls, study: Study, tracer: TracerFactory = SIONNA, links: Measurements | None = None) -> Setup:
@@ -294,8 +307,12 @@ class Setup:
         held_out = None
         if links is None:
             links = study.measurements()
+            if any(entry.spread is not None for entry in study.parameters.values()):
+                study = Study.from_content(with_population(study, links), study.path)
             held_out = study.held_out(links)
-            check_poses(study, links)
+            columns = {POSE: study.links.transmitter, RECEIVER: study.links.device}
+            for kind, column in columns.items():
+                check_labels(str(study.path), study.parameters, links, kind, column)
         scene = _scene_of(study, study.scene.frequency)
         parameters = study.parameter_set(scene.materials, scene.laws)
         parameters.check_carriers([frequency for frequency, _ in links.carriers])
@@ -337,6 +354,10 @@ class Setup:
             paths: The paths of some links.
             links: Indices of these links among all links; all links if None.
         """
+        effects = self._pose_and_region_effects(paths, links)
+        return effects + self._displacement_effects(paths, effects)
+
+    def _pose_and_region_effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
         chosen = np.arange(len(self.links)) if links is None else links
         poses = pose_effects(self.study, self.mountings, self.links.table, self.parameters, (paths, chosen))
         study, parameters = self.study, self.parameters
@@ -347,6 +368,56 @@ class Setup:
     def regions(self) -> dict[str, Region]:
         """The regions of extra loss by name."""
         return study_regions(self.study)
+
+    @cached_property
+    def _displacements(self) -> tuple[Displacement, ...]:
+        if not any(displaces(item.name) for item in self.parameters):
+            return ()
+        columns = {POSE: self.study.links.transmitter, RECEIVER: self.study.links.device}
+        return displacements(self.parameters.items, self.links, columns)
+
+    @property
+    def _placed(self) -> NDArray[np.float64]:
+        """Values of the parameters at which paths are traced."""
+        return np.array([self.placed.get(item.name, item.start) for item in self.parameters])
+
+    def placed_at(self, values: Mapping[str, float], share: float) -> Setup:
+        """The same, traced with antennas at the positions that values of the parameters state.
+
+        Itself if no parameter displaces antennas. The neighbours that path loss is interpolated between are at a
+        `share` of the largest displacement.
+        """
+        if not any(displaces(item.name) for item in self.parameters):
+            return self
+        return self._with_tracer(replace(self, placed=dict(values), share=share))
+
+    @property
+    def _links_in_place(self) -> Measurements:
+        links = self.links
+        for each in self._displacements:
+            links = each.moved(links, (each.weights @ self._placed)[each.group])
+        return links
+
+    def _displacement_effects(self, paths: Paths, others: Effects) -> Effects:
+        """The change of path loss by displacements, from traces at neighbouring positions."""
+        if not self._displacements:
+            return ()
+
+        def traced(links: Measurements) -> tuple[Paths, Effects]:
+            moved = self._with_tracer(replace(self, links=links))
+            paths = moved._mounted(moved._trace(links, self.scene, None))
+            return paths, moved._pose_and_region_effects(paths)
+
+        loss = displacement_loss(
+            self._displacements,
+            self.parameters,
+            self._placed,
+            self.share,
+            self._links_in_place,
+            (paths, others),
+            traced,
+        )
+        return (loss,)
 
     @property
     def radio(self) -> RadioSettings:
@@ -470,10 +541,10 @@ class Setup:
 
     def _trace_links(self, scene: Scene, progress: Progress | None) -> Paths:
         """Paths of the links, or the mean over displaced receivers if positions have errors."""
-        errors = self._position_error_m
+        errors, links = self._position_error_m, self._links_in_place
         if errors is None:
-            return self._trace(self.links, scene, progress)
-        return averaged(self._trace(displaced(self.links, errors), scene, progress), self.links)
+            return self._trace(links, scene, progress)
+        return averaged(self._trace(displaced(links, errors), scene, progress), links)
 
     @cached_property
     def _position_error_m(self) -> NDArray[np.float64] | None:

@@ -8,6 +8,8 @@ the gain.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
+from operator import mul
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -38,11 +40,11 @@ class AntennaPattern:
 
     Attributes:
         antenna: The antenna.
-        amplitude: Amplitude of its field, 1 in every direction for an isotropic one.
+        element: Amplitude of its field, 1 in every direction for an isotropic one; of one antenna if it is an array.
     """
 
     antenna: Antenna
-    amplitude: Amplitude
+    element: Amplitude
 
     @classmethod
     def of(cls, antenna: Antenna) -> AntennaPattern:
@@ -56,9 +58,23 @@ class AntennaPattern:
         table = read_gain_table(antenna.gain_file)
         return cls(
             antenna,
-            lambda zenith, azimuth, xp=np: (
-                10 ** (table.gain(xp.degrees(azimuth), 90 - xp.degrees(zenith), xp) / 20)
+            lambda zenith, azimuth, xp=np: xp.power(
+                10.0, table.gain(xp.degrees(azimuth), 90 - xp.degrees(zenith), xp) / 20
             ),
+        )
+
+    def amplitude(
+        self, zenith: Any, azimuth: Any, downtilt: Any = 0.0, steering: Any = 0.0, xp: Any = np
+    ) -> Any:
+        """Amplitude of the field in a direction, with an electrical downtilt and a horizontal steering [rad].
+
+        They shift the phases of an array; the pattern of a single antenna is shifted downwards. An array's amplitude
+        is relative to its centre and can be negative.
+        """
+        if not self.antenna.is_array:
+            return self.element(xp.clip(zenith - downtilt, 0.0, np.pi), azimuth, xp)
+        return self.element(zenith, azimuth, xp) * array_factor(
+            self.antenna, zenith, azimuth, downtilt, steering, xp
         )
 
     def jones_vectors(self, direction: NDArray[np.float64], arriving: bool = False) -> NDArray[np.complex128]:
@@ -99,7 +115,39 @@ def tr38901(zenith: Any, azimuth: Any, xp: Any = np) -> Any:
     """Amplitude of a base station's antenna element (3GPP TR 38.901, Table 7.3-1); see `Amplitude`."""
     vertical_loss_db = xp.minimum(12 * ((zenith - np.pi / 2) / BEAMWIDTH) ** 2, 30)
     horizontal_loss_db = xp.minimum(12 * (azimuth / BEAMWIDTH) ** 2, 30)
-    return 10 ** ((8 - xp.minimum(vertical_loss_db + horizontal_loss_db, 30)) / 20)
+    return xp.power(10.0, (8 - xp.minimum(vertical_loss_db + horizontal_loss_db, 30)) / 20)
+
+
+def array_factor(
+    antenna: Antenna, zenith: Any, azimuth: Any, downtilt: Any = 0.0, steering: Any = 0.0, xp: Any = np
+) -> Any:
+    """Field of a planar array of isotropic antennas, in which equal amplitudes share the power of one.
+
+    Its main direction is `downtilt` below the horizon and `steering` from the x axis towards the y axis [rad]. `xp` has
+    cosine and sine. Coupling between the antennas is left out, as in Sionna RT and 3GPP TR 38.901, section 7.3.
+    """
+    horizontal, vertical = (2 * np.pi * distance for distance in antenna.spacing)
+    of_columns = horizontal * (xp.sin(zenith) * xp.sin(azimuth) - xp.cos(downtilt) * xp.sin(steering))
+    of_rows = vertical * (xp.cos(zenith) + xp.sin(downtilt))
+    factors = [
+        _sum_of_cosines(count, phase, xp) / np.sqrt(count)
+        for count, phase in ((antenna.columns, of_columns), (antenna.rows, of_rows))
+        if count > 1
+    ]
+    return reduce(mul, factors)
+
+
+def _sum_of_cosines(count: int, phase: Any, xp: Any) -> Any:
+    """Sum of cos((k - (n - 1) / 2) phase) over n numbers k from 0: the field of a row of antennas, about its centre."""
+    half = xp.cos(phase / 2)
+    double = 2 * (2 * half * half - 1)
+    # cos((m + 1) x) = 2 cos x cos(m x) - cos((m - 1) x), from m = 0, or from m = 1/2 if the number is even.
+    before, value = (half, half) if count % 2 == 0 else (double / 2, 1.0)
+    total = 2 * value if count % 2 == 0 else value
+    for _ in range((count - 1) // 2):
+        before, value = value, double * value - before
+        total = total + 2 * value
+    return total
 
 
 _AMPLITUDES: Final[dict[str, Amplitude]] = {

@@ -6,7 +6,7 @@ first and last interaction, so that any pattern in any direction gives their fie
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
@@ -25,6 +25,22 @@ EVERY: Final = "*"
 """Name of the transmitter that stands for all of them."""
 
 
+NEW: Final = "new transmitters"
+"""Name of the transmitter that stands for those without measured links, in a population."""
+
+
+def concerned(names: NDArray[np.str_], label: str, own: Collection[str]) -> NDArray[np.bool_]:
+    """Which transmitters a parameter of the transmitter `label` concerns; `own` have their own one of that field."""
+    if label == EVERY:
+        return np.ones(len(names), dtype=bool)
+    return ~np.isin(names, list(own)) if label == NEW else names == label
+
+
+def turns(name: str) -> bool:
+    """Whether a parameter is the error of an antenna's direction or gain, such as "tx:CELL.azimuth"."""
+    return name.startswith(POSE) and name.rpartition(".")[2] in FIELDS
+
+
 class Pose(NamedTuple):
     """Where antennas point, of P paths or L links.
 
@@ -32,11 +48,14 @@ class Pose(NamedTuple):
         yaw: Rotation about z [rad], from the scene's x axis towards its y axis.
         downtilt: Mechanical downtilt [rad]: the antenna leans forward after it was turned by `yaw`.
         electrical_downtilt: Shift of the pattern downwards in the antenna's own frame [rad].
+        steering: Direction in the antenna's own frame, from its x axis towards its y axis, to which the phases of an
+            array turn its beam [rad].
     """
 
     yaw: Any
     downtilt: Any
     electrical_downtilt: Any
+    steering: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,43 +122,78 @@ def stated_jones(mounting: Mounting, angles: NDArray[np.float64]) -> NDArray[np.
     for number, antenna in enumerate(mounting.antennas):
         chosen = mounting.index == number
         pose = Pose(*(angle[chosen] for angle in mounting.pose))
-        jones[chosen] = jones_vectors(AntennaPattern.of(antenna), angles[chosen], pose)
+        jones[chosen] = jones_vectors(AntennaPattern.of(antenna), wave_basis(angles[chosen]), pose)
     return jones
 
 
-def jones_vectors(pattern: AntennaPattern, angles: Any, pose: Pose, xp: Any = np) -> Any:
-    """Jones vectors [P, ports, 2] in the basis (theta, phi) of directions seen from the antenna.
+def wave_basis(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit vectors of waves in the scene frame [3, 3, P]: direction, theta, phi (3GPP TR 38.901, eq. 7.1-12, 7.1-13).
 
-    Directions are zenith and azimuth [P, 2], [rad]; the pose is that of every path. `xp` is the array library: NumPy,
-    or `jax.numpy` within a JAX function, which then has derivatives by the pose.
+    Angles are zenith and azimuth of the direction [P, 2], [rad].
     """
-    zenith, azimuth = angles[:, 0], angles[:, 1] - pose.yaw
-    sin_z, cos_z, sin_a, cos_a = xp.sin(zenith), xp.cos(zenith), xp.sin(azimuth), xp.cos(azimuth)
+    (sin_z, sin_a), (cos_z, cos_a) = np.sin(angles.T), np.cos(angles.T)
+    zero = np.zeros_like(sin_z)
+    return np.array(
+        [[sin_z * cos_a, sin_z * sin_a, cos_z], [cos_z * cos_a, cos_z * sin_a, -sin_z], [-sin_a, cos_a, zero]]
+    )
+
+
+def jones_vectors(pattern: AntennaPattern, basis: Any, pose: Pose) -> NDArray[np.float64]:
+    """Jones vectors [P, ports, 2] of waves in their basis (theta, phi), seen from a mounted antenna in a pose [P]."""
+    return of_ports(pattern.antenna, *antenna_response(pattern, basis, pose))
+
+
+def antenna_response(
+    pattern: AntennaPattern,
+    basis: Any,
+    pose: Pose,
+    xp: Any = np,
+    index: Any = None,
+    stored: Callable[[Any], Any] = lambda values: values,
+) -> tuple[Any, Any, Any]:
+    """What a mounted antenna does to waves: amplitude, cosine and sine of its theta vector in their basis [P] each.
+
+    The basis is that of `wave_basis`. The pose is that of every path, or with `index` [P] those that paths share. `xp`
+    is the array library: NumPy, or a namespace of `jax.numpy` within a JAX function, which has derivatives by the pose.
+    `stored` keeps intermediate values from being computed again at each use.
+    """
+    cos_yaw, sin_yaw = xp.cos(pose.yaw), xp.sin(pose.yaw)
+    cos_tilt, sin_tilt = xp.cos(pose.downtilt), xp.sin(pose.downtilt)
     to_mount = rotation_matrix(pattern.antenna.orientation).T
-    cos_t, sin_t = xp.cos(pose.downtilt), xp.sin(pose.downtilt)
-
-    def in_antenna(x: Any, y: Any, z: Any) -> list[Any]:
-        """Components in the antenna's frame of a vector that was turned back by yaw [P] each."""
-        x, z = x * cos_t - z * sin_t, x * sin_t + z * cos_t
-        return [row[0] * x + row[1] * y + row[2] * z for row in to_mount]
-
-    # The direction and its basis vectors theta and phi (3GPP TR 38.901, eq. 7.1-12 and 7.1-13).
-    x, y, z = in_antenna(sin_z * cos_a, sin_z * sin_a, cos_z)
-    theta = in_antenna(cos_z * cos_a, cos_z * sin_a, -sin_z)
-    phi = in_antenna(-sin_a, cos_a, 0.0)
+    # From the scene into the mount, R_y(downtilt)' R_z(yaw)', then into the antenna (3GPP TR 38.901, eq. 7.1-4).
+    mount = (
+        (cos_tilt * cos_yaw, cos_tilt * sin_yaw, -sin_tilt),
+        (-sin_yaw, cos_yaw, xp.zeros_like(cos_yaw)),
+        (sin_tilt * cos_yaw, sin_tilt * sin_yaw, cos_tilt),
+    )
+    of_paths = (lambda shared: shared) if index is None else (lambda shared: shared[index])
+    # Row of the antenna's frame, axis of the scene.
+    rotation = stored(
+        [[sum(row[k] * mount[k][axis] for k in range(3)) for axis in range(3)] for row in to_mount]
+    )
+    rotation = [[of_paths(element) for element in row] for row in rotation]
+    (x, y, z), theta, phi = stored(
+        [[sum(row[axis] * vector[axis] for axis in range(3)) for row in rotation] for vector in basis]
+    )
     # A direction along the antenna's own axis has no azimuth; any will do.
     axial = x**2 + y**2 < 1e-20
     rho = xp.sqrt(xp.where(axial, 1.0, x**2 + y**2))
     cos_own, sin_own = xp.where(axial, 1.0, x / rho), xp.where(axial, 0.0, y / rho)
     sin_zenith = xp.where(axial, 0.0, rho)
-    shifted = xp.clip(xp.arctan2(sin_zenith, z) - pose.electrical_downtilt, 0.0, np.pi)
-    amplitude = pattern.amplitude(shifted, xp.arctan2(sin_own, cos_own), xp)
+    tilt, steering = (of_paths(xp.asarray(angle)) for angle in (pose.electrical_downtilt, pose.steering))
+    zenith, azimuth = stored((xp.arctan2(sin_zenith, z), xp.arctan2(sin_own, cos_own)))
+    amplitude = pattern.amplitude(zenith, azimuth, tilt, steering, xp)
     # The antenna's own theta vector is that of the path turned about the direction.
     cosine, sine = (
         vector[0] * z * cos_own + vector[1] * z * sin_own - vector[2] * sin_zenith for vector in (theta, phi)
     )
+    return amplitude, cosine, sine
+
+
+def of_ports(antenna: Antenna, amplitude: Any, cosine: Any, sine: Any, xp: Any = np) -> Any:
+    """Jones vectors [P, ports, 2] of an antenna's ports, whose slant turns the theta vector of `antenna_response`."""
     ports = []
-    for slant in SLANTS[pattern.antenna.polarization]:
+    for slant in SLANTS[antenna.polarization]:
         a, b = np.cos(slant), np.sin(slant)
         ports.append(xp.stack([a * cosine - b * sine, a * sine + b * cosine], axis=-1))
     return amplitude[:, None, None] * xp.stack(ports, axis=1)

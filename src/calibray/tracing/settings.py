@@ -13,6 +13,10 @@ from calibray.tracing.gain_table import is_gain_file, read_gain_table
 
 PATTERNS: Final = ("iso", "dipole", "hw_dipole", "tr38901")
 POLARIZATIONS: Final = ("V", "H", "VH", "cross")
+LARGEST_ARRAY: Final = 64
+"""Largest number of rows, and of columns, of an array."""
+LARGEST_SPACING: Final = 10.0
+"""Largest distance of the antennas of an array [wavelengths]."""
 
 AUTO: Final = "auto"
 """Value of `samples` with which the tracer chooses the number of rays."""
@@ -100,14 +104,21 @@ class Antenna:
         polarization: "V", "H", or dual "VH" or "cross". The field has this polarization in every direction of the
             antenna's frame (3GPP TR 38.901, eq. 7.3-4/5), with the gain of the pattern.
         orientation: Rotation about z, y and x [rad]: yaw, pitch, roll.
+        rows: Rows of a planar array of such antennas along its z axis, which one signal feeds.
+        columns: Columns along its y axis.
+        spacing: Horizontal and vertical distance of its antennas [wavelengths].
 
     Raises:
-        InputError: The pattern or polarization is unknown, or the orientation is not three numbers.
+        InputError: The pattern or polarization is unknown, the orientation is not three numbers, or the array has no
+            such size.
     """
 
     pattern: str = "iso"
     polarization: str = "V"
     orientation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rows: int = 1
+    columns: int = 1
+    spacing: tuple[float, float] = (0.5, 0.5)
 
     def __post_init__(self) -> None:
         if self.pattern not in PATTERNS and not (
@@ -130,6 +141,27 @@ class Antenna:
                 f"antenna orientation = {self.orientation!r}: must be three angles [rad]: yaw, pitch, roll"
             )
         object.__setattr__(self, "orientation", angles)
+        for name in ("rows", "columns"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= LARGEST_ARRAY:
+                raise InputError(
+                    f"antenna {name} = {shortened(repr(value))}: must be a whole number, 1 to {LARGEST_ARRAY}"
+                )
+        try:
+            horizontal, vertical = (float(distance) for distance in self.spacing)
+        except (TypeError, ValueError):
+            horizontal = vertical = 0.0
+        if not (0 < horizontal <= LARGEST_SPACING and 0 < vertical <= LARGEST_SPACING):
+            raise InputError(
+                f"antenna spacing = {self.spacing!r}: must be two distances [wavelengths], horizontal and vertical, "
+                f"greater than 0 and at most {LARGEST_SPACING:g}"
+            )
+        object.__setattr__(self, "spacing", (horizontal, vertical))
+
+    @property
+    def is_array(self) -> bool:
+        """Whether it is an array of several antennas."""
+        return self.rows * self.columns > 1
 
     @property
     def ports(self) -> int:
@@ -146,6 +178,9 @@ class Antenna:
         record: dict[str, object] = asdict(self)
         if self.gain_file is not None:
             record["pattern"] = read_gain_table(self.gain_file).digest()
+        if not self.is_array:
+            for name in ("rows", "columns", "spacing"):
+                del record[name]
         return record
 
 
@@ -162,6 +197,6 @@ def as_antenna(value: Antenna | Mapping[str, object] | None) -> Antenna:
     unknown = set(value) - {field.name for field in fields(Antenna)}
     if unknown:
         raise InputError(
-            f"antenna: unknown key {sorted(unknown)[0]!r}; known: pattern, polarization, orientation"
+            f"antenna: unknown key {sorted(unknown)[0]!r}; known: {', '.join(field.name for field in fields(Antenna))}"
         )
     return Antenna(**value)  # type: ignore[arg-type]

@@ -40,6 +40,8 @@ def load() -> rt.Scene:
             sys.exit(
                 f"The gain of the {end} antenna is a table ({antenna['pattern']}): register it as a pattern first."
             )
+        if antenna["rows"] * antenna["columns"] > 1:
+            sys.exit(f"The {end} antenna is an array with one feed: register its pattern first.")
         array = rt.PlanarArray(
             num_rows=1, num_cols=1, pattern=antenna["pattern"], polarization=antenna["polarization"]
         )

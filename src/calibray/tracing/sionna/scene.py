@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 import sionna.rt as rt
 from numpy.typing import NDArray
+from sionna.rt import antenna_pattern
 from sionna.rt.antenna_pattern import PolarizedAntennaPattern, antenna_pattern_registry
 from sionna.rt.radio_materials import scattering_pattern_registry
 from sionna.rt.scene import load_scene_from_string
@@ -24,6 +25,7 @@ from sionna.rt.scene import load_scene_from_string
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.scenes import COARSE, Mesh, Scene, SurfaceSize, has_copied_meshes, xml_with_copied_meshes
+from calibray.tracing.antennas import array_factor
 from calibray.tracing.gain_table import GainTable, read_gain_table
 from calibray.tracing.settings import Antenna
 from calibray.tracing.sionna.buffers import aligned
@@ -164,11 +166,22 @@ def scattering_pattern(material: Material) -> rt.ScatteringPattern:
 
 def antenna_patterns(antenna: Antenna) -> list:
     """Make an antenna's pattern functions of zenith and azimuth [rad] for Sionna's field stage, one per port."""
-    if antenna.gain_file is None:
+    if antenna.gain_file is None and not antenna.is_array:
         make: Any = antenna_pattern_registry.get(antenna.pattern)
         return make(polarization=antenna.polarization).patterns
-    pattern = tabulated_pattern(read_gain_table(antenna.gain_file))
+    if antenna.gain_file is None:
+        pattern = getattr(antenna_pattern, f"v_{antenna.pattern}_pattern")
+    else:
+        pattern = tabulated_pattern(read_gain_table(antenna.gain_file))
+    if antenna.is_array:
+        pattern = _array_pattern(antenna, pattern)
     return PolarizedAntennaPattern(v_pattern=pattern, polarization=antenna.polarization).patterns
+
+
+def _array_pattern(
+    antenna: Antenna, element: Callable[[mi.Float, mi.Float], mi.Complex2f]
+) -> Callable[[mi.Float, mi.Float], mi.Complex2f]:
+    return lambda zenith, azimuth: element(zenith, azimuth) * array_factor(antenna, zenith, azimuth, xp=dr)
 
 
 def tabulated_pattern(table: GainTable) -> Callable[[mi.Float, mi.Float], mi.Complex2f]:

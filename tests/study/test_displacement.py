@@ -1,0 +1,133 @@
+"""Heights of transmitters and shifts of devices: interpolated between traces, verified by one more, found if wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import calibray as cb
+import two_ray
+from calibray import engines
+from calibray.errors import InputError
+from calibray.fields import path_loss
+from calibray.measurements import Measurements
+from calibray.study import Setup, Study
+from two_ray import COLUMNS, TwoRay
+
+GROUND = "ground.relative_permittivity"
+TRUTH = {"tx:A.height": 5.0, "rx:phone.dx": 6.0, "rx:phone.dy": -4.0}
+BOUNDS = {"tx:A.height": [-8, 8], "tx:B.height": [-8, 8], "rx:phone.dx": [-10, 10], "rx:phone.dy": [-10, 10]}
+NOISE_DB = 1.0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two masts and two devices; mast A is 5 m higher than stated, and the phone's track is displaced."""
+    folder = tmp_path_factory.mktemp("displaced")
+    two_ray.study(folder)
+    random = np.random.default_rng(9)
+    rx = np.column_stack([random.uniform(-80, 80, (160, 2)), np.full(160, 1.5)])
+    mast = np.where(np.arange(160) % 2, "A", "B")
+    tx = np.where((mast == "A")[:, None], [-30.0, 0.0, 15.0], [40.0, 10.0, 20.0])
+    table = pd.DataFrame(np.hstack([tx, rx]), columns=COLUMNS)
+    device = np.where(np.arange(160) % 4 < 2, "phone", "scanner")
+    table.assign(transmitter=mast, device=device, path_loss_db=100.0).to_csv(
+        folder / "stated.csv", index=False
+    )
+    true = table.copy()
+    true.loc[mast == "A", "tx_z"] += TRUTH["tx:A.height"]
+    true.loc[device == "phone", ["rx_x", "rx_y"]] += [TRUTH["rx:phone.dx"], TRUTH["rx:phone.dy"]]
+    true.assign(transmitter=mast, device=device, path_loss_db=100.0).to_csv(folder / "true.csv", index=False)
+    loss = path_loss(Setup.open(study(folder, "true.csv", {}), tracer=TwoRay).trace())
+    noisy = loss + NOISE_DB * random.standard_normal(160)
+    table.assign(transmitter=mast, device=device, path_loss_db=noisy).to_csv(
+        folder / "stated.csv", index=False
+    )
+    return folder
+
+
+def study(folder: Path, file: str, bounds: dict[str, list[float]] | None = None, **changes: object) -> Study:
+    content = {
+        "version": 1,
+        "scene": {"file": "scene.xml", "frequency": two_ray.FREQUENCY},
+        "links": {
+            "file": file, "tx": COLUMNS[:3], "rx": COLUMNS[3:], "value": "path_loss_db", "device": "device",
+        },
+        "antennas": {"tx": {"pattern": "dipole"}, "rx": {"pattern": "dipole"}},
+        "parameters": {GROUND: {"bounds": [1.5, 15.0]}}
+        | {name: {"bounds": each} for name, each in (BOUNDS if bounds is None else bounds).items()},
+        "noise": {"kind": "gaussian", "range_m": 0},
+    }  # fmt: skip
+    return Study.from_content(content | changes, folder / "study.toml")
+
+
+def test_path_loss_is_exact_at_the_traced_neighbours_and_its_derivatives_everywhere(folder: Path) -> None:
+    setup = Setup.open(study(folder, "stated.csv"), tracer=TwoRay)
+    engine = engines.make(setup)
+    start = setup.parameters.start
+    for name, end, axis, step in (("tx:A.height", "tx", 2, 8.0), ("rx:phone.dy", "rx", 1, -10.0)):
+        candidate = np.where(np.array(setup.parameters.names) == name, step, start)
+        moved = setup.links.tx.copy(), setup.links.rx.copy()
+        label = setup.links.table.labels("transmitter" if end == "tx" else "device")
+        moved[end == "rx"][label == name[3:].partition(".")[0], axis] += step
+        there = Measurements(*moved, path_loss_db=np.zeros(160))
+        expected = path_loss(Setup.open(study(folder, "true.csv", {}), TwoRay, there).trace())
+        np.testing.assert_allclose(engine.path_loss(candidate[None])[0], expected, atol=1e-9)
+    candidate = start + np.array([0.5, 2.0, -3.0, 4.0, 1.0])
+    _, jacobian = engine.path_loss_and_jacobian(candidate[None])
+    for index in range(len(start)):
+        step = 1e-4 * np.eye(len(start))[index]
+        above, below = engine.path_loss(np.stack([candidate + step, candidate - step]))
+        np.testing.assert_allclose(jacobian[0, :, index], (above - below) / 2e-4, rtol=1e-5, atol=1e-6)
+        assert np.abs(jacobian[0, :, index]).max() > 1e-3
+
+
+@pytest.fixture(scope="module")
+def result(folder: Path) -> cb.Result:
+    return cb.calibrate(study(folder, "stated.csv"), tracer=TwoRay)
+
+
+def test_wrong_heights_and_shifts_are_found_and_verified_by_a_trace(folder: Path, result: cb.Result) -> None:
+    for name, value in (TRUTH | {"tx:B.height": 0.0, GROUND: 3.0}).items():
+        assert result.intervals[name].lower < value < result.intervals[name].upper, name
+    for name in BOUNDS:
+        assert result.intervals[name].upper - result.intervals[name].lower < 8.0, name
+    # The last trace was at the calibrated positions.
+    assert 0 < (result.fit.retrace_gap_db or 0.0) < 0.5
+    blind = cb.calibrate(study(folder, "stated.csv", {}), tracer=TwoRay)
+    assert blind.fit.retrace_gap_db is None
+    assert result.rmse_db < blind.rmse_db - 0.2
+
+
+def test_predictions_have_the_calibrated_height_at_exact_receivers(folder: Path, result: cb.Result) -> None:
+    new = pd.read_csv(folder / "true.csv")
+    # Stated mast, true receivers: no shift of a track applies to new positions.
+    stated = new.assign(tx_z=pd.read_csv(folder / "stated.csv")["tx_z"])
+    exact = path_loss(Setup.open(study(folder, "true.csv", {}), tracer=TwoRay).trace())
+    predicted = result.predict(stated)
+    assert np.sqrt(np.mean((predicted - exact) ** 2)) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"objective": {"combining": "coherent"}}, r"does not go with objective.combining = 'coherent'"),
+        ({"engine": {"name": "retrace"}}, r"does not go with engine.name = 'retrace'"),
+        ({"engine": {"name": "replay", "chunk_links": 5}}, r"does not go with engine.chunk_links"),
+        ({"parameters": {"tx:C.height": {"bounds": [-1, 1]}}}, r"no link has the transmitter 'C'"),
+        ({"parameters": {"rx:PHONE.dx": {"bounds": [-1, 1]}}}, r"no link has the device 'PHONE' in column 'device'"),
+    ],
+)  # fmt: skip
+def test_impossible_displacements_are_refused(folder: Path, change: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Setup.open(study(folder, "stated.csv", **change), tracer=TwoRay)
+
+
+def test_devices_need_their_column(folder: Path) -> None:
+    content = study(folder, "stated.csv").content()
+    del content["links"]["device"]
+    with pytest.raises(InputError, match=r"'rx:phone.dx' needs links.device"):
+        Study.from_content(content, folder / "study.toml")
