@@ -405,7 +405,7 @@ class Setup:
 
         def traced(links: Measurements) -> tuple[Paths, Effects]:
             moved = self._with_tracer(replace(self, links=links))
-            paths = moved._mounted(moved._trace(links, self.scene, None))
+            paths = moved._mounted(self._trace_links(links, self.scene, None), self.scene)
             return paths, moved._pose_and_region_effects(paths)
 
         loss = displacement_loss(
@@ -529,7 +529,7 @@ class Setup:
             return _paths_of_program(self, materials or {}, progress)
         scene = replace(self.scene, materials={**self.scene.materials, **(materials or {})})
         if self.links.frequency is None:
-            return self._mounted(self._trace_links(scene, progress), scene)
+            return self._mounted(self._trace_links(self._links_in_place, scene, progress), scene)
         ends = np.hstack([self.links.tx, self.links.rx])
         _, first, pair = np.unique(ends, axis=0, return_index=True, return_inverse=True)
         distinct = replace(self.links.select(np.isin(np.arange(len(ends)), first)), frequency=None)
@@ -539,9 +539,9 @@ class Setup:
             take_links(self._trace(distinct, scene, progress), rank[pair.reshape(-1)]), scene
         )
 
-    def _trace_links(self, scene: Scene, progress: Progress | None) -> Paths:
+    def _trace_links(self, links: Measurements, scene: Scene, progress: Progress | None) -> Paths:
         """Paths of the links, or the mean over displaced receivers if positions have errors."""
-        errors, links = self._position_error_m, self._links_in_place
+        errors = self._position_error_m
         if errors is None:
             return self._trace(links, scene, progress)
         return averaged(self._trace(displaced(links, errors), scene, progress), links)
