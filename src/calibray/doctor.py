@@ -68,7 +68,7 @@ class Check:
     Attributes:
         name: The library.
         passed: Whether it works.
-        detail: What was found, or how it failed.
+        detail: The finding, or how it failed.
         remedy: What to do if it failed.
     """
 

@@ -82,11 +82,6 @@ class TableLayout:
     mode: jax.Array
     inner: jax.Array
 
-    @property
-    def num_nodes(self) -> int:
-        """Number of nodes N of all rows."""
-        return self.cosine.shape[0]
-
 
 @partial(jax.tree_util.register_dataclass, data_fields=["values"], meta_fields=[])
 @dataclass(frozen=True)

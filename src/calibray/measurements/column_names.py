@@ -251,9 +251,9 @@ def find_length_unit(names: Iterable[str]) -> float:
         (0.01, 1.0)
     """
     stated = {str(name): words(name) & {*LENGTH_UNITS, "m"} for name in names}
-    units = {next(iter(found)) for found in stated.values() if len(found) == 1}
+    units = {next(iter(marks)) for marks in stated.values() if len(marks) == 1}
     if len({LENGTH_UNITS.get(unit, 1.0) for unit in units}) > 1:
-        listed = ", ".join(name for name, found in stated.items() if found)
+        listed = ", ".join(name for name, marks in stated.items() if marks)
         raise InputError(f"positions are in different units ({listed}); give all in metres")
     return LENGTH_UNITS.get(next(iter(units), "m"), 1.0)
 

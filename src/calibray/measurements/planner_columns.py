@@ -40,12 +40,12 @@ def find_angles(frame: pd.DataFrame, of_transmitters: bool) -> dict[str, str]:
     electrical = [name for name in tilts if matches(name, "electrical")]
     mechanical = [name for name in tilts if matches(name, "mechanical") and name not in electrical]
     plain = [name for name in tilts if name not in (*electrical, *mechanical)]
-    found = {
+    columns_of = {
         "azimuth_deg": [name for name in names if matches(name, "azimuth") and name not in tilts],
         "downtilt_deg": [*mechanical, *plain],
         "electrical_downtilt_deg": electrical,
     }
-    return {key: columns[0] for key, columns in found.items() if columns}
+    return {key: columns[0] for key, columns in columns_of.items() if columns}
 
 
 def unusable(frame: pd.DataFrame, key: str, column: str) -> str:

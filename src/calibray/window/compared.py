@@ -20,12 +20,12 @@ def settings(study: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         >>> settings({"scene": {"frequency": 3.5e9}, "offset": {}})
         {'scene.frequency': 3500000000.0}
     """
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for name, value in study.items():
-        found |= (
+        values |= (
             settings(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
         )
-    return found
+    return values
 
 
 def changes(studies: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
@@ -52,10 +52,10 @@ def better(first: str, second: str, folder: Path) -> str:
     Raises:
         InputError: A result or its validation cannot be read.
     """
-    found = {name: predictive_errors(folder / name) for name in (first, second)}
-    if missing := [name for name, each in found.items() if each is None]:
+    results = {name: predictive_errors(folder / name) for name in (first, second)}
+    if missing := [name for name, errors in results.items() if errors is None]:
         return f"{' and '.join(missing)}: not validated, so nothing shows which result predicts better. Validate both."
-    (model, one), (other_model, other) = (each for each in found.values() if each is not None)
+    (model, one), (other_model, other) = (errors for errors in results.values() if errors is not None)
     same = [(one.position, other.position), (one.measured_db, other.measured_db)]
     if not all(np.array_equal(*pair) for pair in same):
         return f"{first} and {second} were validated on other links, so nothing shows which predicts better."

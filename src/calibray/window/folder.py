@@ -42,13 +42,13 @@ class StudyFolder:
 
     def files(self, endings: tuple[str, ...]) -> list[str]:
         """Names of the folder's files with one of the endings."""
-        found = (file for file in self.path.iterdir() if file.name.lower().endswith(endings))
-        return sorted(file.name for file in found if file.is_file() and not file.name.startswith("."))
+        candidates = (file for file in self.path.iterdir() if file.name.lower().endswith(endings))
+        return sorted(file.name for file in candidates if file.is_file() and not file.name.startswith("."))
 
     def scenes(self) -> list[str]:
         """The scenes of the folder and of its folders, apart from those of results."""
-        found = [*self.path.glob("*.xml"), *self.path.glob("*/*.xml")]
-        names = (file.relative_to(self.path).as_posix() for file in found if file.name != "result-scene.xml")
+        files = [*self.path.glob("*.xml"), *self.path.glob("*/*.xml")]
+        names = (file.relative_to(self.path).as_posix() for file in files if file.name != "result-scene.xml")
         return sorted(name for name in names if not name.startswith("."))
 
     def results(self) -> list[str]:

@@ -114,14 +114,14 @@ class Jobs:
     def elsewhere(self) -> list[Job]:
         """Commands that run in the folder and were started in a terminal."""
         own = {job.pid for job in self.list() if job.state == "running"}
-        found = []
+        commands = []
         for process in psutil.process_iter(["pid", "ppid", "cmdline", "cwd"]):
             line, parent = process.info["cmdline"] or [], process.info["ppid"]
             start = next((k for k, word in enumerate(line[:3]) if Path(word).name == "calibray"), None)
             here = process.info["cwd"] == str(self._study_folder)
             if start is not None and here and parent not in own and line[start + 1 : start + 2] != ["open"]:
-                found.append(Job(0, tuple(line[start + 1 :]), "running", process.info["pid"]))
-        return found
+                commands.append(Job(0, tuple(line[start + 1 :]), "running", process.info["pid"]))
+        return commands
 
     def stop(self, job: Job) -> None:
         """Interrupt a command as Ctrl-C does; what it has finished is kept."""
@@ -133,7 +133,7 @@ class Jobs:
         """Wait until a command has ended, and return its state then."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            now = next(each for each in self.list() if each.number == job.number)
+            now = next(other for other in self.list() if other.number == job.number)
             if now.state != "running":
                 return now
             time.sleep(0.05)

@@ -75,5 +75,5 @@ def findings(folder: StudyFolder) -> list[str]:
         return []
     study = Study.load(folder.study_file)
     links = study.measurements()
-    found = [*examine(study, links), *count_unknowns(study, links)]
-    return [f"{each.problem}: {each.remedy}" for each in found]
+    suspicions = [*examine(study, links), *count_unknowns(study, links)]
+    return [f"{suspicion.problem}: {suspicion.remedy}" for suspicion in suspicions]

@@ -89,8 +89,8 @@ def _view(shown: Solid) -> None:
         ui.button("Closer", on_click=lambda: move(factor=0.7)).props("outline dense")
         ui.button("Farther", on_click=lambda: move(factor=1.4)).props("outline dense")
     with ui.row().props('role=group aria-label="Materials"'):
-        for (name, each), color in zip(objects.items(), COLORS * len(objects), strict=False):
+        for (name, mesh), color in zip(objects.items(), COLORS * len(objects), strict=False):
             with ui.element("span").classes("material"):
                 ui.element("span").classes("swatch").style(f"background: {color}")
-                ui.checkbox(name, value=True, on_change=lambda event, each=each: each.visible(event.value))
+                ui.checkbox(name, value=True, on_change=lambda event, mesh=mesh: mesh.visible(event.value))
     ui.label("Drag to turn, wheel to zoom. Blue: receivers; purple: transmitters.").classes("quiet")
