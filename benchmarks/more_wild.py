@@ -29,7 +29,7 @@ OPTIONS = {
     "dfo-ls": {"radius": RADIUS, "tolerance": 1e-11},
     "gauss-newton": {"step": 1e-9, "tolerance": 1e-14},
 }
-GRADIENTS = (2, 5, 10, 20, 50)
+GRADIENTS = (2, 5, 10, 20)
 TOLERANCES = (1e-1, 1e-3, 1e-5, 1e-7)
 
 

@@ -1,11 +1,11 @@
 """Ray mapping on foreign engines: calls until the engine's own optimum is reached to 0.01 dB.
 
-    python benchmarks/ray_mapping.py --first 3000 --districts 20 --seeds 3 --out rays.jsonl
+    python benchmarks/ray_mapping.py --first 3000 --districts 20 --offices 10 --seeds 3 --out rays.jsonl
 
-The engine is the replay of a district with antennas, constants and physics of its own; it answers with the power of
-every path. The study knows neither. Truths are drawn evenly within the bounds, errors have 3 dB. The excess of a call
-is the RMSE of its candidate on the engine, minus that of the engine's optimum. A call counts as the first one whose
-excess is at most 0.01 dB.
+The engine is the replay of a district or an office with antennas, constants and physics of its own; it answers with the
+power of every path. The study knows neither. Truths are drawn evenly within the bounds, errors have 3 dB. The excess of
+a call is the RMSE of its candidate on the engine, minus that of the engine's optimum. A call counts as the first one
+whose excess is at most 0.01 dB.
 """
 
 from __future__ import annotations
@@ -14,29 +14,33 @@ import argparse
 import json
 import tempfile
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import pandas as pd
 
 import districts
 from calibray.engines import Replay
 from calibray.engines.rays.compile import RaySetting, compile_rays, powers, rays_of
 from calibray.engines.rays.export import Export
-from calibray.engines.rays.table import RayTable
 from calibray.errors import InputError
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_mapping import map_rays
 from calibray.fitting.ray_model import HALF_SPACE
 from calibray.fitting.search import least_squares
 from calibray.materials import Material, itu_material
-from calibray.paths import Paths
-from calibray.study import Study
+from calibray.paths import Kind, Paths, concatenate, take
+from calibray.study import Setup, Study
 from calibray.tracing.settings import Antenna
+from problem_families.sites import office_site
 
 NOISE_DB: Final = 3.0
 REACHED_DB: Final = 0.01
+SEARCHES: Final = 128  # local searches for an engine's optimum
+DIFFUSE: Final = 3  # diffuse paths of a link
 
 SAME: Final = (Antenna("dipole", "V"), Antenna("dipole", "V"))
 OTHER: Final = (Antenna("tr38901", "V", (0.7, 0.1, 0.0)), Antenna("iso", "V"))
@@ -63,22 +67,117 @@ ENGINES: Final[dict[str, tuple[Any, Any]]] = {
 """Antennas, and materials from the study's at a carrier [Hz]."""
 
 
+@dataclass(frozen=True)
+class Place:
+    """Links whose paths are traced.
+
+    Attributes:
+        name: Its name.
+        setup: The study, which states no antennas.
+        paths: Its paths between short dipoles.
+    """
+
+    name: str
+    setup: Setup
+    paths: Paths
+
+    @classmethod
+    def of(cls, name: str, study: Study) -> Place:
+        """Trace a study that states short dipoles."""
+        setup = study.opened()
+        paths = _without_weak(setup.trace())
+        content = {key: value for key, value in setup.study.content().items() if key != "antennas"}
+        return cls(name, Study.from_content(content, study.path).opened(), paths)
+
+
+def district(seed: int, folder: Path) -> Place:
+    """A district of `districts.py`."""
+    made = districts.make(f"district-{seed}", folder)
+    return Place.of(made.name, made.problem.setup.study)
+
+
+def office(seed: int, folder: Path) -> Place:
+    """An office of `problem_families`, with 2 to 5 permittivities to calibrate."""
+    random = np.random.default_rng([seed, 78])
+    count = round(float(np.exp(random.uniform(np.log(20), np.log(100)))))
+    site = office_site(random, 2 * count)
+    frequency = float(random.choice([0.9e9, 2.1e9, 3.5e9, 6e9]))
+    names = random.permutation(list(site.materials))[: random.integers(2, 6)].tolist()
+    folder = folder / f"office-{seed}"
+    table = pd.DataFrame(
+        np.hstack([site.tx, site.rx]).round(3), columns=["tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z"]
+    ).assign(loss_db=100.0)
+    content = {
+        "version": 1,
+        "scene": {"file": str(site.write(folder / "scene")), "frequency": frequency},
+        "links": {
+            "file": "links.csv", "tx": ["tx_x", "tx_y", "tx_z"], "rx": ["rx_x", "rx_y", "rx_z"], "value": "loss_db"
+        },
+        "materials": {
+            name: {
+                "relative_permittivity": float(random.uniform(*ranges.relative_permittivity)),
+                "conductivity": float(np.exp(random.uniform(*np.log(ranges.conductivity)))) * frequency / 4e9,
+                "thickness": float(random.uniform(*ranges.thickness)),
+            }
+            for name, ranges in site.materials.items()
+        },
+        "antennas": {end: {"pattern": "dipole", "polarization": "V"} for end in ("tx", "rx")},
+        "trace": {"max_depth": 3, "refraction": True, "samples": 100_000},
+        "parameters": {f"{name}.relative_permittivity": {"bounds": [1.5, 12.0]} for name in names},
+    }  # fmt: skip
+    table.to_csv(folder / "links.csv", index=False)
+    study = Study.from_content(content, folder / "study.toml")
+    reached = np.setdiff1d(np.arange(len(table)), study.opened().trace().links_without_path)[:count]
+    table.iloc[reached].to_csv(folder / "links.csv", index=False)
+    return Place.of(f"office-{seed}", Study.from_content(content, folder / "study.toml"))
+
+
+def _without_weak(paths: Paths) -> Paths:
+    """The paths with at least a thousandth of their link's power."""
+    power = powers(paths)
+    return take(paths, np.flatnonzero(power > 1e-3 * np.bincount(paths.link, power)[paths.link]))
+
+
+def with_diffuse(place: Place) -> Place:
+    """The place with the strongest diffuse paths of every link, and a study that knows that surfaces scatter."""
+    content = place.setup.study.content()
+    materials = {name: {"scattering_coefficient": 0.2} for name in place.paths.materials}
+    stated = content.get("materials", {})
+    materials = {name: {**stated.get(name, {}), **changed} for name, changed in materials.items()}
+    dipole = {"pattern": "dipole", "polarization": "V"}
+    rough = content | {
+        "materials": materials,
+        "antennas": {"tx": dipole, "rx": dipole},
+        "trace": content.get("trace", {}) | {"max_depth": 1, "diffuse_reflection": True, "samples": 3_000},
+    }
+    file = place.setup.study.path
+    mixed = Study.from_content(rough, file).opened().trace()
+    path = np.repeat(np.arange(mixed.num_paths), np.diff(mixed.first))
+    diffuse = np.unique(path[mixed.kind == Kind.DIFFUSE])
+    power = powers(mixed)[diffuse]
+    order = diffuse[np.lexsort((-power, mixed.link[diffuse]))]
+    rank = np.arange(len(order)) - np.searchsorted(mixed.link[order], mixed.link[order])
+    both = concatenate([place.paths, take(mixed, np.sort(order[rank < DIFFUSE]))])
+    setup = Study.from_content(content | {"materials": materials}, file).opened()
+    return replace(place, setup=setup, paths=both)
+
+
 class Foreign:
     """An engine that answers with rays."""
 
-    def __init__(self, problem: Problem, paths: Paths, name: str) -> None:
+    def __init__(self, place: Place, name: str) -> None:
         antennas, materials = ENGINES[name]
-        setup = problem.setup
-        table = rays_of(paths)
-        setting = RaySetting(setup.scene, setup.radio.frequency, antennas, setup.links)
+        setup, bare = place.setup, place.paths
+        self.table = rays_of(place.paths)
         self.setting = RaySetting.of(setup)
-        self.table: RayTable = table
-        bare = compile_rays(replace(table, power=None), setting)
+        if antennas is not SAME:
+            setting = RaySetting(setup.scene, setup.radio.frequency, antennas, setup.links)
+            bare = compile_rays(replace(self.table, power=None), setting)
         self.paths = replace(
-            bare, materials={key: materials(m, paths.frequency) for key, m in bare.materials.items()}
+            bare, materials={key: materials(m, bare.frequency) for key, m in setup.scene.materials.items()}
         )
-        self.replay = Replay(self.paths, problem.parameters)
-        self.parameters = problem.parameters
+        self.parameters = setup.parameters
+        self.replay = Replay(self.paths, self.parameters)
 
     def rays(self, candidate: np.ndarray) -> Export:
         """The answer to one candidate."""
@@ -86,29 +185,22 @@ class Foreign:
         return Export.of_table(replace(self.table, power=powers(paths)), self.setting)
 
 
-def repetition(district: districts.District, name: str, seed: int) -> dict[str, Any]:
+def repetition(place: Place, name: str, seed: int) -> dict[str, Any]:
     """One planted truth on one engine."""
     started, random = time.process_time(), np.random.default_rng([seed, 30])
-    known = district.problem
-    content = {key: value for key, value in known.setup.study.content().items() if key != "antennas"}
-    setup = Study.from_content(content, known.setup.study.path).opened()
-    foreign = Foreign(replace(known, setup=setup), district.paths, name)
+    foreign = Foreign(place, name)
     parameters = foreign.parameters
     truth = parameters.from_search(random.uniform(*parameters.search_bounds))
     loss = foreign.replay.path_loss(truth[None])[0]
     measured = loss + NOISE_DB * random.standard_normal(len(loss))
-    problem = replace(
-        known,
-        setup=setup,
-        engine=foreign.replay,
-        objective=replace(district.problem.objective, measured=measured),
-    )
-    optimum = least_squares(problem, 256, parameters.to_search(truth)[None]).best.y
+    known = Problem.of(place.setup, foreign.replay)
+    problem = replace(known, objective=replace(known.objective, measured=measured))
+    optimum = least_squares(problem, SEARCHES, parameters.to_search(truth)[None]).best.y
     mapped = map_rays(problem, foreign.rays, seed=seed, most_calls=6)
     points = parameters.to_search(np.array([call.candidate for call in mapped.calls]))
     excess = problem.squares(points).value - optimum
     return {
-        "district": district.name, "engine": name, "seed": seed, "paths": foreign.paths.num_paths,
+        "place": place.name, "engine": name, "seed": seed, "paths": foreign.paths.num_paths,
         "calls": next((k + 1 for k, value in enumerate(excess.tolist()) if value <= REACHED_DB), 99),
         "made": len(excess), "excess_db": excess.tolist(), "misfit_db": mapped.understanding.misfit_db,
         "gap_db": mapped.gap_db, "understood": mapped.understood, "seconds": time.process_time() - started,
@@ -120,33 +212,47 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--first", type=int, default=100)
     parser.add_argument("--districts", type=int, default=2)
+    parser.add_argument("--offices", type=int, default=0)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--engines", default=",".join(ENGINES))
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    rows = []
+    rows, engines = [], options.engines.split(",")
+    places = [(district, options.first + number) for number in range(options.districts)]
+    offices = [(office, options.first + number) for number in range(options.offices)]
+    # Districts and offices in turn, so that a run that is stopped has seen both.
+    order = sorted([*enumerate(places), *enumerate(offices)], key=lambda item: item[0])
     with tempfile.TemporaryDirectory() as folder:
-        for number in range(options.first, options.first + options.districts):
+        for _, (make, number) in order:
             try:
-                district = districts.make(f"district-{number}", Path(folder))
+                place = make(number, Path(folder))
             except InputError as error:  # some draw a carrier for which P.2040 has no constants
-                print(f"district-{number} left out: {error}", flush=True)
+                print(f"{make.__name__} {number} left out: {error}", flush=True)
                 continue
-            for name in options.engines.split(","):
-                for seed in range(options.seeds):
-                    rows.append(repetition(district, name, seed))
-                    print(json.dumps(rows[-1]), flush=True)
-                    if options.out is not None:
-                        with options.out.open("a") as file:
-                            file.write(json.dumps(rows[-1]) + "\n")
-    for name in options.engines.split(","):
-        mine = [row for row in rows if row["engine"] == name]
-        calls = np.array([row["calls"] for row in mine])
-        print(
-            f"{name:14} calls median {np.median(calls):g}, 90th percentile {np.quantile(calls, 0.9):g}; understood "
-            f"{np.mean([row['understood'] for row in mine]):.0%}; last excess "
-            f"{max(row['excess_db'][-1] for row in mine):.4f} dB at most"
+            rough = with_diffuse(place) if "scattering" in engines else place
+            for name, seed in product(engines, range(options.seeds)):
+                rows.append(repetition(rough if name == "scattering" else place, name, seed))
+                print(json.dumps(rows[-1]), flush=True)
+                if options.out is not None:
+                    with options.out.open("a") as file:
+                        file.write(json.dumps(rows[-1]) + "\n")
+    for name in engines:
+        print(f"{name:14} {_summary([row for row in rows if row['engine'] == name])}")
+    print(f"{'all':14} {_summary(rows)}")
+
+
+def _summary(rows: list[dict[str, Any]]) -> str:
+    calls = np.array([row["calls"] for row in rows])
+    understood = np.array([row["understood"] for row in rows])
+    last = np.array([row["excess_db"][-1] for row in rows])
+    text = f"{len(rows)} runs: calls median {np.median(calls):g}, 90th percentile {np.quantile(calls, 0.9):g}"
+    if understood.any():
+        text += f"; {understood.mean():.0%} understood, last excess at most {last[understood].max():.4f} dB"
+    if not understood.all():
+        text += (
+            f"; {(last[~understood] > 0.02).mean():.0%} of {(~understood).sum()} not understood above 0.02 dB"
         )
+    return text
 
 
 if __name__ == "__main__":

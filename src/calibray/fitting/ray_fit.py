@@ -1,56 +1,37 @@
 """What an engine assumes, from ratios of its rays' powers: a global search over constants and polarizations.
 
-A slab resonates: the power of a ray has a minimum for every half wavelength that the thickness grows by, so a local
-search ends in a wrong one. We first scan each material apart, on paths that meet no other one: a fine grid of
-thicknesses up to the depth where the wave has decayed, for some conductivities and polarizations of both ends. The best
-combinations are then refined together by least squares with exact derivatives, and if a misfit remains, each material
-is scanned again on all its paths.
+Materials are added one after the other. Each is scanned (`ray_scan.py`) on paths that meet no material that is still to
+come; the best points, with several polarizations, are refined together with what is known so far, by least squares with
+exact derivatives on all these paths. The best few go on. If a misfit remains at the end, each material is scanned again
+on all its paths.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.constants import epsilon_0, speed_of_light
 from scipy.optimize import least_squares
 
+from calibray.engines.rays.compile import powers
 from calibray.engines.rays.surfaces import TOLERANCE
 from calibray.engines.replay import Replay
-from calibray.fitting.ray_model import HALF_SPACE, Call, RayModel
+from calibray.fitting import ray_scan
+from calibray.fitting.ray_model import Call, Ends, RayModel
 from calibray.parameters import Parameters
-from calibray.paths import Paths
+from calibray.paths import Paths, take
 
-CONDUCTIVITIES: Final = 10.0 ** np.arange(-3.5, 1.1, 0.5)
-"""Conductivities of a scan [S/m]; a refinement bridges half a decade."""
-
-THINNEST: Final = 1e-3
-"""Least thickness of a scan [m]."""
-
-THICKEST: Final = 0.6
-"""Largest thickness of a scan [m], unless the study's is more than half of it."""
-
-DECAYED: Final = 4.0
-"""Attenuation within a slab [Np] beyond which it acts as a half-space: what returns has e^-8 of its amplitude."""
-
-RESOLUTION: Final = 10.0
-"""Points of a scan for a wavelength in the slab, which has two resonances."""
-
-SCANNED: Final = 48
-"""Paths of a scan."""
-
-KEPT: Final = 4
-"""Local minima of each scan that are refined."""
+KEPT: Final = 3
+"""Explanations that go on from one material to the next."""
 
 EXACT_DB: Final = 0.005
 """Misfit at which a search ends [dB]."""
 
 EVALUATIONS: Final = (12, 30)
-"""Evaluations of a first and of a longer refinement."""
+"""Evaluations of a refinement between scans and of the last one, with each loss."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,19 +41,20 @@ class Understanding:
     Attributes:
         model: The model of the last export's paths.
         values: The assumed values [k], as in `RayModel`.
+        linear: Whether the antennas are polarized linearly.
         misfit_db: Weighted root mean square of the errors of the ratios [dB].
     """
 
     model: RayModel
     values: NDArray[np.float64]
+    linear: Ends
     misfit_db: float
 
     def replay(self, parameters: Parameters, last: Call) -> Replay:
         """The replay of a call's paths, corrected so that it agrees with it."""
-        level, _ = self.model.level_and_slope(last.candidate, self.values)
-        correction = 10 ** ((last.export.level_db - level) / 10)
-        paths = replace(self.model.replay_paths(last.candidate, self.values), correction=correction)
-        return Replay(paths, parameters)
+        paths = self.model.replay_paths(last.candidate, self.values, self.linear)
+        correction = 10 ** (last.export.level_db / 10) / np.maximum(powers(paths), 1e-300)
+        return Replay(replace(paths, correction=correction), parameters)
 
 
 class Ratio(NamedTuple):
@@ -80,8 +62,8 @@ class Ratio(NamedTuple):
 
     Attributes:
         call: The earlier call.
-        here: Their indices in the last call [n].
-        weight: Root of their weights, relative to all ratios [n].
+        here: Their indices in the last call, ascending [n].
+        weight: Their weights, 1 over all ratios [n].
         observed: Power in the last call over that in the earlier one [n], [dB].
     """
 
@@ -89,6 +71,11 @@ class Ratio(NamedTuple):
     here: NDArray[np.int64]
     weight: NDArray[np.float64]
     observed: NDArray[np.float64]
+
+    def on(self, kept: NDArray[np.bool_]) -> Ratio:
+        """The same where paths of the last call are kept [P]."""
+        mine = kept[self.here]
+        return Ratio(self.call, self.here[mine], self.weight[mine], self.observed[mine])
 
 
 def understand(
@@ -102,242 +89,153 @@ def understand(
         known: Whether the program's antennas are those of the engine.
         before: What explained the calls before the last one, if any.
     """
-    last, ratios = calls[-1], _ratios(calls)
-    model = RayModel.of(parameters, last.export.paths)
-    if not ratios or not len(model.start):
-        misfit = _misfit(model, ratios, last, model.start) if ratios else np.inf
-        return Understanding(model, model.start, misfit)
-    best = None
+    last, ratios = calls[-1], ratios_of(calls)
+    model = RayModel.of(parameters, last.export.paths, known)
+    first = Understanding(model, model.start, (False, False), np.inf)
+    if not ratios:
+        return first
+    if not len(model.start):
+        return replace(first, misfit_db=float(np.linalg.norm(_errors(first, ratios, last)[0])))
     if before is not None and before.model.assumed == model.assumed:
-        best = _refined(model.with_single(before.model.single), ratios, last, before.values, EVALUATIONS[1])
-        if best.misfit_db <= EXACT_DB:
-            return best
-    return _search(model, ratios, last, known, best)
+        before = _refined(replace(before, model=model), ratios, last, EVALUATIONS[1])
+        if before.misfit_db <= EXACT_DB:
+            return before
+    return _search(first, ratios, last, before)
 
 
 def _search(
-    model: RayModel, ratios: list[Ratio], last: Call, known: bool, best: Understanding | None
+    first: Understanding, ratios: list[Ratio], last: Call, before: Understanding | None
 ) -> Understanding:
-    """Scan, refine, and scan again with all paths."""
-    scans = _scans(model, ratios, last, model.start, apart=True)
-    fits: list[Understanding] = [] if best is None else [best]
-    pairs = _ranked(model, scans)[:1] if known else _ranked(model, scans)[:3]
-    for pair in pairs:
-        values = model.start.copy()
-        for scan in scans:
-            scan.put(values, pair, 0)
-        fits.append(_polarized(model, ratios, last, values, model.polarizations[pair], EVALUATIONS[0]))
-    for again in (False, True):
-        best = min(fits, key=lambda fit: fit.misfit_db)
-        if best.misfit_db <= EXACT_DB:
-            return best
-        if again:
-            scans = _scans(model, ratios, last, best.values, apart=False)
-        for scan in scans:
-            best = min(fits, key=lambda fit: fit.misfit_db)
-            pair = int(np.argmin(scan.misfit[:, 0]))
-            for number in range(0 if again else 1, KEPT):
-                if scan.put(values := best.values.copy(), pair, number):
-                    fits.append(_refined(best.model, ratios, last, values, EVALUATIONS[0]))
-                if fits[-1].misfit_db <= EXACT_DB:
-                    return fits[-1]
-    best = min(fits, key=lambda fit: fit.misfit_db)
-    return min(
-        (best, _refined(best.model, ratios, last, best.values, EVALUATIONS[1])), key=lambda fit: fit.misfit_db
-    )
+    """Add one material after the other, then scan all of them again."""
+    meets, order = _meetings(first.model)
+    fits, done = [first], np.zeros(meets.shape[1], dtype=bool)
+    for material in order:
+        done[material] = True
+        shown = np.logical_not((meets & ~done).any(axis=1))
+        part = [ratio for each in ratios if len((ratio := each.on(shown)).here)]
+        new = _scanned(fits[0], part, last, material, meets[:, material] & shown)
+        if part:
+            fits = _best([_refined(fit, part, last, EVALUATIONS[0]) for fit in [*fits, *new]])
+    fits = _best([_refined(fit, ratios, last, EVALUATIONS[1]) for fit in fits] + ([before] if before else []))
+    for material in order:
+        if fits[0].misfit_db <= EXACT_DB:
+            break
+        new = _scanned(fits[0], ratios, last, material, meets[:, material])
+        fits = _best([*fits, *(_refined(fit, ratios, last, EVALUATIONS[1]) for fit in new)])
+    return fits[0]
 
 
-def _polarized(
-    model: RayModel,
-    ratios: list[Ratio],
-    last: Call,
-    values: NDArray[np.float64],
-    slants: tuple[float | None, float | None],
-    evaluations: int,
-) -> Understanding:
-    """Refine with the polarizations of both ends."""
-    single = model.with_single((slants[0] is not None, slants[1] is not None))
-    angles = [[slant, 0.0, 0.0] for slant in slants if slant is not None]
-    start = np.concatenate([values, *angles])
-    return _refined(single, ratios, last, start, evaluations)
+def _best(fits: list[Understanding]) -> list[Understanding]:
+    return sorted(fits, key=lambda fit: fit.misfit_db)[:KEPT]
 
 
-@dataclass(frozen=True, eq=False)
-class _Scan:
-    """The best thicknesses and conductivities of one material, for every pair of polarizations.
-
-    Attributes:
-        where: Indices of the material's constants in the values of the whole model [c].
-        values: Their values in each local minimum [H, K, c].
-        misfit: Weighted mean square of the ratios' errors [H, K]; inf where there are fewer minima.
-        weight: Weight of the paths scanned.
-    """
-
-    where: NDArray[np.int64]
-    values: NDArray[np.float64]
-    misfit: NDArray[np.float64]
-    weight: float
-
-    def put(self, values: NDArray[np.float64], pair: int, number: int) -> bool:
-        """Put a local minimum into values; says whether there is one."""
-        if not np.isfinite(self.misfit[pair, number]):
-            return False
-        values[self.where] = self.values[pair, number]
-        return True
-
-
-def _ranked(model: RayModel, scans: list[_Scan]) -> list[int]:
-    """Pairs of polarizations, that of the least misfit first."""
-    total = np.zeros(len(model.polarizations))
-    for scan in scans:
-        total += scan.weight * scan.misfit[:, 0]
-    return np.argsort(total, kind="stable").tolist()
-
-
-def _scans(
-    model: RayModel, ratios: list[Ratio], last: Call, values: NDArray[np.float64], apart: bool
-) -> list[_Scan]:
-    """Scan every material that has a parameter: on paths that meet it alone, or on all its paths."""
-    paths, parameters = model.paths, model.parameters
-    names = list(paths.materials)
+def _meetings(model: RayModel) -> tuple[NDArray[np.bool_], list[int]]:
+    """Which materials every path meets [P, M], and those with a parameter, that most paths meet alone first."""
+    paths, names = model.paths, list(model.paths.materials)
     meets = np.zeros((paths.num_paths, len(names)), dtype=bool)
     meets[np.repeat(np.arange(paths.num_paths), np.diff(paths.first)), paths.material] = True
-    shared = np.isin(np.arange(paths.num_paths), ratios[0].here)
-    moved = {names.index(item.material) for item in parameters if item.material in names}
-    scans, present, done = [], values.copy(), np.zeros(len(names), dtype=bool)
-    count = meets[meets.sum(axis=1) == 1].sum(axis=0)
-    for material in sorted(moved, key=lambda index: -count[index]):
-        done[material] = True
-        others = meets & ~done if apart else np.zeros_like(meets)
-        subset = np.flatnonzero(shared & meets[:, material] & ~others.any(axis=1))
-        where = [
-            k for k, (name, field) in enumerate(model.assumed)
-            if name == names[material] and field in ("thickness", "conductivity")
-        ]  # fmt: skip
-        if not len(subset) or not where:
-            continue
-        depth = np.diff(paths.first)[subset]
-        subset = subset[np.lexsort((-paths.spreading[subset], depth))[:SCANNED]]
-        scan = _scan(model, ratios, last, present, (names[material], np.array(where)), np.sort(subset))
-        scans.append(scan)
-        scan.put(present, _ranked(model, scans)[0], 0)
-    return scans
+    moved = {names.index(item.material) for item in model.parameters if item.material in names}
+    alone = meets[meets.sum(axis=1) == 1].sum(axis=0)
+    return meets, sorted(moved, key=lambda index: -alone[index])
 
 
-def _scan(
-    model: RayModel,
-    ratios: list[Ratio],
-    last: Call,
-    values: NDArray[np.float64],
-    material: tuple[str, NDArray[np.int64]],
-    subset: NDArray[np.int64],
-) -> _Scan:
-    """Scan one material, given its name and where its constants are, on some paths of the last call [n]."""
-    name, where = material
-    calls = [last, *(ratio.call for ratio in ratios)]
-    fields = [model.assumed[k][1] for k in where.tolist()]
-    grid = _grid(model, name, fields, calls)
-    part = RayModel.of(model.parameters, model.paths, subset)
-    index = {item: k for k, item in enumerate(model.assumed)}
-    points = np.tile(values[[index[item] for item in part.assumed]], (len(grid), 1))
-    points[:, [part.assumed.index((name, field)) for field in fields]] = grid
-    level = part.levels(last.candidate, points)
-    square, weight = np.zeros(level.shape[:2]), 0.0
+def _scanned(
+    fit: Understanding, ratios: list[Ratio], last: Call, material: int, wanted: NDArray[np.bool_]
+) -> list[Understanding]:
+    """Explanations with other constants of one material, from a scan on some of the paths [P]."""
+    model = fit.model
+    name = list(model.paths.materials)[material]
+    fields = [
+        field for owner, field in model.assumed if owner == name and field in ("thickness", "conductivity")
+    ]
+    where = [model.assumed.index((name, field)) for field in fields]
+    calls, index = [], np.flatnonzero(wanted)
     for ratio in ratios:
-        at = np.searchsorted(ratio.here, subset)
-        at[at == len(ratio.here)] = 0
-        mine = ratio.here[at] == subset
-        change = level - part.levels(ratio.call.candidate, points)
-        square += np.sum((ratio.weight[at] * mine * (change - ratio.observed[at])) ** 2, axis=2)
-        weight += float(np.sum((ratio.weight[at] * mine) ** 2))
-    return _Scan(where, *_minima(grid, square / weight), weight)
+        index = np.intersect1d(index, ratio.here)
+    index = ray_scan.chosen(model.paths, index)
+    if not len(index) or not where:
+        return []
+    for ratio in ratios:
+        at = np.searchsorted(ratio.here, index)
+        materials = model.materials(ratio.call.candidate, fit.values)
+        calls.append(ray_scan.Observed(materials, ratio.weight[at], ratio.observed[at]))
+    found = ray_scan.scan(
+        take(model.paths, index),
+        name,
+        fields,
+        model.materials(last.candidate, fit.values),
+        calls,
+        model.known,
+    )
+    new, first = [], np.isinf(fit.misfit_db)
+    pairs = np.argsort(found.misfit[:, 0], kind="stable")[:KEPT].tolist()
+    for rank, pair in enumerate(pairs):
+        for number in range(int(np.isfinite(found.misfit[pair]).sum())):
+            moved = fit.values.copy()
+            moved[where] = found.values[pair, number]
+            if rank == 0 and not first:
+                new.append(replace(fit, values=moved))
+            if not model.known and (first or number == 0):
+                new.append(_polarized(replace(fit, values=moved), ray_scan.POLARIZATIONS[pair]))
+            elif first:
+                new.append(replace(fit, values=moved))
+    return new
 
 
-def _grid(model: RayModel, name: str, fields: list[str], calls: list[Call]) -> NDArray[np.float64]:
-    """Logarithms of thickness and conductivity, or of the one that is assumed [n, c]."""
-    materials = [model.parameters.materials(call.candidate, model.paths.materials)[name] for call in calls]
-    root = np.sqrt(max(item.relative_permittivity for item in materials))
-    declared = model.paths.materials[name].thickness
-    conductivities = CONDUCTIVITIES
-    if "conductivity" not in fields:
-        conductivities = np.array([max(min(item.conductivity for item in materials), CONDUCTIVITIES[0])])
-    rows = []
-    for conductivity in conductivities.tolist():
-        # Attenuation of a plane wave in a dielectric [Np/m], alpha = sigma / (2 c eps_0 sqrt(eps_r)).
-        attenuation = conductivity / (2 * speed_of_light * epsilon_0 * root)
-        deepest = min(max(THICKEST, 2 * declared), max(DECAYED / attenuation, 2 * THINNEST))
-        step = speed_of_light / model.paths.frequency / (RESOLUTION * root)
-        thickness = np.append(np.arange(THINNEST, deepest, step), HALF_SPACE)
-        if "thickness" not in fields:
-            thickness = np.array([declared])
-        rows.append(np.stack([thickness, np.full(len(thickness), conductivity)], axis=1))
-    return np.log(np.concatenate(rows))[:, [("thickness", "conductivity").index(field) for field in fields]]
+def _polarized(fit: Understanding, slants: tuple[float | None, float | None]) -> Understanding:
+    """The same with upright antennas of given slants."""
+    angles = [part for slant in slants for part in (slant or 0.0, 0.0, 0.0)]
+    values = np.concatenate([fit.values[: len(fit.model.assumed)], angles])
+    return replace(fit, values=values, linear=(slants[0] is not None, slants[1] is not None))
 
 
-def _minima(
-    grid: NDArray[np.float64], square: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The lowest points of a scan that are not next to a lower one: [H, K, c], and their misfits [H, K]."""
-    pairs = square.shape[1]
-    values, misfit = np.zeros((pairs, KEPT, grid.shape[1])), np.full((pairs, KEPT), np.inf)
-    lowest = np.minimum(np.append(np.inf, square.T.ravel()[:-1]), np.append(square.T.ravel()[1:], np.inf))
-    lowest = square <= lowest.reshape(pairs, -1).T
-    for pair in range(pairs):
-        chosen = np.flatnonzero(lowest[:, pair])
-        chosen = chosen[np.argsort(square[chosen, pair], kind="stable")[:KEPT]]
-        values[pair, : len(chosen)], misfit[pair, : len(chosen)] = grid[chosen], square[chosen, pair]
-    return values, misfit
-
-
-def _refined(
-    model: RayModel, ratios: list[Ratio], last: Call, start: NDArray[np.float64], evaluations: int
-) -> Understanding:
-    """Least squares of all ratios from a start."""
-    lower, upper = model.bounds
+def _refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: int) -> Understanding:
+    """Least squares of all ratios, from an explanation."""
+    lower, upper = fit.model.bounds
     kept: dict[bytes, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
 
     def evaluate(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         if (key := values.tobytes()) not in kept:
             kept.clear()
-            kept[key] = _errors(model, ratios, last, values)
+            kept[key] = _errors(replace(fit, values=values), ratios, last)
         return kept[key]
 
     # SciPy's stubs know no function as Jacobian.
     slopes = cast(Any, lambda values: evaluate(values)[1])
-    ended = least_squares(
-        lambda values: evaluate(values)[0], np.clip(start, lower, upper), slopes,
-        bounds=(lower - 1e-9, upper + 1e-9), x_scale="jac", max_nfev=evaluations, xtol=1e-10, ftol=1e-8,
-    )  # fmt: skip
-    return Understanding(model, ended.x, float(np.sqrt(2 * ended.cost)))
-
-
-def _misfit(model: RayModel, ratios: list[Ratio], last: Call, values: NDArray[np.float64]) -> float:
-    return float(np.linalg.norm(_errors(model, ratios, last, values)[0]))
+    weights = np.concatenate([ratio.weight for ratio in ratios])
+    scale = ray_scan.ROBUST_DB * float(np.sqrt(weights.mean()))
+    values = np.clip(fit.values, lower, upper)
+    for loss in ("soft_l1", "linear"):  # paths near a resonance count less at first
+        values = least_squares(
+            lambda values: evaluate(values)[0], values, slopes, bounds=(lower - 1e-9, upper + 1e-9), x_scale="jac",
+            loss=loss, f_scale=scale, max_nfev=evaluations, xtol=1e-10, ftol=1e-8,
+        ).x  # fmt: skip
+    misfit = float(np.linalg.norm(evaluate(values)[0]) / np.sqrt(weights.sum()))
+    return replace(fit, values=values, misfit_db=misfit)
 
 
 def _errors(
-    model: RayModel, ratios: list[Ratio], last: Call, values: NDArray[np.float64]
+    fit: Understanding, ratios: list[Ratio], last: Call
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weighted errors of the ratios [m], [dB], and their derivatives by the values [m, k]."""
-    level, slope = model.level_and_slope(last.candidate, values)
+    level, slope = fit.model.level_and_slope(last.candidate, fit.values, fit.linear)
     residuals, slopes = [], []
     for ratio in ratios:
         # The earlier call is replayed on the paths of the last one.
-        other, other_slope = model.level_and_slope(ratio.call.candidate, values)
-        residuals.append(ratio.weight * ((level - other)[ratio.here] - ratio.observed))
-        slopes.append(ratio.weight[:, None] * (slope - other_slope)[ratio.here])
+        other, other_slope = fit.model.level_and_slope(ratio.call.candidate, fit.values, fit.linear)
+        root = np.sqrt(ratio.weight)
+        residuals.append(root * ((level - other)[ratio.here] - ratio.observed))
+        slopes.append(root[:, None] * (slope - other_slope)[ratio.here])
     return np.concatenate(residuals), np.concatenate(slopes)
 
 
-def _ratios(calls: list[Call]) -> list[Ratio]:
+def ratios_of(calls: list[Call]) -> list[Ratio]:
     """The ratios of the last call to every earlier one that shares a path with it."""
     last = calls[-1].export
     pairs = [(call, *common(last.paths, call.export.paths)) for call in calls[:-1]]
     total = sum(last.weight[here].sum() for _, here, _ in pairs)
     return [
-        Ratio(
-            call, here, np.sqrt(last.weight[here] / total), last.level_db[here] - call.export.level_db[there]
-        )
+        Ratio(call, here, last.weight[here] / total, last.level_db[here] - call.export.level_db[there])
         for call, here, there in pairs
         if len(here)
     ]
@@ -364,10 +262,3 @@ def _by_kinds(paths: Paths) -> dict[tuple[int, ...], list[tuple[int, Any]]]:
         key = (int(paths.link[index]), *paths.kind[start:stop].tolist())
         groups.setdefault(key, []).append((index, paths.vertex[start:stop]))
     return groups
-
-
-def described(understanding: Understanding) -> Iterable[tuple[str, float]]:
-    """Names and values of the assumed constants; half-spaces have no thickness."""
-    for name, value in understanding.model.materials(understanding.values):
-        if not (name.endswith(".thickness") and value > HALF_SPACE / 2):
-            yield name, value

@@ -140,16 +140,20 @@ def _gap(replay: Replay, call: Call) -> float:
 
 def _most_informative(problem: Problem, call: Call, random: np.random.Generator) -> NDArray[np.float64]:
     """The candidate whose ratios to the first call say most about the assumed constants [d]."""
-    model = RayModel.of(problem.parameters, call.export.paths)
+    known = problem.setup.known_antennas is not None
+    model = RayModel.of(problem.parameters, call.export.paths, known)
     probes = problem.parameters.from_unit(design("sobol", PROBES, len(problem.parameters), random))
-    drawn = model.start + np.log(DRAWN) * random.uniform(-1.0, 1.0, (DRAWS, len(model.start)))
+    count = len(model.assumed)
+    drawn = np.tile(model.start, (DRAWS, 1))
+    drawn[:, :count] += np.log(DRAWN) * random.uniform(-1.0, 1.0, (DRAWS, count))
     weight = np.sqrt(call.export.weight)[:, None] / SIGMA_DB
     information = np.zeros(PROBES)
     for values in drawn:
-        _, first = model.level_and_slope(call.candidate, values)
+        _, first = model.level_and_slope(call.candidate, values, (False, False))
         for number, probe in enumerate(probes):
-            slope = (model.level_and_slope(probe, values)[1] - first) * weight
-            information[number] += np.linalg.slogdet(np.eye(len(values)) + slope.T @ slope)[1]
+            slope = model.level_and_slope(probe, values, (False, False))[1] - first
+            slope = (slope * weight)[:, :count]
+            information[number] += np.linalg.slogdet(np.eye(count) + slope.T @ slope)[1]
     return probes[int(np.argmax(information))]
 
 

@@ -1,30 +1,30 @@
 """The powers of an engine's rays as a function of the parameters and of what the engine assumes.
 
 An engine assumes thickness, conductivity and permittivity of the materials that the study does not calibrate, and the
-antennas. The gain of an antenna cancels in ratios of powers, its polarization does not. That of an antenna with one
-port is linear: along a slant angle in the frame of its axis (3GPP TR 38.901, eq. 7.3-4/5), which may be tilted.
+antennas. The gain of an antenna cancels in ratios of powers, its polarization does not. An antenna without polarization
+receives both components of a wave. Any other one is polarized linearly: along a slant angle in the frame of its axis
+(3GPP TR 38.901, eq. 7.3-4/5), which may be tilted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from numpy.typing import NDArray
 
 from calibray.engines.rays.export import Export
 from calibray.fields import GroupedProgram, Layout, jax_settings, layout, program_gains
 from calibray.fields.combining import path_power
 from calibray.fitting.cheap_replay import METAL
-from calibray.materials import FIELDS
+from calibray.materials import FIELDS, Material
 from calibray.parameters import Parameters
-from calibray.paths import Paths, take
+from calibray.paths import Paths
 from calibray.paths.chains import spherical_basis
 
 HALF_SPACE: Final = 1e4
@@ -36,16 +36,15 @@ RANGES: Final = {"thickness": (5e-4, HALF_SPACE), "conductivity": (1e-7, 1e3)}
 PERMITTIVITY_FACTOR: Final = 2.0
 """Largest factor between a permittivity that is not calibrated and the engine's."""
 
-TILT: Final = 1.0
-"""Largest tangent of the tilt of an antenna's axis along x or y; 1 is 45 degrees."""
+TILT: Final = 0.3
+"""Largest tangent of the tilt of an antenna's axis along x or y, 17 degrees: more than base stations have."""
 
-BATCH: Final = 64
-"""Sets of constants for which the program is compiled."""
-
-POLARIZATIONS: Final = (0.0, np.pi / 2, np.pi / 4, -np.pi / 4)
-"""Slants of one port from which its polarization is searched [rad]: vertical, horizontal, and both diagonals."""
+ANGLES: Final = 3
+"""Slant and two tilts of an end."""
 
 Pair = tuple[jax.Array, jax.Array]
+Ends = tuple[bool, bool]
+"""Whether the antenna is polarized linearly, at the transmitter and at the receiver."""
 
 
 class Call(NamedTuple):
@@ -59,24 +58,23 @@ class Call(NamedTuple):
 class RayModel:
     """The powers of an export's paths as a function of the parameters and of the assumed values.
 
-    The values are the logarithms of the assumed constants [k], and then slant and two tilts for each end with one port.
+    The values are the logarithms of the assumed constants [q], and then slant and two tilts [rad] of each end if the
+    antennas are unknown.
 
     Attributes:
         paths: The program, without correction.
         parameters: The study's parameters.
-        single: Whether the antenna has one port of unknown polarization, at the transmitter and at the receiver; else
-            the ports of the program count.
+        known: Whether its antennas are those of the engine; else they have the ports V and H.
     """
 
     paths: Paths
     parameters: Parameters
-    single: tuple[bool, bool] = (False, False)
+    known: bool
 
     @classmethod
-    def of(cls, parameters: Parameters, paths: Paths, subset: NDArray[np.int64] | None = None) -> RayModel:
-        """The model of the paths of an export, or of some of them."""
-        bare = replace(paths, correction=None)
-        return cls(bare if subset is None else take(bare, subset), parameters)
+    def of(cls, parameters: Parameters, paths: Paths, known: bool) -> RayModel:
+        """The model of the paths of an export."""
+        return cls(replace(paths, correction=None), parameters, known)
 
     @cached_property
     def assumed(self) -> tuple[tuple[str, str], ...]:
@@ -95,87 +93,69 @@ class RayModel:
     def start(self) -> NDArray[np.float64]:
         """The study's constants, and upright vertical polarization."""
         constants = [np.log(getattr(self.paths.materials[name], field)) for name, field in self.assumed]
-        return np.array(constants + [0.0] * 3 * sum(self.single))
+        return np.array(constants + [0.0] * (0 if self.known else 2 * ANGLES))
 
     @cached_property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Bounds of the values."""
-        factor, tilt = np.log(PERMITTIVITY_FACTOR), 3 * sum(self.single)
-        centre = self.start[: len(self.assumed)]
+        factor = np.log(PERMITTIVITY_FACTOR)
         pairs = [
             np.log(RANGES[field]) if field in RANGES else (value - factor, value + factor)
-            for (_, field), value in zip(self.assumed, centre, strict=True)
+            for (_, field), value in zip(self.assumed, self.start, strict=False)
         ]
-        pairs += [(-np.pi, np.pi) if number % 3 == 0 else (-TILT, TILT) for number in range(tilt)]
+        pairs += [] if self.known else 2 * [(-np.pi, np.pi), (-TILT, TILT), (-TILT, TILT)]
         lower, upper = np.array(pairs).reshape(-1, 2).T
         return np.minimum(lower, self.start), np.maximum(upper, self.start)
 
-    def with_single(self, single: tuple[bool, bool]) -> RayModel:
-        """The same model with other ports; nothing is compiled again."""
-        model = replace(self, single=single)
-        model.__dict__["_layout"] = self._layout
-        return model
-
     def level_and_slope(
-        self, candidate: NDArray[np.float64], values: NDArray[np.float64]
+        self, candidate: NDArray[np.float64], values: NDArray[np.float64], linear: Ends
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Power of every path [P], [dB], and its derivatives by the values [P, k], for values [k]."""
+        names = list(self.paths.materials)
+        frame = _Frame(
+            self.paths.material_table(self.materials(candidate)),
+            np.array([names.index(name) for name, _ in self.assumed], dtype=np.int64),
+            np.array([FIELDS.index(field) for _, field in self.assumed], dtype=np.int64),
+            *self._bases,
+            np.array([0.0 if end else 1.0 for end in linear]),
+        )
         with jax_settings():
-            level, slope = _level_and_slope(self._layout.program, self._frame(candidate), self.single, values)
+            level, slope = _level_and_slope(self._layout.program, frame, values)
             return np.asarray(level)[self._order], np.asarray(slope)[self._order]
 
-    def levels(self, candidate: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Power of every path with every polarization [n, H, P], [dB], for constants [n, k]."""
-        frame, levels = self._frame(candidate), []
-        with jax_settings():
-            for start in range(0, len(values), BATCH):
-                batch = values[start : start + BATCH]
-                filled = np.concatenate([batch, np.repeat(batch[:1], BATCH - len(batch), axis=0)])
-                level = _levels(self._layout.program, frame, self._polarized, filled)
-                levels.append(np.asarray(level)[: len(batch)])
-        return np.concatenate(levels)[..., self._order]
-
-    @property
-    def polarizations(self) -> tuple[tuple[float | None, float | None], ...]:
-        """Slants that `levels` tries at both ends; None for the ports of the program."""
-        ends: tuple[float | None, ...] = (None, *POLARIZATIONS) if self._polarized else (None,)
-        return tuple((tx, rx) for tx in ends for rx in ends)
-
-    def replay_paths(self, candidate: NDArray[np.float64], values: NDArray[np.float64]) -> Paths:
-        """The program with values [k]: its materials, and its antennas as they are assumed to be."""
-        constants = np.exp(values[: len(self.assumed)]).tolist()
+    def materials(
+        self, candidate: NDArray[np.float64], values: NDArray[np.float64] | None = None
+    ) -> dict[str, Material]:
+        """The materials with parameters [d] and, if given, values [k]."""
         materials = self.parameters.materials(candidate, self.paths.materials)
-        for (name, field), value in zip(self.assumed, constants, strict=True):
-            materials[name] = replace(materials[name], **{field: value})
+        for (name, field), value in zip(self.assumed, [] if values is None else np.exp(values), strict=False):
+            materials[name] = replace(materials[name], **{field: float(value)})
+        return materials
+
+    def replay_paths(
+        self, candidate: NDArray[np.float64], values: NDArray[np.float64], linear: Ends
+    ) -> Paths:
+        """The program with values [k]: its materials, and its antennas as they are assumed to be."""
         fields = [self.paths.tx_field, self.paths.rx_field]
-        angles = iter(values[len(self.assumed) :].reshape(-1, 3))
+        angles = values[len(self.assumed) :].reshape(-1, ANGLES)
         with jax_settings():
-            for end in np.flatnonzero(self.single).tolist():
-                weights = np.asarray(_port_weights(self._bases[end], jnp.asarray(next(angles))))
+            for end in np.flatnonzero(linear).tolist() if not self.known else []:
+                weights = np.asarray(_ports(jnp.asarray(self._bases[end]), jnp.asarray(angles[end])))[:, 0]
                 fields[end] = np.einsum("pt,ptc->pc", weights[self._order], fields[end])[:, None]
+        materials = self.materials(candidate, values)
         return replace(self.paths, materials=materials, tx_field=fields[0], rx_field=fields[1])
 
-    def materials(self, values: NDArray[np.float64]) -> Iterable[tuple[str, float]]:
-        """Name and value of every assumed constant."""
-        names = (f"{name}.{field}" for name, field in self.assumed)
-        return zip(names, np.exp(values[: len(self.assumed)]).tolist(), strict=True)
-
-    def _frame(self, candidate: NDArray[np.float64]) -> _Frame:
-        names = list(self.paths.materials)
-        table = self.paths.material_table(self.parameters.materials(candidate, self.paths.materials))
-        rows = np.array([names.index(name) for name, _ in self.assumed], dtype=np.int64)
-        columns = np.array([FIELDS.index(field) for _, field in self.assumed], dtype=np.int64)
-        return _Frame(table, rows, columns, *self._bases)
+    def described(self, values: NDArray[np.float64]) -> Iterable[tuple[str, float]]:
+        """Names and values of the assumed constants; a half-space has no thickness."""
+        for (name, field), value in zip(self.assumed, np.exp(values).tolist(), strict=False):
+            if not (field == "thickness" and value > HALF_SPACE / 2):
+                yield f"{name}.{field}", value
 
     @cached_property
     def _bases(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Axes theta and phi of the fields at both ends [P, 2, 3], in the order of the program."""
-        order = self._layout.order
+        """Axes theta and phi of the fields at both ends [P, 2, 3], in the order of the program; empty if known."""
+        order = [] if self.known else self._layout.order
         return _basis(self.paths.departure[order]), _basis(self.paths.arrival[order])
-
-    @property
-    def _polarized(self) -> bool:
-        return self.paths.tx_field.shape[1] == self.paths.rx_field.shape[1] == 2
 
     @cached_property
     def _layout(self) -> Layout:
@@ -187,18 +167,28 @@ class RayModel:
 
 
 class _Frame(NamedTuple):
-    """Constants of the materials [M, 8], where the assumed ones belong, and axes of the fields [P, 2, 3]."""
+    """What a level is computed with.
+
+    Attributes:
+        table: Constants of the materials [M, 8].
+        rows: Rows of the assumed constants in it [q].
+        columns: Their columns [q].
+        tx: Axes of the fields at the transmitter [P, 2, 3]; empty if the antennas are known.
+        rx: Those at the receiver.
+        crossed: Weight of the port across the polarization at both ends [2]: 0 for a linear one, else 1.
+    """
 
     table: NDArray[np.float64]
     rows: NDArray[np.int64]
     columns: NDArray[np.int64]
     tx: NDArray[np.float64]
     rx: NDArray[np.float64]
+    crossed: NDArray[np.float64]
 
 
 def _basis(zenith_azimuth: NDArray[np.float64]) -> NDArray[np.float64]:
     """Axes theta and phi [P, 2, 3] of directions [P, 2], [rad]."""
-    (zenith, azimuth) = zenith_azimuth.T
+    zenith, azimuth = zenith_azimuth.T
     direction = np.stack(
         [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1
     )
@@ -206,65 +196,37 @@ def _basis(zenith_azimuth: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([theta, np.cross(direction, theta)], axis=1)
 
 
-def _port_weights(basis: ArrayLike, angles: jax.Array) -> jax.Array:
-    """Weights [P, 2] of the ports V and H that make one port with a slant and a tilted axis [3]."""
+def _ports(basis: jax.Array, angles: jax.Array) -> jax.Array:
+    """Weights of the ports V and H in a port with a slant and a tilted axis, and in the one across it [P, 2, 2]."""
     axis = jnp.stack([angles[1], angles[2], jnp.ones(())])
     # The antenna's own axis theta points away from the pole: -axis, without its part along the direction.
-    theta = -jnp.asarray(basis) @ axis
+    theta = -basis @ axis
     theta = theta / jnp.sqrt(jnp.maximum(jnp.sum(theta**2, axis=1, keepdims=True), 1e-12))
+    phi = jnp.stack([-theta[:, 1], theta[:, 0]], axis=1)
     cos, sin = jnp.cos(angles[0]), jnp.sin(angles[0])
-    return jnp.stack([cos * theta[:, 0] - sin * theta[:, 1], cos * theta[:, 1] + sin * theta[:, 0]], axis=1)
+    return jnp.stack([cos * theta + sin * phi, cos * phi - sin * theta], axis=1)
 
 
-def _decibel(gain: Pair) -> jax.Array:
-    return 10 * jnp.log10(jnp.maximum(path_power(gain), 1e-30))
-
-
-def _gains(program: GroupedProgram, frame: _Frame, constants: jax.Array) -> Pair:
-    """Gains [R, T, P] with logarithms of the assumed constants [k]."""
-    return program_gains(
-        program, jnp.asarray(frame.table).at[frame.rows, frame.columns].set(jnp.exp(constants))
-    )
-
-
-@partial(jax.jit, static_argnums=2)
+@jax.jit
 def _level_and_slope(
-    program: GroupedProgram, frame: _Frame, single: tuple[bool, bool], values: jax.Array
+    program: GroupedProgram, frame: _Frame, values: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Powers [P], [dB], and derivatives [P, k], in the order of the program."""
     count = len(frame.rows)
 
     def level(values: jax.Array) -> jax.Array:
-        gain, angles = _gains(program, frame, values[:count]), values[count:].reshape(-1, 3)
-        for end, basis, weighed in ((0, frame.tx, "rtp,pt->rp"), (1, frame.rx, "rtp,pr->tp")):
-            if single[end]:
-                weights = _port_weights(basis, angles[int(single[0]) * end])
-                gain = tuple(jnp.expand_dims(jnp.einsum(weighed, part, weights), 1 - end) for part in gain)
-        return _decibel((gain[0], gain[1]))
+        table = jnp.asarray(frame.table).at[frame.rows, frame.columns].set(jnp.exp(values[:count]))
+        gain = program_gains(program, table)
+        if len(frame.tx):
+            gain = (_polarized(frame, gain[0], values[count:]), _polarized(frame, gain[1], values[count:]))
+        return 10 * jnp.log10(jnp.maximum(path_power(gain), 1e-30))
 
     return level(values), jax.jacfwd(level)(values)
 
 
-@partial(jax.jit, static_argnums=2)
-def _levels(program: GroupedProgram, frame: _Frame, polarized: bool, values: jax.Array) -> jax.Array:
-    """Powers [n, H, P], [dB], with every polarization, in the order of the program."""
-    ends = [jnp.eye(2), *(jnp.array([[np.cos(slant), np.sin(slant)]]) for slant in POLARIZATIONS)]
-
-    def level(constants: jax.Array) -> jax.Array:
-        gain = _gains(program, frame, constants)
-        if not polarized:
-            return _decibel(gain)[None]
-        return jnp.stack(
-            [
-                _decibel(
-                    (
-                        jnp.einsum("ar,rtp,bt->abp", rx, gain[0], tx),
-                        jnp.einsum("ar,rtp,bt->abp", rx, gain[1], tx),
-                    )
-                )
-                for tx in ends
-                for rx in ends
-            ]
-        )
-
-    return jax.vmap(level)(values)
+def _polarized(frame: _Frame, gain: jax.Array, angles: jax.Array) -> jax.Array:
+    """One part of the gains [R, T, P] between ports along and across the polarizations."""
+    tx = _ports(jnp.asarray(frame.tx), angles[:ANGLES])
+    rx = _ports(jnp.asarray(frame.rx), angles[ANGLES:])
+    weight = [jnp.stack([jnp.ones(()), frame.crossed[end]]) for end in range(2)]
+    return jnp.einsum("pab,pcd,bdp,a,c->acp", rx, tx, gain, weight[1], weight[0])

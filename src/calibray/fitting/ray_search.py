@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from calibray.engines.rays.export import Export, Exporting
 from calibray.fitting.methods import AUTO, local_searches
 from calibray.fitting.problem import Problem
-from calibray.fitting.ray_fit import described
 from calibray.fitting.ray_mapping import MOST_CALLS, RayMap, map_rays, with_engine
 from calibray.fitting.search import Trail, least_squares
 from calibray.result.remark import Remark, RemarkKind
@@ -59,13 +58,14 @@ def search_rays(
 
 
 def _remark(mapped: RayMap) -> Remark:
-    constants = dict(described(mapped.understanding))
-    slabs = any(field == "thickness" for _, field in mapped.understanding.model.assumed)
+    understanding = mapped.understanding
+    constants = dict(understanding.model.described(understanding.values))
+    slabs = any(field == "thickness" for _, field in understanding.model.assumed)
     return Remark(
         RemarkKind.RAY_MAPPING,
         {
             "understood": mapped.understood,
-            "misfit_db": mapped.understanding.misfit_db,
+            "misfit_db": understanding.misfit_db,
             "gap_db": mapped.gap_db,
             "calls": len(mapped.calls),
             "changed": mapped.changed,

@@ -1,0 +1,233 @@
+"""Scan of one material's thickness and conductivity, on ratios of the powers of some paths.
+
+A slab resonates: the power of a ray has a minimum for every half wavelength that the thickness grows by, so a local
+search ends in a wrong one. A scan tries a fine grid of thicknesses up to the depth where the wave has decayed, for some
+conductivities, with several polarizations of both ends. It evaluates reflections and transmissions alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import epsilon_0, speed_of_light
+
+from calibray.fields import jax_settings
+from calibray.fields.slab import coefficients, loss_term
+from calibray.fitting.ray_model import HALF_SPACE
+from calibray.materials import FIELDS, Material
+from calibray.paths import Kind, Paths
+
+CONDUCTIVITIES: Final = 10.0 ** np.arange(-3.5, 1.1, 0.5)
+"""Conductivities of a scan [S/m]; a refinement bridges half a decade."""
+
+THINNEST: Final = 1e-3
+"""Least thickness of a scan [m]."""
+
+THICKEST: Final = 0.6
+"""Largest thickness of a scan [m], unless the study's is more than half of it."""
+
+DECAYED: Final = 4.0
+"""Attenuation within a slab [Np] beyond which it acts as a half-space: what returns has e^-8 of its amplitude."""
+
+RESOLUTION: Final = 20.0
+"""Points of a scan for a wavelength in the slab, which has two resonances."""
+
+ROBUST_DB: Final = 1.5
+"""Error of a ratio beyond which it counts less [dB]: near a resonance, where a ray has next to no power, the step of a
+scan changes it by tens of dB."""
+
+SCANNED: Final = 48
+"""Paths of a scan."""
+
+KEPT: Final = 3
+"""Local minima of each scan."""
+
+BATCH: Final = 512
+"""Points that are evaluated at once."""
+
+SLANTS: Final = (0.0, np.pi / 2, np.pi / 4, -np.pi / 4)
+"""Slants of a linear polarization [rad]: vertical, horizontal, and both diagonals."""
+
+POLARIZATIONS: Final = [(tx, rx) for tx in (None, *SLANTS) for rx in (None, *SLANTS)]
+"""Slants at both ends; None for an antenna without polarization."""
+
+
+class Observed(NamedTuple):
+    """Ratios of some paths [n] at a call to those at the last one.
+
+    Attributes:
+        materials: The materials of the call, without those scanned.
+        weight: Weights of the paths [n].
+        change_db: Power at the last call over that at this one [n], [dB].
+    """
+
+    materials: dict[str, Material]
+    weight: NDArray[np.float64]
+    change_db: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """The best points of a scan for every pair of polarizations, lowest first.
+
+    Attributes:
+        values: Logarithms of the scanned constants [H, K, c].
+        misfit: Mean loss of the ratios [H, K]; inf where there are fewer minima.
+    """
+
+    values: NDArray[np.float64]
+    misfit: NDArray[np.float64]
+
+
+def scan(
+    paths: Paths, name: str, fields: list[str], last: dict[str, Material], calls: list[Observed], known: bool
+) -> Scan:
+    """Scan the constants of one material.
+
+    Args:
+        paths: The paths, of reflections and transmissions, with the ports V and H unless the antennas are known.
+        name: The material.
+        fields: The constants that are scanned, of thickness and conductivity.
+        last: The materials of the last call.
+        calls: The ratios to earlier calls.
+        known: Whether the antennas are known; there is one pair of polarizations then.
+    """
+    everything = [last, *(call.materials for call in calls)]
+    grid = _grid(name, fields, [materials[name] for materials in everything], paths.frequency)
+    square, weight = [], sum(call.weight.sum() for call in calls)
+    for start in range(0, len(grid), BATCH):
+        part = np.exp(grid[start : start + BATCH])
+        level = _levels(paths, last, name, fields, part, known)
+        total = np.zeros(level.shape[:2])
+        for call in calls:
+            error = (level - _levels(paths, call.materials, name, fields, part, known) - call.change_db) ** 2
+            total += (error / (1 + error / ROBUST_DB**2)) @ call.weight  # Geman and McClure's loss
+        square.append(total / weight)
+    return Scan(*_minima(grid, np.concatenate(square), fields))
+
+
+def chosen(paths: Paths, subset: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Of some paths, those that a scan evaluates: of reflections and transmissions, the simplest and shortest."""
+    other = ~np.isin(paths.kind, (Kind.SPECULAR, Kind.REFRACTION))
+    path = np.repeat(np.arange(paths.num_paths), np.diff(paths.first))
+    subset = np.setdiff1d(subset, path[other])
+    depth = np.diff(paths.first)[subset]
+    return np.sort(subset[np.lexsort((-paths.spreading[subset], depth))[:SCANNED]])
+
+
+def _grid(name: str, fields: list[str], materials: list[Material], frequency: float) -> NDArray[np.float64]:
+    """Logarithms of the scanned constants [n, c]."""
+    root = np.sqrt(max(item.relative_permittivity for item in materials))
+    declared = materials[0].thickness
+    conductivities = CONDUCTIVITIES
+    if "conductivity" not in fields:
+        conductivities = np.array([max(min(item.conductivity for item in materials), CONDUCTIVITIES[0])])
+    step, rows = speed_of_light / frequency / (RESOLUTION * root), []
+    for conductivity in conductivities.tolist():
+        # Attenuation of a plane wave in a dielectric [Np/m], alpha = sigma / (2 c eps_0 sqrt(eps_r)).
+        attenuation = conductivity / (2 * speed_of_light * epsilon_0 * root)
+        deepest = min(max(THICKEST, 2 * declared), max(DECAYED / attenuation, 2 * THINNEST))
+        thickness = np.append(np.arange(THINNEST, deepest, step), HALF_SPACE)
+        if "thickness" not in fields:
+            thickness = np.array([declared])
+        rows.append(np.stack([thickness, np.full(len(thickness), conductivity)], axis=1))
+    return np.log(np.concatenate(rows))[:, [("thickness", "conductivity").index(field) for field in fields]]
+
+
+def _minima(
+    grid: NDArray[np.float64], square: NDArray[np.float64], fields: list[str]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The lowest local minima over the thickness, each with the best conductivity: [H, K, c], and losses [H, K]."""
+    pairs = square.shape[1]
+    values, misfit = np.zeros((pairs, KEPT, grid.shape[1])), np.full((pairs, KEPT), np.inf)
+    _, group = np.unique(
+        np.round(grid[:, 0] if "thickness" in fields else 0 * grid[:, 0], 6), return_inverse=True
+    )
+    for pair in range(pairs):
+        order = np.lexsort((square[:, pair], group))
+        first = order[np.flatnonzero(np.diff(group[order], prepend=-1))]
+        lowest = square[first, pair]
+        around = np.minimum(np.append(np.inf, lowest[:-1]), np.append(lowest[1:], np.inf))
+        found = first[lowest <= around]
+        found = found[np.argsort(square[found, pair], kind="stable")[:KEPT]]
+        values[pair, : len(found)], misfit[pair, : len(found)] = grid[found], square[found, pair]
+    return values, misfit
+
+
+def _levels(
+    paths: Paths,
+    materials: dict[str, Material],
+    name: str,
+    fields: list[str],
+    points: NDArray[np.float64],
+    known: bool,
+) -> NDArray[np.float64]:
+    """Powers [n, H, P], [dB] up to a constant, with constants of one material [n, c]."""
+    gain = _gains(paths, materials, name, fields, points)  # [n, P, R, T]
+    if known:
+        power = (np.abs(gain) ** 2).sum(axis=(2, 3))[:, None]
+    else:
+        ends = np.array([[np.cos(slant), np.sin(slant)] for slant in SLANTS])
+        square = np.abs(np.einsum("ar,nprt,bt->nbap", ends, gain, ends, optimize=True)) ** 2
+        # Without polarization, both components of the wave count.
+        square = np.concatenate([square[:, :2].sum(axis=1, keepdims=True), square], axis=1)
+        square = np.concatenate([square[:, :, :2].sum(axis=2, keepdims=True), square], axis=2)
+        power = square.reshape(len(points), -1, paths.num_paths)
+    return 10 * np.log10(np.maximum(power, 1e-30))
+
+
+def _gains(
+    paths: Paths, materials: dict[str, Material], name: str, fields: list[str], points: NDArray[np.float64]
+) -> NDArray[np.complex128]:
+    """Gains [n, P, R, T] up to a real factor of each path: E_rx^H J_K ... J_1 E_tx."""
+    table = np.array([[getattr(item, field) for field in FIELDS] for item in materials.values()])
+    constants = np.tile(table[paths.material], (len(points), 1, 1))  # [n, I, 8]
+    here = paths.material == list(materials).index(name)
+    for column, field in enumerate(fields):
+        constants[:, here, FIELDS.index(field)] = points[:, None, column]
+    te, tm = _coefficients(paths, constants)
+    depth = np.diff(paths.first)
+    field = np.broadcast_to(
+        paths.tx_field.swapaxes(1, 2), (len(points), paths.num_paths, 2, paths.tx_field.shape[1])
+    )
+    for step in range(int(depth.max(initial=0))):
+        on = np.flatnonzero(depth > step)
+        at = paths.first[:-1][on] + step
+        cos, sin = paths.rotation[at].T[:, :, None]
+        first, second = field[:, on, 0], field[:, on, 1]
+        field = field.copy()
+        field[:, on, 0] = te[:, at, None] * (cos * first + sin * second)
+        field[:, on, 1] = tm[:, at, None] * (cos * second - sin * first)
+    return np.einsum("prc,npct->nprt", paths.rx_field.conj(), field)
+
+
+def _coefficients(
+    paths: Paths, constants: NDArray[np.float64]
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Coefficients of all interactions [n, I], with their constants [n, I, 8]; padded, so that few are compiled."""
+    count, size = len(constants), paths.num_interactions
+    padded = np.ones((BATCH, -(-size // 64) * 64, 3))
+    columns = [FIELDS.index(field) for field in ("relative_permittivity", "conductivity", "thickness")]
+    padded[:count, :size] = constants[..., columns]
+    cosine, through = np.ones(padded.shape[1]), np.zeros(padded.shape[1], dtype=bool)
+    cosine[:size], through[:size] = paths.cos_incidence, paths.kind == Kind.REFRACTION
+    with jax_settings():
+        pairs = _slab(*map(jnp.asarray, (cosine, padded, speed_of_light / paths.frequency, through)))
+    te, tm = (
+        np.asarray(real)[:count, :size] + 1j * np.asarray(imaginary)[:count, :size]
+        for real, imaginary in pairs
+    )
+    return te, tm
+
+
+@jax.jit
+def _slab(
+    cosine: jax.Array, constants: jax.Array, wavelength: jax.Array, through: jax.Array
+) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+    loss = loss_term(constants[..., 1], wavelength)
+    return coefficients(cosine, constants[..., 0], loss, constants[..., 2], wavelength, through)
