@@ -1,6 +1,7 @@
 """Calibration on delay spreads and times of flight besides path loss, from the study to predictions."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import planted
@@ -8,20 +9,30 @@ from calibray import engines
 from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.errors import InputError
+from calibray.fields import path_gains
 from calibray.fitting.preliminary_fits import estimate_noise
 from calibray.fitting.problem import Problem
 from calibray.measurements import links_from_frame
 from calibray.measurements.observables import Statistic
 from calibray.reporting import result_tables as tables
+from calibray.reporting.observable_figure import measured_over_modelled
+from calibray.result import wording
 from calibray.result.held_out import Model
 from calibray.result.remark import RemarkKind
-from calibray.study import Setup
+from calibray.study import Setup, Study
 from calibray.tables.text import render
+from calibray.uncertainty.conflict import conflict
 from calibray.validation.validate import validate_problem
 
 MARBLE = "marble.relative_permittivity"
 SPREAD = {"kind": "rms_delay_spread", "column": "spread_ns", "unit": "ns"}
 FLIGHT = {"kind": "round_trip_time", "column": "rtt_ns", "unit": "ns", "bias": "half", "path": "first"}
+PROFILE = {
+    "kind": "power_delay_profile",
+    "columns": ["early", "late"],
+    "unit": "dB",
+    "edges": [0.0, 2e-8, 2e-7],
+}
 FEW = {"name": "auto", "options": {"starts": 8}}
 PLAN = {
     "parameters": {
@@ -45,9 +56,8 @@ def engine(tmp_path_factory):
 def table(engine):
     """Path loss with 2 dB of noise and an offset; delay spreads with 0.3 ns; round trips with a bias per half."""
     random = np.random.default_rng(6)
-    spread, flight = engine.observe(
-        TRUTH[None], (Statistic("rms_delay_spread"), Statistic("round_trip_time", "first"))
-    )[0]
+    wanted = Statistic("rms_delay_spread"), Statistic("round_trip_time", "first")
+    spread, flight = engine.respond(TRUTH[None], wanted).observed[0]
     links = planted.links()
     bias = links.half.map({"west": 40.0, "east": -15.0}).to_numpy()
     return links.assign(
@@ -92,6 +102,12 @@ def test_delay_spreads_determine_what_path_loss_does_not(tmp_path, table, engine
     assert flight.rmse < 1.5 < flight.mean_rmse
     assert "Observables of links held out" in render(*tables.tables(both))
     assert "spread [ns]" in render(*tables.tables(both))
+    bias = both.links.groupby("half")["rtt_bias_ns"].mean().to_dict() if "half" in both.links else biases
+    assert bias == pytest.approx(biases)
+    picture = measured_over_modelled(both)
+    assert [axes.get_title() for axes in picture.axes] == ["spread", "rtt"]
+    points = picture.axes[1].collections[0].get_offsets()
+    assert np.abs(points[:, 0] - points[:, 1]).max() < 3.0
     assert not any(remark.kind == RemarkKind.CONFLICT for remark in both.uncertainty.remarks)
     both.save(tmp_path / "out")
     loaded = Result.load(tmp_path / "out")
@@ -109,7 +125,7 @@ def test_delay_spreads_determine_what_path_loss_does_not(tmp_path, table, engine
 
 
 def test_a_conflict_is_reported_with_both_answers(tmp_path, table, engine):
-    other = engine.observe(np.array([[2.0, 9.0]]), (Statistic("rms_delay_spread"),))[0, 0]
+    other = engine.respond(np.array([[2.0, 9.0]]), (Statistic("rms_delay_spread"),)).observed[0, 0]
     exact = engine.path_loss(TRUTH[None])[0] + 0.2 * np.random.default_rng(1).standard_normal(planted.LINKS)
     result = run(
         tmp_path,
@@ -130,9 +146,20 @@ def test_a_conflict_is_reported_with_both_answers(tmp_path, table, engine):
         (SPREAD | {"path": "first"}, "only a time of flight"),
         (SPREAD | {"kind": "doppler"}, "rms_delay_spread"),
         (SPREAD | {"std": 0.0}, "std"),
+        (SPREAD | {"file": "multipath.csv"}, "give one of column"),
+        (SPREAD | {"edges": [0.0, 1e-7]}, "takes no edges"),
+        (PROFILE | {"edges": [0.0, 1e-7]}, "2 bin"),
+        (PROFILE | {"edges": [0.0, 2e-7, 1e-7]}, "increasing"),
+        (PROFILE | {"kind": "azimuth_power_arrival"}, "takes no edges"),
+        (
+            {**PROFILE, "kind": "azimuth_power_arrival", "edges": [], "edges_deg": [0, 180, 400]},
+            "must span 360",
+        ),
+        ({**SPREAD, "column": None, "columns": ["a", "b"]}, "has one column"),
     ],
 )
 def test_impossible_observables_are_refused(tmp_path, table, section, message):
+    section = {key: value for key, value in section.items() if value is not None}
     with pytest.raises(InputError, match=message):
         planted.study(tmp_path, table, observables={"spread": section})
 
@@ -142,8 +169,6 @@ def test_columns_and_engines_that_cannot_be_used_are_refused(tmp_path, table):
         run(tmp_path, table, observables={"spread": SPREAD | {"column": "nothing"}})
     with pytest.raises(InputError, match="at least two links"):
         run(tmp_path, table.assign(spread_ns=np.nan), observables={"spread": SPREAD})
-    with pytest.raises(InputError, match="needs the engine 'replay'"):
-        run(tmp_path, table, observables={"spread": SPREAD}, engine={"name": "replay", "chunk_links": 6})
 
 
 def test_blocks_held_out_in_turn_judge_every_observable(tmp_path, table, engine):
@@ -157,3 +182,61 @@ def test_blocks_held_out_in_turn_judge_every_observable(tmp_path, table, engine)
     assert flight.rmse < 0.5 * flight.mean_rmse
     assert "spread [ns]" in repr(validation)
     assert validation.content()["observables"]["rtt"]["rmse"] == flight.rmse
+
+
+def test_every_bin_of_a_profile_is_an_observable(tmp_path, table, engine):
+    wanted = [Statistic("power_delay_profile", edges=edges) for edges in ((0.0, 2e-8), (2e-8, 2e-7))]
+    early, late = engine.respond(TRUTH[None], tuple(wanted)).observed[0]
+    measured = table.assign(early=early, late=late)
+    study = planted.study(tmp_path, measured, **(PLAN | {"observables": {"profile": PROFILE}}))
+    assert list(study.observables) == ["profile_1", "profile_2"]
+    assert Study.from_content(study.content(), study.path).observables == study.observables
+    problem = Problem.of(Setup.open(study), engine)
+    at_truth = problem.evaluate(problem.parameters.to_search(TRUTH[None]))
+    assert np.abs(at_truth.residuals[0, -2 * planted.LINKS :]).max() < 1e-9
+    assert early.std() > 0.3
+
+
+def test_values_are_computed_from_a_file_of_components(tmp_path, table, engine):
+    """The paths themselves as components: no residual is left at the truth, but that of the smooth limit."""
+    paths = engine.paths
+    gains = path_gains(paths, engine.parameters.materials(TRUTH, paths.materials))
+    components = {
+        "name": paths.link,
+        "delay_ns": 1e9 * paths.delay,
+        "path_gain_db": 20 * np.log10(np.abs(gains)),
+    }
+    pd.DataFrame(components).to_csv(tmp_path / "multipath.csv", index=False)
+    section = {
+        "kind": "rms_delay_spread",
+        "file": "multipath.csv",
+        "id": "name",
+        "unit": "ns",
+        "floor_db": -100.0,
+    }
+    study = planted.study(
+        tmp_path, table.assign(name=np.arange(len(table))), **(PLAN | {"observables": {"spread": section}})
+    )
+    assert tmp_path / "multipath.csv" in study.files()
+    problem = Problem.of(Setup.open(study), engine)
+    (each,) = problem.observed
+    expected = engine.respond(TRUTH[None], (each.statistic,)).observed[0, 0]
+    assert each.measured == pytest.approx(1e9 * expected, abs=0.05 * each.measured.max())
+    (tmp_path / "multipath.csv").unlink()
+    with pytest.raises(InputError, match=r"multipath\.csv"):
+        Problem.of(Setup.open(study), engine)
+
+
+def test_a_calibration_that_does_not_fit_from_link_to_link_is_a_conflict(tmp_path, table, engine):
+    """Spreads of the links in another order have nothing to do with them."""
+
+    def remarks(measured):
+        study = planted.study(tmp_path, measured, **(PLAN | {"observables": {"spread": SPREAD}}))
+        problem = estimate_noise(Problem.of(Setup.open(study), engine))
+        return conflict(problem, problem.parameters.to_search(TRUTH[None]))
+
+    assert remarks(table) == ()
+    shuffled = table.assign(spread_ns=np.random.default_rng(3).permutation(table.spread_ns))
+    (remark,) = [remark for remark in remarks(shuffled) if "slope" in remark.values]
+    assert remark.values["slope"] + 2 * remark.values["slope_error"] < 1.0
+    assert "from link to link" in wording.remark_text(remark)

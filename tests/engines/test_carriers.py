@@ -21,6 +21,7 @@ from calibray.engines import ReplayCarriers, fingerprint
 from calibray.errors import InputError
 from calibray.fields import path_gains, path_loss
 from calibray.materials import itu_law
+from calibray.measurements.observables import Statistic
 from calibray.paths import Paths, take_links
 from calibray.scenes import read_scene
 from calibray.study import Setup, Study
@@ -117,6 +118,19 @@ def traced_at_ten(folder: Path) -> Paths:
 
 
 # The physics at another carrier
+
+
+def test_further_observables_at_several_carriers_have_exact_derivatives(replay: ReplayCarriers) -> None:
+    value, wanted = vector(TRUTH)[None], (Statistic("rms_delay_spread"), Statistic("k_factor"))
+    answer = replay.respond(value, wanted, derivatives=True)
+    assert answer.path_loss == pytest.approx(replay.path_loss(value))
+    assert answer.loss_slope == pytest.approx(replay.path_loss_and_jacobian(value)[1], abs=1e-9)
+    for index, name in enumerate(LAW):
+        step = 1e-5 * np.eye(len(LAW))[index]
+        above, below = replay.respond(np.vstack([value + step, value - step]), wanted).observed
+        numeric = (above - below)[np.isfinite(above)] / 2e-5
+        slope = answer.observed_slope[0, ..., index][np.isfinite(above)]
+        np.testing.assert_allclose(slope, numeric, rtol=1e-5, atol=1e-5 * np.abs(numeric).max(), err_msg=name)
 
 
 def test_paths_at_another_carrier_are_those_that_sionna_traces_there(folder: Path) -> None:

@@ -37,6 +37,14 @@ VARIANTS = {
         },
         "noise": {"std_db": 1.0},
     },
+    "observables": {
+        "offset": {},
+        "observables": {
+            "spread": {"kind": "rms_delay_spread", "column": "rx_x", "unit": "ns", "std": 2.0},
+            "flight": {"kind": "time_of_flight", "column": "rx_x", "unit": "ns", "bias": "half", "std": 3.0},
+        },
+        "noise": {"std_db": 1.0},
+    },
     "censored": {"objective": {"combining": "coherent", "no_path": "censor", "ceiling_db": 80.0}},
 }
 

@@ -102,7 +102,7 @@ with h5py.File(sys.argv[2]) as request, h5py.File(sys.argv[1], "w") as response:
 )
 def test_answers_that_can_be_read(tmp_path, content, num_links, loss):
     (tmp_path / "response.json").write_text(content)
-    assert read_answer(tmp_path / "response.json", "json", num_links).tolist() == loss
+    assert read_answer(tmp_path / "response.json", "json", num_links)[0].tolist() == loss
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_hdf5_answers_that_are_refused(tmp_path):
         read_answer(path, "hdf5", 2)
     with h5py.File(path, "w") as file:
         file["path_loss_db"] = [[70.0], [np.inf]]
-    assert read_answer(path, "hdf5", 2).tolist() == [70.0, np.inf]
+    assert read_answer(path, "hdf5", 2)[0].tolist() == [70.0, np.inf]
 
 
 @pytest.mark.parametrize(

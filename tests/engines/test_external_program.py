@@ -217,7 +217,7 @@ def test_path_loss_out_of_range_is_refused_with_a_hint_at_the_sign(tmp_path, val
     with pytest.raises(Unusable, match=message):
         read_answer(tmp_path / "response.json", "json", 2)
     (tmp_path / "response.json").write_text('{"path_loss_db": [20, 300, null]}')
-    assert read_answer(tmp_path / "response.json", "json", 3).tolist() == [20, 300, np.inf]
+    assert read_answer(tmp_path / "response.json", "json", 3)[0].tolist() == [20, 300, np.inf]
 
 
 def test_hdf5_responses_that_lie_elsewhere_or_unfold_to_any_size(tmp_path):

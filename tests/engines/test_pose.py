@@ -11,6 +11,7 @@ import planted
 from calibray.engines import Replay
 from calibray.engines.pose import pose_error
 from calibray.fields import path_loss
+from calibray.measurements.observables import Statistic
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Paths
 from calibray.tracing.mounting import Mounting, Pose, mount
@@ -90,6 +91,25 @@ def test_derivatives_agree_with_finite_differences(engine: Replay) -> None:
             jacobian[0, :, index], (above - below) / 2e-4, rtol=1e-5, atol=1e-6, err_msg=name
         )
         assert np.abs(jacobian[0, :, index]).max() > 1e-3
+
+
+def test_derivatives_of_further_observables_agree_with_finite_differences(engine: Replay) -> None:
+    value, wanted = (
+        candidates(engine, 1),
+        (Statistic("rms_delay_spread"), Statistic("azimuth_spread_arrival")),
+    )
+    answer = engine.respond(value, wanted, derivatives=True)
+    # Fields combine coherently to path loss, powers to all other observables.
+    assert answer.path_loss == pytest.approx(engine.path_loss(value))
+    assert answer.loss_slope == pytest.approx(engine.path_loss_and_jacobian(value)[1])
+    for index, name in enumerate(engine.parameters.names):
+        step = 1e-4 * np.eye(value.shape[1])[index]
+        above, below = engine.respond(np.vstack([value + step, value - step]), wanted).observed
+        numeric = (above - below) / 2e-4
+        # The gain of an antenna changes no spread but by rounding.
+        scale = np.abs(numeric).max(axis=1, keepdims=True) + 1e-4 * above.max(axis=1, keepdims=True)
+        slope = answer.observed_slope[0, :, :, index]
+        np.testing.assert_allclose(slope / scale, numeric / scale, atol=1e-5, err_msg=name)
 
 
 def test_without_such_parameters_there_is_no_effect(

@@ -21,7 +21,9 @@ def test_the_observable_with_the_largest_slope_over_its_error_is_chosen():
         SimpleNamespace(study=study), engine, (value, np.ones((1, 3))), np.array([LINK]), known[None, None]
     )
     wanted, step = tuple(map(Statistic, CHOICES)), np.array([[1e-4, 0.0, 0.0]])
-    now, above, below = engine.observe(np.vstack([value, value + step, value - step]), wanted)[:, :, LINK]
+    now, above, below = engine.respond(np.vstack([value, value + step, value - step]), wanted).observed[
+        :, :, LINK
+    ]
     error = np.array([ERROR_DB if KINDS[kind] == "dB" else RELATIVE_ERROR for kind in CHOICES])
     error *= np.where(error == ERROR_DB, 1.0, now)
     slope = (above - below) / 2e-4 / error

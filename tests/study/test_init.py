@@ -333,6 +333,24 @@ def test_metres_of_a_map_projection_are_placed_on_the_scene(scene, tmp_path, crs
     assert draft(scene, tmp_path / "far.csv", tmp_path / "study.toml", frequency=3e9).study.links.crs is None
 
 
+def test_round_trip_times_become_an_observable_with_a_bias_per_access_point(scene, tmp_path):
+    columns = {
+        "ap": ["a", "a", "b", "b"], "ap_x": [0.0, 0, 5, 5], "ap_y": 0.0, "ap_z": 2.5, "rx_x": [3.0, 4, 5, 6],
+        "rx_y": -12.0, "rx_z": 1.5, "rssi_dbm": [-50.0, -52, -54, -60], "rtt_std_ns": 2.0, "rtt_ns": [40.0, 50, 60, 70],
+    }  # fmt: skip
+    found = draft(scene, table(tmp_path, **columns), tmp_path / "study.toml", frequency=5.5e9)
+    section = found.study.observables["flight"]
+    assert (section.kind, section.column, section.unit) == ("round_trip_time", "rtt_ns", "ns")
+    assert (section.bias, section.path) == ("ap", "first")
+    assert "observables.flight" in assumed(found)
+    metres = columns | {"rtt_ns": None, "ftm_distance_m": [3.0, 4, 5, 6]}
+    del metres["rtt_ns"]
+    found = draft(scene, table(tmp_path, **metres), tmp_path / "study.toml", frequency=5.5e9)
+    section = found.study.observables["flight"]
+    assert (section.kind, section.unit) == ("time_of_flight", "m")
+    assert section.scale == pytest.approx(1 / 299_792_458)
+
+
 def test_transmitters_in_the_links_get_an_offset_each(scene, tmp_path):
     columns = {
         "x": np.arange(10.0),

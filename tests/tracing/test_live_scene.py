@@ -13,7 +13,7 @@ import sionna.rt as rt
 import calibray as cb
 from calibray import engines
 from calibray.errors import InputError
-from calibray.measurements.observables import KINDS, Statistic
+from calibray.measurements.observables import KINDS, SECTORS, Statistic
 from calibray.tracing.sionna.live_scene import apply_materials
 
 PLANTED = {"marble": 9.2, "concrete": 3.1}
@@ -81,6 +81,7 @@ def test_observables_equal_those_of_sionnas_impulse_responses(study: cb.Study) -
     response, delays = paths.cir(normalize_delays=False)
     power = sum(np.array(part, dtype=float) ** 2 for part in response).sum(axis=(1, 3, 5))
     delay, departure, arrival = (np.array(part, dtype=float) for part in (delays, paths.phi_t, paths.phi_r))
+    zenith = [np.array(part, dtype=float) for part in (paths.theta_t, paths.theta_r)]
     weight = power / power.sum(axis=-1, keepdims=True)
 
     def mean(value: np.ndarray) -> np.ndarray:
@@ -89,18 +90,31 @@ def test_observables_equal_those_of_sionnas_impulse_responses(study: cb.Study) -
     def spread(angle: np.ndarray) -> np.ndarray:
         return np.sqrt(-2 * np.log(np.minimum(np.abs(mean(np.exp(1j * angle))), 1.0)))
 
-    strongest = weight.max(axis=-1)
+    def share(inside: np.ndarray) -> np.ndarray:
+        return 10 * np.log10(mean(inside) + 1e-3)
+
+    strongest, first = weight.max(axis=-1), np.where(delay < 0, np.inf, delay).min(axis=-1)
     expected = {
         "rms_delay_spread": np.sqrt(mean((delay - mean(delay)[..., None]) ** 2)),
-        "mean_excess_delay": mean(delay) - np.where(delay < 0, np.inf, delay).min(axis=-1),
+        "mean_excess_delay": mean(delay) - first,
         "time_of_flight": mean(delay),
         "round_trip_time": 2 * mean(delay),
         "k_factor": 10 * np.log10(strongest / (1 - strongest)),
         "azimuth_spread_departure": spread(departure),
         "azimuth_spread_arrival": spread(arrival),
     }
+    expected |= {
+        "elevation_spread_departure": spread(zenith[0]),
+        "elevation_spread_arrival": spread(zenith[1]),
+        "power_delay_profile": share((delay - first[..., None] >= 0) & (delay - first[..., None] < 5e-8)),
+        "azimuth_power_departure": share(departure % (2 * np.pi) < 2.0),
+        "azimuth_power_arrival": share(arrival % (2 * np.pi) < 2.0),
+    }
     values = np.array([[PLANTED[name.partition(".")[0]] for name in engine.parameters.names]])
-    found = engine.observe(values, tuple(Statistic(kind) for kind in KINDS))[0]
+    edges = {kind: (0.0, 2.0) for kind in SECTORS} | {"power_delay_profile": (0.0, 5e-8)}
+    found = engine.respond(values, tuple(Statistic(kind, edges=edges.get(kind)) for kind in KINDS)).observed[
+        0
+    ]
     assert set(expected) == set(KINDS)
     for kind, row in zip(KINDS, found, strict=True):
         wanted = expected[kind].T.ravel()

@@ -26,7 +26,7 @@ def observable_fits(
         draws: Draws from the posterior by name of the parameter; may be empty.
 
     Returns:
-        The fits by name; and measured, initial and calibrated values [L] in the unit, by column name.
+        The fits by name; and measured, initial and calibrated values, and biases [L] in the unit, by column name.
     """
     if not problem.observed:
         return {}, {}
@@ -35,7 +35,7 @@ def observable_fits(
     names = problem.parameters.names
     drawn = np.stack([draws[name] for name in names], axis=1) if draws else np.empty((0, len(names)))
     drawn = drawn[np.linspace(0, len(drawn) - 1, min(len(drawn), MOST_DRAWS)).round().astype(int)]
-    before, after, *spread = problem.replay.observe(np.vstack([start, best, drawn]), problem.statistics)
+    before, after, *spread = problem.respond(np.vstack([start, best, drawn])).observed
     fits, columns = {}, {}
     for index, each in enumerate(problem.observed):
         unit, used = sections[each.name].unit, each.used(weight)
@@ -67,6 +67,10 @@ def observable_fits(
             f"{each.name}_before_{unit}": before[index] / each.scale,
             f"{each.name}_after_{unit}": after[index] / each.scale,
         }
+        if each.labels:
+            known = np.append(np.isin(np.arange(len(each.labels)), groups), False)
+            of_links = np.append(biases[0], np.nan)[each.group]
+            columns[f"{each.name}_bias_{unit}"] = np.where(known[each.group], of_links, np.nan)
     return fits, columns
 
 

@@ -96,6 +96,8 @@ def fingerprint(study: OpenedStudy) -> str:
             name: {key: value for key, value in entry.items() if f"{name}.{key}" not in parameters.names}
             for name, entry in law.items()
         }
+    if radio.observables:
+        record["observables"] = [wanted.record() for wanted in radio.observables]
     if study.carriers:
         record["carriers"] = {
             str(frequency): _fixed_constants(materials, free)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calibray.errors import EngineError, InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements
+from calibray.measurements.observables import Statistic
 from calibray.parameters import Parameters
 from calibray.support.progress import Progress
 
@@ -70,6 +71,62 @@ class Differentiable(Engine, Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """Path loss and further observables of all links for n candidates.
+
+    Attributes:
+        path_loss: Path loss [n, L], [dB]; +inf where a link has no path.
+        observed: K further observables [n, K, L], in SI units; NaN where a link has none.
+        loss_slope: Derivatives of path loss by the parameters [n, L, d]; None if they were not asked for.
+        observed_slope: Derivatives of the further observables [n, K, L, d]; likewise.
+    """
+
+    path_loss: NDArray[np.float64]
+    observed: NDArray[np.float64]
+    loss_slope: NDArray[np.float64] | None = None
+    observed_slope: NDArray[np.float64] | None = None
+
+    def arrays(self) -> list[NDArray[np.float64]]:
+        """Path loss, observables and, where there are any, their derivatives."""
+        every = self.path_loss, self.observed, self.loss_slope, self.observed_slope
+        return [array for array in every if array is not None]
+
+
+def joined(parts: Sequence[Responses]) -> Responses:
+    """The responses of successive batches of candidates as one."""
+    columns = zip(*(part.arrays() for part in parts), strict=True)
+    return Responses(*(np.concatenate(column) for column in columns))
+
+
+def of_links(parts: Sequence[Responses], links: Sequence[NDArray[np.intp]]) -> Responses:
+    """The responses of parts of the links [l] as those of all, whose indices in all each part gives."""
+    count, arrays = sum(map(len, links)), []
+    for column, axis in zip(zip(*(part.arrays() for part in parts), strict=True), (1, 2, 1, 2), strict=False):
+        shape = list(column[0].shape)
+        shape[axis] = count
+        every = np.empty(shape)
+        for part, index in zip(column, links, strict=True):
+            every[(slice(None),) * axis + (index,)] = part
+        arrays.append(every)
+    return Responses(*arrays)
+
+
+@runtime_checkable
+class Observing(Engine, Protocol):
+    """An engine that gives further observables of the links."""
+
+    def respond(
+        self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
+    ) -> Responses:
+        """Path loss and the statistics `wanted` of every link for candidates [n, d], one RT call each.
+
+        Raises:
+            InputError: The candidates have another width, or a value is not finite or unphysical.
+        """
+        ...
+
+
 Reduction = Callable[[NDArray[np.float64], NDArray[np.float64] | None], Any]
 """Reduces the path loss of a chunk's links [n, l], [dB], and its derivatives [n, l, d] or None, to a few sums."""
 
@@ -107,7 +164,8 @@ class Answer:
         path_loss_db: Path loss [L], [dB]; +inf where a link has no path, and for all links of a failed call.
         seconds: Time of the call [s].
         failure: Error message with engine and candidate; empty if the call succeeded.
-        rays: The response with the rays, as the program wrote it; empty from an engine without rays.
+        rays: The response with the rays, as the program wrote it; or further observables [K, L] in SI units as
+            little-endian doubles; empty from an engine with neither.
     """
 
     index: int
@@ -161,6 +219,22 @@ def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> ND
         more = f"; so did all {len(failures)} candidates of the first batch" if len(failures) > 1 else ""
         raise EngineError(f"{failures[0]}{more}")
     return losses
+
+
+def gather_responses(
+    answers: Iterable[Answer], shape: tuple[int, int], num_observables: int, first: bool
+) -> Responses:
+    """Collect path loss and further observables of a batch of answers; NaN for all links of a candidate that failed.
+
+    Raises:
+        EngineError: Every candidate of the first batch failed.
+    """
+    answers, (count, num_links) = list(answers), shape
+    observed = np.full((count, num_observables, num_links), np.nan)
+    for answer in answers:
+        if not answer.failure:
+            observed[answer.index] = np.frombuffer(answer.rays, "<f8").reshape(num_observables, num_links)
+    return Responses(gather(answers, shape, first), observed)
 
 
 def check_candidates(candidates: NDArray[np.float64], width: int) -> NDArray[np.float64]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, final
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from calibray import fields
-from calibray.engines.protocol import check_candidates
+from calibray.engines.protocol import Responses, check_candidates, joined, of_links
 from calibray.materials import Material
 from calibray.measurements.observables import Statistic
 from calibray.parameters import Parameters
@@ -89,6 +89,7 @@ class Replay:
             None if tabulate is False or effects else self._table_intervals(force=tabulate is True)
         )
         self._program = self._compile()
+        self._channels: dict[tuple[Statistic, ...], fields.Channel] = {}
 
     @property
     def interactions(self) -> int:
@@ -116,39 +117,52 @@ class Replay:
         loss, jacobian = self._run(self._path_losses_and_jacobian, candidates)
         return loss, jacobian
 
-    def observe(self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...]) -> NDArray[np.float64]:
-        """Statistics of every link for candidates [n, K, L]; NaN where a link has no path."""
-        channel = replace(self._channel, wanted=wanted)
-        batches = self._observed_batches(candidates)
-        return np.concatenate([fields.link_statistics(channel, *batch) for batch in batches])
-
-    def observe_and_jacobian(
-        self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The same with derivatives by the parameters [n, K, L, d]."""
-        channel, values, jacobians = replace(self._channel, wanted=wanted), [], []
-        for batch in self._observed_batches(candidates):
-            found, *slopes = fields.link_statistics_and_slopes(channel, *batch, self._used_columns)
-            values.append(found)
-            jacobians.append(self._by_parameter(*slopes))
-        return np.concatenate(values), np.concatenate(jacobians)
-
-    def _observed_batches(
-        self, candidates: NDArray[np.float64]
-    ) -> Iterator[tuple[NDArray[np.floating], NDArray[np.floating], int]]:
-        values, base = check_candidates(candidates, len(self.parameters)), self.paths.material_table()
-        self.calls += len(values)
+    def respond(
+        self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
+    ) -> Responses:
+        """Path loss and further observables of every link; see `Observing.respond`."""
+        values, batches = check_candidates(candidates, len(self.parameters)), []
+        channel = self._measuring(wanted)
+        function = fields.link_responses_and_slopes if derivatives else fields.link_responses
         for start in range(0, len(values), OBSERVED_SIZE):
             batch = values[start : start + OBSERVED_SIZE]
-            yield *self._arguments(base, batch, OBSERVED_SIZE), len(batch)
+            padded = np.concatenate([batch, np.repeat(batch[:1], OBSERVED_SIZE - len(batch), axis=0)])
+            batches.append(Responses(*function(channel, padded, len(batch))))
+        self.calls += len(values)
+        responses = joined(batches)
+        if self._combining.kind == "power":
+            return responses
+        # Only sums of powers follow from the powers of paths.
+        if not derivatives:
+            return replace(responses, path_loss=self.path_loss(candidates))
+        loss, slope = self.path_loss_and_jacobian(candidates)
+        return replace(responses, path_loss=loss, loss_slope=slope)
+
+    def _measuring(self, wanted: tuple[Statistic, ...]) -> fields.Channel:
+        if wanted not in self._channels:
+            self._channels = {wanted: self._channel.measuring(wanted)}
+        return self._channels[wanted]
 
     @cached_property
     def _channel(self) -> fields.Channel:
         """The paths as further observables see them."""
         plan = fields.layout(self.paths)
-        effects = tuple(effect.ordered(plan.order) for effect in self.effects)
-        departure, arrival = self.paths.departure[plan.order, 1], self.paths.arrival[plan.order, 1]
-        return fields.Channel(plan.program, effects, departure, arrival, ())
+        return fields.Channel(
+            plan.program,
+            tuple(effect.ordered(plan.order) for effect in self.effects),
+            self.paths.material_table(),
+            self.paths.departure[plan.order],
+            self.paths.arrival[plan.order],
+            tuple(
+                zip(
+                    self.parameters.of_materials.tolist(),
+                    self._rows.tolist(),
+                    self._columns.tolist(),
+                    strict=True,
+                )
+            ),
+            tuple(self.parameters.of_effects.tolist()),
+        )
 
     def _by_parameter(
         self, by_material: NDArray[np.floating], by_effect: NDArray[np.floating]
@@ -326,3 +340,22 @@ class ReplayCarriers:
             jacobian[:, links] = by_constant[:, :, self._constant] * slopes[:, None, :]
         self.calls += len(candidates)
         return loss, jacobian
+
+    def respond(
+        self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
+    ) -> Responses:
+        """Path loss and further observables of every link; see `Observing.respond`."""
+        candidates = check_candidates(candidates, len(self.parameters))
+        parts = []
+        for replay, frequency, _ in self._carriers:
+            values, slopes = self.parameters.constants_and_slopes(candidates, frequency)
+            part = replay.respond(values[:, self._first], wanted, derivatives)
+            if part.loss_slope is not None and part.observed_slope is not None:
+                part = replace(
+                    part,
+                    loss_slope=part.loss_slope[..., self._constant] * slopes[:, None, :],
+                    observed_slope=part.observed_slope[..., self._constant] * slopes[:, None, None, :],
+                )
+            parts.append(part)
+        self.calls += len(candidates)
+        return of_links(parts, [links for _, _, links in self._carriers])

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from calibray.fields import Effects
     from calibray.materials import Material
     from calibray.measurements import Measurements
+    from calibray.measurements.observables import Wanted
     from calibray.parameters import Parameters
     from calibray.paths import Paths
     from calibray.scenes import Scene
@@ -36,12 +37,14 @@ class RadioSettings:
         bandwidth: Bandwidth [Hz], or None.
         combining: How a link's paths combine: "power", "coherent" or "band".
         antennas: Transmit and receive antenna.
+        observables: Further observables besides path loss.
     """
 
     frequency: float
     bandwidth: float | None
     combining: str
     antennas: tuple[Antenna, Antenna]
+    observables: tuple[Wanted, ...] = ()
 
 
 class OpenedStudy(Protocol):

@@ -22,7 +22,7 @@ from calibray.fields.evaluation import (
     program_path_loss,
 )
 from calibray.fields.jax_context import jax_settings
-from calibray.fields.observables import Channel, link_statistics, link_statistics_and_slopes
+from calibray.fields.observables import Channel, link_responses, link_responses_and_slopes
 from calibray.fields.program import GroupedProgram, Layout, layout
 
 __all__ = [
@@ -39,8 +39,8 @@ __all__ = [
     "RoughSurfaces",
     "jax_settings",
     "layout",
-    "link_statistics",
-    "link_statistics_and_slopes",
+    "link_responses",
+    "link_responses_and_slopes",
     "path_gains",
     "path_loss",
     "path_loss_of_gains",

@@ -80,34 +80,47 @@ def statistics(
 ) -> ChannelStatistics:
     """Statistics of every link from the powers of its paths [P] and their azimuths [P], [rad]."""
     link, delay = program.phases
-    total = partial(jax.ops.segment_sum, segment_ids=link, num_segments=program.num_links)
-    link_power = total(power)
-    reached = link_power > 0
-    divisor = jnp.where(reached, link_power, 1.0)
-
-    def mean(value: jax.Array) -> jax.Array:
-        return jnp.where(reached, total(power * value) / divisor, jnp.nan)
-
-    mean_delay = mean(delay)
-    excess_delay = delay - jnp.nan_to_num(mean_delay)[link]
-    strongest = jax.ops.segment_max(power, link, program.num_links)
-    rest = link_power - strongest
-    ratio = jnp.where(rest > 0, strongest / jnp.where(rest > 0, rest, 1.0), jnp.inf)
-
-    def azimuth_spread(angle: jax.Array) -> jax.Array:
-        # 3GPP TR 38.901 annex A.1: sqrt(-2 ln |sum P e^{j phi} / sum P|)
-        resultant = jnp.hypot(mean(jnp.cos(angle)), mean(jnp.sin(angle)))
-        spread = safe_sqrt(jnp.maximum(-2 * jnp.log(jnp.clip(resultant, 1e-300, 1.0)), 0.0))
-        return jnp.where(reached, spread, jnp.nan)
-
+    of_links = partial(link_mean, power, link=link, num_links=program.num_links)
     return ChannelStatistics(
-        mean_delay=mean_delay,
-        # ITU-R P.1407-8 eq. 3
-        delay_spread=jnp.where(reached, safe_sqrt(mean(excess_delay**2)), jnp.nan),
-        k_factor_db=jnp.where(reached, 10 * jnp.log10(ratio), jnp.nan),
-        departure_spread=azimuth_spread(departure),
-        arrival_spread=azimuth_spread(arrival),
+        mean_delay=of_links(delay),
+        delay_spread=delay_spread(power, delay, link, program.num_links),
+        k_factor_db=k_factor_db(power, link, program.num_links),
+        departure_spread=angular_spread(power, departure, link, program.num_links),
+        arrival_spread=angular_spread(power, arrival, link, program.num_links),
     )
+
+
+def link_mean(weight: jax.Array, value: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
+    """Weighted mean of the values of every link [L]; NaN where no value has a weight."""
+    total = partial(jax.ops.segment_sum, segment_ids=link, num_segments=num_links)
+    sums = total(weight)
+    return jnp.where(sums > 0, total(weight * value) / jnp.where(sums > 0, sums, 1.0), jnp.nan)
+
+
+def delay_spread(power: jax.Array, delay: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
+    """Root mean square delay spread of every link [L], [s] (ITU-R P.1407-8 eq. 3); NaN without power."""
+    mean = link_mean(power, delay, link, num_links)
+    excess_delay = delay - jnp.nan_to_num(mean)[link]
+    variance = link_mean(power, excess_delay**2, link, num_links)
+    return jnp.where(jnp.isfinite(mean), safe_sqrt(variance), jnp.nan)
+
+
+def angular_spread(power: jax.Array, angle: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
+    """Circular spread of angles of every link [L], [rad] (3GPP TR 38.901 annex A.1); NaN without power."""
+    # sqrt(-2 ln |sum P e^{j phi} / sum P|)
+    cosine, sine = (link_mean(power, part(angle), link, num_links) for part in (jnp.cos, jnp.sin))
+    resultant = jnp.hypot(cosine, sine)
+    spread = safe_sqrt(jnp.maximum(-2 * jnp.log(jnp.clip(resultant, 1e-300, 1.0)), 0.0))
+    return jnp.where(jnp.isfinite(cosine), spread, jnp.nan)
+
+
+def k_factor_db(power: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
+    """Power of the strongest path over that of all others of every link [L], [dB]; NaN without power."""
+    total = jax.ops.segment_sum(power, link, num_links)
+    strongest = jax.ops.segment_max(power, link, num_links)
+    rest = total - strongest
+    ratio = jnp.where(rest > 0, strongest / jnp.where(rest > 0, rest, 1.0), jnp.inf)
+    return jnp.where(total > 0, 10 * jnp.log10(ratio), jnp.nan)
 
 
 @jax_settings()

@@ -1,13 +1,15 @@
 """Further observables of links besides path loss, as a receiver measures them, with derivatives.
 
-Each is a statistic of a link's paths weighted by their powers. A receiver sees neither paths far below the strongest
-nor those below its noise floor. A logistic function of the level in dB, `SOFT_DB` wide, takes the place of that hard
-limit, so that derivatives are exact. It changes the weight of paths within some 2 dB of the limit.
+Each is a statistic of what a receiver sees of a link's paths, weighted by power. A receiver of limited bandwidth sees
+taps in place of paths: samples of its power delay profile, in which the pulse of each path is spread over a few taps.
+It sees neither taps far below the strongest nor those below its noise floor. A logistic function of the level in dB,
+`SOFT_DB` wide, takes the place of that hard limit, so that derivatives are exact. It changes the weight of taps within
+some 2 dB of the limit. `docs/measurements/observables.md` has the error of the smooth limit.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
@@ -17,174 +19,292 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.fields.arithmetic import materialize
-from calibray.fields.channel import statistics
+from calibray.fields.channel import angular_spread, delay_spread, k_factor_db, link_mean
 from calibray.fields.combining import decibel, path_power
 from calibray.fields.effects import Effects, apply_effects
-from calibray.fields.evaluation import WIDE, contract
+from calibray.fields.evaluation import WIDE
 from calibray.fields.jax_context import jax_settings
-from calibray.fields.material_response import material_response, response_and_derivatives, split_by_step
+from calibray.fields.material_response import material_response, split_by_step
 from calibray.fields.program import GroupedProgram
 from calibray.fields.propagation import path_fields
 from calibray.measurements.observables import (
-    ARRIVAL_SPREAD,
+    ARRIVAL_ELEVATION,
+    DELAY_BIN,
     DELAY_SPREAD,
+    DEPARTURE_ELEVATION,
+    DEPARTURE_SECTOR,
     DEPARTURE_SPREAD,
     EXCESS_DELAY,
+    FLIGHTS,
     K_FACTOR,
     ROUND_TRIP,
+    SECTORS,
+    SHARE_RANGE_DB,
     Statistic,
 )
 
 SOFT_DB: Final = 0.5
 """Width of the limit of a receiver's range [dB]."""
 
+TAPS: Final = 4
+"""Taps over which a path is spread: the main lobe of a Hann pulse is four taps wide. All side lobes together hold
+0.05 % of the power, and the highest is 31 dB down."""
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["delay", "link", "index", "share"], meta_fields=[])
+@dataclass(frozen=True)
+class Taps:
+    """The T taps of all links in which a receiver of limited bandwidth sees P paths.
+
+    Attributes:
+        delay: Delay of every tap [T], [s].
+        link: Link of every tap [T].
+        index: Taps of every path [P, TAPS].
+        share: Shares of the path's power in them [P, TAPS].
+    """
+
+    delay: NDArray[np.float64]
+    link: NDArray[np.int64]
+    index: NDArray[np.int64]
+    share: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, delay: NDArray[np.float64], link: NDArray[np.integer], bandwidth: float) -> Taps:
+        """The taps of paths with delays [P], [s], in links [P], at a bandwidth [Hz].
+
+        Taps are 1 / bandwidth apart. At this distance they preserve the power, the mean and the mean square of the
+        delays of the sampled profile, wherever a path lies between two taps.
+        """
+        number = np.floor(delay * bandwidth).astype(np.int64)[:, None] + np.arange(TAPS) - TAPS // 2 + 1
+        share = hann_pulse(number - delay[:, None] * bandwidth)
+        span = int(number.max(initial=0)) + TAPS
+        # Numbers are at least 1 - TAPS // 2.
+        taps, index = np.unique(
+            np.asarray(link)[:, None] * (span + TAPS) + number + TAPS, return_inverse=True
+        )
+        return cls(
+            (taps % (span + TAPS) - TAPS) / bandwidth,
+            taps // (span + TAPS),
+            index.reshape(number.shape),
+            share / share.sum(axis=1, keepdims=True),
+        )
+
+    def power(self, power: jax.Array) -> jax.Array:
+        """Power of every tap [T] from that of every path [P]."""
+        spread = power[:, None] * self.share
+        return jax.ops.segment_sum(spread.ravel(), jnp.asarray(self.index).ravel(), len(self.delay))
+
+    def of_paths(self, seen: jax.Array) -> jax.Array:
+        """Share of every path's power [P] that is seen, from that of every tap [T]."""
+        return jnp.sum(seen[jnp.asarray(self.index)] * self.share, axis=1)
+
+
+def hann_pulse(time: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Power of the pulse of a receiver whose spectrum has a Hann window, at times in units of 1 / bandwidth.
+
+    Its root mean square width is 1 / (sqrt(3) bandwidth). It is 0 outside the main lobe.
+    """
+    inside = np.abs(time) < TAPS / 2
+    near = np.isclose(np.abs(time), 1.0)
+    divisor = np.where(near, 1.0, 1.0 - time**2)
+    return np.where(inside, np.where(near, 0.5, np.sinc(time) / divisor) ** 2, 0.0)
+
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["program", "effects", "departure", "arrival"],
-    meta_fields=["wanted"],
+    data_fields=["program", "effects", "base", "departure", "arrival", "taps"],
+    meta_fields=["cells", "of_effects", "wanted"],
 )
 @dataclass(frozen=True)
 class Channel:
-    """Paths, and what a receiver measures of them.
+    """Paths, and what a receiver measures of them for values of d parameters.
 
     Attributes:
         program: The program, with delays.
         effects: Effects on the paths.
-        departure: Azimuth of departure of every path [P], [rad].
-        arrival: Azimuth of arrival of every path [P], [rad].
+        base: Constants of the materials before calibration [M, 8].
+        departure: Zenith and azimuth of departure of every path [P, 2], [rad].
+        arrival: The same of arrival.
+        taps: The taps at every bandwidth of the statistics.
+        cells: Index of a parameter, row and column of its constant, for every parameter of a material.
+        of_effects: Indices of the parameters of effects.
         wanted: The K statistics.
     """
 
     program: GroupedProgram
     effects: Effects
-    departure: jax.Array | NDArray[np.float64]
-    arrival: jax.Array | NDArray[np.float64]
-    wanted: tuple[Statistic, ...]
+    base: NDArray[np.float64]
+    departure: NDArray[np.float64]
+    arrival: NDArray[np.float64]
+    cells: tuple[tuple[int, int, int], ...]
+    of_effects: tuple[int, ...]
+    taps: tuple[Taps, ...] = ()
+    wanted: tuple[Statistic, ...] = ()
+
+    @jax_settings()
+    def measuring(self, wanted: tuple[Statistic, ...]) -> Channel:
+        """The same with other statistics."""
+        link, delay = (np.asarray(part) for part in self.program.phases)
+        taps = tuple(Taps.of(delay, link, bandwidth) for bandwidth in _bandwidths(wanted))
+        return jax.tree.map(jnp.asarray, replace(self, taps=taps, wanted=wanted))
+
+
+def _bandwidths(wanted: tuple[Statistic, ...]) -> list[float]:
+    return sorted({each.bandwidth for each in wanted if each.bandwidth is not None})
 
 
 @jax_settings()
-def link_statistics(
-    channel: Channel, tables: NDArray[np.floating], values: NDArray[np.floating], count: int
-) -> NDArray[np.float64]:
-    """Statistics of every link [count, K, L]; NaN where a link has no path.
+def link_responses(
+    channel: Channel, values: NDArray[np.float64], count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Path loss by the sum of powers [count, L], [dB], and statistics [count, K, L]; NaN where a link has no path.
 
     Args:
         channel: The paths.
-        tables: Material constants [n, M, 8].
-        values: Values of the parameters of effects [n, e].
+        values: Values of the parameters [n, d].
         count: Number of candidates that are evaluated; the function is compiled for n.
     """
-    return np.asarray(_values(channel, jnp.asarray(tables), jnp.asarray(values), count))[:count]
+    loss, observed = _responses(channel, jnp.asarray(values), count)
+    return np.asarray(loss)[:count], np.asarray(observed)[:count]
 
 
 @jax_settings()
-def link_statistics_and_slopes(
-    channel: Channel,
-    tables: NDArray[np.floating],
-    values: NDArray[np.floating],
-    count: int,
-    columns: tuple[int, ...],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Statistics, their derivatives by materials [count, K, L, M, columns] and by effects [count, K, L, e]."""
-    answers = _values_and_slopes(channel, jnp.asarray(tables), jnp.asarray(values), count, columns)
-    found, by_material, by_effect = (np.asarray(answer)[:count] for answer in answers)
-    return found, by_material, by_effect
+def link_responses_and_slopes(
+    channel: Channel, values: NDArray[np.float64], count: int
+) -> tuple[NDArray[np.float64], ...]:
+    """Path loss, statistics, and their derivatives by the parameters [count, L, d] and [count, K, L, d]."""
+    answers = _responses_and_slopes(channel, jnp.asarray(values), count)
+    return tuple(np.asarray(answer)[:count] for answer in answers)
 
 
 @partial(jax.jit, compiler_options=WIDE)
-def _values(channel: Channel, tables: jax.Array, values: jax.Array, count: int) -> jax.Array:
-    program, effects = channel.program, channel.effects
-    stored = partial(materialize, positive=program.wavelength)
-
-    def evaluate(index: jax.Array, every: jax.Array) -> jax.Array:
-        changed = apply_effects(program, effects, values[index])
-        responses = split_by_step(changed, stored(material_response(changed, tables[index])))
-        power = stored(path_power(path_fields(changed, responses)))
-        return every.at[index].set(_measured(channel, power))
-
-    shape = len(tables), len(channel.wanted), program.num_links
-    return jax.lax.fori_loop(0, count, evaluate, jnp.zeros(shape))
-
-
-@partial(jax.jit, static_argnums=4, compiler_options=WIDE)
-def _values_and_slopes(
-    channel: Channel, tables: jax.Array, values: jax.Array, count: int, columns: tuple[int, ...]
-) -> tuple[jax.Array, ...]:
-    program, effects, materials = channel.program, channel.effects, tables.shape[1]
-    stored = partial(materialize, positive=program.wavelength)
-    kinds, num_links = len(channel.wanted), program.num_links
-
+def _responses(channel: Channel, values: jax.Array, count: int) -> tuple[jax.Array, ...]:
     def evaluate(index: jax.Array, every: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        changed = apply_effects(program, effects, values[index])
-        response, derivatives = stored(response_and_derivatives(changed, tables[index], columns))
-        responses = split_by_step(changed, response)
-        power, pull = jax.vjp(
-            lambda responses: stored(path_power(path_fields(changed, responses, stored))), responses
-        )
-        found, weigh = jax.vjp(partial(_measured, channel), power)
-        # Every path belongs to one link: a reverse pass per statistic gives the derivatives of all links.
-        ones = jnp.eye(kinds)[:, :, None] * jnp.ones(num_links)
-        by_power = stored(jax.vmap(lambda one: weigh(one)[0])(ones))
-        by_material = jax.lax.map(
-            lambda slope: contract(changed, pull(slope)[0], derivatives, materials), by_power
-        )
-
-        by_effect = jnp.zeros((kinds, num_links, values.shape[1]))
-        if effects:
-            slopes = jax.jacfwd(
-                lambda value: path_power(path_fields(apply_effects(program, effects, value), responses))
-            )(values[index])  # [P, e]
-            sums = partial(jax.ops.segment_sum, segment_ids=program.phases[0], num_segments=num_links)
-            by_effect = jax.vmap(lambda slope: sums(slope[:, None] * slopes))(by_power)
-        answers = found, by_material, by_effect
+        answers = _response(channel, values[index])
         return tuple(array.at[index].set(answer) for array, answer in zip(every, answers, strict=True))
 
-    shapes = (), (materials, len(columns)), (values.shape[1],)
-    blank = tuple(jnp.zeros((len(tables), kinds, num_links, *shape)) for shape in shapes)
-    return jax.lax.fori_loop(0, count, evaluate, blank)
+    return jax.lax.fori_loop(0, count, evaluate, _blank(channel, len(values)))
 
 
-def _measured(channel: Channel, power: jax.Array) -> jax.Array:
-    """The statistics [K, L], from the powers of paths [P]."""
-    azimuths = jnp.asarray(channel.departure), jnp.asarray(channel.arrival)
-    return jnp.stack([_statistic(channel.program, power, azimuths, each) for each in channel.wanted])
+@partial(jax.jit, compiler_options=WIDE)
+def _responses_and_slopes(channel: Channel, values: jax.Array, count: int) -> tuple[jax.Array, ...]:
+    directions = jnp.eye(values.shape[1])
+
+    def evaluate(index: jax.Array, every: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        def push(direction: jax.Array) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
+            return jax.jvp(partial(_response, channel), (values[index],), (direction,))
+
+        # Statistics are many and parameters few: forward mode is faster to compile and to run.
+        found, slopes = jax.vmap(push, out_axes=(None, -1))(directions)
+        answers = *found, *slopes
+        return tuple(array.at[index].set(answer) for array, answer in zip(every, answers, strict=True))
+
+    blank = _blank(channel, len(values))
+    slopes = tuple(jnp.zeros((*array.shape, values.shape[1])) for array in blank)
+    return jax.lax.fori_loop(0, count, evaluate, (*blank, *slopes))
 
 
-def _statistic(
-    program: GroupedProgram, power: jax.Array, azimuths: tuple[jax.Array, jax.Array], wanted: Statistic
-) -> jax.Array:
-    link, delay = program.phases
-    num_links = program.num_links
-    first = jax.ops.segment_min(delay, link, num_links)
-    strongest = jax.ops.segment_max(power, link, num_links)
-    level_db = -decibel(power)
-    seen = jnp.ones_like(power)
+def _blank(channel: Channel, size: int) -> tuple[jax.Array, jax.Array]:
+    num_links = channel.program.num_links
+    return jnp.zeros((size, num_links)), jnp.zeros((size, len(channel.wanted), num_links))
+
+
+def _response(channel: Channel, values: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Path loss [L] and the statistics [K, L] for values of the parameters [d]."""
+    program, table = channel.program, jnp.asarray(channel.base)
+    stored = partial(materialize, positive=program.wavelength)
+    if channel.cells:
+        index, rows, columns = np.array(channel.cells).T
+        table = table.at[rows, columns].set(values[index])
+    changed = apply_effects(program, channel.effects, values[jnp.array(channel.of_effects, dtype=int)])
+    responses = split_by_step(changed, stored(material_response(changed, table)))
+    power = stored(path_power(path_fields(changed, responses)))
+    link, _ = program.phases
+    loss = decibel(jax.ops.segment_sum(power, link, program.num_links))
+    every = [_statistic(channel, power, each) for each in channel.wanted]
+    return loss, jnp.stack(every) if every else jnp.zeros((0, program.num_links))
+
+
+def _statistic(channel: Channel, power: jax.Array, wanted: Statistic) -> jax.Array:
+    """A statistic of every link [L], from the powers of paths [P]."""
+    num_links, (link, delay) = channel.program.num_links, channel.program.phases
+    if wanted.bandwidth is None:
+        tap_delay, tap_link, tap_power = delay, link, power
+    else:
+        taps = channel.taps[_bandwidths(channel.wanted).index(wanted.bandwidth)]
+        tap_delay, tap_link, tap_power = jnp.asarray(taps.delay), jnp.asarray(taps.link), taps.power(power)
+    seen = _seen(tap_power, tap_link, num_links, wanted)
+    # Where the receiver sees more than half of a tap, it detects it.
+    detected = jnp.where((tap_power > 0) & (seen >= 0.5), tap_delay, jnp.inf)
+    first = jax.ops.segment_min(detected, tap_link, num_links)
+    if wanted.window is not None:
+        seen = jnp.where(tap_delay - first[tap_link] <= wanted.window, seen, 0.0)
+    weight = tap_power * seen
+    if wanted.kind == DELAY_SPREAD:
+        return delay_spread(weight, tap_delay, tap_link, num_links)
+    if wanted.kind == EXCESS_DELAY:
+        mean = link_mean(weight, tap_delay, tap_link, num_links)
+        return jnp.where(jnp.isfinite(first), mean - first, jnp.nan)
+    if wanted.kind == K_FACTOR:
+        return k_factor_db(weight, tap_link, num_links)
+    if wanted.kind == DELAY_BIN:
+        return _share(weight, tap_delay - first[tap_link], tap_link, num_links, wanted)
+    of_paths = seen if wanted.bandwidth is None else taps.of_paths(seen)
+    path_weight = power * of_paths
+    if wanted.kind in FLIGHTS:
+        time = _flight(path_weight, of_paths, delay, link, num_links, wanted)
+        return 2.0 * time if wanted.kind == ROUND_TRIP else time
+    angle = jnp.asarray(_angles(channel, wanted.kind))
+    if wanted.kind in SECTORS:
+        start = wanted.edges[0]
+        turned = (angle - start) % (2 * np.pi) + start
+        return _share(path_weight, turned, link, num_links, wanted)
+    return angular_spread(path_weight, angle, link, num_links)
+
+
+def _seen(power: jax.Array, link: jax.Array, num_links: int, wanted: Statistic) -> jax.Array:
+    """How much of every tap the receiver sees, by its level [T]."""
+    level_db, seen = -decibel(power), jnp.ones_like(power)
     if wanted.dynamic_range_db is not None:
+        strongest = jax.ops.segment_max(power, link, num_links)
         below = level_db + decibel(strongest)[link]
         seen = seen * jax.nn.sigmoid((below + wanted.dynamic_range_db) / SOFT_DB)
     if wanted.floor_db is not None:
         seen = seen * jax.nn.sigmoid((level_db - wanted.floor_db) / SOFT_DB)
-    if wanted.window is not None:
-        seen = jnp.where(delay - first[link] <= wanted.window, seen, 0.0)
-    # A path of no power is not seen, whatever its level.
-    weight = jnp.where(power > 0, power * seen, 0.0)
-    found = statistics(program, weight, *azimuths)
-    if wanted.kind == DELAY_SPREAD:
-        return found.delay_spread
-    if wanted.kind == EXCESS_DELAY:
-        return found.mean_delay - first
-    if wanted.kind == K_FACTOR:
-        return found.k_factor_db
-    if wanted.kind in (DEPARTURE_SPREAD, ARRIVAL_SPREAD):
-        return found.departure_spread if wanted.kind == DEPARTURE_SPREAD else found.arrival_spread
-    reached = jnp.isfinite(found.mean_delay)
+    # A tap of no power is not seen, whatever its level.
+    return jnp.where(power > 0, seen, 0.0)
+
+
+def _share(
+    weight: jax.Array, value: jax.Array, link: jax.Array, num_links: int, wanted: Statistic
+) -> jax.Array:
+    """Share of every link's weight whose value lies in the bin [L], [dB]; at least minus the dynamic range."""
+    low, high = wanted.edges
+    share = link_mean(weight, ((value >= low) & (value < high)).astype(weight.dtype), link, num_links)
+    range_db = SHARE_RANGE_DB if wanted.dynamic_range_db is None else wanted.dynamic_range_db
+    return 10 * jnp.log10(share + 10 ** (-range_db / 10))
+
+
+def _flight(
+    weight: jax.Array, seen: jax.Array, delay: jax.Array, link: jax.Array, num_links: int, wanted: Statistic
+) -> jax.Array:
+    """Time of flight of every link [L], [s]: of the mean path, or of one with those that it is not resolved from."""
     if wanted.path == "mean":
-        time = found.mean_delay
-    elif wanted.path == "first":
-        time = jnp.where(reached, first, jnp.nan)
+        return link_mean(weight, delay, link, num_links)
+    if wanted.path == "first":
+        chosen = (weight > 0) & (seen >= 0.5)
     else:
-        is_strongest = power >= strongest[link]
-        time = jax.ops.segment_min(jnp.where(is_strongest, delay, jnp.inf), link, num_links)
-        time = jnp.where(reached, time, jnp.nan)
-    return 2.0 * time if wanted.kind == ROUND_TRIP else time
+        chosen = (weight > 0) & (weight >= jax.ops.segment_max(weight, link, num_links)[link])
+    start = jax.ops.segment_min(jnp.where(chosen, delay, jnp.inf), link, num_links)
+    if wanted.bandwidth is None:
+        return jnp.where(jnp.isfinite(start), start, jnp.nan)
+    apart = (delay - start[link]) * wanted.bandwidth
+    unresolved = jnp.where(jnp.abs(apart) < 1.0, 0.5 * (1 + jnp.cos(jnp.pi * apart)), 0.0)
+    return link_mean(weight * unresolved, delay, link, num_links)
+
+
+def _angles(channel: Channel, kind: str) -> NDArray[np.float64]:
+    """Zenith or azimuth of every path at one end [P], [rad]."""
+    at_departure = kind in (DEPARTURE_SPREAD, DEPARTURE_ELEVATION, DEPARTURE_SECTOR)
+    angles = channel.departure if at_departure else channel.arrival
+    return angles[:, 0 if kind in (DEPARTURE_ELEVATION, ARRIVAL_ELEVATION) else 1]

@@ -9,17 +9,18 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
-from typing import Final, Protocol, final
+from typing import Final, Protocol, cast, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.kinds.replay import replay
-from calibray.engines.protocol import PATH_LOSS
+from calibray.engines.protocol import PATH_LOSS, Responses
 from calibray.errors import EngineError, InputError
 from calibray.fitting.methods import AUTO
 from calibray.fitting.problem import Problem
 from calibray.materials import Material
+from calibray.measurements.observables import Statistic
 from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, Constants
 from calibray.parameters import Parameter, Parameters
 from calibray.parameters.laws import PARAMETER_BOUNDS
@@ -55,20 +56,35 @@ class StoredPaths(Protocol):
         """Path loss, and its derivatives by the parameters [n, L, d]."""
         ...
 
+    def respond(
+        self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
+    ) -> Responses:
+        """Path loss and further observables, and their derivatives; see `Observing.respond`."""
+        ...
+
 
 class Rows(Protocol):
-    """Converts path loss to the residuals of a cheap model."""
+    """Converts path loss and further observables to the residuals of a cheap model."""
+
+    @property
+    def wanted(self) -> tuple[Statistic, ...]:
+        """The further observables."""
+        ...
 
     def residuals(
-        self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64]
+        self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64], observed: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Residuals [n, m] of candidates [n, d] with path loss [n, L], [dB]."""
+        """Residuals [n, m] of candidates [n, d] with path loss [n, L], [dB], and further observables [n, K, L]."""
         ...
 
     def slopes(
-        self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64], slope: NDArray[np.float64]
+        self,
+        candidates: NDArray[np.float64],
+        path_loss: NDArray[np.float64],
+        slope: NDArray[np.float64],
+        observed_slope: NDArray[np.float64] | None,
     ) -> NDArray[np.float64]:
-        """Derivatives of the residuals [n, m, k] from those of the path loss [n, L, k]."""
+        """Derivatives of the residuals [n, m, k] from those of path loss [n, L, k] and observables [n, K, L, k]."""
         ...
 
     @property
@@ -121,22 +137,37 @@ class ReplayedModel:
     def residuals(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `CheapModel.residuals`."""
         started, candidates = time.perf_counter(), self._candidates(points, constants)
-        loss = self._filled(self.engine.path_loss(candidates))
+        answer = self._respond(candidates, False)
         self._count(started, len(points))
-        return self.rows.residuals(candidates[:, : self.count], loss)
+        loss = self._filled(answer.path_loss)
+        return self.rows.residuals(candidates[:, : self.count], loss, answer.observed)
 
     def answer(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> CheapAnswer:
         """See `CheapModel.answer`."""
         started, candidates = time.perf_counter(), self._candidates(points, constants)
-        loss, slope = self.engine.path_loss_and_jacobian(candidates)
+        answer = self._respond(candidates, True)
         self._count(started, len(points))
-        slope = np.where(np.isfinite(slope) & np.isfinite(loss)[:, :, None], slope, 0.0)
-        slope = slope * self.engine.parameters.search_slope(candidates)[:, None, :]
-        loss, studied = self._filled(loss), candidates[:, : self.count]
-        slopes = self.rows.slopes(studied, loss, slope)
+        unit = self.engine.parameters.search_slope(candidates)
+        slope, observed_slope = cast(NDArray, answer.loss_slope), answer.observed_slope
+        slope = np.where(np.isfinite(slope) & np.isfinite(answer.path_loss)[:, :, None], slope, 0.0)
+        if observed_slope is not None:
+            observed_slope = observed_slope * unit[:, None, None, :]
+        loss, studied = self._filled(answer.path_loss), candidates[:, : self.count]
+        slopes = self.rows.slopes(studied, loss, slope * unit[:, None, :], observed_slope)
         return CheapAnswer(
-            self.rows.residuals(studied, loss), slopes[:, :, : self.count], slopes[:, :, self.count :]
+            self.rows.residuals(studied, loss, answer.observed),
+            slopes[:, :, : self.count],
+            slopes[:, :, self.count :],
         )
+
+    def _respond(self, candidates: NDArray[np.float64], derivatives: bool) -> Responses:
+        if self.rows.wanted:
+            return self.engine.respond(candidates, self.rows.wanted, derivatives)
+        none = np.zeros((len(candidates), 0, len(self._reached)))
+        if not derivatives:
+            return Responses(self.engine.path_loss(candidates), none)
+        loss, slope = self.engine.path_loss_and_jacobian(candidates)
+        return Responses(loss, none, slope)
 
     def _candidates(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:
         return self.engine.parameters.from_search(np.hstack([points, constants]))
@@ -167,23 +198,33 @@ class ProblemRows:
             return np.full(len(objective.measured), objective.ceiling_db)
         return objective.measured
 
+    @property
+    def wanted(self) -> tuple[Statistic, ...]:
+        """See `Rows.wanted`."""
+        return self.problem.statistics
+
     def known(self, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """See `Rows.known`; False for rows of priors, which the model does not predict."""
-        links = reached[self.problem.objective.weight > 0]
+        weight = self.problem.objective.weight
         priors = int((self.problem.objective.nuisance.prior < np.inf).sum()) + len(self.problem.priors)
-        return np.append(links, np.zeros(priors, dtype=bool))
+        further = [reached[each.used(weight)] for each in self.problem.observed]
+        return np.concatenate([reached[weight > 0], np.zeros(priors, dtype=bool), *further])
 
     def residuals(
-        self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64]
+        self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64], observed: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """See `Rows.residuals`."""
-        return self.problem.residuals(candidates, path_loss)
+        return self.problem.residuals(candidates, path_loss, observed)
 
     def slopes(
-        self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64], slope: NDArray[np.float64]
+        self,
+        candidates: NDArray[np.float64],
+        path_loss: NDArray[np.float64],
+        slope: NDArray[np.float64],
+        observed_slope: NDArray[np.float64] | None,
     ) -> NDArray[np.float64]:
         """See `Rows.slopes`."""
-        return self.problem.slopes(candidates, path_loss, slope)
+        return self.problem.slopes(candidates, path_loss, slope, observed_slope)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,14 +8,18 @@ mean residual of its group.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.engines.protocol import Engine
+from calibray.engines.protocol import Engine, Observing
 from calibray.errors import InputError
 from calibray.measurements import Measurements
+from calibray.measurements.impulse_responses import ENDINGS, read_impulse_responses
+from calibray.measurements.multipath import Multipath, measure, read_multipath
 from calibray.measurements.observables import Statistic
 from calibray.study import Setup
 
@@ -103,21 +107,29 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
     sections, links = setup.study.observables, setup.links
     if not sections:
         return ()
-    # JAX is slow to import, and a comparison of methods is drawn without it.
-    from calibray.engines.replay import Replay
-
-    if not isinstance(engine, Replay):
+    if not isinstance(engine, Observing):
         raise InputError(
-            f"{setup.study.path}: [observables] needs the engine 'replay' in this process, with one carrier, without "
-            "workers, chunk_links and coefficients of laws"
+            f"{setup.study.path}: [observables]: the engine {setup.study.engine.name!r} gives path loss only; use "
+            "'replay' or 'command'"
         )
-    every = []
+    every, read = [], cache(_read)
     for name, section in sections.items():
-        measured = links.table.numbers(section.column, gaps=True)
+        if section.file is None:
+            place, measured = (
+                f"column {section.column!r}",
+                links.table.numbers(str(section.column), gaps=True),
+            )
+        else:
+            path = setup.study.observable_paths[name]
+            labels = tuple(links.table.labels(section.id).tolist())
+            source = read(path, section.id, labels, section.compass, section.sample_rate, section.margin_db)
+            values = measure(source, section.statistic)
+            place = f"{path}"
+            measured = np.array([values.get(label, np.nan) for label in labels]) / section.scale
         if np.isfinite(measured).sum() < 2:
             raise InputError(
-                f"{links.source}: column {section.column!r} of [observables.{name}] has "
-                f"{int(np.isfinite(measured).sum())} values; at least two links need one"
+                f"{links.source}: {place} of [observables.{name}] has {int(np.isfinite(measured).sum())} values for "
+                "these links; at least two need one"
             )
         group, labels = _groups(links, section.bias)
         # Equal values have no deviation; the error is estimated from the residuals later.
@@ -135,6 +147,14 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
             )
         )
     return tuple(every)
+
+
+def _read(
+    path: Path, label: str, links: tuple[str, ...], compass: bool, sample_rate: float | None, margin_db: float
+) -> Multipath:
+    if path.is_dir() or path.suffix.lower() in ENDINGS:
+        return read_impulse_responses(path, list(links), sample_rate, margin_db)
+    return read_multipath(path, label, compass)
 
 
 def _groups(links: Measurements, bias: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:

@@ -109,7 +109,8 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
     study = problem.setup.study
     stated = study.noise.std_db is not None or study.links.std is not None
     random_effects = any(term.around for term in problem.objective.nuisance.terms)
-    if not problem.has_priors or (stated and not problem.observed and not random_effects):
+    unstated = not all(each.stated for each in problem.observed)
+    if not problem.has_priors or (stated and not unstated and not random_effects):
         return problem
     if not stated and (not problem.differentiable or problem.freedom < 1):
         cause = (
@@ -196,7 +197,7 @@ def with_estimated_errors(problem: Problem, point: NDArray[np.float64]) -> Probl
     if not problem.observed:
         return problem
     candidate = problem.parameters.from_search(point[None])
-    values = problem.replay.observe(candidate, problem.statistics)[0]
+    values = problem.respond(candidate).observed[0]
     return replace(problem, observed=with_errors(problem.observed, values, problem.objective.weight))
 
 

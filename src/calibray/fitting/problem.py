@@ -4,12 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.engines.protocol import PATH_LOSS, Chunked, Differentiable, Engine, Observable, Reduced
+from calibray.engines.protocol import (
+    PATH_LOSS,
+    Chunked,
+    Differentiable,
+    Engine,
+    Observable,
+    Observing,
+    Reduced,
+    Responses,
+)
 from calibray.errors import InputError
 from calibray.fitting.nuisance import OFFSET, Nuisance, make_term, random_effect
 from calibray.fitting.objective import Objective, make_objective
@@ -20,9 +29,6 @@ from calibray.measurements.observables import Statistic
 from calibray.parameters import NO_PRIOR, LogNormal, Parameters
 from calibray.study import Setup, Study
 
-if TYPE_CHECKING:
-    from calibray.engines.replay import Replay
-
 
 class Evaluation(NamedTuple):
     """A problem evaluated at n points of the search space.
@@ -32,6 +38,7 @@ class Evaluation(NamedTuple):
         residuals: Weighted residuals, then one row per prior [n, m].
         jacobian: Their derivatives by the search coordinates [n, m, d]; None if not requested.
         modelled: The engine's values [n, L]; [n, 0] if it returned only sums.
+        observed: Further observables [n, K, L], in SI units; [n, 0, 0] if the engine returned only sums.
         rmse_db: The RMSE of the links only (paper eq. 1) [n].
         represents: Number of full residuals that the m compressed ones represent, with the same mean squares and
             products; None if the residuals are the full ones.
@@ -42,6 +49,7 @@ class Evaluation(NamedTuple):
     jacobian: NDArray[np.float64] | None
     modelled: NDArray[np.float64]
     rmse_db: NDArray[np.float64]
+    observed: NDArray[np.float64]
     represents: int | None = None
 
     @property
@@ -106,7 +114,13 @@ class Problem:
         """
         setup = setup.with_position_noise()
         study, links, held_out = setup.study, setup.links, setup.held_out
-        before = observable.modelled(engine, engine.parameters.start[None])[0]
+        further = observed(setup, engine) if observable is PATH_LOSS else ()
+        if further and isinstance(engine, Observing):
+            # On an expensive engine one call answers for path loss and all observables.
+            statistics = tuple(each.statistic for each in further)
+            before = engine.respond(engine.parameters.start[None], statistics).path_loss[0]
+        else:
+            before = observable.modelled(engine, engine.parameters.start[None])[0]
         censored = np.zeros(len(links), dtype=bool) if links.censored is None else links.censored
         objective = make_objective(
             links,
@@ -119,7 +133,6 @@ class Problem:
         objective = replace(objective, measured=observable.measured(links))
         _check_groups(links, objective, held_out & ~censored & np.isfinite(before))
         faint = censored if censored.any() else None
-        further = observed(setup, engine) if observable is PATH_LOSS else ()
         return cls(setup, engine, objective, before, observable, study.priors, faint, further)
 
     @property
@@ -132,6 +145,11 @@ class Problem:
     def statistics(self) -> tuple[Statistic, ...]:
         """What the further observables are."""
         return tuple(each.statistic for each in self.observed)
+
+    @property
+    def num_links(self) -> int:
+        """Number of links L."""
+        return len(self.objective.measured)
 
     @property
     def parameters(self) -> Parameters:
@@ -165,17 +183,35 @@ class Problem:
         """
         parameters, objective, jacobian = self.parameters, self.objective, None
         candidates = parameters.from_search(points)
+        with_slopes = derivatives and self.differentiable
+        answer = self.respond(candidates, with_slopes)
+        modelled, observed = answer.path_loss, answer.observed
+        if with_slopes and answer.loss_slope is not None:
+            unit = parameters.search_slope(candidates)
+            further = (
+                None if answer.observed_slope is None else answer.observed_slope * unit[:, None, None, :]
+            )
+            jacobian = self.slopes(candidates, modelled, answer.loss_slope * unit[:, None, :], further)
+        residuals = self.residuals(candidates, modelled, observed)
+        rmse_db = np.sqrt(np.mean(residuals[:, : objective.num_counted] ** 2, axis=1))
+        value = np.sqrt(np.mean(residuals**2, axis=1))
+        return Evaluation(value, residuals, jacobian, modelled, rmse_db, observed)
+
+    def respond(self, candidates: NDArray[np.float64], derivatives: bool = False) -> Responses:
+        """What the engine answers: the links' values and the further observables.
+
+        Args:
+            candidates: Candidates in the fields' units [n, d].
+            derivatives: Whether to compute derivatives by the parameters; the engine must give them.
+        """
+        if self.observed:
+            return self._observing.respond(candidates, self.statistics, derivatives)
+        none = np.zeros((len(candidates), 0, self.num_links))
         with_slopes = self.observable.derivatives
         if derivatives and with_slopes is not None and isinstance(self.engine, Differentiable):
             modelled, slope = with_slopes(self.engine, candidates)
-            slope = slope * parameters.search_slope(candidates)[:, None, :]
-            jacobian = self.slopes(candidates, modelled, slope)
-        else:
-            modelled = self.observable.modelled(self.engine, candidates)
-        residuals = self.residuals(candidates, modelled)
-        rmse_db = np.sqrt(np.mean(residuals[:, : objective.num_counted] ** 2, axis=1))
-        value = np.sqrt(np.mean(residuals**2, axis=1))
-        return Evaluation(value, residuals, jacobian, modelled, rmse_db)
+            return Responses(modelled, none, slope)
+        return Responses(self.observable.modelled(self.engine, candidates), none)
 
     def squares(self, points: NDArray[np.float64], derivatives: bool = False) -> Evaluation:
         """Like `evaluate`, for methods that use only squares and products of the residuals.
@@ -210,6 +246,16 @@ class Problem:
                 prior_rows = np.concatenate([slopes, prior_rows], axis=2)
             products = products + prior_rows.transpose(0, 2, 1) @ prior_rows
             count += prior_rows.shape[1]
+        if self.observed:
+            answer = self.respond(candidates, derivatives)
+            further = -np.concatenate(self._further(answer.observed), axis=1)[..., None]
+            if derivatives and answer.observed_slope is not None:
+                slopes = answer.observed_slope * unit[:, None, None, :-1]
+                further = np.concatenate(
+                    [np.concatenate(self._further_slopes(slopes), axis=1), further], axis=2
+                )
+            products = products + further.transpose(0, 2, 1) @ further
+            count += further.shape[1]
         lost = ~np.isfinite(products[:, -1, -1])
         # The mean square over `width` compressed rows equals the mean square over all `count` rows.
         compressed = rows(np.where(lost[:, None, None], 0.0, products)) * np.sqrt(width / count)
@@ -221,29 +267,34 @@ class Problem:
             jacobian=compressed[:, :, :-1] if derivatives else None,
             modelled=np.empty((len(points), 0)),
             rmse_db=np.where(lost, np.inf, rmse_db),
+            observed=np.empty((len(points), 0, 0)),
             represents=count,
         )
 
     def modelled(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """The engine's values of all links [n, L] at points of the search space [n, d]."""
-        return self.observable.modelled(self.engine, self.parameters.from_search(points))
+        return self.respond(self.parameters.from_search(points)).path_loss
 
     @cached_property
     def _chunks(self) -> tuple[Reduced, list[Share]] | None:
         """The engine's chunks reduced to sums, with their shares; None if the engine has no chunks."""
-        if not isinstance(self.engine, Chunked) or self.observable is not PATH_LOSS or self.observed:
+        if not isinstance(self.engine, Chunked) or self.observable is not PATH_LOSS:
             return None
         shares = self.objective.shares(self.engine.chunks)
         return self.engine.reducing(shares), shares
 
     def residuals(
-        self, candidates: NDArray[np.float64], modelled: NDArray[np.float64]
+        self,
+        candidates: NDArray[np.float64],
+        modelled: NDArray[np.float64],
+        observed: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
-        """Weighted residuals of modelled values, then one row per prior of a parameter.
+        """Weighted residuals of modelled values, one row per prior of a parameter, then those of further observables.
 
         Args:
             candidates: Parameter values [n, d], in the fields' units.
             modelled: The engine's values for them [n, L].
+            observed: Its further observables [n, K, L], in SI units; None without any.
 
         Returns:
             The residuals [n, m].
@@ -251,11 +302,8 @@ class Problem:
         parts = [self.objective.residuals(modelled)]
         if len(self.priors):
             parts.append(self.objective.noise_db * self.priors.residuals(candidates))
-        if self.observed:
-            values = self.replay.observe(candidates, self.statistics)
-            for index, each in enumerate(self.observed):
-                rows, _ = each.residuals(values[:, index], self.objective.weight)
-                parts.append(self.objective.noise_db / each.std * rows)
+        if observed is not None:
+            parts += self._further(observed)
         return np.concatenate(parts, axis=1)
 
     def slopes(
@@ -263,6 +311,7 @@ class Problem:
         candidates: NDArray[np.float64],
         modelled: NDArray[np.float64],
         slope: NDArray[np.float64],
+        observed_slope: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
         """Derivatives of `residuals`.
 
@@ -270,37 +319,48 @@ class Problem:
             candidates: Parameter values [n, d], in the fields' units.
             modelled: The engine's values for them [n, L].
             slope: Their derivatives by k variables [n, L, k]: the d search coordinates, then any others.
+            observed_slope: The same of the further observables [n, K, L, k]; None without any.
 
         Returns:
             Derivatives of the residuals by the same variables [n, m, k].
         """
-        parts, noise_db = [self.objective.jacobian(modelled, slope)], self.objective.noise_db
-        unit = self.parameters.search_slope(candidates)[:, None, :]
-        rows = []
+        parts = [self.objective.jacobian(modelled, slope)]
         if len(self.priors):
-            rows.append(noise_db * self.priors.jacobian(candidates) * unit)
-        if self.observed:
-            _, slopes = self.replay.observe_and_jacobian(candidates, self.statistics)
-            for index, each in enumerate(self.observed):
-                of_rows = each.slopes(slopes[:, index], self.objective.weight)
-                rows.append(noise_db / each.std * of_rows * unit)
-        for part in rows:
-            others = np.zeros((*part.shape[:2], slope.shape[2] - part.shape[2]))
-            parts.append(np.concatenate([part, others], axis=2))
+            unit = self.parameters.search_slope(candidates)[:, None, :]
+            rows = self.objective.noise_db * self.priors.jacobian(candidates) * unit
+            others = np.zeros((*rows.shape[:2], slope.shape[2] - rows.shape[2]))
+            parts.append(np.concatenate([rows, others], axis=2))
+        if observed_slope is not None:
+            parts += self._further_slopes(observed_slope)
         return np.concatenate(parts, axis=1)
 
+    def _further(self, observed: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Rows of every further observable [n, m], in units of the errors of path loss."""
+        weight, noise_db = self.objective.weight, self.objective.noise_db
+        return [
+            noise_db / each.std * each.residuals(observed[:, index], weight)[0]
+            for index, each in enumerate(self.observed)
+        ]
+
+    def _further_slopes(self, slope: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Derivatives of these rows [n, m, k] from those of the observables [n, K, L, k]."""
+        weight, noise_db = self.objective.weight, self.objective.noise_db
+        return [
+            noise_db / each.std * each.slopes(slope[:, index], weight)
+            for index, each in enumerate(self.observed)
+        ]
+
     @property
-    def replay(self) -> Replay:
+    def _observing(self) -> Observing:
         """The engine, which gives further observables.
 
         Raises:
-            InputError: It is not a replay in this process.
+            InputError: It gives path loss only.
         """
-        from calibray.engines.replay import Replay
-
-        if not isinstance(self.engine, Replay):
+        if not isinstance(self.engine, Observing):
             raise InputError(
-                f"{self.setup.study.path}: [observables] needs the engine 'replay' in this process"
+                f"{self.setup.study.path}: [observables]: the engine {self.setup.study.engine.name!r} gives path loss "
+                "only; use 'replay' or 'command'"
             )
         return self.engine
 

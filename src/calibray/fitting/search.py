@@ -89,6 +89,7 @@ class Trail:
         rt_calls: RT calls of the search, including calls of an earlier run that the ledger answered.
         ledger_hits: Number of calls that the ledger answered.
         modelled: The engine's values for each candidate [L], for an engine without derivatives only.
+        observed: Further observables for each candidate [K, L], likewise.
     """
 
     candidates: list[NDArray[np.float64]] = field(default_factory=list)
@@ -104,6 +105,7 @@ class Trail:
     rt_calls: int = 0
     ledger_hits: int = 0
     modelled: list[NDArray[np.float64]] = field(default_factory=list)
+    observed: list[NDArray[np.float64]] = field(default_factory=list)
 
     def add(
         self, candidates: NDArray[np.float64], evaluation: Evaluation, iteration: int, seconds: float
@@ -163,6 +165,7 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
         trail.add(candidates, evaluation, iteration, time.perf_counter() - started)
         if not problem.differentiable:
             trail.modelled += list(evaluation.modelled)
+            trail.observed += list(evaluation.observed)
         if progress is not None:
             stage = f"calibrating: best RMSE {trail.best_rmse_db:.2f} dB"
             progress(stage, len(trail.rmse_db), optimizer.budget)

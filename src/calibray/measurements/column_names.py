@@ -41,6 +41,9 @@ PATTERNS: Final = {
     "another quantity": r"std|sigma|n?sinr|snr|cinr|n?rsrq|cqi|count|n|nr?x|ncell|number|noise|floor|eirp|tx|id|error|"
     r"rtt|rtd|toa|tof|aoa|distance|ecio|ecno|ec|ta|neighbou?r|neigh|nbr|adj|quality|accuracy|asu|bitrate|speed|channel|"
     r"rauschen|ruido|bruit|rumore|qualit(a|ae)t|calidad|qualite|qualita|nachbar(zelle)?|vecin[ao]|voisine?",
+    "round-trip time": r"rtt|ftm|rtd",
+    "time of flight": r"tof|toa",
+    "accuracy": r"std|sigma|var|variance|error|accuracy|count|n|num|number|status|success.*|attempt.*|quality",
     "EIRP": r"eirp",
     "transmitted": r"tx|transmit|transmitted|sende(r|leistung)|transmitida|emise",
     "power": r"power|pwr|dbm|(sende)?leistung|potencia|puissance|potenza",
@@ -144,6 +147,27 @@ def matches(name: object, *rows: str) -> bool:
         (True, False)
     """
     return any(re.fullmatch(PATTERNS[row], word) for row in rows for word in words(name))
+
+
+def find_flight_time(frame: pd.DataFrame) -> tuple[str, str, str] | None:
+    """Find the column of round-trip times or times of flight, its kind and its unit; None without one.
+
+    Wi-Fi devices also give a round trip as the distance, in metres.
+
+    Example:
+        >>> find_flight_time(pd.DataFrame({"rtt_std_ns": [2.0], "rtt_ns": [80.0]}))
+        ('rtt_ns', 'round_trip_time', 'ns')
+        >>> find_flight_time(pd.DataFrame({"FTM distance [m]": [12.0]}))
+        ('FTM distance [m]', 'time_of_flight', 'm')
+    """
+    for name in numeric_columns(frame):
+        if matches(name, "accuracy") or not matches(name, "round-trip time", "time of flight"):
+            continue
+        unit = next((unit for unit in ("ps", "ns", "us", "ms", "s", "m") if unit in words(name)), None)
+        if unit is not None and (without_codes(frame[name]).dropna() > 0).mean() > 0.5:
+            returned = matches(name, "round-trip time") and unit != "m"
+            return name, "round_trip_time" if returned else "time_of_flight", unit
+    return None
 
 
 def numeric_columns(frame: pd.DataFrame) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Final
 
 DELAY_SPREAD: Final = "rms_delay_spread"
@@ -12,6 +12,11 @@ ROUND_TRIP: Final = "round_trip_time"
 K_FACTOR: Final = "k_factor"
 DEPARTURE_SPREAD: Final = "azimuth_spread_departure"
 ARRIVAL_SPREAD: Final = "azimuth_spread_arrival"
+DEPARTURE_ELEVATION: Final = "elevation_spread_departure"
+ARRIVAL_ELEVATION: Final = "elevation_spread_arrival"
+DELAY_BIN: Final = "power_delay_profile"
+DEPARTURE_SECTOR: Final = "azimuth_power_departure"
+ARRIVAL_SECTOR: Final = "azimuth_power_arrival"
 
 KINDS: Final = {
     DELAY_SPREAD: "s",
@@ -21,8 +26,23 @@ KINDS: Final = {
     K_FACTOR: "dB",
     DEPARTURE_SPREAD: "rad",
     ARRIVAL_SPREAD: "rad",
+    DEPARTURE_ELEVATION: "rad",
+    ARRIVAL_ELEVATION: "rad",
+    DELAY_BIN: "dB",
+    DEPARTURE_SECTOR: "dB",
+    ARRIVAL_SECTOR: "dB",
 }
 """Kinds of observables, with the unit of their values."""
+
+FLIGHTS: Final = (TIME_OF_FLIGHT, ROUND_TRIP)
+"""Kinds that are times, of which a device may have a bias."""
+
+SECTORS: Final = (DEPARTURE_SECTOR, ARRIVAL_SECTOR)
+PROFILES: Final = (DELAY_BIN, *SECTORS)
+"""Kinds that are shares of a link's power in bins: one value per bin, each an observable of its own."""
+
+SHARE_RANGE_DB: Final = 30.0
+"""Dynamic range of the share of power in a bin, unless a study states one [dB]."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +55,8 @@ class Statistic:
         dynamic_range_db: How far below the strongest path the receiver sees paths [dB]; None for all.
         floor_db: Path gain below which it sees none [dB]; None for no limit.
         window: Longest delay after the first path [s]; None for no limit.
+        bandwidth: Bandwidth of the receiver [Hz]; None if it resolves all paths.
+        edges: Ends of the bin of one of `PROFILES`: delays after the first path [s], or azimuths [rad].
     """
 
     kind: str
@@ -42,3 +64,27 @@ class Statistic:
     dynamic_range_db: float | None = None
     floor_db: float | None = None
     window: float | None = None
+    bandwidth: float | None = None
+    edges: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A statistic that an external program answers with.
+
+    Attributes:
+        name: Its name in the study.
+        statistic: What is measured.
+        unit: Unit of the answer.
+        scale: The unit in SI units.
+    """
+
+    name: str
+    statistic: Statistic
+    unit: str
+    scale: float
+
+    def record(self) -> dict[str, object]:
+        """What a program is told: name, kind, unit, and the limits that the study states."""
+        limits = {key: value for key, value in asdict(self.statistic).items() if value is not None}
+        return {"name": self.name, "unit": self.unit, **limits}

@@ -22,6 +22,7 @@ from calibray.measurements import MIN_DISTANCE
 from calibray.prediction.batches import batch_size, predict_links
 from calibray.prediction.cost import announce
 from calibray.prediction.map_files import CoverageMap
+from calibray.prediction.observables import observable_columns
 from calibray.prediction.position_checks import INSIDE, is_indoors, locate
 from calibray.prediction.predict import as_links, open_for_links
 from calibray.result.prediction_model import NO_PATH
@@ -101,6 +102,7 @@ def coverage_map(
     cells = np.flatnonzero(np.linalg.norm(rx - transmitter, axis=1) > MIN_DISTANCE)
     names = ("path_loss_db",) if level is None else ("path_loss_db", "lower_db", "upper_db")
     layers, no_path = np.full((3, len(rx)), np.nan), np.zeros(len(rx), dtype=bool)
+    observables = {name: np.full(len(rx), np.nan) for name in observable_columns(study, None)}
     size = batch_size(setup, workers)
     announce(result, len(cells), "cells")
     for start in range(0, len(cells), size):
@@ -111,6 +113,8 @@ def coverage_map(
         predictions = predict_links(result, setup, level, batch_progress, workers)
         for layer, name in enumerate(names):
             layers[layer, batch] = predictions[name]
+        for name in observables.keys() & set(predictions):
+            observables[name][batch] = predictions[name]
         no_path[batch] = predictions["basis"].str.startswith(NO_PATH)
     # Outdoors, the log-distance model does not apply inside buildings.
     without_scene = no_path | (result.prediction.model.parameters is None)
@@ -121,7 +125,7 @@ def coverage_map(
     path_loss, lower, upper = layers.reshape(3, *z.shape)
     return CoverageMap(
         transmitter, height, cell, x, y, z, path_loss, lower, upper, no_path.reshape(z.shape), level, power_dbm,
-        frame, triangles,
+        frame, triangles, {name: values.reshape(z.shape) for name, values in observables.items()},
     )  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, final
@@ -60,6 +60,7 @@ class CoverageMap:
         power_dbm: Transmitted power of a map of received power [dBm]; None for a map of path loss.
         frame: Position of the scene on the globe; None where it is unknown.
         triangles: The scene, for drawing.
+        observables: Further observables of the study by name and unit, such as spread_ns [ny, nx].
     """
 
     tx: NDArray[np.float64]
@@ -76,6 +77,7 @@ class CoverageMap:
     power_dbm: float | None
     frame: Frame | None
     triangles: Triangles
+    observables: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     @property
     def layers(self) -> dict[str, NDArray[np.float64]]:
@@ -93,10 +95,10 @@ class CoverageMap:
         return best if self.level is None else best | interval
 
     def table(self) -> pd.DataFrame:
-        """One row per cell, from south to north and west to east: x_m, y_m, z_m, the layers and the basis."""
+        """One row per cell, from south to north and west to east: x_m, y_m, z_m, layers, observables, basis."""
         x, y = np.meshgrid(self.x, self.y)
         predicted = np.where(self.no_path, NO_PATH, np.where(np.isfinite(self.path_loss_db), "model", ""))
-        columns = {"x_m": x, "y_m": y, "z_m": self.z, **self.layers, "basis": predicted}
+        columns = {"x_m": x, "y_m": y, "z_m": self.z, **self.layers, **self.observables, "basis": predicted}
         return pd.DataFrame({name: values.reshape(-1) for name, values in columns.items()})
 
     def save(
@@ -131,7 +133,7 @@ class CoverageMap:
 
 
 def geotiff(coverage: CoverageMap, path: Path) -> None:
-    """Write a map as a GeoTIFF, north up: one band per layer, then 1 where no path leads, else 0.
+    """Write a map as a GeoTIFF, north up: one band per layer and observable, then 1 where no path leads, else 0.
 
     Args:
         coverage: The map. Without a frame, coordinates are those of the scene, and no reference system is declared.
@@ -141,7 +143,8 @@ def geotiff(coverage: CoverageMap, path: Path) -> None:
         InputError: rasterio is not installed, or the frame's projection is unknown.
     """
     rasterio = library("rasterio", "scenes")
-    frame, bands = coverage.frame, {**coverage.layers, "no_path": coverage.no_path.astype(float)}
+    frame, bands = coverage.frame, {**coverage.layers, **coverage.observables}
+    bands["no_path"] = coverage.no_path.astype(float)
     west, north = coverage.x[0] - coverage.cell / 2, coverage.y[-1] + coverage.cell / 2
     georeference: dict[str, Any] = {}
     if frame is not None:
@@ -159,7 +162,8 @@ def geotiff(coverage: CoverageMap, path: Path) -> None:
                 file.write(finite[::-1].astype("float32"), number)
                 file.set_band_description(number, name)
                 if name != "no_path":
-                    file.set_band_unit(number, "dBm" if name.endswith("dbm") else "dB")
+                    unit = name.rpartition("_")[2]
+                    file.set_band_unit(number, {"dbm": "dBm", "db": "dB"}.get(unit, unit))
             file.update_tags(
                 tx_m=" ".join(f"{coordinate:g}" for coordinate in coverage.tx),
                 receiver_height_m=f"{coverage.height:g}",

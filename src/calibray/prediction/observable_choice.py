@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.engines.replay import Replay
+from calibray.engines.protocol import Observing
 from calibray.measurements.observables import (
     ARRIVAL_SPREAD,
     DELAY_SPREAD,
@@ -44,7 +44,7 @@ class Worth(NamedTuple):
 
 def worth_measuring(
     result: Record,
-    engine: Replay,
+    engine: Observing,
     draws: tuple[NDArray[np.float64], NDArray[np.float64]],
     index: NDArray[np.int64],
     information: NDArray[np.float64],
@@ -64,7 +64,8 @@ def worth_measuring(
     own = {section.kind: (name, section) for name, section in result.study.observables.items()}
     statistics = tuple(own[kind][1].statistic if kind in own else Statistic(kind) for kind in CHOICES)
     values, unit_slope = draws
-    modelled, jacobian = (part[:, :, index] for part in engine.observe_and_jacobian(values, statistics))
+    answer = engine.respond(values, statistics, derivatives=True)
+    modelled, jacobian = answer.observed[:, :, index], cast(NDArray, answer.observed_slope)[:, :, index]
     best: list[Worth] = []
     before = _deviation(information)
     for column, kind in enumerate(CHOICES):

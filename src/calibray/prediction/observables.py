@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from calibray.engines.protocol import Engine
-from calibray.engines.replay import Replay
+from calibray.engines.protocol import Engine, Observing
 from calibray.result.record import Record
 from calibray.study import Study
 
@@ -59,12 +58,12 @@ def further_observables(
         The columns; empty without further observables, or without a scene.
     """
     sections = result.study.observables
-    if not sections or replayed is None or not isinstance(replayed.engine, Replay):
+    if not sections or replayed is None or not isinstance(replayed.engine, Observing):
         return {}
     best, draws = replayed.values[:1], replayed.values[1:] if level is not None else replayed.values[:0]
     draws = draws[np.linspace(0, len(draws) - 1, min(len(draws), MOST_DRAWS)).round().astype(int)]
     statistics = tuple(section.statistic for section in sections.values())
-    found = replayed.engine.observe(np.vstack([best, draws]), statistics)
+    found = replayed.engine.respond(np.vstack([best, draws]), statistics).observed
     columns: list[NDArray[np.float64]] = []
     for index, (name, section) in enumerate(sections.items()):
         value, drawn = found[0, index] / section.scale, found[1:, index] / section.scale

@@ -10,8 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.engines.kinds.replay import ReplaySection, replay
-from calibray.engines.protocol import Differentiable
-from calibray.engines.replay import Replay
+from calibray.engines.protocol import Differentiable, Observing
 from calibray.errors import InputError
 from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, Term
 from calibray.fitting.problem import Evaluation, Problem
@@ -197,10 +196,10 @@ class _ReplayedDraws:
         """
         engine, values = self._engine(setup), self.values[: self.num_draws]
         section = setup.study.engine
-        if not isinstance(engine, Replay) or getattr(section, "compress_db", None) is not None:
+        if not isinstance(engine, Observing) or getattr(section, "compress_db", None) is not None:
             raise InputError(
-                f"{setup.study.path}: further observables need the engine 'replay' with one carrier, without "
-                "compress_db and coefficients of laws; suggest without them"
+                f"{setup.study.path}: further observables need paths that engine.compress_db does not keep; suggest "
+                "without them"
             )
         unit_slope = self.problem.parameters.search_slope(values) * self.width
         return worth_measuring(self.result, engine, (values, unit_slope), index, information)

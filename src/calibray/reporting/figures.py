@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calibray.optimizers import label
 from calibray.reporting.link_survey import Survey, in_measured_quantity, measured_quantity
+from calibray.reporting.observable_figure import measured_over_modelled
 from calibray.reporting.trust_figures import residuals_by_direction, trust_figures
 from calibray.result.record import Record
 from calibray.support.figure_style import (
@@ -248,6 +249,9 @@ def result_figures(result: Record, links: Survey | None) -> dict[str, Figure]:
         figures["residual-over-distance"] = residual_over_distance(links)
         if links.group is not None:
             figures["residual-by-group"] = residual_by_group(links)
+    observables = measured_over_modelled(result)
+    if observables is not None:
+        figures["observables"] = observables
     directions = residuals_by_direction(result)
     if directions is not None:
         figures["residual-by-direction"] = directions

@@ -68,6 +68,8 @@ CAPTIONS: Final = {
     "residual says nothing about its error.",
     "residual-by-depth": "Mean residual by the number of interactions of the strongest path, with two standard errors. "
     "Number of links in brackets.",
+    "observables": "Measured over modelled values of further observables, link by link, without biases of devices: the "
+    "line marks equal values.",
     "residual-by-direction": "Predicted minus measured path loss around each transmitter, by compass direction: points "
     "outside the black circle received more than was predicted. Orange: the stated pattern on the horizon, from its "
     "maximum at the rim to 30 dB less at the centre.",

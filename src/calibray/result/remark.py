@@ -12,7 +12,8 @@ class RemarkKind(StrEnum):
     CORRELATED_NOISE = "correlated noise"  # weight, gaussian_weight
     HEAVY_TAILS = "heavy tails"  # weight, gaussian_weight
     STRUCTURED_NOISE = "structured noise"  # weight, gaussian_weight
-    CONFLICT = "conflict"  # observables, names, path_loss, further, standard_errors
+    # observables, names, path_loss, further, standard_errors; slope and slope_error of measured over modelled values
+    CONFLICT = "conflict"
     HETEROGENEITY = "heterogeneity"  # weight, gaussian_weight
     UNDECLARED_OFFSET = "undeclared offset"  # offset_db, error_db, rmse_db, rmse_without_db
     MISSED_OPTIMUM = "missed optimum"  # draws_db, found_db

@@ -187,6 +187,13 @@ def _conflict(values: dict[str, Any]) -> str:
     rows = zip(values["names"], values["path_loss"], values["further"], strict=True)
     answers = "; ".join(f"{name} {first:.4g} or {second:.4g}" for name, first, second in rows)
     observables = ", ".join(values["observables"])
+    if "slope" in values:
+        return (
+            f"Measured {observables} changes from link to link by {values['slope']:.2f} times what the calibrated "
+            f"model predicts (standard error {values['slope_error']:.2f}), {values['standard_errors']:.1f} standard "
+            f"errors below 1. Path loss or further observables alone want {answers}. Check that the values belong to "
+            "these links and this scene, and the receiver's range."
+        )
     return (
         f"Path loss and {observables} want different parameters, by {values['standard_errors']:.1f} standard errors: "
         f"{answers}. Check units, the receiver's range and the scene; the common fit explains neither."

@@ -116,6 +116,7 @@ def _content(links: LinksDraft, antennas: Path | None) -> dict[str, Any]:
         "trace": trace,
         "parameters": _parameters(links, scene, indoors) | attenuation,
         **({"regions": regions} if regions else {}),
+        **({"observables": links.observables} if links.observables else {}),
         "offset": {"per": links.groups} if links.groups else {},
         # Refracted paths are sampled by the materials, so every new trace changes some links: one is enough.
         **({"fidelity": {"tolerance_db": 2.0, "rounds": 1}} if indoors else {}),

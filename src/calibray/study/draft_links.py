@@ -79,6 +79,7 @@ class LinksDraft:
         assumptions: The assumptions.
         frequency: The study's carrier [Hz].
         groups: The columns that group the offset.
+        observables: The sections of ``[observables]``.
     """
 
     scene: str
@@ -92,6 +93,7 @@ class LinksDraft:
     assumptions: list[Assumption] = field(default_factory=list)
     frequency: float = 0.0
     groups: list[str] = field(default_factory=list)
+    observables: dict[str, dict[str, str]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._transmitter_key = ""
@@ -111,6 +113,7 @@ class LinksDraft:
         self._add_noise_floor(value)
         self._add_averaging(rx)
         self._add_heights(tx, rx)
+        self._add_flight_times()
 
     @cached_property
     def overhead(self) -> SceneSurfaces:
@@ -429,6 +432,23 @@ class LinksDraft:
         reason = "each transmitter and each receiver has its own gain"
         self.assume("offset.per", ", ".join(groups) or "one", reason)
         return groups
+
+    def _add_flight_times(self) -> None:
+        found = column_names.find_flight_time(self._table.frame)
+        # Averages of samples keep the observables of the first one.
+        if found is None or "average" in self.section or "wide" in self.section:
+            return
+        column, kind, unit = found
+        transmitter = self.section.get("transmitter")
+        bias = transmitter if transmitter in self._table.frame else "all"
+        self.observables["flight"] = {
+            "kind": kind, "column": column, "unit": unit, "bias": bias, "path": "first"
+        }  # fmt: skip
+        self.assume(
+            "observables.flight",
+            column,
+            f"its name; the bias of {'each ' if bias != 'all' else ''}device is unknown",
+        )
 
     def _add_noise_floor(self, value: ValueColumn) -> None:
         raw = self._table.frame[value.column]

@@ -32,7 +32,7 @@ from calibray.study.displacement import RECEIVER, displaces
 from calibray.study.facades import FacadeSection
 from calibray.study.link_obstruction import CLUTTER, REGION
 from calibray.study.link_obstruction import COLUMNS as OBSTRUCTION
-from calibray.study.observables import ObservableSection
+from calibray.study.observables import ObservableSection, by_column
 from calibray.study.regions import PREFIX, RegionSection
 from calibray.study.sections import (
     AntennasSection,
@@ -103,6 +103,11 @@ class StudyModel(Section, ABC):
             )
         return value
 
+    @field_validator("observables")
+    @classmethod
+    def _one_per_column(cls, value: dict[str, ObservableSection]) -> dict[str, ObservableSection]:
+        return by_column(value)
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.objective.combining == "band" and self.scene.bandwidth is None:
@@ -117,6 +122,7 @@ class StudyModel(Section, ABC):
                 "counted as if their errors were independent; leave one of them out"
             )
         self._check_rays()
+        self._check_observables()
         self._check_losses()
         self._check_poses()
         self._check_position_errors()
@@ -152,6 +158,29 @@ class StudyModel(Section, ABC):
                     "engine.rays = true: powers of rays are compared at one carrier and add up, so it does not go with "
                     f"{key}; remove one of them"
                 )
+
+    def _check_observables(self) -> None:
+        if not self.observables:
+            return
+        if getattr(self.engine, "compress_db", None) is not None:
+            raise InputError(
+                "engine.compress_db: few weighted paths keep path loss, not the delays and angles of [observables]; "
+                "remove one of them"
+            )
+        if self.links.average is not None and any(each.file is None for each in self.observables.values()):
+            raise InputError(
+                "links.average with [observables]: averages keep the columns of the first sample; average the table "
+                "itself, or remove one of them"
+            )
+        if self.engine.name == "retrace":
+            raise InputError("[observables] with engine.name = 'retrace': use 'replay' or 'command'")
+        unstated = [name for name, section in self.observables.items() if section.std is None]
+        if self.engine.expensive and (unstated or (self.links.std is None and self.noise.std_db is None)):
+            missing = f"observables.{unstated[0]}.std" if unstated else "noise.std_db"
+            raise InputError(
+                f"{missing}: is required, because observables are weighted by their errors, and the engine "
+                f"{self.engine.name!r} has too few calls to estimate them"
+            )
 
     def _check_losses(self) -> None:
         for name in self.parameters:
@@ -316,6 +345,15 @@ class StudyModel(Section, ABC):
         """The ray table that is replayed, if there is one."""
         file = self.engine.rays if isinstance(self.engine, ReplaySection) else None
         return None if file is None else self._resolve("engine.rays", file)
+
+    @property
+    def observable_paths(self) -> dict[str, Path]:
+        """The file of every observable that is computed from one, by name."""
+        return {
+            name: self._resolve(f"observables.{name}.file", section.file)
+            for name, section in self.observables.items()
+            if section.file is not None
+        }
 
     @property
     def region_paths(self) -> dict[str, Path | None]:
@@ -513,6 +551,8 @@ class StudyModel(Section, ABC):
             files.append((f"regions.{name}.{key}", stated, path))
         for name, path in self.facade_paths.items():
             files.append((f"facades.{name}.file", self.facades[name].file, path))
+        for name, path in self.observable_paths.items():
+            files.append((f"observables.{name}.file", self.observables[name].file, path))
         if not self.scene.file.startswith(BUNDLED):
             files.append(("scene.file", self.scene.file, Path(self.scene_source)))
         written = [("tx", self.antennas.tx), ("rx", self.antennas.rx)]

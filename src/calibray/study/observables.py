@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Final, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
+from scipy.constants import speed_of_light
 
 from calibray.errors import InputError
-from calibray.measurements.observables import KINDS, ROUND_TRIP, TIME_OF_FLIGHT, Statistic
+from calibray.measurements.impulse_responses import MARGIN_DB
+from calibray.measurements.observables import FLIGHTS, KINDS, PROFILES, SECTORS, Statistic, Wanted
 from calibray.support.strict_models import Section, Text
 
 UNITS: Final = {
-    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    # A distance is the time in which light travels it.
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ps": 1e-12, "m": 1 / speed_of_light},
     "dB": {"dB": 1.0},
     "rad": {"rad": 1.0, "deg": float(np.pi / 180)},
 }
 """Units in which values of a dimension may be given, in SI units."""
+
+Positive = Annotated[float, Field(gt=0)]
 
 
 class ObservableSection(Section):
@@ -25,6 +31,12 @@ class ObservableSection(Section):
     Attributes:
         kind: What was measured.
         column: Column of the measured values; links without a value lack this observable.
+        columns: Columns of the bins of a profile, in place of `column`.
+        file: Measured multipath or impulse responses, from which the values are computed, in place of columns.
+        id: Column of the links' labels, also in a multipath table.
+        compass: Whether azimuths in the file are bearings, clockwise from north.
+        sample_rate: Sample rate of impulse responses without delays [Hz].
+        margin_db: How far above its noise a sample of an impulse response counts [dB].
         unit: Unit of the values: "s", "ms", "us" or "ns"; "dB"; "rad" or "deg".
         std: Standard deviation of a value's error, in the unit; estimated if absent.
         bias: "all" for one unknown bias of all values, or a column of labels for one bias per label; none if absent.
@@ -32,6 +44,9 @@ class ObservableSection(Section):
         dynamic_range_db: How far below the strongest path the receiver sees paths [dB]; all if absent.
         floor_db: Path gain below which it sees none [dB]; no limit if absent.
         window: Longest delay after the first path [s]; no limit if absent.
+        bandwidth: Bandwidth of the receiver [Hz]; it resolves all paths if absent.
+        edges: Ends of the bins of a power delay profile, one more than bins: delays after the first path [s].
+        edges_deg: Ends of angular sectors: azimuths, counterclockwise from the x axis [deg].
     """
 
     kind: Literal[
@@ -42,26 +57,66 @@ class ObservableSection(Section):
         "k_factor",
         "azimuth_spread_departure",
         "azimuth_spread_arrival",
+        "elevation_spread_departure",
+        "elevation_spread_arrival",
+        "power_delay_profile",
+        "azimuth_power_departure",
+        "azimuth_power_arrival",
     ]
-    column: Text
+    column: Text | None = None
+    columns: tuple[Text, ...] = ()
+    file: Text | None = None
+    id: Text = "id"
+    compass: bool = False
+    sample_rate: Positive | None = None
+    margin_db: Positive = MARGIN_DB
     unit: Text
-    std: Annotated[float, Field(gt=0)] | None = None
+    std: Positive | None = None
     bias: Text | None = None
     path: Literal["mean", "first", "strongest"] = "mean"
-    dynamic_range_db: Annotated[float, Field(gt=0)] | None = None
+    dynamic_range_db: Positive | None = None
     floor_db: Annotated[float, Field(lt=0)] | None = None
-    window: Annotated[float, Field(gt=0)] | None = None
+    window: Positive | None = None
+    bandwidth: Positive | None = None
+    edges: tuple[float, ...] = ()
+    edges_deg: tuple[float, ...] = ()
 
     @model_validator(mode="after")
-    def _known_unit(self) -> Self:
+    def _consistent(self) -> Self:
         allowed = UNITS[KINDS[self.kind]]
         if self.unit not in allowed:
             raise InputError(f"unit = {self.unit!r}: a {self.kind} is given in {' or '.join(allowed)}")
-        if self.path != "mean" and self.kind not in (TIME_OF_FLIGHT, ROUND_TRIP):
+        if self.path != "mean" and self.kind not in FLIGHTS:
             raise InputError(
                 f"path = {self.path!r}: only a time of flight or a round-trip time is that of one path"
             )
+        if (self.column is not None) + bool(self.columns) + (self.file is not None) != 1:
+            raise InputError("give one of column, the measured values; columns, one for each bin; and file")
+        self._check_bins()
         return self
+
+    def _check_bins(self) -> None:
+        needed = {
+            "edges": self.kind in PROFILES and self.kind not in SECTORS,
+            "edges_deg": self.kind in SECTORS,
+        }
+        for key, wanted in needed.items():
+            if bool(getattr(self, key)) != wanted:
+                raise InputError(
+                    f"{key}: a {self.kind} {'needs' if wanted else 'takes no'} {key}, the ends of its bins"
+                )
+        edges = np.array(self.edges or self.edges_deg)
+        bins = len(edges) - 1 if self.file is not None else max(len(self.columns), 1)
+        if self.kind not in PROFILES:
+            if len(self.columns) > 1:
+                raise InputError(f"columns: a {self.kind} has one column; name it with column")
+            return
+        if len(edges) != bins + 1 or bins < 1 or not (np.diff(edges) > 0).all():
+            raise InputError(
+                f"edges: {max(bins, 1)} bin(s) need {max(bins, 1) + 1} increasing ends, not {edges.tolist()}"
+            )
+        if self.kind in SECTORS and edges[-1] - edges[0] > 360:
+            raise InputError(f"edges_deg: span {edges[-1] - edges[0]:g} degrees, must span 360 or fewer")
 
     @property
     def scale(self) -> float:
@@ -71,4 +126,40 @@ class ObservableSection(Section):
     @property
     def statistic(self) -> Statistic:
         """The statistic of the modelled paths."""
-        return Statistic(self.kind, self.path, self.dynamic_range_db, self.floor_db, self.window)
+        edges = None
+        if self.kind in PROFILES:
+            low, high = self.edges or np.radians(self.edges_deg).tolist()
+            edges = (float(low), float(high))
+        return Statistic(
+            self.kind, self.path, self.dynamic_range_db, self.floor_db, self.window, self.bandwidth, edges
+        )
+
+    def wanted(self, name: str) -> Wanted:
+        """What an external program is asked for."""
+        return Wanted(name, self.statistic, self.unit, self.scale)
+
+
+def by_column(sections: Mapping[str, ObservableSection]) -> dict[str, ObservableSection]:
+    """The sections with those of several columns split into one per column, named NAME_1, NAME_2, ...
+
+    Raises:
+        InputError: Two of them have one name.
+    """
+    split: dict[str, ObservableSection] = {}
+    for name, section in sections.items():
+        parts = {name: section}
+        bins = max(len(section.edges), len(section.edges_deg)) - 1
+        if bins > 1:
+            columns = section.columns or (None,) * bins
+            parts = {
+                f"{name}_{number}": section.model_copy(update={
+                    "column": column, "columns": (),
+                    "edges": section.edges[number - 1 : number + 1],
+                    "edges_deg": section.edges_deg[number - 1 : number + 1],
+                })
+                for number, column in enumerate(columns, start=1)
+            }  # fmt: skip
+        if double := sorted(set(parts) & set(split)):
+            raise InputError(f"observables: {double[0]!r} is also the name of a bin; choose another")
+        split |= parts
+    return split

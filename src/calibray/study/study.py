@@ -423,8 +423,13 @@ class Setup:
     def radio(self) -> RadioSettings:
         """Carrier, bandwidth, combining and antennas."""
         study = self.study
+        wanted = tuple(section.wanted(name) for name, section in study.observables.items())
         return RadioSettings(
-            study.scene.frequency, study.scene.bandwidth, study.objective.combining, study.antenna_pair
+            study.scene.frequency,
+            study.scene.bandwidth,
+            study.objective.combining,
+            study.antenna_pair,
+            wanted,
         )
 
     @property

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.compression import strongest
-from calibray.engines.protocol import PATH_LOSS
+from calibray.engines.protocol import PATH_LOSS, Responses
 from calibray.engines.replay import Replay
 from calibray.fitting.problem import Problem
 from calibray.measurements.observables import Statistic
@@ -62,11 +62,11 @@ class SplitReplay:
         """
         return self.engine.path_loss(self._candidates(values, factors))
 
-    def observe(
+    def respond(
         self, values: NDArray[np.float64], factors: NDArray[np.float64], wanted: tuple[Statistic, ...]
-    ) -> NDArray[np.float64]:
-        """Further observables of buildings that differ [n, K, L]; arguments as for `path_loss`."""
-        return self.engine.observe(self._candidates(values, factors), wanted)
+    ) -> Responses:
+        """Path loss and further observables of buildings that differ; arguments as for `path_loss`."""
+        return self.engine.respond(self._candidates(values, factors), wanted)
 
     def _candidates(self, values: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
         bounds = [PARAMETER_BOUNDS[parameter.field] for parameter in self.engine.parameters]
@@ -98,7 +98,9 @@ def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool)
     """
     study, engine = problem.setup.study, problem.engine
     paths, effects = engine.paths, engine.effects  # type: ignore[attr-defined]
-    if paths.num_interactions > MANY and study.objective.combining == "power" and not effects:
+    # Weak paths are late ones, which delay spreads depend on.
+    may_drop = study.objective.combining == "power" and not effects and not problem.observed
+    if paths.num_interactions > MANY and may_drop:
         paths = strongest(paths, problem.parameters, WEAK)
     names = list(paths.materials)
     building = np.full(paths.num_interactions, -1)

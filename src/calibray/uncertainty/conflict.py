@@ -1,18 +1,21 @@
-"""Whether path loss and further observables want different parameters, beyond their errors.
+"""Whether path loss and further observables contradict each other, beyond their errors.
 
-The parameters are fitted to path loss alone, to the further observables alone, and to both. The increase of both sums
-of squares at the common fit, in units of the errors' variances, follows Fisher's F if one set of parameters explains
-everything.
+They may want different parameters. The parameters are fitted to path loss alone, to the further observables alone, and
+to both. The increase of both sums of squares at the common fit, in units of the errors' variances, follows Fisher's F
+if one set of parameters explains everything.
+
+Or no parameters explain an observable, as if it was measured in another scene. Measured values are regressed on
+modelled ones: the slope is 1 if the model is right, and near 0 if the two have nothing to do with each other.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtrc, ndtri
+from scipy.special import fdtrc, ndtri, stdtr
 
 from calibray.fitting.preliminary_fits import with_estimated_errors
 from calibray.fitting.problem import Problem
@@ -23,11 +26,19 @@ SIGNIFICANT: Final = 0.005
 """Probability of a larger increase without a conflict, below which one is reported; errors that neighbouring links
 share make small probabilities somewhat more frequent."""
 
+UNRELATED: Final = 0.02
+"""Probability of a slope, if the model is right, below which an observable does not belong to the scene; shared among
+the observables."""
+
+FEWEST: Final = 5
+"""Degrees of freedom below which no slope is judged."""
+
 STARTS: Final = 32
 """Local searches of the fits to one kind of data."""
 
 DOMINANT: Final = 1e3
-"""Weight of the further observables' rows where they alone are fitted, relative to path loss."""
+"""Weight of the further observables' rows, relative to path loss, where they alone are fitted; its inverse where path
+loss alone is. The same compiled program then serves all fits."""
 
 
 def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...]:
@@ -38,13 +49,12 @@ def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...
         minima: Its relevant minima [k, d].
 
     Returns:
-        A remark with both answers if they differ beyond the errors, or none.
+        Remarks with both answers and the conflict in standard errors; none without a conflict.
     """
     objective, width = problem.objective, len(problem.parameters)
     starts = minima[:BASINS]
-    links = least_squares(replace(problem, observed=()), STARTS, starts).best.x
-    dominant = replace(problem, objective=replace(objective, noise_db=DOMINANT * objective.noise_db))
-    further = least_squares(dominant, STARTS, starts).best.x
+    links = least_squares(_weighted(problem, 1 / DOMINANT), STARTS, starts).best.x
+    further = least_squares(_weighted(problem, DOMINANT), STARTS, starts).best.x
     freedom = objective.num_counted - problem.unknowns
     of_further = sum(each.freedom(objective.weight) for each in problem.observed) - width
     if freedom < 1 or of_further < 1:
@@ -58,8 +68,6 @@ def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...
     ) / noise_db**2
     statistic = float(increase.sum()) / width
     probability = float(fdtrc(width, freedom + of_further, max(statistic, 0.0)))
-    if probability >= SIGNIFICANT:
-        return ()
     first, second = (problem.parameters.from_search(point) for point in (links, further))
     values: dict[str, Value] = {
         "observables": [each.name for each in problem.observed],
@@ -68,7 +76,58 @@ def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...
         "further": second.tolist(),
         "standard_errors": float(-ndtri(max(probability, 1e-15) / 2)),
     }
-    return (Remark(RemarkKind.CONFLICT, values),)
+    remarks = [Remark(RemarkKind.CONFLICT, values)] if probability < SIGNIFICANT else []
+    for slope in _slopes(problem, both):
+        if slope.probability < UNRELATED / len(problem.observed):
+            of_one: dict[str, Value] = {
+                "observables": [slope.name],
+                "slope": slope.value,
+                "slope_error": slope.error,
+                "standard_errors": (1 - slope.value) / slope.error,
+            }
+            remarks.append(Remark(RemarkKind.CONFLICT, values | of_one))
+    return tuple(remarks)
+
+
+class Slope(NamedTuple):
+    """Slope of measured over modelled values of an observable.
+
+    Attributes:
+        name: The observable.
+        value: The slope.
+        error: Its standard error.
+        probability: Probability of as small a slope if the model is right.
+    """
+
+    name: str
+    value: float
+    error: float
+    probability: float
+
+
+def _slopes(problem: Problem, point: NDArray[np.float64]) -> list[Slope]:
+    """Slopes of the observables at a point of the search space, with a constant or the biases of devices."""
+    modelled = problem.respond(problem.parameters.from_search(point[None])).observed[0]
+    slopes = []
+    for each, values in zip(problem.observed, modelled, strict=True):
+        used = each.used(problem.objective.weight)
+        used = used[np.isfinite(values[used])]
+        x, y = values[used] / each.scale, each.measured[used]
+        groups = np.unique(each.group[used], return_inverse=True)[1]
+        x, y = (column - (np.bincount(groups, column) / np.bincount(groups))[groups] for column in (x, y))
+        left = len(used) - (groups.max(initial=0) + 1) - 1
+        # Values that hardly differ from link to link say nothing about a slope.
+        if left < FEWEST or np.sum(x**2) <= 1e-12 * np.sum((values[used] / each.scale) ** 2):
+            continue
+        slope = float(np.sum(x * y) / np.sum(x**2))
+        error = float(np.sqrt(max(np.sum((y - slope * x) ** 2), 1e-300) / left / np.sum(x**2)))
+        slopes.append(Slope(each.name, slope, error, float(stdtr(left, (slope - 1) / error))))
+    return slopes
+
+
+def _weighted(problem: Problem, weight: float) -> Problem:
+    """The problem with the rows of its further observables times a weight."""
+    return replace(problem, observed=tuple(replace(each, std=each.std / weight) for each in problem.observed))
 
 
 def _squares(problem: Problem, point: NDArray[np.float64]) -> NDArray[np.float64]:

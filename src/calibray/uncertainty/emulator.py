@@ -9,17 +9,20 @@ all others; if these leave-one-out errors exceed the expected ones, the drawn fu
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.engines.protocol import Responses
 from calibray.fitting.cheap_replay import ReplayedModel, StoredPaths
-from calibray.fitting.objective import Objective
+from calibray.fitting.observed import Observed
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.materials import Material
+from calibray.measurements.observables import Statistic
 from calibray.optimizers.arguments import Box
 from calibray.optimizers.evaluations import merge_repeated
 from calibray.optimizers.multifidelity import discrepancy
@@ -85,39 +88,68 @@ class ConstantMean:
 
 
 @dataclass(frozen=True, eq=False)
-class LossRows:
-    """The path loss of the links with weight as residuals of a cheap model.
+class ResponseRows:
+    """The path loss of the links with weight, then the further observables, as residuals of a cheap model.
+
+    Further observables are in units of their errors times the error of path loss, so that all rows compare.
 
     Attributes:
-        objective: The objective, which holds ceiling and measured values.
+        problem: The problem.
         links: Indices of the m links with weight [m].
     """
 
-    objective: Objective
+    problem: Problem
     links: NDArray[np.int64]
+
+    @property
+    def wanted(self) -> tuple[Statistic, ...]:
+        """See `Rows.wanted`."""
+        return self.problem.statistics
 
     @property
     def filling(self) -> NDArray[np.float64]:
         """The ceiling, or without one the measured path loss [L], [dB]."""
-        ceiling = self.objective.ceiling_db
-        return self.objective.measured if ceiling is None else np.full(len(self.objective.measured), ceiling)
+        objective = self.problem.objective
+        ceiling = objective.ceiling_db
+        return objective.measured if ceiling is None else np.full(len(objective.measured), ceiling)
 
     def known(self, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """See `Rows.known`."""
-        return reached[self.links]
+        return np.concatenate([reached[self.links], *(reached[used] for used in self.used)])
 
     def residuals(
-        self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64]
+        self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64], observed: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """See `Rows.residuals`."""
-        return self.objective.capped(path_loss)[:, self.links]
+        """See `Rows.residuals`; without a path, an observable is taken as measured."""
+        rows = [self.problem.objective.capped(path_loss)[:, self.links]]
+        for index, (each, used) in enumerate(zip(self.problem.observed, self.used, strict=True)):
+            values = observed[:, index, used] / each.scale
+            rows.append(np.where(np.isfinite(values), values, each.measured[used]) * self.unit(index))
+        return np.concatenate(rows, axis=1)
 
     def slopes(
-        self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64], slope: NDArray[np.float64]
+        self,
+        candidates: NDArray[np.float64],
+        path_loss: NDArray[np.float64],
+        slope: NDArray[np.float64],
+        observed_slope: NDArray[np.float64] | None,
     ) -> NDArray[np.float64]:
         """See `Rows.slopes`."""
-        capped = self.objective.capped(path_loss) < path_loss
-        return np.where(capped[:, :, None], 0.0, slope)[:, self.links]
+        capped = self.problem.objective.capped(path_loss) < path_loss
+        rows = [np.where(capped[:, :, None], 0.0, slope)[:, self.links]]
+        if observed_slope is not None:
+            for index, (each, used) in enumerate(zip(self.problem.observed, self.used, strict=True)):
+                rows.append(np.nan_to_num(observed_slope[:, index, used]) * self.unit(index) / each.scale)
+        return np.concatenate(rows, axis=1)
+
+    @property
+    def used(self) -> list[NDArray[np.int64]]:
+        """Indices of the links that have each further observable."""
+        return [each.used(self.problem.objective.weight) for each in self.problem.observed]
+
+    def unit(self, index: int) -> float:
+        """Rows of an observable per its unit."""
+        return self.problem.objective.noise_db / self.problem.observed[index].std
 
 
 class Calls(NamedTuple):
@@ -125,12 +157,12 @@ class Calls(NamedTuple):
 
     Attributes:
         unit: Distinct points, in the unit cube [n, d].
-        loss: Path loss of the m links with weight [n, m], [dB].
+        rows: Their rows of `ResponseRows` [n, m].
         value: Objective [n].
     """
 
     unit: NDArray[np.float64]
-    loss: NDArray[np.float64]
+    rows: NDArray[np.float64]
     value: NDArray[np.float64]
 
 
@@ -144,7 +176,7 @@ class EmulatedEngine:
         interactions: Cost of a candidate, as an equivalent number of interactions.
         mean: The mean function.
         function: The function added to the mean.
-        links: Indices of the m emulated links [m].
+        rows: What the m emulated rows are.
         initial_loss: Initial path loss of all links, kept for links that are not emulated [L], [dB].
         calls: Candidates evaluated so far.
     """
@@ -154,26 +186,41 @@ class EmulatedEngine:
     interactions: int
     mean: MeanFunction
     function: SampledFunction
-    links: NDArray[np.int64]
+    rows: ResponseRows
     initial_loss: NDArray[np.float64]
     calls: int = 0
     large: bool = False
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `Engine.path_loss`."""
-        base, inputs = self.mean.base(self._unit(candidates))
-        return self._for_all_links(base + self.function.values(inputs))
+        return self.respond(candidates, ()).path_loss
 
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """See `Differentiable.path_loss_and_jacobian`."""
-        base, slope, inputs, change = self.mean.base_and_slope(self._unit(candidates))
+        answer = self.respond(candidates, (), derivatives=True)
+        return answer.path_loss, cast(NDArray, answer.loss_slope)
+
+    def respond(
+        self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
+    ) -> Responses:
+        """See `Observing.respond`; the emulator knows the study's observables, or none of them."""
+        unit, count = self._unit(candidates), len(candidates)
+        if not derivatives:
+            base, inputs = self.mean.base(unit)
+            return Responses(*self._for_all_links(base + self.function.values(inputs), wanted))
+        base, slope, inputs, change = self.mean.base_and_slope(unit)
         box, scale = self._box, self.parameters.search_slope(candidates)
         slope = (slope + self.function.slopes(inputs, change)) / (box.width * scale[:, None, :])
-        all_slopes = np.zeros((len(candidates), len(self.initial_loss), box.dimension))
-        all_slopes[:, self.links] = slope
-        return self._for_all_links(base + self.function.values(inputs)), all_slopes
+        links, last = self.rows.links, len(self.rows.links)
+        loss_slope = np.zeros((count, len(self.initial_loss), box.dimension))
+        loss_slope[:, links] = slope[:, :last]
+        observed_slope = np.zeros((count, len(wanted), len(self.initial_loss), box.dimension))
+        for index, (each, used, part) in enumerate(self._further(slope, wanted)):
+            observed_slope[:, index, used] = part * each.scale / self.rows.unit(index)
+        values = self._for_all_links(base + self.function.values(inputs), wanted)
+        return Responses(*values, loss_slope, observed_slope)
 
     @property
     def _box(self) -> Box:
@@ -183,10 +230,26 @@ class EmulatedEngine:
         self.calls += len(candidates)
         return self._box.to_unit(self.parameters.to_search(candidates))
 
-    def _for_all_links(self, loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        all_links = np.tile(self.initial_loss, (len(loss), 1))
-        all_links[:, self.links] = loss
-        return all_links
+    def _for_all_links(
+        self, rows: NDArray[np.float64], wanted: tuple[Statistic, ...]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Path loss [n, L] and further observables [n, K, L] of emulated rows [n, m]."""
+        loss = np.tile(self.initial_loss, (len(rows), 1))
+        loss[:, self.rows.links] = rows[:, : len(self.rows.links)]
+        observed = np.full((len(rows), len(wanted), len(self.initial_loss)), np.nan)
+        for index, (each, used, part) in enumerate(self._further(rows, wanted)):
+            observed[:, index, used] = part * each.scale / self.rows.unit(index)
+        return loss, observed
+
+    def _further(
+        self, rows: NDArray[np.float64], wanted: tuple[Statistic, ...]
+    ) -> Iterator[tuple[Observed, NDArray[np.int64], NDArray[np.float64]]]:
+        """The observables, the links that have them, and the part of emulated rows [n, m, ...] that is theirs."""
+        first = len(self.rows.links)
+        every = self.rows.problem.observed if wanted else ()
+        for each, used in zip(every, self.rows.used, strict=False):
+            yield each, used, rows[:, first : first + len(used)]
+            first += len(used)
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,10 +285,10 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
         The emulators; None if there are too few calls.
     """
     objective, parameters, method = problem.objective, problem.parameters, problem.setup.study.method
-    box, links = Box(*parameters.search_bounds), np.flatnonzero(objective.weight > 0)
-    calls = _calls(problem, trail, box, links)
+    box, rows = Box(*parameters.search_bounds), ResponseRows(problem, np.flatnonzero(objective.weight > 0))
+    calls = _calls(problem, trail, box, rows)
     random, noisy = np.random.default_rng([method.seed, 8]), bool(method.options.get("noisy", False))
-    replayed = None if model is None else _replayed(model, LossRows(objective, links))
+    replayed = None if model is None else _replayed(model, rows)
     corrected = None
     if replayed is not None and len(calls.unit) > 1:
         corrected = _corrected(replayed, box, calls, random, noisy)
@@ -235,10 +298,10 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
         mean: MeanFunction = corrected
         process = corrected.discrepancy
     elif len(calls.unit) >= box.dimension + 2:
-        mean, replayed = ConstantMean(calls.loss.mean(axis=0)), None
+        mean, replayed = ConstantMean(calls.rows.mean(axis=0)), None
         base, inputs = mean.base(calls.unit)
-        scale = float(np.sqrt(np.mean((calls.loss - base) ** 2)))
-        process = discrepancy.fit(inputs, calls.loss - base, max(scale, 1e-6), noisy=noisy)
+        scale = float(np.sqrt(np.mean((calls.rows - base) ** 2)))
+        process = discrepancy.fit(inputs, calls.rows - base, max(scale, 1e-6), noisy=noisy)
     else:
         return None
     better = np.argsort(calls.value, kind="stable")[: max(2, len(calls.value) // 2)]
@@ -246,13 +309,13 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
     stretch = max(
         1.0, standardized_error(process, better), standardized_error(process, np.arange(len(calls.value)))
     )
-    cost = calls.loss.size + (0 if replayed is None else _interactions(replayed.engine))
+    cost = calls.rows.size + (0 if replayed is None else _interactions(replayed.engine))
     functions = [
         sample_function(process, random, 0.0),
         *(sample_function(process, random, stretch) for _ in range(FUNCTIONS)),
     ]
     mean_engine, *drawn = (
-        EmulatedEngine(parameters, problem.engine.materials, cost, mean, function, links, problem.before)
+        EmulatedEngine(parameters, problem.engine.materials, cost, mean, function, rows, problem.before)
         for function in functions
     )
     _, inputs = mean.base(design("sobol", CLOUD, box.dimension, random))
@@ -267,18 +330,27 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
     )
 
 
-def _calls(problem: Problem, trail: Trail, box: Box, links: NDArray[np.int64]) -> Calls:
+def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Calls:
     """The calls with a path loss for every link with weight; of too many, the most informative."""
-    objective, parameters = problem.objective, problem.parameters
-    candidates = np.array([*trail.candidates, parameters.start])
-    modelled = np.array([*trail.modelled, problem.before])
-    loss = objective.capped(modelled)[:, links]
-    complete = np.isfinite(loss).all(axis=1)
-    unit, loss_and_value = merge_repeated(
+    parameters = problem.parameters
+    candidates, modelled = np.array(trail.candidates), np.array(trail.modelled)
+    observed = np.array(trail.observed)
+    if not problem.observed:
+        candidates = np.vstack([candidates, parameters.start])
+        modelled = np.vstack([modelled, problem.before])
+        observed = np.zeros((len(candidates), 0, problem.num_links))
+    every = rows.residuals(candidates, modelled, observed)
+    complete = np.isfinite(every).all(axis=1)
+    if problem.observed:
+        residuals = problem.residuals(candidates[complete], modelled[complete], observed[complete])
+        value = np.sqrt(np.mean(residuals**2, axis=1))
+    else:
+        value = problem.objective.value(modelled[complete])
+    unit, rows_and_value = merge_repeated(
         box.to_unit(parameters.to_search(candidates[complete])),
-        np.column_stack([loss[complete], objective.value(modelled[complete])]),
+        np.column_stack([every[complete], value]),
     )
-    order = np.argsort(loss_and_value[:, -1], kind="stable")
+    order = np.argsort(rows_and_value[:, -1], kind="stable")
     if len(order) > MAX_CALLS:
         distinct: list[int] = []
         for index in order.tolist():
@@ -290,7 +362,7 @@ def _calls(problem: Problem, trail: Trail, box: Box, links: NDArray[np.int64]) -
         if len(others):
             others = others[np.unique(np.linspace(0, len(others) - 1, half).astype(np.int64))]
         order = np.concatenate([best, others])
-    return Calls(unit[order], loss_and_value[order, :-1], loss_and_value[order, -1])
+    return Calls(unit[order], rows_and_value[order, :-1], rows_and_value[order, -1])
 
 
 def _corrected(
@@ -301,11 +373,11 @@ def _corrected(
     trials = constants.draw(random.standard_normal((TRIALS, len(constants.centre))))
     trials = np.vstack([constants.centre, trials])
     cloud = design("sobol", CLOUD, box.dimension, random)
-    return correct(model, box, calls.unit, calls.loss, cloud, trials, noisy=noisy)
+    return correct(model, box, calls.unit, calls.rows, cloud, trials, noisy=noisy)
 
 
-def _replayed(model: ReplayedModel, rows: LossRows) -> ReplayedModel | None:
-    """The replay with path loss as residuals; None if it predicts no link."""
+def _replayed(model: ReplayedModel, rows: ResponseRows) -> ReplayedModel | None:
+    """The replay with responses as residuals; None if it predicts no link."""
     replayed = ReplayedModel(model.engine, model.count, rows)
     return replayed if replayed.known.any() else None
 

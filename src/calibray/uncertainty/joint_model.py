@@ -216,11 +216,12 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
         return (measured - objective.capped(loss)[:, counted]) * scale
 
     def loss_of(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return problem.observable.modelled(problem.engine, values)
+        return problem.respond(values).path_loss
 
     def gaps_of(points: NDArray[np.float64], _: NDArray[np.float64]) -> NDArray[np.float64]:
         values = problem.parameters.from_unit(points)
-        return np.hstack([gap(loss_of(values)), *_further(problem, lambda: _observe(problem, values))])
+        answer = problem.respond(values)
+        return np.hstack([gap(answer.path_loss), *_further(problem, answer.observed)])
 
     if len(counted) > MAX_LINKS:
         marginal = marginal.without_improbable(gap(loss_of(problem.parameters.from_search(best[None]))))
@@ -266,11 +267,18 @@ def _with_constants(
     fixed = _fixed_constants(problem)
     every = replace(study, items=(*study.items, *fixed))
     replay, effects = split_replay(problem, every, by_building=model.spread != 0), {}
+
+    def loss_at(values: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
+        if not problem.observed:
+            return replay.path_loss(values, factors)
+        # The same compiled program as for the gaps.
+        return replay.respond(values, factors, problem.statistics).path_loss
+
     if fixed:
         values = np.append(study.from_search(best), [item.start for item in fixed])
         steps = np.exp(known_to * np.eye(len(values))[len(study) :])
         alike = np.ones((len(values) - len(study) + 1, len(replay.parameter_of)))
-        gaps = gap(replay.path_loss(np.vstack([values, values * steps]), alike))
+        gaps = gap(loss_at(np.vstack([values, values * steps]), alike))
         with np.errstate(invalid="ignore"):  # inf - inf for a censored link without a path
             change = gaps[1:] - gaps[:1]
         effect_db = np.sqrt(np.mean(np.where(np.isfinite(change), change, 0.0) ** 2, axis=1))
@@ -294,8 +302,10 @@ def _with_constants(
         factors = np.ones((len(points), len(replay.parameter_of)))
         factors[:, of_building] = np.exp(logarithms)
         values = full(parameters.from_unit(points))
-        further = _further(problem, lambda: replay.observe(values, factors, problem.statistics))
-        return np.hstack([gap(replay.path_loss(values, factors)), *further])
+        if not problem.observed:
+            return gap(replay.path_loss(values, factors))
+        answer = replay.respond(values, factors, problem.statistics)
+        return np.hstack([gap(answer.path_loss), *_further(problem, answer.observed)])
 
     return replace(
         model,
@@ -304,7 +314,7 @@ def _with_constants(
             range(len(study), len(parameters)), [item.start for item in fixed], known_to
         ),
         gaps=gaps_of,
-        loss=lambda values: replay.path_loss(full(values), np.ones((len(values), len(replay.parameter_of)))),
+        loss=lambda values: loss_at(full(values), np.ones((len(values), len(replay.parameter_of)))),
         parameter_of=parameter_of,
         building_of=np.unique(replay.building_of[of_building], return_inverse=True)[1],
         only_buildings=np.flatnonzero((constants == of_buildings) & (constants > 0)),
@@ -313,18 +323,11 @@ def _with_constants(
     )
 
 
-def _observe(problem: Problem, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return problem.replay.observe(values, problem.statistics)
-
-
-def _further(problem: Problem, observe: Callable[[], NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+def _further(problem: Problem, observed: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Rows of the further observables [n, m] each, in units of the error where that is stated."""
-    if not problem.observed:
-        return []
-    modelled = observe()
     rows = []
     for index, each in enumerate(problem.observed):
-        residuals, _ = each.residuals(modelled[:, index], problem.objective.weight)
+        residuals, _ = each.residuals(observed[:, index], problem.objective.weight)
         rows.append(residuals / each.std if each.stated else residuals)
     return rows
 

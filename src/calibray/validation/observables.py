@@ -38,7 +38,7 @@ def held_out_gaps(
     """
     if not problem.observed:
         return {}
-    modelled = problem.replay.observe(best[None], problem.statistics)[0]
+    modelled = problem.respond(best[None]).observed[0]
     weight, links, gaps = problem.objective.weight, problem.setup.links, {}
     for each, values in zip(problem.observed, modelled, strict=True):
         features = [values / each.scale, np.zeros(len(links)), _law(each, links)]

@@ -9,17 +9,26 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from threading import Lock
-from typing import Any, Final, final
+from typing import Any, Final, cast, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.cluster.chunks import Shared, count_links, identity, select_links
 from calibray.engines.cluster.workers import Workers
-from calibray.engines.protocol import Differentiable, Reduced, Reduction, check_candidates
+from calibray.engines.protocol import (
+    Differentiable,
+    Observing,
+    Reduced,
+    Reduction,
+    Responses,
+    check_candidates,
+    of_links,
+)
 from calibray.engines.section import OpenedStudy
 from calibray.materials import Material
 from calibray.measurements import Measurements
+from calibray.measurements.observables import Statistic
 from calibray.support.progress import Progress
 
 Open = Callable[[OpenedStudy, Mapping[str, Material]], Differentiable]
@@ -122,6 +131,15 @@ class ChunkedReplay:
             jacobian[:, chunk] = chunk_jacobian
         return loss, jacobian
 
+    def respond(
+        self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
+    ) -> Responses:
+        """Path loss and further observables of every link, all sent to this process; see `Observing.respond`."""
+        values = check_candidates(candidates, len(self.parameters))
+        parts = self._workers.ask(_respond, [self._kept], values, wanted, derivatives)
+        self.calls += len(values)
+        return of_links(parts, list(self.chunks))
+
     def reducing(self, reductions: Sequence[Reduction]) -> Reduced:
         """A function that reduces every chunk's path loss on its worker; see `Chunked.reducing`."""
         kept = self._workers.keep(identity, reductions)
@@ -160,6 +178,12 @@ def _path_loss_and_jacobian(
     chunk: Chunk, candidates: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return chunk.engine.path_loss_and_jacobian(candidates)
+
+
+def _respond(
+    chunk: Chunk, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool
+) -> Responses:
+    return cast(Observing, chunk.engine).respond(candidates, wanted, derivatives)
 
 
 def _reduce(chunk: Chunk, reduction: Reduction, candidates: NDArray[np.float64], derivatives: bool) -> object:

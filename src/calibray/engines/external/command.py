@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from calibray.engines.external.exchange import Request
 from calibray.engines.external.program import POLL, ExternalProgram, Outcome
-from calibray.engines.protocol import Answer, check_candidates, gather
+from calibray.engines.protocol import Answer, Responses, check_candidates, gather, gather_responses
 from calibray.engines.section import OpenedStudy
 from calibray.errors import EngineError, InputError
+from calibray.measurements.observables import Statistic
 from calibray.support.messages import printable
 from calibray.support.progress import Progress
 
@@ -63,6 +64,22 @@ class Command:
         values = check_candidates(candidates, len(self.parameters))
         return gather(self.answers(values), (len(values), self.num_links), first)
 
+    def respond(
+        self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
+    ) -> Responses:
+        """Path loss and further observables of every link, as the program answers; see `Observing.respond`.
+
+        Raises:
+            InputError: The program was not asked for these, or derivatives are wanted.
+        """
+        first = not self.calls
+        values = check_candidates(candidates, len(self.parameters))
+        if derivatives or wanted != tuple(each.statistic for each in self._study.radio.observables):
+            raise InputError(
+                f"{self._source}: the program answers the study's [observables] alone, without derivatives"
+            )
+        return gather_responses(self.answers(values), (len(values), self.num_links), len(wanted), first)
+
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
         """Answer candidates, each as soon as its call ends; see `Answering.answers`."""
         if not self.calls:
@@ -78,7 +95,7 @@ class Command:
             self._sequential(requests, stop) if executor is None else self._parallel(requests, stop, executor)
         )
         for done, (index, raw) in enumerate(outcomes, start=1):
-            outcome = self._with_path_loss(raw) if raw.rays else raw
+            outcome = self._with_path_loss(raw) if raw.rays and self._program.rays else raw
             self.calls += 1
             if self._progress is not None:
                 self._progress("running", done, len(requests))

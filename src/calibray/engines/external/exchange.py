@@ -25,6 +25,7 @@ from calibray.materials import Material
 SCHEMA: Final = "calibray.request"
 VERSION: Final = 1
 ANSWER: Final = "path_loss_db"
+OBSERVABLES: Final = "observables"
 PATH_LOSS_DB: Final = (20.0, 300.0)  # range of a plausible answer
 RESPONSE_BYTES: Final = (16 << 20, 4 << 10)  # largest response: fixed part, and per link
 RAYS_BYTES: Final = (16 << 20, 64 << 10)  # the same with rays: some hundred paths per link
@@ -73,6 +74,10 @@ class Request:
             "combining": self.radio.combining,
         }
 
+    @property
+    def _wanted(self) -> list[dict[str, Any]]:
+        return [wanted.record() for wanted in self.radio.observables]
+
     def _json(self) -> dict[str, Any]:
         # Materials and parameters are lists: MATLAB turns the keys of an object into identifiers, and would garble
         # names such as "walls.relative_permittivity".
@@ -87,6 +92,8 @@ class Request:
             "materials": _list_materials(self.materials),
             "parameters": [{"name": name, "value": value} for name, value in self.parameters.items()],
         }
+        if self._wanted:
+            content["observables"] = self._wanted
         if self.carriers:
             content["carriers"] = [
                 {"frequency": frequency, "materials": _list_materials(materials)}
@@ -107,6 +114,8 @@ class Request:
                 group = file.create_group(f"carriers/{number}")
                 group.attrs["frequency"] = frequency
                 _write_materials(group.create_group("materials", track_order=True), materials)
+            for number, wanted in enumerate(self._wanted):
+                file.create_group(f"observables/{number}").attrs.update(wanted)
             file["parameters/names"] = list(self.parameters)
             file["parameters/values"] = list(self.parameters.values())
 
@@ -120,15 +129,27 @@ def _write_materials(group: h5py.Group, materials: Mapping[str, Material]) -> No
         group.create_group(name.replace("/", "_")).attrs.update({"name": name, **asdict(material)})
 
 
-def read_answer(path: Path, file_format: str, num_links: int) -> NDArray[np.float64]:
-    """Read the path loss [L], [dB], from a program's response; +inf where a link has no path.
+def read_answer(
+    path: Path, file_format: str, num_links: int, num_observables: int = 0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Read a program's response: path loss [L], [dB], and further observables [K, L], in their units.
+
+    Path loss is +inf where a link has no path; an observable is NaN where a link has none.
 
     Raises:
-        Unusable: The file is missing or malformed, or does not hold one path loss per link.
+        Unusable: The file is missing or malformed, or does not hold one number per link.
     """
+    read = _read_json if file_format == "json" else _read_hdf5
     response = _read_bytes(path, RESPONSE_BYTES[0] + RESPONSE_BYTES[1] * num_links)
-    values = _read_json(response) if file_format == "json" else _read_hdf5(response, num_links)
-    _check_shape(values.shape, num_links)
+    values = read(response, ANSWER, num_links)
+    if values.size == max(
+        values.shape, default=1
+    ):  # MATLAB writes a vector as a matrix with one row or column
+        values = values.reshape(-1)
+    if values.shape != (num_links,):
+        raise Unusable(
+            f"its response holds {ANSWER} of shape {values.shape}, must be ({num_links},): one per link"
+        )
     lower, upper = PATH_LOSS_DB
     wrong = ~((values >= lower) & (values <= upper) | np.isposinf(values))
     if wrong.any():
@@ -138,7 +159,18 @@ def read_answer(path: Path, file_format: str, num_links: int) -> NDArray[np.floa
             f"its response holds {ANSWER}[{link}] = {values[link]:g}; must be a number between {lower:g} and "
             f"{upper:g} dB, or infinite without a path{hint}"
         )
-    return values
+    shape = num_observables, num_links
+    if not num_observables:
+        return values, np.empty(shape)
+    observed = read(response, OBSERVABLES, num_observables * num_links)
+    if num_observables == 1 and observed.size == num_links:
+        observed = observed.reshape(shape)
+    if observed.shape != shape:
+        raise Unusable(
+            f"its response holds {OBSERVABLES} of shape {observed.shape}, must be {shape}: a list with one value per "
+            "link for each observable, in the order of the request"
+        )
+    return values, np.where(np.isfinite(observed), observed, np.nan)
 
 
 def read_rays(path: Path, num_links: int) -> bytes:
@@ -148,11 +180,6 @@ def read_rays(path: Path, num_links: int) -> bytes:
         Unusable: The file is missing, no regular file, or too large.
     """
     return _read_bytes(path, RAYS_BYTES[0] + RAYS_BYTES[1] * num_links)
-
-
-def _check_shape(shape: tuple[int, ...], num_links: int) -> None:
-    if shape != (num_links,):
-        raise Unusable(f"its response holds {ANSWER} of shape {shape}, must be ({num_links},): one per link")
 
 
 def _read_bytes(path: Path, limit: int) -> bytes:
@@ -176,54 +203,60 @@ def _read_bytes(path: Path, limit: int) -> bytes:
         return file.read(limit)
 
 
-def _read_json(response: bytes) -> NDArray[np.float64]:
+def _read_json(response: bytes, name: str, _: int) -> NDArray[np.float64]:
     try:
         content = json.loads(response.decode("utf-8"))
     except ValueError as error:
         raise Unusable(f"its response is not JSON ({error})") from None
     except RecursionError:
         raise Unusable("its response nests lists or objects too deeply") from None
-    if not isinstance(content, dict) or ANSWER not in content:
-        raise Unusable(f"its response has no key {ANSWER!r}")
-    entries = content[ANSWER]
+    if not isinstance(content, dict) or name not in content:
+        raise Unusable(f"its response has no key {name!r}")
+    entries = content[name]
     # MATLAB writes a list of one number as that number.
-    return np.array([_number(entry) for entry in (entries if isinstance(entries, list) else [entries])])
+    entries = entries if isinstance(entries, list) else [entries]
+    if name == OBSERVABLES and all(isinstance(entry, list) for entry in entries):
+        rows = [[_number(entry, name) for entry in row] for row in entries]
+        if len({len(row) for row in rows}) != 1:
+            raise Unusable(
+                f"its response holds {name} with lists of different lengths; must be one value per link"
+            )
+        return np.array(rows)
+    return np.array([_number(entry, name) for entry in entries])
 
 
-def _number(entry: Any) -> float:
+def _number(entry: Any, name: str) -> float:
     if entry in _WITHOUT_PATH:
         return np.inf
     if isinstance(entry, bool) or not isinstance(entry, int | float):
         text = json.dumps(entry) if isinstance(entry, str | bool) else reprlib.repr(entry)
-        raise Unusable(f"its response holds {text[:80]} in {ANSWER}, which is not a number")
+        raise Unusable(f"its response holds {text[:80]} in {name}, which is not a number")
     try:
         return float(entry)
     except OverflowError:
-        raise Unusable(f"its response holds a number in {ANSWER} that is too large") from None
+        raise Unusable(f"its response holds a number in {name} that is too large") from None
 
 
-def _read_hdf5(response: bytes, num_links: int) -> NDArray[np.float64]:
+def _read_hdf5(response: bytes, name: str, size: int) -> NDArray[np.float64]:
     try:
         with h5py.File(BytesIO(response), "r") as file:
-            link = file.get(ANSWER, getlink=True)
+            link = file.get(name, getlink=True)
             if link is None:
-                raise Unusable(f"its response has no dataset {ANSWER!r}")
+                raise Unusable(f"its response has no dataset {name!r}")
             if not isinstance(link, h5py.HardLink):
-                raise Unusable(
-                    f"its response links {ANSWER!r} to another object; write the numbers themselves"
-                )
-            dataset = file[ANSWER]
+                raise Unusable(f"its response links {name!r} to another object; write the numbers themselves")
+            dataset = file[name]
             if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "iuf":
-                raise Unusable(f"its response has {ANSWER!r}, which is not a dataset of numbers")
+                raise Unusable(f"its response has {name!r}, which is not a dataset of numbers")
             if dataset.is_virtual or dataset.external:
-                raise Unusable(f"its response has {ANSWER!r} in other files; write the numbers themselves")
+                raise Unusable(f"its response has {name!r} in other files; write the numbers themselves")
             # Checked before it is read, because a small compressed file may unpack to any size.
-            if dataset.size != num_links:
-                _check_shape(dataset.shape, num_links)
-            values = np.asarray(dataset[()], dtype=float)
+            if dataset.size != size:
+                raise Unusable(
+                    f"its response holds {name} of shape {dataset.shape}, must hold {size} numbers"
+                )
+            return np.asarray(dataset[()], dtype=float)
     except Unusable:
         raise
     except (OSError, KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-        raise Unusable(f"its response is not an HDF5 file with the numbers {ANSWER!r} ({error})") from None
-    # MATLAB writes a vector as a matrix with one row or column.
-    return values.reshape(-1) if values.size == max(values.shape, default=1) else values
+        raise Unusable(f"its response is not an HDF5 file with the numbers {name!r} ({error})") from None

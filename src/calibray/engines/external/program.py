@@ -41,6 +41,10 @@ GUARD: Final = (
 )
 
 
+Response = tuple[NDArray[np.float64], NDArray[np.float64]] | bytes
+"""Path loss [L], [dB], and further observables [K, L], in SI units; or a ray table."""
+
+
 class Unstartable(Unusable):
     """A program that does not exist or cannot be executed: another attempt would fail too."""
 
@@ -57,7 +61,8 @@ class Outcome:
         path_loss_db: Path loss [L], [dB]; +inf without a path, and for all links if the attempts failed.
         seconds: Time of all attempts together [s].
         failure: Error of the last attempt; empty if it succeeded.
-        rays: The response of a program that answers with rays, from which path loss follows; else empty.
+        rays: The response of a program that answers with rays, from which path loss follows; or further observables
+            [K, L] in SI units as little-endian doubles; else empty.
     """
 
     path_loss_db: NDArray[np.float64]
@@ -126,11 +131,12 @@ class ExternalProgram:
                 seconds = time.perf_counter() - started
                 if isinstance(response, bytes):
                     return Outcome(no_path, seconds, rays=response)
-                return Outcome(response, seconds)
+                loss, observed = response
+                return Outcome(loss, seconds, rays=observed.astype("<f8").tobytes())
         attempts = "" if attempt < 2 else f" (attempt {attempt} of {self.retries + 1})"
         return Outcome(no_path, time.perf_counter() - started, failure + attempts)
 
-    def _attempt(self, request: Request, num_links: int, stop: Event | None) -> NDArray[np.float64] | bytes:
+    def _attempt(self, request: Request, num_links: int, stop: Event | None) -> Response:
         ending = "json" if self.file_format == "json" else "h5"
         with _call_folder() as folder:
             request_file, response_file = folder / f"request.{ending}", folder / f"response.{ending}"
@@ -152,7 +158,10 @@ class ExternalProgram:
                     raise Unusable(f"ended with {_describe_status(report['status'])}")
                 if self.rays:
                     return read_rays(response_file, num_links)
-                return read_answer(response_file, self.file_format, num_links)
+                wanted = request.radio.observables
+                loss, observed = read_answer(response_file, self.file_format, num_links, len(wanted))
+                scale = np.array([each.scale for each in wanted])[:, None]
+                return loss, observed * scale if wanted else observed
             except Unusable as error:
                 output = report["output"]
                 raise Unusable(

@@ -13,9 +13,17 @@ from numpy.typing import NDArray
 
 from calibray.engines.ledger.database import LedgerEntry, key
 from calibray.engines.ledger.ledger import Ledger
-from calibray.engines.protocol import Answer, Answering, check_candidates, gather
-from calibray.errors import EngineError
+from calibray.engines.protocol import (
+    Answer,
+    Answering,
+    Responses,
+    check_candidates,
+    gather,
+    gather_responses,
+)
+from calibray.errors import EngineError, InputError
 from calibray.materials import Material
+from calibray.measurements.observables import Statistic
 from calibray.parameters import Parameters
 from calibray.support.progress import Progress
 
@@ -68,12 +76,29 @@ class Recorded:
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of every link for candidates, from the ledger or else the engine; see `Answering`."""
-        values = check_candidates(candidates, len(self.parameters))
+        answers, first = self._all_answers(candidates)
+        return gather(answers, (len(candidates), self._engine.num_links), first)
+
+    def respond(
+        self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
+    ) -> Responses:
+        """Path loss and the further observables that the engine is asked for; see `Observing.respond`.
+
+        Raises:
+            InputError: Derivatives are wanted.
+        """
+        if derivatives:
+            raise InputError(f"engine {self._name!r}: gives no derivatives; use a method without")
+        answers, first = self._all_answers(candidates)
+        return gather_responses(answers, (len(candidates), self._engine.num_links), len(wanted), first)
+
+    def _all_answers(self, candidates: NDArray[np.float64]) -> tuple[list[Answer], bool]:
+        """The answers to candidates, and whether they are the first."""
         first = self.calls + self.hits == 0
-        answers = list(self.answers(values))
+        answers = list(self.answers(check_candidates(candidates, len(self.parameters))))
         if first and all(answer.failure for answer in answers) and not self._ledger.read_only:
             self._ledger.forget_failures(self._problem)
-        return gather(answers, (len(values), self._engine.num_links), first)
+        return answers, first
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
         """Answer candidates from the ledger or else the engine, until `stop` is set; see `Answering.answers`."""

@@ -1,0 +1,139 @@
+"""Multipath tables and impulse responses against closed forms, in every file format."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+
+from calibray.errors import InputError
+from calibray.measurements.impulse_responses import read_impulse_responses
+from calibray.measurements.multipath import measure, read_multipath
+from calibray.measurements.observables import Statistic
+
+TABLE = pd.DataFrame(
+    {
+        "id": [7, 7, 7, 7, 9],
+        "rotation": [1, 1, 2, 2, 1],
+        "delay_ns": [100.0, 200.0, 100.0, 300.0, 50.0],
+        "azimuth_deg": [90.0, 0.0, 90.0, 0.0, 10.0],
+        "path_loss_db": [80.0, 80.0, 80.0, 80.0, 90.0],
+    }
+)
+
+
+def values(multipath, kind, **limits):
+    return measure(multipath, Statistic(kind, **limits))
+
+
+def test_statistics_are_means_over_rotations(tmp_path):
+    TABLE.to_csv(tmp_path / "multipath.csv", index=False)
+    paths = read_multipath(tmp_path / "multipath.csv", "id")
+    # Two equal paths 100 ns and 200 ns apart have spreads of half of that.
+    assert values(paths, "rms_delay_spread") == pytest.approx({"7": 75e-9, "9": 0.0})
+    assert values(paths, "mean_excess_delay") == pytest.approx({"7": 75e-9, "9": 0.0})
+    assert values(paths, "time_of_flight", path="first") == pytest.approx({"7": 100e-9, "9": 50e-9})
+    assert values(paths, "round_trip_time") == pytest.approx({"7": 350e-9, "9": 100e-9})
+    assert values(paths, "k_factor")["7"] == pytest.approx(0.0)
+    assert np.isnan(values(paths, "k_factor")["9"])
+    # sqrt(-2 ln cos 45 degrees)
+    assert values(paths, "azimuth_spread_arrival")["7"] == pytest.approx(np.sqrt(np.log(2)))
+    with pytest.raises(InputError, match="needs angles"):
+        values(paths, "elevation_spread_arrival")
+
+
+def test_limits_bins_and_sectors(tmp_path):
+    table = TABLE.assign(path_loss_db=[80.0, 80.0, 80.0, 111.0, 133.0])
+    table.to_csv(tmp_path / "multipath.csv", index=False)
+    paths = read_multipath(tmp_path / "multipath.csv", "id", compass=True)
+    limits = {"dynamic_range_db": 30.0, "floor_db": -132.0}
+    # In the second rotation only the first path is within 30 dB of the strongest; link 9 is below the floor.
+    assert values(paths, "rms_delay_spread", **limits) == pytest.approx({"7": 25e-9})
+    assert values(paths, "rms_delay_spread", window=5e-8)["7"] == 0.0
+    full, half = 10 * np.log10(1.001), 10 * np.log10(0.5 + 1e-3)
+    first = values(paths, "power_delay_profile", edges=(0.0, 5e-8), **limits)
+    assert first == pytest.approx({"7": (half + full) / 2})
+    assert values(paths, "power_delay_profile", edges=(5e-8, 1.5e-7), **limits)["7"] == pytest.approx(
+        (half - 30) / 2
+    )
+    # A bearing of 90 degrees is east, the x axis.
+    east = values(paths, "azimuth_power_arrival", edges=(-np.pi / 4, np.pi / 4), **limits)
+    assert east["7"] == pytest.approx((half + full) / 2)
+    north = values(paths, "azimuth_power_arrival", edges=(np.pi / 4, 3 * np.pi / 4), **limits)
+    assert north["7"] == pytest.approx((half - 30) / 2)
+
+
+def test_a_table_without_delays_is_refused(tmp_path):
+    TABLE.drop(columns="delay_ns").to_csv(tmp_path / "multipath.csv", index=False)
+    with pytest.raises(InputError, match="no column of a delay"):
+        read_multipath(tmp_path / "multipath.csv", "id")
+
+
+RATE, SAMPLES = 1e8, 400
+
+
+@pytest.fixture(scope="module")
+def responses():
+    """Responses of two links with two and one paths, noise 40 dB below them [2, samples]."""
+    random = np.random.default_rng(5)
+    noise = 0.01 * (random.standard_normal((2, SAMPLES)) + 1j * random.standard_normal((2, SAMPLES)))
+    noise[0, 20] += 1.0
+    noise[0, 50] += 1.0j
+    noise[1, 30] += 2.0
+    return noise
+
+
+def write(folder, ending, responses):
+    delay = np.arange(SAMPLES) / RATE
+    file = folder / f"cir.{ending.strip('.')}"
+    if ending == ".npz":
+        np.savez(file, cir=responses, delay=delay)
+    elif ending == ".npy":
+        np.save(file, responses)
+    elif ending == ".mat":
+        scipy.io.savemat(file, {"h": responses, "tau": delay})
+    elif ending == "v7.3.mat":
+        with h5py.File(file, "w") as content:
+            pairs = np.empty(responses.T.shape, [("real", "f8"), ("imag", "f8")])
+            pairs["real"], pairs["imag"] = responses.T.real, responses.T.imag
+            content["h"], content["tau"] = pairs, delay[:, None]
+    else:
+        with h5py.File(file, "w") as content:
+            content["cir"], content["delays"] = responses, delay
+    return file
+
+
+@pytest.mark.parametrize("ending", [".npz", ".npy", ".mat", "v7.3.mat", ".h5"])
+def test_impulse_responses_of_every_format(tmp_path, responses, ending):
+    rate = RATE if ending == ".npy" else None
+    multipath = read_impulse_responses(write(tmp_path, ending, responses), ["a", "b"], rate, margin_db=15.0)
+    assert multipath.delay == pytest.approx([2e-7, 5e-7, 3e-7])
+    assert values(multipath, "rms_delay_spread") == pytest.approx({"a": 150e-9, "b": 0.0}, rel=0.02)
+
+
+def test_a_folder_with_a_file_per_link(tmp_path, responses):
+    for name, response in zip("ab", responses, strict=True):
+        np.savez(
+            tmp_path / f"{name}.npz", cir=np.stack([response, response]), delay=np.arange(SAMPLES) / RATE
+        )
+    multipath = read_impulse_responses(tmp_path, ["a", "b", "c"], margin_db=15.0)
+    assert multipath.snapshot.tolist() == ["0", "0", "1", "1", "0", "1"]
+    assert values(multipath, "time_of_flight", path="first") == pytest.approx({"a": 2e-7, "b": 3e-7})
+
+
+def test_impulse_responses_that_fit_no_links_are_refused(tmp_path, responses):
+    file = write(tmp_path, ".npy", responses)
+    with pytest.raises(InputError, match="one row for each of 3 links"):
+        read_impulse_responses(file, ["a", "b", "c"], RATE)
+    with pytest.raises(InputError, match="give the sample rate"):
+        read_impulse_responses(file, ["a", "b"])
+    (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04 no zip")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_impulse_responses(tmp_path / "bad.npz", ["a"], RATE)
+    np.save(tmp_path / "objects.npy", np.array([{}], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_impulse_responses(tmp_path / "objects.npy", ["a"], RATE)
+    with pytest.raises(InputError, match="no file is named like a link"):
+        read_impulse_responses(tmp_path, ["x"], RATE)
