@@ -128,8 +128,8 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
             measured = np.array([values.get(label, np.nan) for label in labels]) / section.scale
         if np.isfinite(measured).sum() < 2:
             raise InputError(
-                f"{links.source}: {place} of [observables.{name}] has {int(np.isfinite(measured).sum())} values for "
-                "these links; at least two need one"
+                f"{links.source}: {place} of [observables.{name}] has {int(np.isfinite(measured).sum())} values; at "
+                "least two links need one"
             )
         group, labels = _groups(links, section.bias)
         # Equal values have no deviation; the error is estimated from the residuals later.
