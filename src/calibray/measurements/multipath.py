@@ -132,11 +132,11 @@ def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:
             raise InputError(f"{statistic.kind} needs angles, which were not measured")
     snapshots: dict[str, list[float]] = {}
     keys = pd.DataFrame({"link": multipath.link, "snapshot": multipath.snapshot})
-    for (link, _), index in keys.groupby(["link", "snapshot"], sort=False).indices.items():
+    for index in keys.groupby(["link", "snapshot"], sort=False).indices.values():
         seen = _seen(multipath, np.asarray(index), statistic)
         if len(seen):
             value = _value(multipath, seen, None if angle is None else angle[seen], statistic)
-            snapshots.setdefault(link, []).append(value)
+            snapshots.setdefault(str(multipath.link[seen[0]]), []).append(value)
     return {link: float(np.mean(values)) for link, values in snapshots.items()}
 
 

@@ -67,6 +67,17 @@ class Statistic:
     bandwidth: float | None = None
     edges: tuple[float, float] | None = None
 
+    @property
+    def bin(self) -> tuple[float, float]:
+        """Ends of the bin.
+
+        Raises:
+            ValueError: It has none.
+        """
+        if self.edges is None:
+            raise ValueError(f"{self.kind}: needs edges, the ends of its bin")
+        return self.edges
+
 
 @dataclass(frozen=True)
 class Wanted:

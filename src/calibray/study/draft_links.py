@@ -93,7 +93,7 @@ class LinksDraft:
     assumptions: list[Assumption] = field(default_factory=list)
     frequency: float = 0.0
     groups: list[str] = field(default_factory=list)
-    observables: dict[str, dict[str, str]] = field(default_factory=dict)
+    observables: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._transmitter_key = ""
