@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calibray.comparison.method_runs import ComparisonProblem
 from calibray.fitting.cheap_replay import ReplayedModel, with_constants
 from calibray.fitting.problem import Evaluation
+from calibray.measurements.observables import Statistic
 from problem_families import landscapes
 from problem_families.family import PlantedProblem, problem
 from problem_families.numpy_replay import NumpyReplay
@@ -79,6 +80,11 @@ class PlantedRows:
     planted: PlantedProblem
 
     @property
+    def wanted(self) -> tuple[Statistic, ...]:
+        """No further observables."""
+        return ()
+
+    @property
     def filling(self) -> NDArray[np.float64]:
         """The measured path loss [L], [dB]."""
         return self.planted.measured
@@ -88,13 +94,17 @@ class PlantedRows:
         return reached
 
     def residuals(
-        self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64]
+        self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64], observed: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """See `Rows.residuals`."""
         return self.planted.residuals(path_loss)
 
     def slopes(
-        self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64], slope: NDArray[np.float64]
+        self,
+        candidates: NDArray[np.float64],
+        path_loss: NDArray[np.float64],
+        slope: NDArray[np.float64],
+        observed_slope: NDArray[np.float64] | None,
     ) -> NDArray[np.float64]:
         """See `Rows.slopes`; residuals are linear in the path loss minus the measurements."""
         rows = np.moveaxis(slope, 1, -1)

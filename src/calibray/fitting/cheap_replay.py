@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.kinds.replay import replay
-from calibray.engines.protocol import PATH_LOSS, Responses
+from calibray.engines.protocol import PATH_LOSS, Observing, Responses
 from calibray.errors import EngineError, InputError
 from calibray.fitting.methods import AUTO
 from calibray.fitting.problem import Problem
@@ -54,12 +54,6 @@ class StoredPaths(Protocol):
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Path loss, and its derivatives by the parameters [n, L, d]."""
-        ...
-
-    def respond(
-        self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
-    ) -> Responses:
-        """Path loss and further observables, and their derivatives; see `Observing.respond`."""
         ...
 
 
@@ -162,7 +156,7 @@ class ReplayedModel:
 
     def _respond(self, candidates: NDArray[np.float64], derivatives: bool) -> Responses:
         if self.rows.wanted:
-            return self.engine.respond(candidates, self.rows.wanted, derivatives)
+            return cast(Observing, self.engine).respond(candidates, self.rows.wanted, derivatives)
         none = np.zeros((len(candidates), 0, len(self._reached)))
         if not derivatives:
             return Responses(self.engine.path_loss(candidates), none)

@@ -38,10 +38,10 @@ class Evaluation(NamedTuple):
         residuals: Weighted residuals, then one row per prior [n, m].
         jacobian: Their derivatives by the search coordinates [n, m, d]; None if not requested.
         modelled: The engine's values [n, L]; [n, 0] if it returned only sums.
-        observed: Further observables [n, K, L], in SI units; [n, 0, 0] if the engine returned only sums.
         rmse_db: The RMSE of the links only (paper eq. 1) [n].
         represents: Number of full residuals that the m compressed ones represent, with the same mean squares and
             products; None if the residuals are the full ones.
+        observed: Further observables [n, K, L], in SI units; empty if the engine returned only sums.
     """
 
     value: NDArray[np.float64]
@@ -49,8 +49,8 @@ class Evaluation(NamedTuple):
     jacobian: NDArray[np.float64] | None
     modelled: NDArray[np.float64]
     rmse_db: NDArray[np.float64]
-    observed: NDArray[np.float64]
     represents: int | None = None
+    observed: NDArray[np.float64] = np.empty((0, 0, 0))
 
     @property
     def num_rows(self) -> int:
@@ -195,7 +195,7 @@ class Problem:
         residuals = self.residuals(candidates, modelled, observed)
         rmse_db = np.sqrt(np.mean(residuals[:, : objective.num_counted] ** 2, axis=1))
         value = np.sqrt(np.mean(residuals**2, axis=1))
-        return Evaluation(value, residuals, jacobian, modelled, rmse_db, observed)
+        return Evaluation(value, residuals, jacobian, modelled, rmse_db, observed=observed)
 
     def respond(self, candidates: NDArray[np.float64], derivatives: bool = False) -> Responses:
         """What the engine answers: the links' values and the further observables.
@@ -267,7 +267,6 @@ class Problem:
             jacobian=compressed[:, :, :-1] if derivatives else None,
             modelled=np.empty((len(points), 0)),
             rmse_db=np.where(lost, np.inf, rmse_db),
-            observed=np.empty((len(points), 0, 0)),
             represents=count,
         )
 
