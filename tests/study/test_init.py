@@ -232,6 +232,23 @@ def test_what_cannot_be_told_is_asked_for(scene, tmp_path, columns, message):
         draft(scene, table(tmp_path, **columns), tmp_path / "study.toml")
 
 
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"Lat": "50.01N", "Lon": 9.99, "RSRP": -80.0}, "'Lat' holds text such as '50.01N': write numbers"),
+        ({"x": 0.0, "y": 30.0, "RSRP": ["<-110"] + ["-80"] * 9}, "'RSRP' holds text such as '<-110'"),
+        (
+            {"x": 0.0, "y": 30.0, "Signal": 84.0},
+            "'Signal' has values about 84, and received powers .* negative",
+        ),
+    ],
+)
+def test_a_refusal_says_what_is_wrong_with_a_column_that_was_meant(scene, tmp_path, columns, message):
+    file = table(tmp_path, tx_x=np.full(10, -30.0), tx_y=0.0, **columns)
+    with pytest.raises(InputError, match=message):
+        draft(scene, file, tmp_path / "study.toml", frequency=3.5e9)
+
+
 def test_the_schema_is_that_of_the_model():
     status, out, _ = typed("schema")
     assert (status, out) == (0, schema_text())

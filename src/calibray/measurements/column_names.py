@@ -16,6 +16,7 @@ from calibray.measurements.links import FREQUENCIES
 from calibray.measurements.preparation import Quantity
 from calibray.measurements.selection import comparison, naming_column, without_codes
 from calibray.measurements.source_table import SourceTable
+from calibray.support.messages import shortened
 
 PATTERNS: Final = {
     # What a column may hold, and the regular expression that a whole word of its name matches.
@@ -179,6 +180,23 @@ def numeric_columns(frame: pd.DataFrame) -> list[str]:
     ]
 
 
+def text_instead(frame: pd.DataFrame, *rows: str) -> str:
+    """What a column holds that is named as in some rows of `PATTERNS`, but has text; empty without such a column.
+
+    Example:
+        >>> text_instead(pd.DataFrame({"Lat": ["51.2N", "51.3N"], "cell": "A"}), "latitude")
+        "; column 'Lat' holds text such as '51.2N': write numbers"
+    """
+    for name in frame:
+        if str(name) not in numeric_columns(frame) and matches(name, *rows):
+            cells = frame[name].dropna()
+            bad = cells[pd.to_numeric(cells, errors="coerce").isna()]
+            if len(bad):
+                cell = shortened(str(bad.iloc[0]))
+                return f"; column {shortened(str(name))!r} holds text such as {cell!r}: write numbers"
+    return ""
+
+
 def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) -> PositionColumns | None:
     """Find the columns of one end's position; metres are preferred to degrees.
 
@@ -230,6 +248,7 @@ def find_value(table: SourceTable) -> ValueColumn:
         ("path loss", "path_loss"), ("path gain", "path_gain"), ("received power", "rsrp"),
     )  # fmt: skip
     candidates: list[tuple[bool, int, bool, str, Quantity]] = []
+    unlikely = ""
     for name in numeric_columns(table.frame):
         rank = next((rank for rank, (row, _) in enumerate(kinds) if matches(name, row)), None)
         if rank is None or matches(name, "another quantity"):
@@ -239,10 +258,16 @@ def find_value(table: SourceTable) -> ValueColumn:
             secondary = rank == 2 and not matches(name, "reference signal")
             has_unit = matches(name, "decibel") or not secondary
             candidates.append((not has_unit, rank, secondary, name, kinds[rank][1]))
+        elif table.frame[name].notna().any():
+            median = float(table.frame[name].median())
+            unlikely = (
+                f"; column {name!r} has values about {median:.0f}, and received powers in dBm are negative"
+            )
     if not candidates:
         raise InputError(
             f"{table.source}: no column looks like path loss, path gain or received power "
             f"({', '.join(map(str, table.frame))}); name it path_loss_db, path_gain_db or rsrp_dbm"
+            f"{unlikely or text_instead(table.frame, *(row for row, _ in kinds))}"
         )
     candidates.sort(key=lambda candidate: candidate[:3])
     *_, name, quantity = candidates[0]

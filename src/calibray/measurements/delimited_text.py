@@ -266,6 +266,10 @@ def _checked_layout(path: Path, text: str, layout: _Layout) -> tuple[list[str], 
                 continue
             if not header:
                 header = cells
+                if all(map(_is_number, filter(str.strip, header))):
+                    raise InputError(
+                        f"{path}, row {line}: holds numbers; put a line with the names of the columns above it"
+                    )
                 names = Counter(name.strip() for name in header if name.strip())
                 if repeated := [name for name, count in names.items() if count > 1]:
                     raise InputError(f"{path}, row {line}: column {repeated[0]!r} appears twice; rename one")

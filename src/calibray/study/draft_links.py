@@ -266,6 +266,7 @@ class LinksDraft:
             raise InputError(
                 f"{self.links}: no columns of receiver positions ({self._columns()}); name them rx_x, rx_y, rx_z [m], "
                 "or longitude and latitude"
+                f"{column_names.text_instead(self._table.frame, 'x', 'y', 'longitude', 'latitude')}"
             )
         if self.stated_tx is not None:
             return rx, None

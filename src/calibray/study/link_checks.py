@@ -58,7 +58,7 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
     """
     overhead = SceneSurfaces.read(study.scene_source)
     checks = (
-        *_positions(overhead, links),
+        *_positions(overhead, links, study.links.position == "geographic"),
         *_levels(study, links),
         *_angles(study, links),
         *_averages(study, overhead),
@@ -94,9 +94,11 @@ def _averages(study: StudyModel, overhead: SceneSurfaces) -> Iterator[tuple[str,
         )
 
 
-def _positions(overhead: SceneSurfaces, links: Measurements) -> Iterator[tuple[str, str]]:
+def _positions(
+    overhead: SceneSurfaces, links: Measurements, is_geographic: bool
+) -> Iterator[tuple[str, str]]:
     tx, rx = np.unique(links.tx, axis=0), np.unique(links.rx, axis=0)
-    _refuse_far_links(overhead, rx, links.source)
+    _refuse_far_links(overhead, rx, links.source, is_geographic)
     for name, points in (("receivers", rx), ("transmitters", tx)):
         below = overhead.underground(points) | (points[:, 2] < overhead.bounds[2])
         if below.any():
@@ -133,13 +135,20 @@ def _positions(overhead: SceneSurfaces, links: Measurements) -> Iterator[tuple[s
         yield problem, "check position and height: an antenna on a roof is above it"
 
 
-def _refuse_far_links(overhead: SceneSurfaces, rx: NDArray[np.float64], source: str) -> None:
+def _refuse_far_links(
+    overhead: SceneSurfaces, rx: NDArray[np.float64], source: str, is_geographic: bool
+) -> None:
     size = max(float(np.max(overhead.bounds[3:5] - overhead.bounds[:2])), 100.0)
     if overhead.outside(rx, FAR * size).all():
         centre = rx.mean(axis=0)
         raise InputError(
             f"{source}: all receivers are more than {FAR * size:.0f} m from the scene, near ({centre[0]:.0f}, "
-            f"{centre[1]:.0f}); give positions relative to the scene's origin"
+            f"{centre[1]:.0f}) m; "
+            + (
+                "check the order of longitude and latitude, and that the scene is one of this place"
+                if is_geographic
+                else "give positions relative to the scene's origin, or state their map projection as links.crs"
+            )
         )
 
 
