@@ -311,7 +311,7 @@ def _with_constants(
         model,
         parameters=parameters,
         priors=model.priors.extended(
-            range(len(study), len(parameters)), [item.start for item in fixed], known_to
+            range(len(study), len(parameters)), [item.start for item in varied], known_to
         ),
         gaps=gaps_of,
         loss=lambda values: loss_at(full(values), np.ones((len(values), len(replay.parameter_of)))),
