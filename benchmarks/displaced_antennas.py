@@ -3,9 +3,9 @@
     python benchmarks/displaced_antennas.py --first 100 --districts 20 --repetitions 1
 
 Districts are those of antenna_pose.py, with directions that are right. The stated heights of all three transmitters are
-off by 5 m, up or down, and the whole track by up to 5 m along x and along y. The noise is 3 dB. Every draw is calibrated
-with heights and shift as parameters, and without. The table says how often the 90 % intervals of the draws hold the
-truth; the RMSE on the held-out block is that against path loss without noise.
+off by 5 m, up or down, and the whole track by up to 5 m along x and along y. The noise is 3 dB. Every draw is
+calibrated with heights and shift as parameters, and without. The table says how often the 90 % intervals of the draws
+hold the truth; the RMSE on the held-out block is that against path loss without noise.
 """
 
 from __future__ import annotations
