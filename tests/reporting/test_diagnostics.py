@@ -8,11 +8,11 @@ import pytest
 import shapely
 
 import shown
+from calibray.calibration.link_diagnostics import _depth_and_power
 from calibray.calibration.result import Result
 from calibray.fields import path_gains
 from calibray.reporting.diagnostics import diagnostics_table
 from calibray.scenes.regions import Region
-from calibray.uncertainty.link_diagnostics import _depth_and_power
 from changed import changed
 from made_up_report import made_up
 

@@ -45,7 +45,7 @@ def test_the_integral_agrees_with_quadrature():
 def test_derivatives_agree_with_finite_differences(freedom):
     random = np.random.default_rng(2)
     censored = np.arange(30) % 3 == 0
-    left, columns = 3 * random.standard_normal((4, 30)), random.standard_normal((4, 30, 2))
+    left, columns = 3 * random.standard_normal((4, 30)), random.standard_normal((30, 2))
     point = np.column_stack([random.standard_normal((4, 2)), random.uniform(0.5, 1.5, 4)])
     given = left, censored, columns, np.array([0.3, 0.0]), freedom
     _, slope, curvature = joint(point, *given)

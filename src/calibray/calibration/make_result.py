@@ -16,6 +16,7 @@ from calibray.calibration.held_out_accuracy import (
     on_held_out_links,
     rmse_of,
 )
+from calibray.calibration.link_diagnostics import diagnose_links
 from calibray.calibration.observable_fits import observable_fits
 from calibray.calibration.result import Result
 from calibray.engines.replay import Replay
@@ -38,7 +39,6 @@ from calibray.study.facades import without_facade_materials
 from calibray.study.link_obstruction import REGION
 from calibray.tracing.positions import EnclosedAntennas
 from calibray.uncertainty.assessment import Certainty
-from calibray.uncertainty.link_diagnostics import diagnose_links
 from calibray.uncertainty.noise_models import HEAVY
 from calibray.uncertainty.residual_correlation import shared_errors
 from calibray.validation.baselines import log_distance, without_scene

@@ -59,7 +59,6 @@ def log_evidence(
     design: NDArray[np.float64],
     ridge: NDArray[np.float64],
     freedom: float = np.inf,
-    weight: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """Log density of errors with censored links; nuisance and noise level integrated out.
 
@@ -70,24 +69,21 @@ def log_evidence(
         design: Columns of the nuisance [m, q].
         ridge: Inverse standard deviations of the coefficients' priors [q]; 0 for a flat prior.
         freedom: Degrees of freedom of Student's t; +inf for a Gaussian.
-        weight: Relative inverse variances of the links [n, m]; 1 if None.
 
     Returns:
         The log densities [n].
     """
-    root = np.ones_like(gap) if weight is None else np.sqrt(weight)
     size = np.maximum(np.median(np.abs(gap[:, ~censored]), axis=1), 1e-6)
-    gap = root * np.where(censored, np.maximum(gap, -LARGEST * size[:, None]), gap)
-    columns = root[:, :, None] * design
-    point = _start(gap, censored, columns, ridge)
-    value, slope, curvature = joint(point, gap, censored, columns, ridge, freedom)
+    gap = np.where(censored, np.maximum(gap, -LARGEST * size[:, None]), gap)
+    point = _start(gap, censored, design, ridge)
+    value, slope, curvature = joint(point, gap, censored, design, ridge, freedom)
     damping = np.full(len(gap), 1e-3)
     for _ in range(MAX_STEPS):
         step = np.linalg.solve(_damped(curvature, damping), slope[..., None])[..., 0]
         if not (np.sum(step * slope, axis=1) > TOLERANCE).any():
             break
         trial = np.asarray(point + np.clip(step, -_longest(point), _longest(point)), dtype=np.float64)
-        trial_value, trial_slope, trial_curvature = joint(trial, gap, censored, columns, ridge, freedom)
+        trial_value, trial_slope, trial_curvature = joint(trial, gap, censored, design, ridge, freedom)
         better = trial_value > value
         point = np.where(better[:, None], trial, point)
         value = np.where(better, trial_value, value)
@@ -96,8 +92,6 @@ def log_evidence(
         damping = np.clip(np.where(better, damping / 10, damping * 10), 1e-12, 1e12)
     has_prior = ridge > 0
     value = value + np.log(ridge[has_prior]).sum() - 0.5 * has_prior.sum() * np.log(2 * np.pi)
-    if weight is not None:
-        value = value + 0.5 * np.log(weight[:, ~censored]).sum(axis=1)
     eigenvalues = np.maximum(np.linalg.eigvalsh(curvature), 1e-12)
     return value + 0.5 * point.shape[1] * np.log(2 * np.pi) - 0.5 * np.log(eigenvalues).sum(axis=1)
 
@@ -105,17 +99,15 @@ def log_evidence(
 def _start(
     gap: NDArray[np.float64],
     censored: NDArray[np.bool_],
-    columns: NDArray[np.float64],
+    design: NDArray[np.float64],
     ridge: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Coefficients and log scale by least squares on the measured links [n, q + 1]."""
-    measured, columns = gap[:, ~censored], columns[:, ~censored]
-    matrix = np.einsum("nmi,nmj->nij", columns, columns) + np.diag(ridge**2)
-    trace = np.trace(matrix, axis1=1, axis2=2)[:, None, None]
-    matrix = matrix + (1e-10 * trace + 1e-12) * np.eye(matrix.shape[1])
-    side = np.einsum("nmi,nm->ni", columns, measured)
-    coefficients = np.linalg.solve(matrix, side[..., None])[..., 0]
-    errors = measured - np.einsum("nmi,ni->nm", columns, coefficients)
+    measured, design = gap[:, ~censored], design[~censored]
+    matrix = design.T @ design + np.diag(ridge**2)
+    matrix += (1e-10 * np.trace(matrix) + 1e-12) * np.eye(len(matrix))
+    coefficients = np.linalg.solve(matrix, design.T @ measured.T).T
+    errors = measured - coefficients @ design.T
     scale = np.maximum(np.sqrt(np.mean(errors**2, axis=1)), 1e-6)
     return np.column_stack([coefficients, np.log(scale)])
 
@@ -124,7 +116,7 @@ def joint(
     point: NDArray[np.float64],
     gap: NDArray[np.float64],
     censored: NDArray[np.bool_],
-    columns: NDArray[np.float64],
+    design: NDArray[np.float64],
     ridge: NDArray[np.float64],
     freedom: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -134,7 +126,7 @@ def joint(
         point: Coefficients and log scale [n, q + 1].
         gap: Measured minus modelled path loss, or the floor's for a censored link [n, m], [dB].
         censored: Mask of the censored links [m].
-        columns: Columns of the nuisance [n, m, q].
+        design: Columns of the nuisance [m, q].
         ridge: Inverse standard deviations of the coefficients' priors [q]; 0 for a flat prior.
         freedom: Degrees of freedom of Student's t; +inf for a Gaussian.
 
@@ -142,13 +134,13 @@ def joint(
         Its value up to a constant [n], its gradient [n, q + 1], and minus its Hessian [n, q + 1, q + 1].
     """
     coefficients, scale = point[:, :-1], np.exp(point[:, -1])
-    error = (gap - np.einsum("nmi,ni->nm", columns, coefficients)) / scale[:, None]
+    error = (gap - coefficients @ design.T) / scale[:, None]
     terms = _terms(error, censored, freedom)
     measured = int((~censored).sum())
     penalty = 0.5 * np.sum((ridge * coefficients) ** 2, axis=1)
     value = terms.value.sum(axis=1) - measured * point[:, -1] - penalty
     # Derivatives of the errors by coefficients and log scale.
-    rows = np.concatenate([-columns / scale[:, None, None], -error[..., None]], axis=2)
+    rows = np.concatenate([-design / scale[:, None, None], -error[..., None]], axis=2)
     slope = np.einsum("nm,nmi->ni", terms.first, rows)
     slope[:, :-1] -= ridge**2 * coefficients
     slope[:, -1] -= measured

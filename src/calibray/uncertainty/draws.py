@@ -25,18 +25,6 @@ class Draws:
     weight: NDArray[np.float64]
     agree: bool = True
 
-    def resampled(self, count: int, seed: int = 0) -> NDArray[np.float64]:
-        """Points of equal weight.
-
-        Args:
-            count: Their number.
-            seed: Seed of the random numbers.
-
-        Returns:
-            Points drawn by their weights, in the order of the draws [count, d].
-        """
-        return self.point[systematic_resampling(self.weight, count, np.random.default_rng(seed))]
-
 
 def pooled(draws: Sequence[Draws]) -> Draws:
     """Draws from the mean of several posteriors, with equal weight of each."""

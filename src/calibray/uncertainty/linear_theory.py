@@ -54,13 +54,10 @@ def with_reason(local: dict[str, Interval], reason: Reason) -> dict[str, Interva
     Curvature alone does not show other minima and correlated errors, so no parameter is more than weakly identified,
     except where the data have no noise.
     """
-    exact = reason.kind == ReasonKind.NO_NOISE
-
-    def capped(verdict: Verdict) -> Verdict:
-        return Verdict.WEAKLY_IDENTIFIED if verdict == Verdict.IDENTIFIED and not exact else verdict
-
+    exact, identified = reason.kind == ReasonKind.NO_NOISE, Verdict.IDENTIFIED
+    capped = {identified: identified if exact else Verdict.WEAKLY_IDENTIFIED}
     return {
-        name: replace(interval, verdict=capped(interval.verdict), reason=reason)
+        name: replace(interval, verdict=capped.get(interval.verdict, interval.verdict), reason=reason)
         for name, interval in local.items()
     }
 

@@ -41,7 +41,7 @@ class Correlation:
     Attributes:
         range_m: Distance at which the correlated part has fallen to 1/e [m].
         shared_db: Standard deviation of the correlated part [dB].
-        own_db: Standard deviation of the uncorrelated part, for a link of deviation 1 [dB].
+        own_db: Standard deviation of the uncorrelated part [dB].
         log_likelihood: Restricted log likelihood of the fitted errors.
         independent: Restricted log likelihood of the best fit without a correlated part.
     """
@@ -52,27 +52,15 @@ class Correlation:
     log_likelihood: float
     independent: float
 
-    def covariance(
-        self, position: NDArray[np.float64], deviation: NDArray[np.float64] | float = 1.0
-    ) -> NDArray[np.float64]:
-        """Covariance of the links' errors.
-
-        Args:
-            position: Positions of the links [m, k], [m].
-            deviation: Known relative standard deviations of the uncorrelated part [m].
-
-        Returns:
-            The covariance [m, m], [dB^2].
-        """
-        own = np.broadcast_to(self.own_db * np.asarray(deviation), len(position))
-        return self.shared_db**2 * np.exp(-cdist(position, position) / self.range_m) + np.diag(own**2)
+    def covariance(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Covariance of the errors of links [m, m], [dB^2], from their positions [m, k], [m]."""
+        shared = np.exp(-cdist(position, position) / self.range_m)
+        return self.shared_db**2 * shared + self.own_db**2 * np.eye(len(position))
 
 
 def fit_correlation(
     errors: NDArray[np.float64],
     position: NDArray[np.float64],
-    *,
-    deviation: NDArray[np.float64] | float = 1.0,
     design: NDArray[np.float64] | None = None,
 ) -> Correlation:
     """Fit range and size of the correlated part by restricted maximum likelihood.
@@ -80,7 +68,6 @@ def fit_correlation(
     Args:
         errors: Errors at the best fit [m], [dB].
         position: Positions of the receivers, or of both ends [m, k], [m].
-        deviation: Known relative standard deviations of the uncorrelated part [m].
         design: Columns that were fitted to the same links, of full rank [m, q]: nuisances, and derivatives by the
             parameters.
 
@@ -103,12 +90,11 @@ def fit_correlation(
         raise InputError("noise: all receivers have the same position; set range_m = 0")
     if not errors.any():
         raise EngineError("noise: all errors are zero, which no noise explains; check the measured values")
-    uncorrelated = np.diag(np.broadcast_to(deviation, count) ** 2.0)
     log_ranges = np.log([pairs[pairs > 0].min() / 3, 3 * pairs.max()])
 
     def trial(share: float, log_range: float) -> tuple[float, float]:
         """Restricted log likelihood, and the total variance."""
-        matrix = share * np.exp(-distance / np.exp(log_range)) + (1 - share) * uncorrelated
+        matrix = share * np.exp(-distance / np.exp(log_range)) + (1 - share) * np.eye(count)
         return _restricted(matrix, errors, columns)
 
     def cost(point: NDArray[np.float64]) -> float:
@@ -122,7 +108,7 @@ def fit_correlation(
         optimum = minimize(cost, first, method="Nelder-Mead", bounds=bounds, options={"xatol": 1e-3})
         share, log_range = optimum.x
         likelihood, variance = trial(share, log_range)
-        independent = _restricted(uncorrelated, errors, columns)[0]
+        independent = _restricted(np.eye(count), errors, columns)[0]
     return Correlation(
         range_m=float(np.exp(log_range)),
         shared_db=float(np.sqrt(share * variance)),

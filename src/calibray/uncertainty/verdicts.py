@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calibray.result.verdict import Interval, Reason, ReasonKind
 from calibray.result.verdict import Verdict as VerdictName
 from calibray.uncertainty.credible_sets import credible_sets
-from calibray.uncertainty.draws import Draws
+from calibray.uncertainty.draws import Draws, systematic_resampling
 
 JUDGED: Final = 0.9
 """Level of the credible sets behind the verdicts. The last few per cent of a 95 % interval can lie far out, under a
@@ -36,6 +36,9 @@ TRADE_OFF: Final = 0.5
 
 LARGE_EFFECT: Final = 3.0
 """Change of path loss, in standard deviations of the errors, above which single links would determine the parameter."""
+
+RANKED: Final = 400
+"""Draws of equal weight that rank correlations are computed from."""
 
 LINE: Final = 25
 """Values over the range of a parameter at which its effect is computed."""
@@ -215,7 +218,8 @@ def _effect(
 
 def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, noise_db: float) -> Reason:
     """Why most of the range fits although links depend on the parameter: a trade-off, or large errors."""
-    rank = np.argsort(np.argsort(draws.resampled(400), axis=0), axis=0)
+    drawn = draws.point[systematic_resampling(draws.weight, RANKED, np.random.default_rng(0))]
+    rank = np.argsort(np.argsort(drawn, axis=0), axis=0)
     varied = np.ptp(rank, axis=0) > 0
     correlation = np.zeros(len(names))
     if varied[index]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibray.uncertainty.link_diagnostics import leverage
+from calibray.calibration.link_diagnostics import leverage
 
 
 def test_leverage_of_a_mean_is_shared_and_of_a_single_link_is_one():
