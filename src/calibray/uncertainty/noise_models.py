@@ -54,6 +54,13 @@ DEPARTURE: Final = 2.0
 errors rarely are. Structured errors count once: where the truth has diffraction and refraction, development districts
 favour them by factors from 20 to 10^9, and a larger weight widens intervals where nothing is missing."""
 
+IMPROBABLE: Final = 50.0
+"""Log odds at the optimum against a model that is left out for many links. Its own optimum can be better by some units
+for each parameter, far less than this."""
+
+FEATURE_RANGES: Final = (1.0, 4.0)
+"""Correlation ranges of structured errors that are tried, in standard deviations of the links' features."""
+
 # Kinds of noise; "student-t" includes Gaussian noise with gross errors.
 GAUSSIAN, CORRELATED, STRUCTURED, HEAVY = "gaussian", "correlated", "structured", "student-t"
 
