@@ -3,6 +3,7 @@
     python benchmarks/coverage.py --repetitions 200 --workers 2 --out coverage.jsonl
     python benchmarks/coverage.py --districts demo --worlds random,offset --repetitions 20
     python benchmarks/coverage.py --districts judging --repetitions 200 --workers 2 --out judging.jsonl
+    python benchmarks/coverage.py --districts district-233:10138 --worlds random --repetitions 10   # as many links
 
 Every repetition draws a truth for each parameter evenly from its search range, makes path losses of it, adds the errors
 of its world, and calibrates as `calibray run` does, from fewer starting points. The study does not state the world:

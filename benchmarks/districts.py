@@ -128,28 +128,30 @@ def named(words: str) -> list[str]:
     return [name for word in words.split(",") for name in groups.get(word, (word,))]
 
 
-def make(name: str, folder: Path, missing: float = 0.0, links: int | None = None) -> District:
+def make(name: str, folder: Path, missing: float = 0.0) -> District:
     """Make a district and trace it; the package's cache keeps its paths.
 
     Args:
-        name: "demo", or "district-SEED".
+        name: "demo", "district-SEED" with 20 to 200 links, or "district-SEED:LINKS".
         folder: Folder for the scene and its links.
         missing: Share of the buildings that the scene lacks; the links are those of the complete district.
-        links: Number of links; drawn from 20 to 200 if None.
     """
     if name == DEMO:
         setup = Study.load(demo_study_path()).opened()
         footprints = tuple(building.footprint for building in district())
     else:
         # A folder for each process: another one may be writing the same district.
-        seed = int(name.removeprefix("district-"))
-        setup, footprints = _drawn(seed, folder / f"{name}-{missing:g}-{os.getpid()}", missing, links)
+        seed, _, links = name.removeprefix("district-").partition(":")
+        setup, footprints = _drawn(
+            int(seed),
+            folder / f"{name.replace(':', '-')}-{missing:g}-{os.getpid()}",
+            missing,
+            int(links or 0),
+        )
     return District(name, Problem.of(setup, engines.make(setup, "replay")), footprints)
 
 
-def _drawn(
-    seed: int, folder: Path, missing: float, links: int | None
-) -> tuple[Setup, tuple[np.ndarray, ...]]:
+def _drawn(seed: int, folder: Path, missing: float, links: int) -> tuple[Setup, tuple[np.ndarray, ...]]:
     random = np.random.default_rng([seed, 77])
     blocks, width = random.integers(2, 5, 2), random.uniform(14, 30)
     block = random.uniform(50, 130, 2)
