@@ -19,6 +19,7 @@ from calibray.reporting.trust_figures import residuals_by_direction
 from calibray.result.remark import RemarkKind
 from calibray.result.wording import remark_text
 from calibray.study import Setup, Study
+from calibray.tracing.mounting import stated_jones
 from calibray.tracing.settings import Antenna
 from two_ray import COLUMNS, TRUTH, TwoRay
 
@@ -172,9 +173,31 @@ def test_antennas_aimed_at_each_other_have_their_largest_gain(planted: Study) ->
         )
 
 
+def test_arrays_are_steered_per_transmitter_from_columns(planted: Study) -> None:
+    """A beam that is turned clockwise and tilted has its largest gain there; the element does not turn."""
+    steered = {"azimuth_deg": "bearing", "electrical_downtilt_deg": "tilt", "steering_deg": 20.0}
+    content = mounted(planted, steered).content()
+    content["antennas"]["tx"] = {"pattern": "tr38901", "rows": 8, "columns": 8}
+    setup = Setup.open(Study.from_content(content, planted.path), tracer=TwoRay)
+    mounting = setup.mountings["tx"]
+    grid = np.stack(np.meshgrid(np.arange(0.0, 20.0), np.arange(-180.0, 180.0)), axis=-1).reshape(-1, 2)
+    angles = np.radians(np.column_stack([90.0 + grid[:, 0], 90.0 - grid[:, 1]]))
+    for link in np.unique(setup.links.table.labels("transmitter"), return_index=True)[1]:
+        jones = stated_jones(mounting.of_paths(np.full(len(grid), link)), angles)
+        power = (jones**2).sum(axis=(1, 2))
+        stated = setup.links.frame.iloc[link]
+        downtilt, bearing = grid[power.argmax()]
+        assert downtilt == pytest.approx(stated["tilt"], abs=1.0)
+        assert (bearing - stated["bearing"] - 20.0 + 180) % 360 - 180 == pytest.approx(0.0, abs=1.0)
+        # 64 elements, 12 (20 / 65)^2 dB beside the element's main direction.
+        expected = 8 + 10 * np.log10(64) - 12 * (20 / 65) ** 2 - 12 * (stated["tilt"] / 65) ** 2
+        assert 10 * np.log10(power.max()) == pytest.approx(expected, abs=0.2)
+
+
 @pytest.mark.parametrize(
     ("tx", "links", "message"),
     [
+        ({"steering_deg": 5.0}, {}, "links.tx_antenna.steering_deg: the antenna is no array; give antennas.tx rows"),
         ({"type": "transmitter"}, {}, r"row 2, column 'transmitter': 'north' is no antenna of .antennas.types."),
         ({"azimuth_deg": "heading"}, {}, "no column 'heading'"),
         ({"azimuth_deg": 720.0}, {}, "links.tx_antenna.azimuth_deg: 720 must be -360 to 360; give degrees"),

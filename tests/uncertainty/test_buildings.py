@@ -153,6 +153,21 @@ def test_logarithms_of_factors_act_on_the_gaps(problem):
         assert np.abs(by_factor - model.gaps(model.parameters.to_unit(value)[None], none)).max() > 0.1
 
 
+def test_constants_without_effect_stay_fixed(problem, monkeypatch):
+    best = problem.parameters.to_search(np.array(list(planted.TRUTH.values())))
+    study = Study.from_content(planted.content("links.csv", noise={"constants_spread": 0.3}))
+    measured = problem.modelled(best[None])[0]
+    objective = replace(problem.objective, measured=measured)
+    problem = replace(problem, setup=replace(problem.setup, study=study), objective=objective)
+    every = joint_model(problem, best, 0.3**2, problem.freedom)
+    middle = float(np.median(list(every.effects_db.values())))
+    monkeypatch.setattr("calibray.uncertainty.joint_model.NO_EFFECT", middle / every.marginal.noise_db)
+    model = joint_model(problem, best, 0.3**2, problem.freedom)
+    assert len(problem.parameters) < len(model.parameters) < len(every.parameters)
+    assert len(model.priors) == len(model.parameters) - len(problem.parameters)
+    assert model.draw_prior(3, np.random.default_rng(1)).shape == (3, len(model.parameters))
+
+
 def test_weak_paths_are_left_out_of_large_programs(problem, monkeypatch):
     values = problem.parameters.from_unit(np.random.default_rng(6).random((20, 3)))
     whole = problem.engine.path_loss(values)
