@@ -20,7 +20,7 @@ HISTORY: Final = {"call": "i", "iteration": "i", "rmse_db": "f", "best_db": "f",
 COLUMNS: Final = {"result-links.csv": LINKS, "result-history.csv": HISTORY}
 """Columns of each file and the NumPy kind of their values: integer, float or Boolean."""
 
-OPTIONAL: Final = ("leverage", "depth")
+OPTIONAL: Final = ("leverage", "depth", "out_of_sight", "obstruction_m", "region_m")
 """Columns of numbers that are optional."""
 
 FINITE: Final = ("measured_db", "log_distance_db", "best_db", "seconds")
