@@ -222,6 +222,12 @@ def test_values_are_computed_from_a_file_of_components(tmp_path, table, engine):
     (each,) = problem.observed
     expected = engine.respond(TRUTH[None], (each.statistic,)).observed[0, 0]
     assert each.measured == pytest.approx(1e9 * expected, abs=0.05 * each.measured.max())
+    section["where"] = "half == 'west'"
+    study = planted.study(
+        tmp_path, table.assign(name=np.arange(len(table))), **(PLAN | {"observables": {"spread": section}})
+    )
+    (part,) = Problem.of(Setup.open(study), engine).observed
+    np.testing.assert_array_equal(np.isfinite(part.measured), table.half == "west")
     (tmp_path / "multipath.csv").unlink()
     with pytest.raises(InputError, match=r"multipath\.csv"):
         Problem.of(Setup.open(study), engine)

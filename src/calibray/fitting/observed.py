@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from calibray.engines.protocol import Engine, Observing
 from calibray.errors import InputError
 from calibray.measurements import Measurements
+from calibray.measurements.filters import evaluate
 from calibray.measurements.impulse_responses import ENDINGS, read_impulse_responses
 from calibray.measurements.multipath import Multipath, measure, read_multipath
 from calibray.measurements.observables import Statistic
@@ -126,6 +127,8 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
             values = measure(source, section.statistic)
             place = f"{path}"
             measured = np.array([values.get(label, np.nan) for label in labels]) / section.scale
+        if section.where is not None:
+            measured = np.where(evaluate(section.where, links.table.frame), measured, np.nan)
         if np.isfinite(measured).sum() < 2:
             raise InputError(
                 f"{links.source}: {place} of [observables.{name}] has {int(np.isfinite(measured).sum())} values; at "

@@ -34,6 +34,7 @@ class ObservableSection(Section):
         columns: Columns of the bins of a profile, in place of `column`.
         file: Measured multipath or impulse responses, from which the values are computed, in place of columns.
         id: Column of the links' labels, also in a multipath table.
+        where: Row filter: the links that have this observable; all if absent.
         compass: Whether azimuths in the file are bearings, clockwise from north.
         sample_rate: Sample rate of impulse responses without delays [Hz].
         margin_db: How far above its noise a sample of an impulse response counts [dB].
@@ -67,6 +68,7 @@ class ObservableSection(Section):
     columns: tuple[Text, ...] = ()
     file: Text | None = None
     id: Text = "id"
+    where: Text | None = None
     compass: bool = False
     sample_rate: Positive | None = None
     margin_db: Positive = MARGIN_DB
