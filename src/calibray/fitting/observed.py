@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from calibray.engines.protocol import Engine, Observing
 from calibray.errors import InputError
 from calibray.measurements import Measurements
-from calibray.measurements.filters import evaluate
 from calibray.measurements.impulse_responses import ENDINGS, read_impulse_responses
 from calibray.measurements.multipath import Multipath, measure, read_multipath
 from calibray.measurements.observables import Statistic
@@ -128,7 +127,7 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
             place = f"{path}"
             measured = np.array([values.get(label, np.nan) for label in labels]) / section.scale
         if section.where is not None:
-            measured = np.where(evaluate(section.where, links.table.frame), measured, np.nan)
+            measured = np.where(links.where(section.where), measured, np.nan)
         if np.isfinite(measured).sum() < 2:
             raise InputError(
                 f"{links.source}: {place} of [observables.{name}] has {int(np.isfinite(measured).sum())} values; at "
