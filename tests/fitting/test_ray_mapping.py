@@ -13,8 +13,9 @@ from calibray.engines.rays.compile import RaySetting, compile_rays, powers, rays
 from calibray.engines.rays.export import Export
 from calibray.engines.rays.table import RayTable
 from calibray.fitting.problem import Problem
+from calibray.fitting.ray_fit import understand
 from calibray.fitting.ray_mapping import RayMap, map_rays
-from calibray.fitting.ray_model import HALF_SPACE
+from calibray.fitting.ray_model import HALF_SPACE, Call
 from calibray.materials import Material
 from calibray.paths import Paths
 from calibray.study import Setup
@@ -76,6 +77,21 @@ def test_three_calls_find_the_truth_of_an_engine_that_differs(mapped: RayMap, fo
     # Its replay stands for the engine elsewhere, too.
     loss = -10 * np.log10(np.bincount(foreign.paths.link, foreign.rays(np.array([4.4])).power))
     np.testing.assert_allclose(mapped.engine.path_loss(np.array([[4.4]]))[0], loss, atol=0.02)
+
+
+def test_a_slab_is_found_among_its_resonances(foreign: Foreign) -> None:
+    """The study assumes 1 m and 0.5 S/m, where no wave comes back through the slab."""
+    paths = replace(
+        foreign.paths, materials={**foreign.paths.materials, "ground": Material(3.0, 0.004, 0.437)}
+    )
+    calls = [
+        Call(np.array([value]), replace(foreign, paths=paths)(np.array([value]))) for value in (4.0, 9.0)
+    ]
+    found = understand(foreign.problem.parameters, calls, known=False)
+    constants = dict(found.model.described(found.values))
+    assert found.misfit_db < 0.01
+    assert constants["ground.thickness"] == pytest.approx(0.437, rel=1e-3)
+    assert constants["ground.conductivity"] == pytest.approx(0.004, rel=0.05)
 
 
 def test_an_engine_of_other_physics_is_not_understood(foreign: Foreign) -> None:

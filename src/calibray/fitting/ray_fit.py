@@ -30,6 +30,9 @@ KEPT: Final = 3
 EXACT_DB: Final = 0.005
 """Misfit at which a search ends [dB]."""
 
+KNOWN_DB: Final = 0.02
+"""Misfit up to which what explained earlier calls is kept for the next one [dB]; wrong minima have 0.1 dB and more."""
+
 EVALUATIONS: Final = (12, 30)
 """Evaluations of a refinement between scans and of the last one, with each loss."""
 
@@ -98,7 +101,7 @@ def understand(
         return replace(first, misfit_db=float(np.linalg.norm(_errors(first, ratios, last)[0])))
     if before is not None and before.model.assumed == model.assumed:
         before = _refined(replace(before, model=model), ratios, last, EVALUATIONS[1])
-        if before.misfit_db <= EXACT_DB:
+        if before.misfit_db <= KNOWN_DB:
             return before
     return _search(first, ratios, last, before)
 
