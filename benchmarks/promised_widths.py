@@ -45,7 +45,7 @@ def repetition(district: District, seed: int) -> list[dict[str, object]]:
 
     before = calibrated(known)
     suggested = cb.suggest(before, table.iloc[others].reset_index(drop=True), MORE)
-    after = calibrated(np.concatenate([known, others[suggested["row"].to_numpy(int)]]))
+    after = calibrated(np.concatenate([known, others[suggested["row"].to_numpy(int) - 1]]))
     rows = []
     for name, section in study.parameters.items():
         old, new = before.intervals[name], after.intervals[name]
