@@ -142,3 +142,17 @@ def test_credible_sets_cover_their_level():
     weight = norm.pdf(value, 5, 0.5)
     ((low, high),) = credible(value, weight / weight.sum(), 0.0, 10.0, 0.95)
     assert (low, high) == pytest.approx((5 - 0.98, 5 + 0.98), abs=0.12)
+
+
+def test_wider_bounds_do_not_improve_a_verdict():
+    draws = normal_draws([5.0], [1.0])
+
+    def told(upper, customary):
+        axes = Axes(NAMES[:1], np.zeros(1), np.full(1, upper), customary=customary)
+        return verdicts(draws, lambda x: 5 * x, axes, 1.0)[0]
+
+    assert told(10.0, None).name == told(40.0, np.full(1, 10.0)).name == "weakly identified"
+    assert told(40.0, None).name == "identified"  # what shares of the bounds alone would say
+    assert "of a customary range" in reason_text(told(40.0, np.full(1, 10.0)).reason)
+    # Narrower bounds count as they are.
+    assert told(10.0, np.full(1, 1000.0)).name == "weakly identified"

@@ -23,7 +23,7 @@ class Verdict(StrEnum):
 class ReasonKind(StrEnum):
     """Reasons for a verdict; the comments name the values of each."""
 
-    WIDTH = "width"  # share of the range; ranges outside the judged set: lower, upper, weight
+    WIDTH = "width"  # share of the range, or of a customary one; ranges outside the judged set: lower, upper, weight
     SEEN_BUILDINGS = "seen buildings"  # share of the range for the buildings that were measured
     SEPARATE_RANGES = "separate ranges"  # ranges: most probable value, weight
     AT_BOUND = "at bound"  # side and the other end of the interval

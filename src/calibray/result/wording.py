@@ -71,8 +71,12 @@ _STATEMENTS: Final = {
 }
 
 
+def _range(values: dict[str, Any]) -> str:
+    return "a customary range" if values.get("customary") else "the range"
+
+
 def _width(values: dict[str, Any], ranges: tuple[tuple[float, ...], ...]) -> str:
-    text = f"90 % of the posterior covers {percent(values['share'])} of the range"
+    text = f"90 % of the posterior covers {percent(values['share'])} of {_range(values)}"
     if ranges:
         others = ", ".join(
             f"{low:.4g} to {high:.4g} ({percent(weight)} of it)" for low, high, weight in ranges
@@ -90,8 +94,8 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
     ReasonKind.WIDTH: _width,
     ReasonKind.SEPARATE_RANGES: _separate,
     ReasonKind.SEEN_BUILDINGS: lambda values, _: (
-        f"for the measured buildings the value is known to {percent(values['share'])} of the range; other buildings of "
-        "this material may differ"
+        f"for the measured buildings the value is known to {percent(values['share'])} of {_range(values)}; other "
+        "buildings of this material may differ"
     ),
     ReasonKind.AT_BOUND: lambda values, _: (
         f"the interval reaches the {values['side']} bound: the links only show that the value is "

@@ -53,6 +53,10 @@ MAX_COLUMNS: Final = 100
 SHOWN_DIFFERENCE: Final = 0.1
 """Difference between the intervals of measured and of all buildings that is reported, as a share of the width."""
 
+CUSTOMARY: Final = {("relative_permittivity", "linear"): 10.0, ("conductivity", "log"): float(np.log(1000.0))}
+"""Widths of customary ranges: permittivities of building materials lie between 2 and 12, conductivities within three
+decades. Wider bounds do not make a verdict better."""
+
 EXACT_DB: Final = 1e-6
 """RMSE below which the data have no noise, so that linear theory is exact [dB]."""
 
@@ -259,7 +263,7 @@ def _intervals(
     judged = verdicts(
         posterior.means,
         lambda points: problem.objective.capped(problem.modelled(points))[:, counted],
-        Axes(parameters.names, lower, upper, value_at),
+        Axes(parameters.names, lower, upper, value_at, _customary(parameters)),
         model.marginal.noise_db,
         level=CONFIDENCE,
         seen=posterior.seen,
@@ -281,6 +285,12 @@ def _intervals(
             without=without[index],
         )
     return intervals
+
+
+def _customary(parameters: Parameters) -> NDArray[np.float64]:
+    """Customary widths of the parameters' ranges in the search space [d]; infinite where there is none."""
+    keys = ((parameter.field, parameter.scale) for parameter in parameters)
+    return np.array([CUSTOMARY.get(key, np.inf) for key in keys])
 
 
 def _differ(verdict: VerdictOnDraws) -> bool:

@@ -57,12 +57,20 @@ class Axes:
         lower: Lower bounds [d].
         upper: Upper bounds [d].
         value: Maps the index of a parameter and a search coordinate to the value that reasons state.
+        customary: Customary widths of the parameters' ranges [d]; widths of the bounds if None. Shares refer to the
+            smaller width, so that wider bounds do not improve a verdict.
     """
 
     names: Sequence[str]
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     value: Callable[[int, float], float] = lambda _, coordinate: coordinate
+    customary: NDArray[np.float64] | None = None
+
+    def extent(self, index: int) -> float:
+        """Width of the range that shares refer to."""
+        width = float(self.upper[index] - self.lower[index])
+        return width if self.customary is None else min(width, float(self.customary[index]))
 
 
 @dataclass(frozen=True)
@@ -125,13 +133,14 @@ def verdicts(
             seen_pieces, seen_reported = credible_sets(
                 seen.point[:, index], seen.weight, lower, upper, (JUDGED, level)
             )
-        share = _width(pieces) / (upper - lower)
-        seen_share = _width(seen_pieces) / (upper - lower)
+        extent = axes.extent(index)
+        share, seen_share = _width(pieces) / extent, _width(seen_pieces) / extent
+        range_ = {"customary": True} if extent < upper - lower else {}
         ends = _bounds_reached(pieces, lower, upper)
         ends = ends or _bounds_reached(seen_pieces, lower, upper)
         if share > WEAKLY >= seen_share and len(seen_pieces) == 1 and not ends:
             name = VerdictName.WEAKLY_IDENTIFIED
-            reason = Reason(ReasonKind.SEEN_BUILDINGS, {"share": float(seen_share)})
+            reason = Reason(ReasonKind.SEEN_BUILDINGS, {"share": float(seen_share), **range_})
         elif share > WEAKLY and seen_share > WEAKLY:
             name, change = VerdictName.NOT_IDENTIFIABLE, _effect(index, modelled, best, axes)
             if change < NO_EFFECT_DB:
@@ -150,7 +159,7 @@ def verdicts(
         else:
             name = VerdictName.IDENTIFIED if share <= IDENTIFIED else VerdictName.WEAKLY_IDENTIFIED
             others = _outlying_pieces(index, pieces, reported, draws, axes)
-            reason = Reason(ReasonKind.WIDTH, {"share": float(share)}, others)
+            reason = Reason(ReasonKind.WIDTH, {"share": float(share), **range_}, others)
         result.append(Verdict(reported, name, reason, seen_reported))
     return result
 
