@@ -144,7 +144,10 @@ def test_a_planted_slope_is_recovered_reported_and_used_for_prediction(tmp_path,
         ({"links": CENSORED | {"noise_floor_dbm": None}}, "needs noise_floor_dbm"),
         ({"links": CENSORED | {"average": {"by": "cell", "size": 5.0}}}, "leave one of them out"),
         ({"links": CENSORED, "noise": {"range_m": 30.0}}, "leave one of them out"),
-        ({"parameters": {MARBLE: {"bounds": [1.5, 12], "prior": {"spread": 0.3}}}}, "one of itu, value and like"),
+        (
+            {"parameters": {MARBLE: {"bounds": [1.5, 12], "prior": {"spread": 0.3}}}},
+            "one of itu, value and like",
+        ),
         ({"parameters": {MARBLE: {"bounds": [1.5, 12], "prior": {"itu": "bread", "spread": 1}}}}, "bread"),
     ],
 )
