@@ -1,6 +1,7 @@
 """A planted belt of trees: is its attenuation found, does validation prefer the model with it, does the report see it?
 
     python benchmarks/regions.py --districts 20 --repetitions 5
+    python benchmarks/regions.py --lines --districts 20 --repetitions 5
     python benchmarks/regions.py --plain
 
 Every district has buildings and two masts (`antenna_pose.district`). A repetition plants a belt of trees in a street,
@@ -11,6 +12,7 @@ parameter, and without. Held out are the receivers in a quarter of all squares o
 held-out links, and how often the page of the model without the belt points at a region of extra loss that covers a
 third of the belt or more; and how often at one if there are no trees (first repetition in each district).
 
+With `--lines`, only the search for a region is judged, on errors that the belts cause on straight lines, with noise.
 With `--plain`, the time of a replay of a study without regions over that of the bare evaluation of the same program,
 and the largest difference of their path loss, which must be 0.
 """
@@ -18,6 +20,7 @@ and the largest difference of their path loss, which must be 0.
 from __future__ import annotations
 
 import argparse
+import json
 import tempfile
 import time
 from pathlib import Path
@@ -31,7 +34,10 @@ import calibray as cb
 from antenna_pose import FREQUENCY, MATERIALS, NOISE_DB, POSITION, district
 from calibray import engines, fields
 from calibray.reporting.diagnostics import diagnostics
+from calibray.reporting.missing_region import missing_region
+from calibray.scenes.regions import Region
 from calibray.study import Setup, Study
+from calibray.study.regions import RegionSection
 
 TREES: Final = "region:trees.specific_attenuation"
 BOUNDS: Final = [0.0, 3.0]
@@ -89,7 +95,7 @@ def points_at(result: cb.Result, belt: shapely.Geometry) -> tuple[bool, bool]:
 
 def reached(folder: Path, seed: int) -> pd.DataFrame:
     """The links of a new district that paths reach."""
-    links = district(folder, seed).assign(held_out=False)
+    links = district(folder, seed)
     setup = Setup.open(study(folder, links, None))
     return links[np.isfinite(fields.path_loss(setup.trace()))]
 
@@ -144,9 +150,34 @@ def repetition(folder: Path, links: pd.DataFrame, seed: list[int], bare: bool) -
     }
 
 
+def on_lines(folder: Path, seed: int, number: int) -> dict[str, Any]:
+    """Search a planted belt in errors that follow from straight lines alone: nothing is traced or calibrated."""
+    random, started = np.random.default_rng([seed, number, 291]), time.process_time()
+    links = district(folder, seed)
+    belt, attenuation = planted_belt(random)
+    tx, rx = links[POSITION[:3]].to_numpy(), links[POSITION[3:]].to_numpy()
+    outline = shapely.box(*belt["boxes"][0])
+    length = Region(np.array([outline]), np.zeros(1), np.full(1, belt["top"])).length_inside(tx, rx)
+    largest = RegionSection.model_validate_json(json.dumps(belt)).largest_loss_db(FREQUENCY)
+    loss, noise = (
+        largest * -np.expm1(-length * attenuation / largest),
+        random.normal(0, NOISE_DB, len(length)),
+    )
+    found, without = missing_region(tx, rx, loss + noise), missing_region(tx, rx, noise)
+    points = found is not None and found.significant
+    covered = shapely.area(shapely.intersection(shapely.box(*found.box), outline)) if found else 0.0
+    return {
+        "shaded": int((loss > 1.0).sum()),
+        "points": points,
+        "covers": points and covered > shapely.area(outline) / 3,
+        "alarm": without is not None and without.significant,
+        "seconds": time.process_time() - started,
+    }
+
+
 def plain_study(folder: Path) -> None:
     """Print the time and the differences of a study without regions against the bare evaluation of its paths."""
-    links = district(folder, 900).assign(held_out=False)
+    links = district(folder, 900)
     engine = engines.make(Setup.open(study(folder, links, None)))
     assert isinstance(engine, engines.Replay)
     candidates = engine.parameters.from_unit(np.random.default_rng(0).random((320, len(engine.parameters))))
@@ -182,25 +213,44 @@ def main() -> None:
     parser.add_argument("--repetitions", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=np.inf, help="start no repetition after this time")
     parser.add_argument("--plain", action="store_true")
+    parser.add_argument("--lines", action="store_true")
     options = parser.parse_args()
     started, rows, links = time.perf_counter(), [], {}
+    run = [
+        (number, seed)
+        for number in range(options.repetitions)
+        for seed in range(options.first, options.first + options.districts)
+    ]
     with tempfile.TemporaryDirectory() as root:
         if options.plain:
             plain_study(Path(root))
             return
-        # One repetition of every district before the second of any, so that a stop leaves all districts.
-        for number in range(options.repetitions):
-            for seed in range(options.first, options.first + options.districts):
+        if options.lines:
+            for number, seed in run:
                 if time.perf_counter() - started < options.seconds:
-                    folder = Path(root) / str(seed)
-                    if seed not in links:
-                        links[seed] = reached(folder, seed)
-                    row = repetition(folder, links[seed], [seed, number, 290], number == 0)
-                    rows.append({"seed": seed, **row})
-                    print(
-                        *(f"{name}={value:.3g}" for name, value in rows[-1].items() if value is not None),
-                        flush=True,
-                    )
+                    rows.append(on_lines(Path(root) / str(seed), seed, number))
+            table = pd.DataFrame(rows)
+            print(table.mean().round(3).to_string())
+            seen = table[table["shaded"] >= 8]
+            print(
+                f"{len(table)} belts; 8 links or more lose 1 dB or more behind {len(seen)} of them, of which"
+            )
+            print(
+                f"{seen['points'].mean():.2f} are reported as a region and {seen['covers'].mean():.2f} at the belt"
+            )
+            return
+        # One repetition of every district before the second of any, so that a stop leaves all districts.
+        for number, seed in run:
+            if time.perf_counter() - started < options.seconds:
+                folder = Path(root) / str(seed)
+                if seed not in links:
+                    links[seed] = reached(folder, seed)
+                row = repetition(folder, links[seed], [seed, number, 290], number == 0)
+                rows.append({"seed": seed, **row})
+                print(
+                    *(f"{name}={value:.3g}" for name, value in rows[-1].items() if value is not None),
+                    flush=True,
+                )
     table = pd.DataFrame(rows)
     gain = table["without_db"] - table["belt_db"]
     print(table.select_dtypes("number").median().round(2).to_string())
