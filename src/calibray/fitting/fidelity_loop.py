@@ -38,8 +38,9 @@ def retrace(
     study, parameters = problem.setup.study, problem.parameters
     section = study.engine
     sampled = study.trace.refraction or study.trace.diffuse_reflection
-    replayed = isinstance(section, ReplaySection) and not section.rays and study.fidelity.rounds > 0
-    if not replayed or not (sampled or any(displaces(name) for name in parameters.names)):
+    if not isinstance(section, ReplaySection) or section.rays or study.fidelity.rounds == 0:
+        return problem, trail, None
+    if not (sampled or any(displaces(name) for name in parameters.names)):
         return problem, trail, None
     gap = None
     for turn in range(study.fidelity.rounds):

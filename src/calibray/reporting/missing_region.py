@@ -7,6 +7,7 @@ Communications in Statistics 26, 1997).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
@@ -159,7 +160,7 @@ def _lengths(
     number = np.arange(len(tx))[:, None] * GRID**2 + index[..., 0] * GRID + index[..., 1]
     piece = np.linalg.norm(rx - tx, axis=1)[:, None] / SAMPLES * (point[..., 2] < top)
     counts = np.bincount(number.reshape(-1), piece.reshape(-1), len(tx) * GRID**2)
-    return counts.reshape(len(tx), GRID**2)
+    return counts.reshape(len(tx), GRID**2).astype(np.float64)
 
 
 def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> Iterator[Explained]:
@@ -179,7 +180,9 @@ def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> 
         for rows in range(1, GRID + 1):
             x, y = np.ogrid[: GRID + 1 - columns, : GRID + 1 - rows]
             corners = ((x + columns, y + rows, 1), (x, y + rows, -1), (x + columns, y, -1), (x, y, 1))
-            square = sum(one * other * total[u, v, s, t] for u, v, one in corners for s, t, other in corners)
+            square = np.zeros((GRID + 1 - columns, GRID + 1 - rows))
+            for (u, v, one), (s, t, other) in itertools.product(corners, corners):
+                square += one * other * total[u, v, s, t]
             product = moment[:, columns:, rows:] - moment[:, :-columns, rows:]
             product -= moment[:, columns:, :-rows] - moment[:, :-columns, :-rows]
             used = square > NEGLIGIBLE * largest

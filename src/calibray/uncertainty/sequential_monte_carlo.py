@@ -212,7 +212,7 @@ def _anneal(
         empty,
     )
     population = evaluated(model, population)
-    power, evidence, lengths = 0.0, 0.0, Lengths()
+    power, evidence, lengths, moves = 0.0, 0.0, Lengths(), Moves(model, 0.0, random)
     for step in range(MAX_STEPS):
         before, power = power, _next_power(population.log_likelihood, power)
         if step == MAX_STEPS - 1:
