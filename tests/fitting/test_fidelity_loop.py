@@ -70,6 +70,9 @@ def test_the_gap_is_the_change_of_path_loss(tmp_path):
     result, _ = run(tmp_path, [0.25])
     assert result.fit.retrace_gap_db == pytest.approx(0.25, abs=1e-9)
     np.testing.assert_allclose(result.links["retrace_gap_db"], -0.25, atol=1e-9)
+    # Predictions and exports trace anew, so their path loss contains the gap.
+    for name in ("predicted_db", "scene_db"):
+        np.testing.assert_allclose(result.links[name] - result.links["after_db"], -0.25, atol=1e-9)
 
 
 def test_auto_calibrates_again_until_the_paths_are_stable(tmp_path):

@@ -6,6 +6,7 @@ import copy
 import csv
 import io
 import json
+import runpy
 import shutil
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from calibray.cli.app import app
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.reporting.export import FILES, export, matlab
+from calibray.reporting.wording import sampling_text
 from calibray.scenes import export_scene, read_scene
 from calibray.scenes.export import exported_names
 from calibray.tracing.settings import Antenna, TraceSettings
@@ -72,6 +74,35 @@ def test_plain_sionna_gives_the_reported_path_loss(folder, tmp_path):
     # Nor would the scene before calibration, or one without offsets, have done.
     assert np.abs(computed[reached] - links.before_db[reached].to_numpy()).max() > 10 * LIMIT_DB
     assert "calibray" not in (tmp_path / "there" / "load_scene.py").read_text().replace("Calibray", "")
+
+
+def test_the_reported_path_loss_is_that_of_paths_sampled_with_the_calibrated_materials(
+    tmp_path, monkeypatch, capsys
+):
+    """Few rays through walls: which paths are found depends on the materials of the trace."""
+    monkeypatch.setenv("CALIBRAY_CACHE", "")
+    study = planted.study(
+        tmp_path,
+        planted.campaign(),
+        trace={"max_depth": 3, "samples": 200, "line_of_sight": False, "refraction": True},
+        method={"name": "auto", "options": {"starts": 2, "iterations": 5}},
+        fidelity={"rounds": 1},
+    )
+    result = cb.calibrate(study)
+    links = result.links
+    with np.errstate(invalid="ignore"):  # of links without a path
+        gap = np.abs(links.predicted_db - links.after_db)
+    assert gap[np.isfinite(gap)].max() > 5 * LIMIT_DB
+    export(result, tmp_path / "exported")
+    monkeypatch.setattr(sys, "argv", ["load_scene.py"])
+    runpy.run_path(str(tmp_path / "exported" / "load_scene.py"), run_name="__main__")
+    rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    computed = np.array([float(row["computed_db"]) for row in rows])
+    assert computed == pytest.approx(links.scene_db.to_numpy(), abs=LIMIT_DB)
+    assert np.isfinite(computed).sum() > len(links) / 2
+    assert sampling_text(result) == ""
+    unchecked = replace(result, fit=replace(result.fit, retrace_gap_db=None))
+    assert "depends on the materials" in sampling_text(unchecked)
 
 
 def test_tables_hold_the_calibrated_constants_and_intervals(folder, tmp_path):

@@ -137,7 +137,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
         accuracy, name, residuals = on_blocks(
             validation, problem, rmse_of(problem, models.initial, validation.judged), fitted
         )
-    chosen = fit_prediction_model(problem, trail, name, residuals)
+    chosen = fit_prediction_model(problem, trail, name, residuals, gap_db)
     table = table.assign(predicted_db=chosen.path_loss_db, scene_db=chosen.scene_db, basis=str(name))
     prediction = Prediction(chosen.model, chosen.materials, _residual_field(problem, table, validation))
     if chosen.model.parameters is not None:

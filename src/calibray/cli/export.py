@@ -26,10 +26,10 @@ def export(
     """Write the calibrated scene for Sionna RT, a script that loads it, and its materials as tables."""
     from calibray.calibration.result import Result
     from calibray.reporting.export import export as write
-    from calibray.reporting.wording import scene_alone_text
+    from calibray.reporting.wording import sampling_text, scene_alone_text
 
     result = Result.load(folder)
     names = write(result, out, copy, overwrite)
-    if warning := scene_alone_text(result):
-        echo(f"Note: {warning}", err=True)
+    for note in filter(None, (scene_alone_text(result), sampling_text(result))):
+        echo(f"Note: {note}", err=True)
     echo(f"Written to {out}: {', '.join(names)}", err=True)

@@ -70,6 +70,11 @@ def path_loss_change(after: NDArray[np.float64], before: NDArray[np.float64]) ->
     return np.where(lost, 0.0, after - np.where(lost, 0.0, before))
 
 
+def traced_again(path_loss_db: NDArray[np.float64], gap: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Path loss [L], [dB], on the paths of the new trace; unchanged at links that had no path before."""
+    return np.where(np.isneginf(gap), path_loss_db, path_loss_db + np.where(np.isneginf(gap), 0.0, gap))
+
+
 def largest_gap(gap: NDArray[np.float64] | None, counted: NDArray[np.bool_]) -> float | None:
     """Largest gap of the links with weight and a path on both traces [dB]; None if not checked."""
     if gap is None:

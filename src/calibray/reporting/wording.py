@@ -80,6 +80,29 @@ def scene_alone_text(record: Record) -> str:
     )
 
 
+def sampling_text(record: Record) -> str:
+    """Why the exported scene can give another path loss than the reported one; empty if it cannot.
+
+    Returns:
+        One or two sentences.
+    """
+    trace, model = record.study.trace, record.prediction.model
+    calibrated = model.parameters is None or model.parameters == record.parameters
+    causes = []
+    if trace.adaptive:
+        causes.append(
+            f"The exported script sends out {type(trace).samples:,} rays, a calibration with trace.samples = "
+            '"auto" as many as it needs.'
+        )
+    sampled = record.study.engine.name == "replay" and (trace.refraction or trace.diffuse_reflection)
+    if sampled and not (calibrated and record.fit.retrace_gap_db is not None):
+        causes.append(
+            "Which refracted and diffuse paths are traced depends on the materials, and the reported path loss was "
+            "computed on paths that may have been traced with others than those of the exported scene."
+        )
+    return " ".join([*causes, "load_scene.py prints the difference of every link."]) if causes else ""
+
+
 def held_out_text(record: Record) -> str:
     """How many links were held out."""
     held_out = record.held_out

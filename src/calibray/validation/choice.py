@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calibray.engines.replay import Replay
 from calibray.fields import path_loss
+from calibray.fitting.fidelity_loop import traced_again
 from calibray.fitting.nuisance import OFFSET
 from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
@@ -80,7 +81,11 @@ class FittedModel:
 
 
 def fit_prediction_model(
-    problem: Problem, trail: Trail, name: str, residuals: HeldOutResiduals
+    problem: Problem,
+    trail: Trail,
+    name: str,
+    residuals: HeldOutResiduals,
+    retrace_gap_db: NDArray[np.float64] | None = None,
 ) -> FittedModel:
     """Fit the chosen model to all links that have a weight.
 
@@ -89,9 +94,11 @@ def fit_prediction_model(
         trail: Its search.
         name: The model; see `Model`.
         residuals: Its residuals on new links.
+        retrace_gap_db: Gap of every link between the search's paths and those traced with its optimum [L], [dB];
+            None if not traced again.
 
     Returns:
-        The fitted model.
+        The fitted model. Predictions and exports trace with its materials, so its values at the links contain the gap.
     """
     setup, parameters = problem.setup, problem.parameters
     candidate, scene_db = trail.best, trail.best_modelled
@@ -129,7 +136,11 @@ def fit_prediction_model(
         whole = parameters.materials(candidate, setup.scene.materials)
         whole |= {name: whole[section.of] for name, section in facades.items()}
         scene_db = path_loss(problem.engine.paths, whole, setup.radio.combining, setup.radio.bandwidth)
-    return FittedModel(model, materials, add_nuisance(objective, modelled), scene_db)
+    path_loss_db = add_nuisance(objective, modelled)
+    if retrace_gap_db is not None and (candidate == trail.best).all():
+        scene_db = traced_again(scene_db, retrace_gap_db)
+        path_loss_db = traced_again(path_loss_db, retrace_gap_db) if uses_scene else path_loss_db
+    return FittedModel(model, materials, path_loss_db, scene_db)
 
 
 def with_prior_mean(terms: tuple[FittedTerm, ...], study: Study) -> tuple[FittedTerm, ...]:
