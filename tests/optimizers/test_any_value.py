@@ -86,6 +86,8 @@ def test_the_minima_of_likelihood_and_mean_square_differ():
         ("vector-surrogate", 1e-3),
         ("space-mapping", 1e-3),
         ("dfo-ls", 1e-3),
+        ("pounders", 1e-3),
+        ("gauss-newton", 1e-2),
         ("gaussian-process", 0.1),
         ("cma-es", 0.1),
         ("differential-evolution", 1.0),

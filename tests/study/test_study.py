@@ -344,6 +344,7 @@ def keys(model, prefix=""):
             "parameters": '."NAME.FIELD"',
             "nuisance": ".NAME",
             "regions": ".NAME",
+            "facades": ".NAME",
             "observables": ".NAME",
         }.get(name, "")
         inner = (key for table in tables for key in keys(table, f"{prefix}{name}{wild}."))

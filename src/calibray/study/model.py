@@ -7,7 +7,6 @@ import json
 import os
 from abc import ABC
 from collections.abc import Collection, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -396,7 +395,8 @@ class StudyModel(Section, ABC):
         if antenna.gain_file is None:
             return antenna
         file = self._resolve(f"antennas.{key}.pattern", antenna.pattern).resolve()
-        return replace(antenna, pattern=str(file))
+        array = antenna.rows, antenna.columns, antenna.spacing
+        return Antenna(str(file), antenna.polarization, antenna.orientation, *array)
 
     @property
     def overrides(self) -> dict[str, dict[str, Any]]:

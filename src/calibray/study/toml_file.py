@@ -174,21 +174,26 @@ def split_engine_keys(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
     name = content.get("name", DEFAULT) if isinstance(content, dict) else None
     if not isinstance(name, str) or name not in KINDS:
         return content, {}
-    fields = {key: field for kind in KINDS.values() for key, field in kind.model_fields.items()}
-    others = {
-        key: value for key, value in content.items() if key in fields and key not in KINDS[name].model_fields
-    }
-    for key, value in others.items():
-        _check(f"{source}: engine.{key} = {shortened(repr(value))}", fields[key], value)
+    own, others = KINDS[name].model_fields, {}
+    for key, value in content.items():
+        fields = [kind.model_fields[key] for kind in KINDS.values() if key in kind.model_fields]
+        faults = [_fault(field, value) for field in fields]
+        # Engines may share a key, such as `rays`, for values of different types.
+        if fields and (key not in own or (_fault(own[key], value) is not None and None in faults)):
+            if None not in faults:
+                raise InputError(f"{source}: engine.{key} = {shortened(repr(value))}: {faults[0]}")
+            others[key] = value
     rest = {key: value for key, value in content.items() if key not in others}
     return {"name": DEFAULT, **rest}, others
 
 
-def _check(prefix: str, field: FieldInfo, value: Any) -> None:
+def _fault(field: FieldInfo, value: Any) -> str | None:
+    """What is wrong with the value of a key; None if nothing is."""
     # The type is composed at run time, which type checkers cannot follow.
     annotated: Any = Annotated
     checker = TypeAdapter[Any](annotated[field.annotation, Field(), *field.metadata], config=CLOSED)
     try:
         checker.validate_json(json.dumps(value, default=str))
     except ValidationError as error:
-        raise InputError(f"{prefix}: {describe_fault(error.errors()[0])}") from None
+        return describe_fault(error.errors()[0])
+    return None
