@@ -26,7 +26,7 @@ import pandas as pd
 
 import calibray as cb
 from calibray.fields import path_loss
-from calibray.result.remark import RemarkKind
+from calibray.result.verdict import RemarkKind
 from calibray.scenes import Mesh, MeshObject, join_meshes, write_scene
 from calibray.study import Setup, Study
 

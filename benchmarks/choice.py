@@ -44,8 +44,7 @@ from calibray import engines
 from calibray.errors import InputError
 from calibray.fitting.preliminary_fits import estimate_noise
 from calibray.fitting.problem import Problem
-from calibray.result.held_out import FITTED, WITHOUT_MATERIALS, Model
-from calibray.result.prediction_model import BlockErrors
+from calibray.result.held_out import FITTED, WITHOUT_MATERIALS, BlockErrors, Model
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers

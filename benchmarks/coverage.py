@@ -44,8 +44,8 @@ import districts
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, search
 from calibray.optimizers import LeastSquares
-from calibray.tables import Column, Table, markdown, numbers
-from calibray.tables.text import render
+from calibray.tables import Column, Table, numbers
+from calibray.tables.text import render, render_markdown
 from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.credible_sets import credible, credible_sets
 from calibray.uncertainty.draws import Draws
@@ -310,7 +310,7 @@ def main() -> None:
         print(f"{count} of {len(tasks)}", end="\r", file=sys.stderr)
     lines = [each for each in lines if each["district"] in names and each["world"] in worlds]
     for table in tables(lines):
-        print(f"\n**{table.title}**\n\n{markdown.render(table)}" if given.markdown else render(table))
+        print(f"\n**{table.title}**\n\n{render_markdown(table)}" if given.markdown else render(table))
     count, denied = determined(lines)
     print(f"Well determined with the noise known: {count} values; called not identifiable of them: {denied}.")
     if denied:

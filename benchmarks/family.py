@@ -27,7 +27,8 @@ from calibray.cli.console import log
 from calibray.cli.progress_bars import progress_bars
 from calibray.comparison.comparison import quantile
 from calibray.optimizers import label
-from calibray.tables import Column, Table, markdown, numbers
+from calibray.tables import Column, Table, numbers
+from calibray.tables.text import render_markdown
 from problem_families.family_comparison import FamilyComparison, compare_family, seed_range, tables
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -70,8 +71,8 @@ def main() -> None:
     for name, part in named:
         print(f"## {name}: {len(part.seeds)} problems\n")
         for table in tables(part):
-            print(f"{table.title}\n\n{markdown.render(table)}\n", flush=True)
-    print(f"{markdown.render(shown(together))}\n")
+            print(f"{table.title}\n\n{render_markdown(table)}\n", flush=True)
+    print(f"{render_markdown(shown(together))}\n")
     for part in finished:
         for seed, reason in part.failed_problems:
             print(f"- {part.kind} {seed} could not be made: {reason}")

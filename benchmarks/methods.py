@@ -32,7 +32,7 @@ from calibray.scenarios import demo_study_path
 from calibray.support.figure_style import write
 from calibray.support.output_files import write_text
 from calibray.support.output_tables import write_table
-from calibray.tables import markdown
+from calibray.tables.text import render_markdown
 from problem_families.problems import landscape_problem
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -81,7 +81,7 @@ def main() -> None:
         write(figure(finished), chosen.out / f"{name}.png")
         sections.append(
             f"## {title}\n\nOptimum {finished.optimum:.6g} dB, found by {finished.found_by}.\n\n"
-            f"{markdown.render(table(finished))}\n\n![Excess RMSE over RT calls]({name}.png)"
+            f"{render_markdown(table(finished))}\n\n![Excess RMSE over RT calls]({name}.png)"
         )
         print(sections[-1], flush=True)
     write_text(chosen.out / "tables.md", "\n\n".join(sections) + "\n")

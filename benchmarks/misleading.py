@@ -37,7 +37,8 @@ from calibray.comparison.method_runs import (
     code_fingerprint,
 )
 from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, CheapModel, Constants
-from calibray.tables import Column, Table, markdown, numbers
+from calibray.tables import Column, Table, numbers
+from calibray.tables.text import render_markdown
 from problem_families.family_comparison import seed_range
 from problem_families.problems import planted_problem
 
@@ -244,7 +245,7 @@ def main() -> None:
                     runs[name].append(run)
                     found.append(run.at(run.evaluations))
             lowest += [min(problem.minimum, *found)] * chosen.repeats
-    print(markdown.render(compared(runs, np.array(lowest))))
+    print(render_markdown(compared(runs, np.array(lowest))))
     for name, each in runs.items():
         for run in each:
             if run.failure:

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.optimizers import label, make
-from calibray.tables import Column, Table, markdown, numbers
+from calibray.tables import Column, Table, numbers
+from calibray.tables.text import render_markdown
 from problem_families.more_wild import MoreWild, problems
 
 RADIUS = 0.005  # of the box, which makes the first trust region a tenth of the starting point, as by default in DFO-LS
@@ -81,7 +82,7 @@ def main() -> None:
         for column, tolerance in enumerate(TOLERANCES)
         for row, method in enumerate(methods)
     )
-    print(markdown.render(Table("", columns, rows)))
+    print(render_markdown(Table("", columns, rows)))
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ from calibray.fitting.preliminary_fits import estimate_noise
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
 from calibray.measurements.observables import Statistic
-from calibray.result.remark import Remark, RemarkKind
+from calibray.result.verdict import Remark, RemarkKind
 from calibray.scenes import Mesh, MeshObject, write_scene
 from calibray.study import Setup, Study
 from calibray.uncertainty.conflict import conflict

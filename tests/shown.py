@@ -11,7 +11,7 @@ import pandas as pd
 import synthetic
 from calibray.calibration.result import Result
 from calibray.comparison.comparison import Comparison
-from calibray.comparison.experiment import Demo
+from calibray.comparison.demo import Demo
 from calibray.comparison.method_runs import BudgetedMethod, MethodRun
 from calibray.doctor import Check, Diagnosis
 from calibray.paths import Kind, Paths

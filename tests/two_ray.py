@@ -20,8 +20,7 @@ from calibray.scenes import Scene, read_scene
 from calibray.study import Study
 from calibray.support.progress import Progress
 from calibray.tracing.antennas import AntennaPattern
-from calibray.tracing.positions import link_positions
-from calibray.tracing.protocol import Links, Solution, compile_paths
+from calibray.tracing.protocol import Links, Solution, compile_paths, link_positions
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.trace_plan import TracePlan, plan_trace
 from small_scenes import write_scene

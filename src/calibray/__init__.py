@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from calibray.reporting.page import report as report
     from calibray.study import Setup as Setup
     from calibray.study import Study as Study
-    from calibray.study.rays import read_rays as read_rays
-    from calibray.study.rays import write_rays as write_rays
+    from calibray.study.trace import read_rays as read_rays
     from calibray.study.trace import trace as trace
+    from calibray.study.trace import write_rays as write_rays
     from calibray.validation.validate import validate as validate
     from calibray.version import __version__ as __version__
 
@@ -50,8 +50,8 @@ _HOMES = {
     "channel_statistics": "calibray.fields.channel",
     "power_delay_profile": "calibray.fields.channel",
     "trace": "calibray.study.trace",
-    "read_rays": "calibray.study.rays",
-    "write_rays": "calibray.study.rays",
+    "read_rays": "calibray.study.trace",
+    "write_rays": "calibray.study.trace",
     "path_gains": "calibray.fields",
     "path_loss": "calibray.fields",
     "Study": "calibray.study",

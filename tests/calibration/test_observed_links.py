@@ -15,10 +15,10 @@ from calibray.fitting.problem import Problem
 from calibray.measurements import links_from_frame
 from calibray.measurements.observables import Statistic
 from calibray.reporting import result_tables as tables
-from calibray.reporting.observable_figure import measured_over_modelled
+from calibray.reporting.figures import measured_over_modelled
 from calibray.result import wording
 from calibray.result.held_out import Model
-from calibray.result.remark import RemarkKind
+from calibray.result.verdict import RemarkKind
 from calibray.study import Setup, Study
 from calibray.tables.text import render
 from calibray.uncertainty.conflict import conflict

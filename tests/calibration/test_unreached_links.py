@@ -14,7 +14,7 @@ import calibray as cb
 from calibray.calibration.result import Result
 from calibray.cli.app import app
 from calibray.measurements import links_from_frame
-from calibray.prediction.cost import LOG, announce
+from calibray.prediction.batches import LOG, announce
 from calibray.prediction.fallback import fill_missing
 from calibray.prediction.map_files import figure
 from calibray.reporting.wording import prediction_text

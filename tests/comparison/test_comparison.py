@@ -20,7 +20,7 @@ from calibray.comparison.method_runs import BudgetedMethod, MethodRun, RunFile, 
 from calibray.errors import InputError
 from calibray.optimizers import METHODS, SGWOIM, RandomSearch
 from calibray.study import Study
-from calibray.tables import markdown
+from calibray.tables.text import render_markdown
 from problem_families.problems import landscape_problem
 
 STREET = partial(landscape_problem, "street")
@@ -235,7 +235,7 @@ def test_the_figure_shows_medians_and_quartiles_within_each_budget(small):
 
 
 def test_markdown_has_a_row_for_each_method(small):
-    lines = markdown.render(render_table(small[0])).splitlines()
+    lines = render_markdown(render_table(small[0])).splitlines()
     assert len(lines) == 2 + 4
     assert len({line.count("|") for line in lines}) == 1
 

@@ -14,8 +14,7 @@ from typer.testing import CliRunner
 from calibray import engines
 from calibray.cli.app import app
 from calibray.comparison import demo as module
-from calibray.comparison.demo import FIGURES, run_demo, write_demo
-from calibray.comparison.experiment import MAPPING, METHODS, trust
+from calibray.comparison.demo import FIGURES, MAPPING, METHODS, run_demo, trust, write_demo
 from calibray.fitting.problem import Problem
 from calibray.scenarios import demo_study_path
 from calibray.study import Setup, Study

@@ -10,10 +10,9 @@ import pytest
 import planted
 from calibray.calibration.calibrate import calibrate
 from calibray.errors import InputError
-from calibray.fitting.group_spread import group_spread
 from calibray.fitting.nuisance import Nuisance, random_effect
 from calibray.fitting.objective import make_objective
-from calibray.fitting.preliminary_fits import estimate_noise
+from calibray.fitting.preliminary_fits import estimate_noise, group_spread
 from calibray.fitting.problem import Problem
 from calibray.measurements import Measurements
 from fitting.test_preliminary_fits import Ramp

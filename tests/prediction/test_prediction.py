@@ -18,7 +18,7 @@ from calibray.cli.app import app
 from calibray.prediction.position_checks import locate
 from calibray.prediction.residual_field import calibration_residuals, krige_residuals
 from calibray.prediction.suggestion import suggest
-from calibray.result.prediction_model import BlockErrors, ResidualField
+from calibray.result.held_out import BlockErrors, ResidualField
 from calibray.scenes import Triangles
 from calibray.uncertainty.residual_correlation import shared_errors
 from calibray.validation.held_out_statistics import FEWEST_FOR_RANKS, interval_half_width, two_levels

@@ -10,10 +10,9 @@ import numpy as np
 import shown
 from calibray.comparison import comparison
 from calibray.reporting import result_tables
-from calibray.reporting import trace_tables as trace
-from calibray.tables import markdown
-from calibray.tables.text import render
-from calibray.tracing.positions import EnclosedAntennas
+from calibray.reporting import scene_tables as trace
+from calibray.tables.text import render, render_markdown
+from calibray.tracing.protocol import EnclosedAntennas
 from changed import changed
 
 
@@ -46,14 +45,14 @@ def test_a_trace_and_its_check_are_printed_as_stored():
 def test_demo_comparison_and_diagnosis_are_printed_as_stored():
     assert render(*shown.demo().tables()) == golden("demo")
     assert render(comparison.table(shown.comparison())) == golden("comparison")
-    assert markdown.render(comparison.table(shown.comparison())) == golden("comparison-markdown")
+    assert render_markdown(comparison.table(shown.comparison())) == golden("comparison-markdown")
     assert render(shown.diagnosis().table()) == golden("doctor")
 
 
 def test_tables_and_figures_import_no_ray_tracer():
     code = """
 import importlib, sys
-for name in ("calibray.doctor", "calibray.comparison.comparison", "calibray.comparison.experiment"):
+for name in ("calibray.doctor", "calibray.comparison.comparison", "calibray.comparison.demo"):
     importlib.import_module(name)
 for name in "figures result_tables trace_tables".split():
     importlib.import_module(f"calibray.reporting.{name}")

@@ -17,8 +17,7 @@ from calibray.reporting.link_survey import residual
 from calibray.reporting.result_tables import parameters, values
 from calibray.reporting.summary import summary
 from calibray.reporting.wording import prediction_text, scene_alone_text
-from calibray.result.held_out import Model
-from calibray.result.prediction_model import ResidualField
+from calibray.result.held_out import Model, ResidualField
 from calibray.result.verdict import Interval, ReasonKind, Verdict
 from calibray.result.wording import reason_text
 from calibray.scenes import read_scene

@@ -14,7 +14,7 @@ import pytest
 
 from calibray.engines import Replay
 from calibray.errors import InputError
-from calibray.scenarios import campaign, demo_study_path, district, world
+from calibray.scenarios import campaign, demo_study_path, district
 from calibray.scenes import Mesh, join_meshes, ply_bytes
 from calibray.study import Study
 from calibray.support.output_files import SIGNATURES
@@ -87,21 +87,21 @@ def rmse(loss: np.ndarray, measured: np.ndarray) -> np.ndarray:
 
 
 def test_regenerating_what_needs_no_tracer_gives_the_same_bytes(tmp_path):
-    campaign.write_model(tmp_path, world.world())
+    campaign.write_model(tmp_path, campaign.world())
     committed = contents(PACKAGED)
     del committed["links.csv"]
     assert contents(tmp_path) == committed
 
 
 def test_regenerating_the_measurement_gives_the_same_bytes():
-    true_world = world.world()
+    true_world = campaign.world()
     table = campaign.links_csv(true_world, campaign.measure(true_world))
     assert table.encode() == (PACKAGED / "links.csv").read_bytes()
 
 
 def test_another_seed_gives_another_world_in_the_same_streets():
-    other = world.world(seed=world.SEED + 1)
-    same = world.world()
+    other = campaign.world(seed=campaign.SEED + 1)
+    same = campaign.world()
     assert not np.array_equal(other.rx, same.rx)
     assert not np.array_equal(other.permittivity, same.permittivity)
     assert [building.footprint.tolist() for building in other.buildings] == [
@@ -253,7 +253,7 @@ def test_two_transmitters_have_27_and_13_receivers(links):
 
 
 def test_all_antennas_stand_on_streets_and_clear_of_lamp_posts():
-    true_world = world.world()
+    true_world = campaign.world()
     spots = np.concatenate(
         [true_world.tx, true_world.rx, true_world.tx_recorded, true_world.rx_recorded], axis=0
     )[:, :2]
@@ -296,11 +296,11 @@ def test_the_truth_is_complete(truth, links):
 def test_planted_permittivities_scatter_as_said(truth):
     for name in ("concrete", "glass"):
         drawn = [entry[f"{name}.relative_permittivity"] for entry in truth["buildings"].values()]
-        planted = world.PLANTED[name]
+        planted = campaign.PLANTED[name]
         standard_error = planted.spread / np.sqrt(len(drawn))
         assert np.mean(drawn) == pytest.approx(planted.relative_permittivity, abs=3 * standard_error)
         assert np.std(drawn) == pytest.approx(planted.spread, rel=0.15)
-        assert len(set(drawn)) == len(world.LEVELS)
+        assert len(set(drawn)) == len(campaign.LEVELS)
 
 
 def test_recorded_positions_are_off_by_about_a_metre(truth):
@@ -310,7 +310,7 @@ def test_recorded_positions_are_off_by_about_a_metre(truth):
 
 
 def test_the_true_world_has_its_own_materials_and_lamp_posts():
-    true_world = world.world()
+    true_world = campaign.world()
     materials = true_world.materials()
     objects = true_world.scene_objects()
     assert {item.material for item in objects} == set(materials)

@@ -27,7 +27,7 @@ from calibray.scenes.authoring import (
     read_terrain,
     read_trees,
 )
-from calibray.scenes.authoring.canopy import read_canopy
+from calibray.scenes.authoring.trees import read_canopy
 from planted_maps import FRAME, write_extract, write_park
 
 SQUARE = [(0, 0), (20, 0), (20, 20), (0, 20)]

@@ -6,8 +6,8 @@ from scipy.stats import norm
 
 from calibray.errors import InputError
 from calibray.scenes import Triangles
-from calibray.scenes.clutter import clutter_loss_db
 from calibray.scenes.obstruction import obstruction
+from calibray.study.link_obstruction import clutter_loss_db
 
 
 def box(low, high, bottom=0.0, top=10.0):

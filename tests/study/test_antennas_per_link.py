@@ -16,7 +16,7 @@ from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.measurements import SourceTable, links_from_frame
 from calibray.reporting.trust_figures import residuals_by_direction
-from calibray.result.remark import RemarkKind
+from calibray.result.verdict import RemarkKind
 from calibray.result.wording import remark_text
 from calibray.study import Setup, Study
 from calibray.tracing.mounting import stated_jones

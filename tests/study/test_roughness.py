@@ -15,7 +15,7 @@ from calibray.parameters import Parameter, Parameters
 from calibray.paths import Kind
 from calibray.reporting.wording import scene_alone_text
 from calibray.study import Setup, Study
-from calibray.study.roughness import roughness_effects
+from calibray.study.facades import roughness_effects
 
 ROUGH = "marble.roughness_mm"
 PARAMETERS = {name: {"bounds": planted.BOUNDS} for name in planted.TRUTH} | {ROUGH: {"bounds": [0.0, 15.0]}}

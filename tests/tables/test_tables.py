@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from calibray.tables import Column, Table, html, markdown, numbers
-from calibray.tables.text import render, rows_text
+from calibray.tables import Column, Table, numbers
+from calibray.tables.text import render, render_html, render_markdown, rows_text
 from html_cells import Cells
 
 HOSTILE = '<script>alert("x")</script>&amp;'
@@ -50,7 +50,7 @@ def test_only_the_first_rows_are_listed():
 
 
 def test_html_contains_the_text_of_the_table():
-    cells = Cells(html.render("study.toml", RMSE))
+    cells = Cells(render_html("study.toml", RMSE))
     headings = [column.heading for column in RMSE.columns]
     assert cells.words == ["study.toml", RMSE.title, *headings, *(cell for row in RMSE.rows for cell in row)]
     assert cells.tags == {"p", "table", "caption", "thead", "tbody", "tr", "th", "td"}
@@ -58,20 +58,20 @@ def test_html_contains_the_text_of_the_table():
 
 def test_html_escapes_all_text():
     table = Table(HOSTILE, (Column(HOSTILE, HOSTILE),), ((HOSTILE,),))
-    fragment = html.render(HOSTILE, table)
+    fragment = render_html(HOSTILE, table)
     assert "<script" not in fragment
     assert Cells(fragment).words == [HOSTILE, HOSTILE, f"{HOSTILE} [{HOSTILE}]", HOSTILE]
 
 
 def test_markdown_escapes_column_separators():
     table = Table("", (Column("a"), Column("b")), (("x|y", "z"),))
-    assert markdown.render(table).splitlines()[-1] == r"| x\|y | z |"
+    assert render_markdown(table).splitlines()[-1] == r"| x\|y | z |"
 
 
 def test_tables_import_no_pandas():
     code = """
 import importlib, sys
-for name in ("display", "html", "markdown", "text"):
+for name in ("display", "text"):
     importlib.import_module(f"calibray.tables.{name}")
 print("pandas" in sys.modules)
 """

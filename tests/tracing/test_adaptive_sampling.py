@@ -14,7 +14,7 @@ import pytest
 from calibray.errors import InputError
 from calibray.fields import path_gains, path_loss
 from calibray.paths import Kind, Paths
-from calibray.reporting import trace_tables as report
+from calibray.reporting import scene_tables as report
 from calibray.scenes import read_scene
 from calibray.tracing import convergence
 from calibray.tracing.settings import Antenna, TraceSettings

@@ -11,7 +11,7 @@ import pytest
 
 from calibray.errors import InputError
 from calibray.fields import path_loss
-from calibray.reporting import trace_tables as report
+from calibray.reporting import scene_tables as report
 from calibray.scenes import read_scene
 from calibray.tables.text import render
 from calibray.tracing.convergence import Convergence, check, compare

@@ -25,8 +25,7 @@ from calibray.support import cache_folder as caching
 from calibray.tracing import convergence
 from calibray.tracing.antennas import AntennaPattern
 from calibray.tracing.default_tracer import SIONNA
-from calibray.tracing.positions import EnclosedAntennas
-from calibray.tracing.protocol import Tracer, TracerFactory
+from calibray.tracing.protocol import EnclosedAntennas, Tracer, TracerFactory
 from calibray.tracing.settings import PATTERNS, POLARIZATIONS, Antenna, TraceSettings
 from small_scenes import write_scene
 from two_ray import MIRROR, TwoRay
@@ -265,7 +264,7 @@ def test_enclosed_antennas_are_told_by_row_unless_most_are() -> None:
 LIGHT = (
     "calibray.tracing", "calibray.tracing.protocol", "calibray.tracing.default_tracer", "calibray.tracing.settings",
     "calibray.tracing.antennas", "calibray.tracing.cache", "calibray.tracing.convergence",
-    "calibray.tracing.positions", "calibray.study.trace", "calibray.study", "calibray.result", "calibray.engines",
+    "calibray.tracing.antennas", "calibray.study.trace", "calibray.study", "calibray.result", "calibray.engines",
 )  # fmt: skip
 
 

@@ -14,8 +14,7 @@ from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import make_objective
 from calibray.measurements import Measurements, SourceTable
 from calibray.prediction.fallback import fill_missing
-from calibray.result.held_out import Model
-from calibray.result.prediction_model import FittedTerm, PredictionModel
+from calibray.result.held_out import FittedTerm, Model, PredictionModel
 from calibray.result.record import Prediction
 from calibray.study import Study
 from calibray.validation.baselines import (

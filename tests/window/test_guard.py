@@ -7,7 +7,7 @@ import asyncio
 import httpx
 import pytest
 
-from calibray.window.guard import POLICY, Guard
+from calibray.window.server import POLICY, Guard
 
 TOKEN, PORT = "a" * 43, 4711
 HOST = f"127.0.0.1:{PORT}"

@@ -13,7 +13,7 @@ from scipy.special import fdtrc
 from calibray.engines.kinds.replay import replay
 from calibray.engines.replay import Replay
 from calibray.fitting.problem import Evaluation, Problem
-from calibray.result.remark import Remark, RemarkKind
+from calibray.result.verdict import Remark, RemarkKind
 from calibray.study import Study
 from calibray.tracing.mounting import EVERY, POSE
 

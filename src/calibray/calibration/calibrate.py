@@ -9,9 +9,9 @@ from typing import Final
 
 from calibray import engines
 from calibray.calibration.antenna_directions import directions_remark
+from calibray.calibration.link_diagnostics import unreached_remark
 from calibray.calibration.make_result import Run, Timing, make_result
 from calibray.calibration.result import Result
-from calibray.calibration.unreached_links import unreached_remark
 from calibray.engines.cluster.workers import Workers
 from calibray.engines.ledger.ledger import LEDGER_FILE
 from calibray.engines.protocol import Answering, Engine
@@ -19,8 +19,7 @@ from calibray.engines.rays.export import Exporting
 from calibray.fitting.cheap_replay import CheapReplay, make_cheap_replay
 from calibray.fitting.fidelity_loop import retrace
 from calibray.fitting.methods import check_fit, check_method, choose
-from calibray.fitting.population_spread import estimate_spreads
-from calibray.fitting.preliminary_fits import estimate_noise, leave_out_near_floor
+from calibray.fitting.preliminary_fits import estimate_noise, estimate_spreads, leave_out_near_floor
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_search import maps_rays, search_rays
 from calibray.fitting.search import search

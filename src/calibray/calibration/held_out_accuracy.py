@@ -1,4 +1,9 @@
-"""Accuracy on held-out links, chosen by a filter or in blocks, and the prediction model that they choose."""
+"""Accuracy on held-out links, chosen by a filter or in blocks, and the prediction model that they choose.
+
+It has the study's nuisances and is fitted to the calibration links, like the rival in the validation. Links that no
+path reaches are mostly behind obstacles, so their path loss exceeds what this fit gives. Where the study has enough of
+them, their mean residual is added, and the fallback's errors are theirs.
+"""
 
 from __future__ import annotations
 
@@ -8,21 +13,23 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.fitting.nuisance import CONSTANT
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
-from calibray.result.held_out import Model
+from calibray.result.held_out import FittedTerm, Model, PredictionModel
 from calibray.result.record import Accuracy
 from calibray.scenes.obstruction import OUT_OF_SIGHT
-from calibray.validation.baselines import has_obstruction, obstructed, without_scene
-from calibray.validation.choice import HeldOutResiduals
+from calibray.validation.baselines import has_obstruction, log_distance_objective, obstructed, without_scene
+from calibray.validation.choice import HeldOutResiduals, fitted_terms, quantiles
 from calibray.validation.held_out_statistics import (
     choose,
     compare,
+    held_out_gaps,
+    observable_errors,
     out_of_sight_ratio,
     spatial_blocks,
     two_levels,
 )
-from calibray.validation.observables import held_out_gaps, observable_errors
 from calibray.validation.validate import DEFAULT_BLOCKS
 from calibray.validation.validation import Validation
 from calibray.validation.variants import add_nuisance, initial_objective
@@ -180,3 +187,61 @@ def _out_of_sight(problem: Problem, errors: NDArray[np.float64], links: NDArray[
     if any(term.around and term.by == OUT_OF_SIGHT for term in terms) or OUT_OF_SIGHT not in table.frame:
         return 1.0
     return out_of_sight_ratio(errors, table.numbers(OUT_OF_SIGHT)[links] > 0)
+
+
+FEWEST: Final = 8
+"""Links without a path, or held-out links, from which errors are computed; as for the prediction model."""
+
+WITHOUT_PATH: Final = "without a path"
+"""Name of the term with the mean residual of the links without a path."""
+
+
+def fit_fallback(
+    problem: Problem, without_path: NDArray[np.bool_], held_out_db: NDArray[np.float64], basis: str
+) -> PredictionModel:
+    """Fit the fallback to the calibration links.
+
+    Args:
+        problem: The problem.
+        without_path: Mask of its links without a path [links].
+        held_out_db: Residuals of the log-distance model on held-out links [n], [dB].
+        basis: What these links are.
+
+    Returns:
+        The log-distance model. Its errors are those of links without a path; of held-out links if there are too few; of
+        the calibration links if there are too few of these as well.
+    """
+    setup, links = problem.setup, problem.setup.links
+    objective, known_db = log_distance_objective(links, problem.objective, without_scene(setup.study, links))
+    terms = fitted_terms(objective, known_db, setup.study)
+    residuals = objective.measured - add_nuisance(objective, known_db)
+    usable = without_path & ~setup.held_out
+    for excluded in (links.censored, problem.faint):
+        usable = usable if excluded is None else usable & ~excluded
+    count = int(usable.sum())
+    if count >= FEWEST:
+        mean_db = float(residuals[usable].mean())
+        terms += (FittedTerm(WITHOUT_PATH, CONSTANT, "", {"": mean_db}),)
+        # The error of each link if the mean is that of the others.
+        errors = (residuals[usable] - mean_db) * count / (count - 1)
+        basis = f"errors of {count} links without a path"
+    elif len(held_out_db) >= FEWEST:
+        errors = held_out_db
+    else:
+        counted = objective.weight > 0
+        count, unknowns = int(counted.sum()), int(objective.determined.sum())
+        # In-sample errors are too small by the unknowns that were fitted to them.
+        inflation = np.sqrt(count / (count - unknowns)) if count > unknowns else np.nan
+        errors = residuals[counted] * inflation
+        errors, basis = errors[np.isfinite(errors)], f"errors of {count} calibration links"
+    rms_db = float(np.sqrt(np.mean(errors**2))) if len(errors) else None
+    absolute_errors = quantiles(np.sort(np.abs(errors)))
+    return PredictionModel(
+        Model.LOG_DISTANCE,
+        None,
+        terms,
+        rms_db,
+        f"{Model.LOG_DISTANCE}, {basis}",
+        len(errors),
+        absolute_errors,
+    )

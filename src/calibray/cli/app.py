@@ -11,21 +11,17 @@ from typing import Annotated, Any, Final
 import typer
 from typer.core import TyperGroup
 
-from calibray.cli.cache import cache
 from calibray.cli.compare import compare
 from calibray.cli.console import echo
-from calibray.cli.demo import demo
-from calibray.cli.doctor import doctor
-from calibray.cli.export import export
+from calibray.cli.doctor import cache, doctor
 from calibray.cli.init import init, schema
 from calibray.cli.ledger import ledger
 from calibray.cli.map import map
 from calibray.cli.open import open
-from calibray.cli.predict import predict
-from calibray.cli.report import report
-from calibray.cli.run import run
+from calibray.cli.predict import predict, suggest
+from calibray.cli.report import export, report
+from calibray.cli.run import demo, run
 from calibray.cli.scene import scene
-from calibray.cli.suggest import suggest
 from calibray.cli.trace import trace
 from calibray.cli.validate import validate
 from calibray.errors import EngineError, InputError

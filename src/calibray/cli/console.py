@@ -44,7 +44,7 @@ def print_costs() -> None:
         def emit(self, record: logging.LogRecord) -> None:
             echo(record.getMessage(), err=True)
 
-    from calibray.prediction.cost import LOG
+    from calibray.prediction.batches import LOG
 
     LOG.setLevel(logging.INFO)
     LOG.addHandler(Echo())

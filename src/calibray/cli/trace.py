@@ -41,7 +41,7 @@ def trace(
         from calibray.engines import open_workers
         from calibray.engines.cluster.chunks import stated_chunk_size, trace_in_chunks
         from calibray.engines.cluster.workers import InProcess
-        from calibray.reporting import trace_tables
+        from calibray.reporting import scene_tables
         from calibray.study import Study
         from calibray.support.output_files import check_file
         from calibray.tables.text import render
@@ -62,11 +62,11 @@ def trace(
                 )
                 if out is not None:
                     paths.save(out, overwrite)
-    echo(render(trace_tables.overview(paths, links.row, setup.enclosed)))
+    echo(render(scene_tables.overview(paths, links.row, setup.enclosed)))
     if check and study.trace.adaptive:
-        echo("\n" + trace_tables.last_round(paths.settings, study.fidelity.tolerance_db))
+        echo("\n" + scene_tables.last_round(paths.settings, study.fidelity.tolerance_db))
     if change is not None:
-        echo("\n" + render(*trace_tables.convergence(change, links.row, study.fidelity.tolerance_db)))
+        echo("\n" + render(*scene_tables.convergence(change, links.row, study.fidelity.tolerance_db)))
     if out is not None:
         echo(f"Written to {out}", err=True)
 

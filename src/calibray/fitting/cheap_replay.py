@@ -24,7 +24,7 @@ from calibray.measurements.observables import Statistic
 from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, Constants
 from calibray.parameters import Parameter, Parameters
 from calibray.parameters.laws import PARAMETER_BOUNDS
-from calibray.result.remark import Remark, RemarkKind
+from calibray.result.verdict import Remark, RemarkKind
 from calibray.study import Setup
 from calibray.support.progress import Progress
 

@@ -5,24 +5,33 @@ A selection by measured values keeps these and biases the fit. A selection by pr
 prediction is independent of the link's error (selection on the explanatory variables: J. M. Wooldridge, Econometric
 Analysis of Cross Section and Panel Data, 2nd ed., MIT Press 2010, chapter 19). We fit the model to all links above the
 floor, then to the links predicted well above it, until the selection is stable.
+
+Residuals follow y = X b + Z u + e with u ~ N(0, lambda sigma^2) per group and e ~ N(0, sigma^2). X has what is fitted
+besides. The restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971) does not take the scatter that
+the fit of b removes for less spread, as a maximum likelihood would.
+
+Expectation maximization with a Gaussian approximation at the optimum (D. Bates and S. DebRoy, J. Multivariate Analysis
+91, 2004, section 5): the square of the spread is the mean of the transmitters' squared values plus their variances.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.fitting.group_spread import group_spread
 from calibray.fitting.nuisance import Nuisance
 from calibray.fitting.objective import Objective
 from calibray.fitting.observed import with_errors
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import least_squares
+from calibray.study import Study
+from calibray.study.population import estimated_fields, with_spreads
 from calibray.support.progress import Progress
+from calibray.tracing.mounting import NEW, POSE
 
 MARGIN: Final = 8.0
 """Required distance of a predicted path loss from the noise floor, in standard deviations of the links' errors.
@@ -203,3 +212,121 @@ def with_estimated_errors(problem: Problem, point: NDArray[np.float64]) -> Probl
 
 def _with_noise(problem: Problem, noise_db: float) -> Problem:
     return replace(problem, objective=replace(problem.objective, noise_db=max(noise_db, LEAST_NOISE_DB)))
+
+
+RATIOS: Final = np.concatenate([[0.0], np.geomspace(1e-3, 1e3, 121)])
+"""Ratios of both variances that are compared."""
+
+SINGULAR: Final = 1e-10
+"""Share of the largest singular value of the design below which its columns count as dependent."""
+
+
+class GroupSpread(NamedTuple):
+    """Standard deviations.
+
+    Attributes:
+        between: Between groups, in the unit of the residuals per unit of the column; 0 if no group differs.
+        within: Of a single link, in the unit of the residuals.
+    """
+
+    between: float
+    within: float
+
+
+def group_spread(
+    residuals: NDArray[np.float64],
+    design: NDArray[np.float64],
+    column: NDArray[np.float64],
+    group: NDArray[np.int64],
+) -> GroupSpread:
+    """Estimate the spread of a column's coefficient between groups.
+
+    Args:
+        residuals: Residuals of the links [n].
+        design: Columns X of what is fitted besides, with the derivatives of the model [n, k].
+        column: The column [n].
+        group: Group of every link [n], from 0.
+
+    Returns:
+        The standard deviations; none between groups if there are too few links.
+
+    Example:
+        >>> shift = np.repeat([3.0, -2.0, 0.0, -1.0], 5)
+        >>> noise = np.tile([1.0, -1.0, 0.5, -0.5, 0.0], 4)
+        >>> found = group_spread(shift + noise, np.ones((20, 1)), np.ones(20), np.repeat(np.arange(4), 5))
+        >>> round(found.between, 1), round(found.within, 1)
+        (2.1, 0.8)
+    """
+    left, size, _ = np.linalg.svd(design, full_matrices=False)
+    basis = left[:, size > SINGULAR * max(size.max(initial=0.0), 1e-300)]
+    freedom = len(residuals) - basis.shape[1]
+    if freedom < 2:
+        return GroupSpread(0.0, float(np.std(residuals)))
+    all_columns = np.column_stack([basis, residuals])
+    products, groups = all_columns.T @ all_columns, int(group.max()) + 1
+    sums = np.stack([np.bincount(group, column * each, groups) for each in all_columns.T])
+    square = np.bincount(group, column**2, groups)
+    best, found = np.inf, GroupSpread(0.0, 0.0)
+    for ratio in RATIOS:
+        # V = I + ratio Z Z' is a block per group, so that its inverse is a rank-one update (Sherman and Morrison).
+        weighted = products - (sums * (ratio / (1.0 + ratio * square))) @ sums.T
+        inner, side = weighted[:-1, :-1], weighted[:-1, -1]
+        variance = float(weighted[-1, -1] - side @ np.linalg.solve(inner, side)) / freedom
+        variance = max(variance, 1e-12)
+        deviance = freedom * np.log(variance) + np.log1p(ratio * square).sum() + np.linalg.slogdet(inner)[1]
+        if deviance < best:
+            best, found = deviance, GroupSpread(float(np.sqrt(ratio * variance)), float(np.sqrt(variance)))
+    return found
+
+
+ROUNDS: Final = 20
+"""Largest number of estimates; where links determine most transmitters well, three suffice."""
+
+LEAST: Final = 1e-3
+"""Lower limit of a spread, as a share of the width of the bounds, so that priors stay finite."""
+
+
+def estimate_spreads(problem: Problem, progress: Progress | None = None) -> Problem:
+    """Estimate the spread of every population of transmitters whose study leaves it open.
+
+    Args:
+        problem: The problem.
+        progress: Called with the stage "estimating spreads" after every estimate.
+
+    Returns:
+        The problem with these spreads in its study and priors; itself without such a population.
+    """
+    fields, parameters = estimated_fields(problem.setup.study), problem.parameters
+    if not fields or not problem.differentiable:
+        return problem
+    priors = {name: entry.prior for name, entry in problem.setup.study.parameters.items()}
+    shared = [name for name, prior in priors.items() if prior is not None and prior.shared]
+    members = {
+        field: [
+            number
+            for number, item in enumerate(parameters)
+            if item.name in shared and item.field == field and item.material != POSE + NEW
+        ]
+        for field in fields
+    }
+    starts, spreads = parameters.to_search(parameters.start)[None], dict.fromkeys(fields, np.inf)
+    if not all(members.values()):
+        return problem
+    for turn in range(ROUNDS):
+        fit = least_squares(problem, SEARCHES if turn == 0 else 1, starts)
+        starts, before = fit.minima[:SEARCHES], spreads
+        curvature = problem.squares(fit.best.x[None], derivatives=True).curvature[0]
+        variance = problem.objective.noise_db**2 * np.diag(np.linalg.pinv(curvature, hermitian=True))
+        spreads = {}
+        for field, numbers in members.items():
+            width = parameters.upper[numbers[0]] - parameters.lower[numbers[0]]
+            square = np.mean(fit.best.x[numbers] ** 2 + variance[numbers])
+            spreads[field] = float(max(np.sqrt(square), LEAST * width))
+        stated = problem.setup.study
+        study = Study.from_content(with_spreads(stated, spreads), stated.path)
+        problem = replace(problem, setup=replace(problem.setup, study=study), priors=study.priors)
+        if progress is not None:
+            progress("estimating spreads", turn + 1, ROUNDS)
+        if all(abs(spreads[field] / before[field] - 1) <= TOLERANCE for field in fields):
+            break
+    return estimate_noise(problem, progress)

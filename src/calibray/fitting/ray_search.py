@@ -12,7 +12,7 @@ from calibray.fitting.methods import AUTO, local_searches
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_mapping import MOST_CALLS, RayMap, map_rays, with_engine
 from calibray.fitting.search import Trail, least_squares
-from calibray.result.remark import Remark, RemarkKind
+from calibray.result.verdict import Remark, RemarkKind
 from calibray.study import Setup
 from calibray.support.progress import Progress
 

@@ -12,11 +12,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.measurements.averaging import average_samples
+from calibray.measurements.averaging import average_samples, merge_repeats
 from calibray.measurements.links import Measurements
 from calibray.measurements.placement import RX_COLUMNS, TX_COLUMNS, clear_buildings, place_rows
 from calibray.measurements.preparation import LinkColumns, Preparation, Quantity
-from calibray.measurements.repeats import merge_repeats
 from calibray.measurements.selection import select_rows
 from calibray.measurements.source_table import Coordinates, SourceTable
 from calibray.measurements.table_files import read_table

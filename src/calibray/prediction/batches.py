@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final
@@ -12,12 +13,13 @@ import pandas as pd
 from calibray.engines.cluster.chunks import CHUNK_LINKS, for_each_chunk, select_links, stated_chunk_size
 from calibray.engines.cluster.workers import InProcess, Workers
 from calibray.measurements import Measurements, PiecedTable
-from calibray.prediction.cost import announce
 from calibray.prediction.position_checks import remarks
 from calibray.prediction.predict import as_links, check_groups, interval, open_for_links
 from calibray.result.record import Record
 from calibray.study import Setup
+from calibray.support.messages import duration
 from calibray.support.progress import Progress, with_total
+from calibray.tracing.trace_plan import LANES_PER_SECOND
 
 BATCH: Final = 10_000
 """Links that are traced and evaluated together."""
@@ -154,3 +156,36 @@ def _predict_chunk(task: _Task, links: Measurements, progress: Progress | None =
     setup = task.setup.at(links)
     predictions = interval(task.result, setup, task.level, progress)
     return predictions.assign(remark=remarks(task.result, setup) if task.with_remarks else "")
+
+
+LOG: Final = logging.getLogger(__name__)
+"""Costs are logged before the work; the command line prints them."""
+
+
+def announce(result: Record, links: int, what: str = "links") -> None:
+    """Log how many links are traced, and about how long that takes.
+
+    Args:
+        result: The calibration.
+        links: Number of links.
+        what: What they are.
+    """
+    if result.prediction.model.parameters is None:
+        LOG.info("%s %s, predicted without a trace: the log-distance model uses no scene", f"{links:,}", what)
+        return
+    calibrated, seconds = len(result.links), _seconds(result, links)
+    time = f"up to about {duration(seconds)}" if seconds >= 2 else "less than 2 seconds"
+    LOG.info(
+        "Tracing %s %s: %s at the rate of the %s calibration links, less if they are cached",
+        f"{links:,}", what, time, f"{calibrated:,}",
+    )  # fmt: skip
+
+
+def _seconds(result: Record, links: int) -> float:
+    """Estimated duration of a trace [s].
+
+    The calibration may have taken its trace from the cache, so the estimate from the number of rays is a lower limit.
+    """
+    settings = result.study.trace
+    lanes = 0 if settings.adaptive else settings.rays * max(settings.max_depth, 1) * links
+    return max(result.cost.trace_seconds * links / len(result.links), lanes / LANES_PER_SECOND)

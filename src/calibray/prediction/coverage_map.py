@@ -19,13 +19,12 @@ from calibray.engines.cluster.workers import Workers
 from calibray.errors import InputError
 from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE
 from calibray.measurements import MIN_DISTANCE
-from calibray.prediction.batches import batch_size, predict_links
-from calibray.prediction.cost import announce
+from calibray.prediction.batches import announce, batch_size, predict_links
 from calibray.prediction.map_files import CoverageMap
 from calibray.prediction.observables import observable_columns
 from calibray.prediction.position_checks import INSIDE, is_indoors, locate
 from calibray.prediction.predict import as_links, open_for_links
-from calibray.result.prediction_model import NO_PATH
+from calibray.result.held_out import NO_PATH
 from calibray.result.record import Record
 from calibray.scenes import Triangles, ground_heights, read_triangles
 from calibray.study import Study

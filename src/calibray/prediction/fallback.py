@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calibray.measurements import Measurements
 from calibray.prediction.nuisance_shift import model_terms, nuisance_shift
-from calibray.result.prediction_model import NO_PATH
+from calibray.result.held_out import NO_PATH
 from calibray.result.record import Prediction
 from calibray.study import Study
 from calibray.validation.baselines import without_scene

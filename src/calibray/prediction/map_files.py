@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from calibray.coordinates import Frame, parse_crs
 from calibray.errors import InputError
-from calibray.result.prediction_model import NO_PATH
+from calibray.result.held_out import NO_PATH
 from calibray.scenes.buildings import footprints
 from calibray.scenes.triangles import Triangles
 from calibray.support.figure_style import FAINT, INK, LINE, ORANGE, PAPER, dress, styled, write

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE, OFFSET, UNKNOWN_DB, transmitters
 from calibray.measurements import Measurements
-from calibray.result.prediction_model import PredictionModel
+from calibray.result.held_out import PredictionModel
 
 TRANSMITTER: Final = "transmitter"
 """`FittedTerm.per` of a term with one coefficient per transmitter, which needs no column."""

@@ -22,8 +22,7 @@ from calibray.prediction.nuisance_shift import model_terms, nuisance_shift
 from calibray.prediction.observables import Replayed, further_observables
 from calibray.prediction.position_checks import POSITION_COLUMNS, remarks
 from calibray.prediction.residual_field import calibration_residuals, krige_residuals
-from calibray.result.held_out import Model
-from calibray.result.prediction_model import PredictionModel
+from calibray.result.held_out import Model, PredictionModel
 from calibray.result.record import Record
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study import Setup, Study

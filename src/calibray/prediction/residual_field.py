@@ -17,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
-from calibray.result.prediction_model import ResidualField
+from calibray.result.held_out import ResidualField
 
 MOST_EXACT: Final = 1000
 """Most measured links that are all used at every new link; with more, only the nearest ones are used."""

@@ -15,7 +15,7 @@ from calibray.errors import InputError
 from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, Term
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.measurements import Measurements
-from calibray.prediction.cost import announce
+from calibray.prediction.batches import announce
 from calibray.prediction.experiment_design import (
     UNIFORM_INFORMATION,
     Beliefs,

@@ -16,7 +16,7 @@ from calibray.result.verdict import Verdict
 from calibray.result.wording import explanation_text, interval_text
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import decibels, rows_text
-from calibray.tracing.positions import EnclosedAntennas
+from calibray.tracing.protocol import EnclosedAntennas
 from calibray.validation.validation import Validation, observables_table
 
 MARKS: Final[dict[str, str]] = {

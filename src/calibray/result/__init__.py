@@ -1,8 +1,7 @@
 """The record of a finished calibration: sections of plain data, their files, and their wording."""
 
 from calibray.result.files import FILES
-from calibray.result.held_out import HeldOutErrors, Judgement
-from calibray.result.prediction_model import FittedTerm, PredictionModel, ResidualField
+from calibray.result.held_out import FittedTerm, HeldOutErrors, Judgement, PredictionModel, ResidualField
 from calibray.result.record import (
     Accuracy,
     Cost,
@@ -13,8 +12,7 @@ from calibray.result.record import (
     Record,
     Uncertainty,
 )
-from calibray.result.remark import Remark, RemarkKind
-from calibray.result.verdict import Interval, Reason, ReasonKind, Verdict
+from calibray.result.verdict import Interval, Reason, ReasonKind, Remark, RemarkKind, Verdict
 
 __all__ = [
     "FILES",

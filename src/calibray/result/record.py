@@ -10,13 +10,17 @@ from pydantic import Field
 
 from calibray.materials import Material
 from calibray.paths import Paths
-from calibray.result.held_out import HeldOutErrors, Judgement, ObservableErrors
-from calibray.result.prediction_model import PredictionModel, ResidualField
-from calibray.result.remark import Remark
-from calibray.result.verdict import Interval
+from calibray.result.held_out import (
+    HeldOutErrors,
+    Judgement,
+    ObservableErrors,
+    PredictionModel,
+    ResidualField,
+)
+from calibray.result.verdict import Interval, Remark
 from calibray.scenes import Scene
 from calibray.study import Study
-from calibray.tracing.positions import EnclosedAntennas
+from calibray.tracing.protocol import EnclosedAntennas
 
 # `files` validates the sections with Pydantic when it reads them; these are the bounds of their numbers.
 NonNegative = Annotated[float, Field(ge=0)]

@@ -7,8 +7,7 @@ from typing import Any, Final
 
 from calibray.result.held_out import WITHOUT_MATERIALS, Judgement, Model
 from calibray.result.record import Record
-from calibray.result.remark import Remark, RemarkKind
-from calibray.result.verdict import Cause, Interval, Reason, ReasonKind
+from calibray.result.verdict import Cause, Interval, Reason, ReasonKind, Remark, RemarkKind
 from calibray.support.messages import percent
 
 MOST_ODDS: Final = 1000.0

@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
+from scipy.constants import speed_of_light
 
 from calibray.errors import InputError
 from calibray.materials import DEFAULT_REVISION, Material, itu_law, itu_material
-from calibray.parameters.laws import frequency_independent_law
-from calibray.paths import Paths
+from calibray.parameters import Parameters
+from calibray.parameters.laws import ROUGHNESS, frequency_independent_law
+from calibray.paths import Kind, Paths
 from calibray.scenes import Scene, check_material_name
 from calibray.study.regions import Place, read_polygons
 from calibray.support.lazy_imports import library
@@ -22,7 +24,9 @@ from calibray.support.messages import did_you_mean, shortened
 from calibray.support.strict_models import Section, Text
 
 if TYPE_CHECKING:
+    from calibray.fields import Effects
     from calibray.scenes.checks import SceneSurfaces
+
 
 NEAR: Final = 0.5
 """Distance from a polygon up to which a wall belongs to it [m]: walls stand on the outlines of buildings."""
@@ -225,3 +229,38 @@ def _walls(
     outward = np.where((front & ~back)[:, None], -outward, outward)
     bearing = np.degrees(np.arctan2(outward[:, 0], outward[:, 1])) % 360
     return bearing, along, length
+
+
+def roughness_effects(stated: Mapping[str, float], parameters: Parameters, paths: Paths) -> Effects:
+    """The loss of specular reflections on rough surfaces; none if no material is rough.
+
+    Args:
+        stated: Standard deviation of the surface heights by material, where it is stated [mm].
+        parameters: The study's parameters.
+        paths: The paths.
+    """
+    names = [parameters.names[index] for index in parameters.of_effects]
+    number = {
+        name.removesuffix(f".{ROUGHNESS}"): index
+        for index, name in enumerate(names)
+        if name.endswith(f".{ROUGHNESS}")
+    }
+    rough = [name for name in paths.materials if stated.get(name) or name in number]
+    if not rough:
+        return ()
+    # JAX is slow to import, and every study file that is read imports this module.
+    from calibray.fields import RoughSurfaces
+
+    path = np.repeat(np.arange(paths.num_paths), np.diff(paths.first))
+    specular = paths.kind == Kind.SPECULAR
+    known = list(paths.materials)
+    square = [
+        np.bincount(
+            path, (specular & (paths.material == known.index(name))) * paths.cos_incidence**2, paths.num_paths
+        )
+        for name in rough
+    ]
+    per_mm = 8 * (np.pi * 1e-3 * paths.frequency / speed_of_light) ** 2
+    heights = np.array([stated.get(name, 0.0) for name in rough])
+    exponent = np.asarray(per_mm * np.stack(square, axis=1), dtype=np.float64)
+    return (RoughSurfaces(exponent, heights, tuple(map(number.get, rough))),)

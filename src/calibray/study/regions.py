@@ -122,7 +122,7 @@ class RegionSection(Section):
         if path is None:
             outline = np.array([shapely.box(*box) for box in self.boxes])
         elif self.canopy is not None:
-            from calibray.scenes.authoring.canopy import read_canopy
+            from calibray.scenes.authoring.trees import read_canopy
 
             bounds = place.surfaces().bounds[[0, 1, 3, 4]]
             outline, top = read_canopy(path, _known(place.frame, path), bounds)

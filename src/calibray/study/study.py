@@ -41,19 +41,26 @@ from calibray.scenes.scene_file import read_content as scene_content
 from calibray.study.displacement import (
     RECEIVER,
     Displacement,
+    averaged,
     check_labels,
+    displaced,
     displacement_loss,
     displacements,
     displaces,
+    mounted_at_displaced,
+    spread_db,
 )
-from calibray.study.facades import with_facade_materials, with_facades, without_facade_materials
+from calibray.study.facades import (
+    roughness_effects,
+    with_facade_materials,
+    with_facades,
+    without_facade_materials,
+)
 from calibray.study.link_obstruction import with_obstruction
 from calibray.study.model import StudyModel
 from calibray.study.mounting import link_mountings, pose_effects
 from calibray.study.population import with_population
-from calibray.study.position_errors import averaged, displaced, mounted_at_displaced, spread_db
 from calibray.study.regions import region_effects
-from calibray.study.roughness import roughness_effects
 from calibray.study.row_steps import (
     link_columns,
     position_steps,
@@ -71,8 +78,7 @@ from calibray.tables import display
 from calibray.tracing import cache
 from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.mounting import POSE, Mounting, mount
-from calibray.tracing.positions import EnclosedAntennas
-from calibray.tracing.protocol import Tracer, TracerFactory
+from calibray.tracing.protocol import EnclosedAntennas, Tracer, TracerFactory
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.trace_plan import LONG_TRACE_SECONDS
 

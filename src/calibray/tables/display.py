@@ -7,9 +7,8 @@ from dataclasses import replace
 from typing import Final
 
 from calibray.support.messages import printable
-from calibray.tables import html as markup
-from calibray.tables import text as plain
 from calibray.tables.table import Table
+from calibray.tables.text import render, render_html
 
 ROWS: Final = 10
 """Most rows of a table; the rest is only counted."""
@@ -23,12 +22,12 @@ SENTENCE: Final = 200
 
 def text(*parts: Table | str) -> str:
     """Plain text for `__repr__`, with long tables and cells cut, and control characters escaped."""
-    return plain.render(*_fitted(parts))
+    return render(*_fitted(parts))
 
 
 def html(*parts: Table | str) -> str:
     """HTML for `_repr_html_`, with long tables and cells cut, and all text escaped."""
-    return markup.render(*_fitted(parts))
+    return render_html(*_fitted(parts))
 
 
 def named(names: Iterable[str], count: int = 4) -> str:

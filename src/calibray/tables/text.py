@@ -1,8 +1,12 @@
-"""Tables as plain text, for terminals, files and pipes. Control characters are escaped, since names come from files."""
+"""Tables and sentences as plain text for terminals, files and pipes, as HTML and as Markdown.
+
+Control characters and markup are escaped, since names come from files.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from html import escape
 from io import StringIO
 from typing import Final
 
@@ -36,6 +40,24 @@ def render(*parts: Table | str) -> str:
     return "\n\n".join(
         printable(part, "\n") if isinstance(part, str) else _lines(part) for part in parts if part
     )
+
+
+def render_html(*parts: Table | str) -> str:
+    """Render tables and sentences as HTML: elements `p` and `table`, without scripts and links.
+
+    Example:
+        >>> render_html("a < b")
+        '<p>a &lt; b</p>'
+    """
+    return "\n".join(
+        f"<p>{escape(part)}</p>" if isinstance(part, str) else _html_table(part) for part in parts if part
+    )
+
+
+def render_markdown(table: Table) -> str:
+    """Render a table in Markdown, without a title above it and a line break at the end."""
+    rules = ["---" if column.align == "left" else "---:" for column in table.columns]
+    return "\n".join(_markdown_line(line) for line in [table.headings, rules, *table.rows])
 
 
 def rows_text(rows: Sequence[int]) -> str:
@@ -73,3 +95,25 @@ def _lines(table: Table) -> str:
         console.print(grid)
     lines = [line.rstrip() for line in shown.get().splitlines()]
     return "\n".join([printable(table.title), *lines] if table.titled else lines)
+
+
+def _html_table(table: Table) -> str:
+    caption = f"<caption>{escape(table.title)}</caption>" if table.title else ""
+    headings = [column.heading for column in table.columns]
+    head = f"<thead>{_html_row(table, 'th', headings)}</thead>" if any(headings) else ""
+    body = "".join(_html_row(table, "td", row) for row in table.rows)
+    return f"<table>{caption}{head}<tbody>{body}</tbody></table>"
+
+
+def _html_row(table: Table, tag: str, cells: list[str] | tuple[str, ...]) -> str:
+    return "<tr>{}</tr>".format(
+        "".join(
+            f'<{tag} style="text-align: {column.align}">{escape(cell)}</{tag}>'
+            for column, cell in zip(table.columns, cells, strict=True)
+        )
+    )
+
+
+def _markdown_line(cells: Iterable[str]) -> str:
+    escaped = (printable(cell).replace("|", r"\|") for cell in cells)
+    return f"| {' | '.join(escaped)} |"

@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from calibray.tracing.convergence import Convergence as Convergence
     from calibray.tracing.default_tracer import SIONNA as SIONNA
     from calibray.tracing.gain_table import read_gain_table as read_gain_table
-    from calibray.tracing.positions import EnclosedAntennas as EnclosedAntennas
-    from calibray.tracing.positions import link_positions as link_positions
+    from calibray.tracing.protocol import EnclosedAntennas as EnclosedAntennas
     from calibray.tracing.protocol import Links as Links
     from calibray.tracing.protocol import Solution as Solution
     from calibray.tracing.protocol import Tracer as Tracer
     from calibray.tracing.protocol import TracerFactory as TracerFactory
     from calibray.tracing.protocol import compile_paths as compile_paths
+    from calibray.tracing.protocol import link_positions as link_positions
     from calibray.tracing.settings import Antenna as Antenna
     from calibray.tracing.settings import TraceSettings as TraceSettings
     from calibray.tracing.trace_plan import TracePlan as TracePlan
@@ -29,7 +29,7 @@ _HOMES = {
     "Antenna": "calibray.tracing.settings",
     "AntennaPattern": "calibray.tracing.antennas",
     "Convergence": "calibray.tracing.convergence",
-    "EnclosedAntennas": "calibray.tracing.positions",
+    "EnclosedAntennas": "calibray.tracing.antennas",
     "Links": "calibray.tracing.protocol",
     "SIONNA": "calibray.tracing.default_tracer",
     "Solution": "calibray.tracing.protocol",
@@ -38,7 +38,7 @@ _HOMES = {
     "Tracer": "calibray.tracing.protocol",
     "TracerFactory": "calibray.tracing.protocol",
     "compile_paths": "calibray.tracing.protocol",
-    "link_positions": "calibray.tracing.positions",
+    "link_positions": "calibray.tracing.antennas",
     "plan_trace": "calibray.tracing.trace_plan",
     "read_gain_table": "calibray.tracing.gain_table",
 }

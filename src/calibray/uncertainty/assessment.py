@@ -15,8 +15,7 @@ from calibray.fitting.cheap_replay import ReplayedModel
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, find_minima, relevant_minima
 from calibray.parameters import Parameters
-from calibray.result.remark import Remark, RemarkKind
-from calibray.result.verdict import CONFIDENCE, Interval, Reason, ReasonKind, Verdict
+from calibray.result.verdict import CONFIDENCE, Interval, Reason, ReasonKind, Remark, RemarkKind, Verdict
 from calibray.support.memory import single_blas_thread
 from calibray.support.progress import Progress
 from calibray.uncertainty.buildings import can_split

@@ -20,7 +20,7 @@ from scipy.special import fdtrc, ndtri, stdtr
 from calibray.fitting.preliminary_fits import with_estimated_errors
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import BASINS, least_squares
-from calibray.result.remark import Remark, RemarkKind, Value
+from calibray.result.verdict import Remark, RemarkKind, Value
 
 SIGNIFICANT: Final = 0.005
 """Probability of a larger increase without a conflict, below which one is reported; errors that neighbouring links

@@ -13,8 +13,7 @@ from scipy.special import fdtri
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import BASINS, Trail, least_squares, relevant_minima
-from calibray.result.remark import Remark, RemarkKind, Value
-from calibray.result.verdict import CONFIDENCE, Interval
+from calibray.result.verdict import CONFIDENCE, Interval, Remark, RemarkKind, Value
 from calibray.result.wording import MOST_ODDS
 from calibray.uncertainty.draws import Draws
 from calibray.uncertainty.joint_model import has_offset

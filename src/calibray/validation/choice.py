@@ -19,8 +19,7 @@ from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.materials import Material
-from calibray.result.held_out import WITHOUT_MATERIALS, Model
-from calibray.result.prediction_model import BlockErrors, FittedTerm, PredictionModel
+from calibray.result.held_out import WITHOUT_MATERIALS, BlockErrors, FittedTerm, Model, PredictionModel
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study import Study
 from calibray.validation.baselines import (

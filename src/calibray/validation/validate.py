@@ -24,8 +24,7 @@ from calibray.support.progress import Progress
 from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.protocol import TracerFactory
 from calibray.validation.baselines import has_obstruction, kriging, log_distance, obstructed, without_scene
-from calibray.validation.held_out_statistics import spatial_blocks
-from calibray.validation.observables import MODELS, held_out_gaps, observable_errors
+from calibray.validation.held_out_statistics import MODELS, held_out_gaps, observable_errors, spatial_blocks
 from calibray.validation.validation import Validation
 from calibray.validation.variants import NO_MINIMA, add_nuisance, fit_variants
 

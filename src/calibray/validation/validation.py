@@ -22,12 +22,12 @@ from calibray.result.held_out import (
     BASELINES,
     FITTED,
     WITHOUT_MATERIALS,
+    BlockErrors,
     HeldOutErrors,
     Judgement,
     Model,
     ObservableErrors,
 )
-from calibray.result.prediction_model import BlockErrors
 from calibray.result.wording import choice_text, judgement_text
 from calibray.support.messages import percent
 from calibray.tables import Column, Table, display, numbers

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import hmac
 import secrets
 import socket
 from collections.abc import Callable
+from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
+from typing import Any, Final, final
+from urllib.parse import parse_qs
 
 import uvicorn
 from fastapi import FastAPI
@@ -15,7 +19,6 @@ from nicegui import run, ui
 from calibray.errors import InputError
 from calibray.window.desk import Desk
 from calibray.window.folder import StudyFolder
-from calibray.window.guard import Guard
 from calibray.window.page import build
 from calibray.window.plan import findings, plan
 
@@ -110,3 +113,115 @@ def _listen(port: int) -> socket.socket:
             f"--port {port}: cannot be opened ({error}); give another, or 0 for a free one"
         ) from None
     return listening
+
+
+POLICY: Final = (
+    # NiceGUI compiles its templates in the browser, which needs eval; nothing is loaded from elsewhere.
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; frame-src 'self'; worker-src 'self' blob:; "
+    "object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'self'"
+)
+HEADERS: Final = (
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"x-frame-options", b"SAMEORIGIN"),
+)
+
+
+@final
+class Guard:
+    """An ASGI application that refuses requests before they reach another one.
+
+    Args:
+        app: The application.
+        token: The secret of this session.
+        port: The port that the server listens on.
+    """
+
+    def __init__(self, app: Any, token: str, port: int) -> None:
+        self._app, self._token, self._port = app, token.encode(), port
+        self._hosts = {f"{name}:{port}".encode() for name in ("127.0.0.1", "localhost")}
+        # Cookies do not tell ports apart, so the name does.
+        self._cookie = f"calibray_{port}"
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        """Answer a request, or pass it on."""
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        headers = dict(scope["headers"])
+        fault = self._fault(scope, headers)
+        entering = scope["type"] == "http" and scope["path"] == "/" and self._given(scope)
+        if fault is None and entering:
+            # The token leaves the address bar and the history; the cookie stands for it.
+            cookie = f"{self._cookie}={self._token.decode()}; HttpOnly; SameSite=Strict; Path=/".encode()
+            await _answer(send, 303, b"", ((b"location", b"/"), (b"set-cookie", cookie)))
+        elif fault is not None or not self._known(headers):
+            text = fault or "open the address that `calibray open` printed: this one has no valid token"
+            await _refuse(scope, receive, send, 400 if fault else 403, text)
+        else:
+            await self._app(scope, receive, _with_headers(send))
+
+    def _fault(self, scope: Any, headers: dict[bytes, bytes]) -> str | None:
+        """What is wrong with a request whoever sent it; None if nothing is."""
+        path = scope["path"]
+        if ".." in path.split("/") or "\\" in path or not path.isprintable():
+            return "the path leads out of the window"
+        if headers.get(b"host") not in self._hosts:
+            return "the request names another host"
+        origins = {b"http://" + host for host in self._hosts}
+        if b"origin" in headers and headers[b"origin"] not in origins:
+            return "the request comes from another origin"
+        # Another port of this machine is the same site, so SameSite=Strict alone would let it pass.
+        if headers.get(b"sec-fetch-site", b"none") not in {b"none", b"same-origin"}:
+            return "the request comes from another site"
+        return None
+
+    def _given(self, scope: Any) -> bool:
+        """Whether the address has the token."""
+        query = parse_qs(scope["query_string"].decode("latin-1"))
+        return self._same(query.get("token", [""])[0])
+
+    def _known(self, headers: dict[bytes, bytes]) -> bool:
+        """Whether the cookie has the token."""
+        try:
+            cookies = SimpleCookie(headers.get(b"cookie", b"").decode("latin-1"))
+        except CookieError:
+            return False
+        return self._cookie in cookies and self._same(cookies[self._cookie].value)
+
+    def _same(self, token: str) -> bool:
+        return hmac.compare_digest(token.encode("utf-8", "replace"), self._token)
+
+
+async def _refuse(scope: Any, receive: Any, send: Any, status: int, text: str) -> None:
+    if scope["type"] == "websocket":
+        await receive()
+        await send({"type": "websocket.close", "code": 1008})
+    else:
+        await _answer(send, status, f"Refused: {text}\n".encode(), ())
+
+
+async def _answer(send: Any, status: int, body: bytes, headers: tuple[tuple[bytes, bytes], ...]) -> None:
+    kind = (b"content-type", b"text/plain; charset=utf-8")
+    length = (b"content-length", str(len(body)).encode())
+    fields = [kind, length, *HEADERS, *headers]
+    await send({"type": "http.response.start", "status": status, "headers": fields})
+    await send({"type": "http.response.body", "body": body})
+
+
+def _with_headers(send: Any) -> Any:
+    """Add the headers of the window to answers, which may bring a stricter policy of their own."""
+
+    async def sending(message: Any) -> None:
+        if message["type"] == "http.response.start":
+            names = {name.lower() for name, _ in message["headers"]}
+            policy = (
+                ()
+                if b"content-security-policy" in names
+                else ((b"content-security-policy", POLICY.encode()),)
+            )
+            message = {**message, "headers": [*message["headers"], *HEADERS, *policy]}
+        await send(message)
+
+    return sending

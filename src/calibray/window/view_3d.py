@@ -9,8 +9,7 @@ from typing import Any, Final
 import numpy as np
 from nicegui import run, ui
 
-from calibray.window.desk import Desk
-from calibray.window.solid import RADIUS, Solid, solid
+from calibray.window.desk import RADIUS, Desk, Solid, solid
 
 COLORS: Final = ("#8f9aa3", "#56b4e9", "#e69f00", "#009e73", "#cc79a7", "#f0e442", "#0072b2", "#d55e00")
 """Grey, then those of Okabe and Ito, which colour-blind people can distinguish (jfly.uni-koeln.de/color)."""

@@ -30,10 +30,11 @@ from calibray.engines.ledger.database import (
     insert_answer,
     insert_problem,
     read_entry,
+    rescue_files,
     set_up,
     transaction,
+    write_rescue_file,
 )
-from calibray.engines.ledger.rescue import rescue_files, write_rescue_file
 from calibray.errors import EngineError, InputError
 
 LEDGER_FILE: Final = "ledger.sqlite"

@@ -26,8 +26,7 @@ from calibray.scenes import Scene
 from calibray.support.interruption import unwrap_interruption
 from calibray.support.memory import available_memory
 from calibray.support.progress import Progress
-from calibray.tracing.positions import link_positions
-from calibray.tracing.protocol import Links, Solution
+from calibray.tracing.protocol import Links, Solution, link_positions
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna.adaptive_sampling import AdaptiveSearch, SequenceCache
 from calibray.tracing.sionna.buffers import TracedBuffer, drop_repeats, reverse, to_points
