@@ -52,9 +52,9 @@ def test_demo_comparison_and_diagnosis_are_printed_as_stored():
 def test_tables_and_figures_import_no_ray_tracer():
     code = """
 import importlib, sys
-for name in ("calibray.doctor", "calibray.comparison.comparison", "calibray.comparison.demo"):
+for name in ("calibray.doctor", "calibray.comparison.comparison"):
     importlib.import_module(name)
-for name in "figures result_tables trace_tables".split():
+for name in "figures result_tables scene_tables".split():
     importlib.import_module(f"calibray.reporting.{name}")
 heavy = ("jax", "drjit", "mitsuba", "sionna")
 print([name for name in heavy if name in sys.modules])
