@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 import pandas as pd
@@ -46,6 +46,7 @@ from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study import Setup, Study
 from calibray.study.facades import without_facade_materials
 from calibray.study.link_obstruction import REGION
+from calibray.study.model import StudyModel
 from calibray.tracing.protocol import EnclosedAntennas
 from calibray.uncertainty.assessment import Certainty
 from calibray.uncertainty.noise_models import HEAVY
@@ -156,7 +157,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
         predictions = fill_missing(prediction, study, links, predictions)
         table = table.assign(predicted_db=predictions["path_loss_db"], basis=predictions["basis"])
     return Result(
-        study=study,
+        study=cast(Study, study),
         fit=Fit(
             parameters=parameters.named(trail.best),
             initial_parameters=parameters.named(parameters.start),
@@ -206,7 +207,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
     )
 
 
-def _not_judged(study: Study, accuracy: Accuracy) -> tuple[Remark, ...]:
+def _not_judged(study: StudyModel, accuracy: Accuracy) -> tuple[Remark, ...]:
     """A remark if no link was held out, although replay could hold blocks out at little cost."""
     if accuracy.judgement is None and (not study.engine.expensive or study.engine.exports_rays):
         return (Remark(RemarkKind.NOT_JUDGED),)
@@ -275,7 +276,9 @@ def _obstruction(setup: Setup) -> dict[str, NDArray[np.float64]]:
     return {name: table.numbers(name) for name in names}
 
 
-def _as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
+def _as_measured(
+    study: StudyModel, links: Measurements, table: pd.DataFrame
+) -> dict[str, NDArray[np.float64]]:
     """Columns in the measured quantity, path gain or received power; none where path loss was measured."""
     quantity, column = study.links.quantity, study.links.value
     if quantity == "path_loss" or column not in links.frame:

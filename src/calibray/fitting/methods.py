@@ -13,7 +13,8 @@ from calibray.fitting.problem import Problem
 from calibray.optimizers import METHODS, Optimizer
 from calibray.optimizers.multifidelity.cheap_model import CheapModel
 from calibray.parameters import Parameters
-from calibray.study import Setup, Study
+from calibray.study import Setup
+from calibray.study.model import StudyModel
 from calibray.support.messages import did_you_mean
 
 AUTO: Final = "auto"
@@ -73,7 +74,7 @@ def check_fit(setup: Setup) -> None:
 
 
 def _make(
-    study: Study,
+    study: StudyModel,
     parameters: Parameters,
     differentiable: bool,
     interactions: int | None,

@@ -27,7 +27,8 @@ from calibray.fitting.sums_of_squares import Share, rows, total
 from calibray.measurements import Measurements
 from calibray.measurements.observables import Statistic
 from calibray.parameters import NO_PRIOR, LogNormal, Parameters
-from calibray.study import Setup, Study
+from calibray.study import Setup
+from calibray.study.model import StudyModel
 
 
 class Evaluation(NamedTuple):
@@ -364,7 +365,7 @@ class Problem:
         return self.engine
 
 
-def study_nuisance(study: Study, links: Measurements) -> Nuisance:
+def study_nuisance(study: StudyModel, links: Measurements) -> Nuisance:
     """Make the nuisance that a study declares: its offset, for all links or per group, and its further terms.
 
     Args:
@@ -391,7 +392,7 @@ def study_nuisance(study: Study, links: Measurements) -> Nuisance:
     return Nuisance(len(links), tuple(terms))
 
 
-def _noise(study: Study, links: Measurements) -> float:
+def _noise(study: StudyModel, links: Measurements) -> float:
     """Declared standard deviation of a link's error at the mean weight [dB]; 1 until it is estimated."""
     if study.links.position_error_m is not None:
         return float(1.0 / np.sqrt(links.weight.mean()))

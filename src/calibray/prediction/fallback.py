@@ -10,14 +10,14 @@ from calibray.measurements import Measurements
 from calibray.prediction.nuisance_shift import model_terms, nuisance_shift
 from calibray.result.held_out import NO_PATH
 from calibray.result.record import Prediction
-from calibray.study import Study
+from calibray.study.model import StudyModel
 from calibray.validation.baselines import without_scene
 from calibray.validation.held_out_statistics import interval_half_width
 
 
 def fill_missing(
     prediction: Prediction,
-    study: Study,
+    study: StudyModel,
     links: Measurements,
     table: pd.DataFrame,
     level: float | None = None,

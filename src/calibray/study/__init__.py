@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING
 from calibray.support.lazy_imports import lazy_attributes
 
 if TYPE_CHECKING:
-    from calibray.study.model import VERSION as VERSION
-    from calibray.study.study import Setup as Setup
+    from calibray.study.content import VERSION as VERSION
+    from calibray.study.setup import Setup as Setup
     from calibray.study.study import Study as Study
     from calibray.study.toml_file import expand as expand
 
 _HOMES = {
-    "VERSION": "calibray.study.model",
-    "Setup": "calibray.study.study",
+    "VERSION": "calibray.study.content",
+    "Setup": "calibray.study.setup",
     "Study": "calibray.study.study",
     "expand": "calibray.study.toml_file",
 }

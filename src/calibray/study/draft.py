@@ -21,9 +21,9 @@ from calibray.measurements.planner_columns import plain_name
 from calibray.scenes import Scene, read_frame, read_scene
 from calibray.scenes.authoring import TREES_FILE
 from calibray.scenes.checks import count_crossings
+from calibray.study.content import BUNDLED, VERSION
 from calibray.study.draft_links import Assumption, LinksDraft
 from calibray.study.link_checks import LINKS_PER_UNKNOWN, count_unknowns
-from calibray.study.model import BUNDLED, VERSION
 from calibray.study.regions import Place, RegionSection, dense_trees
 from calibray.study.study import Study
 from calibray.study.toml_file import study_text

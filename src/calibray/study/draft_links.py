@@ -29,8 +29,8 @@ from calibray.measurements.planner_columns import find_powers
 from calibray.measurements.selection import comparison, find_codes, without_codes
 from calibray.scenes import read_frame
 from calibray.scenes.checks import SceneSurfaces
+from calibray.study.content import BUNDLED, VERSION
 from calibray.study.link_checks import CELL_SHARE, FAR
-from calibray.study.model import BUNDLED, VERSION
 from calibray.study.study import Study
 
 RECEIVER_HEIGHT: Final = 1.5

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Final
 
 from calibray.coordinates import WGS84, Frame
 from calibray.errors import InputError
-from calibray.measurements import Averaging, LinkColumns, Preparation, Track, read_table
+from calibray.measurements import (
+    Averaging,
+    LinkColumns,
+    Measurements,
+    Preparation,
+    Track,
+    measured_links,
+    read_table,
+)
 from calibray.study.model import StudyModel
 from calibray.study.mounting import PORT_POWER, mounting_columns, port_power, states_port_power
 from calibray.study.regions import Place
@@ -20,6 +28,15 @@ if TYPE_CHECKING:
 
 _COLUMN_KEYS: Final = {"tx", "rx", "value", "quantity", "weight", "std", "tx_power_dbm", "frequency"}
 """Keys of ``[links]`` that are fields of `LinkColumns`."""
+
+
+def study_links(study: StudyModel) -> Measurements:
+    """All links of a study, held-out ones included.
+
+    Raises:
+        InputError: The table cannot be used, or the scene's place on the globe is unknown.
+    """
+    return measured_links(read_table(study.links_path), link_columns(study), row_steps(study))
 
 
 def link_columns(study: StudyModel) -> LinkColumns:

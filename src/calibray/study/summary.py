@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from calibray.study.model import OFFSET, StudyModel
-from calibray.study.sections import HoldoutSection
+from calibray.study.calibration_sections import HoldoutSection
+from calibray.study.content import OFFSET
+from calibray.study.model import StudyModel
 from calibray.tables import Column, Table, numbers
 from calibray.tables.display import hertz
 

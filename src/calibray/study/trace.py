@@ -20,7 +20,8 @@ from calibray.materials import Material
 from calibray.measurements import Measurements, SourceTable
 from calibray.paths import Paths
 from calibray.scenes import Scene, read_scene
-from calibray.study.study import Setup, Study
+from calibray.study.setup import Setup
+from calibray.study.study import Study
 from calibray.support.progress import Progress
 from calibray.tracing import default_tracer
 from calibray.tracing.protocol import Links

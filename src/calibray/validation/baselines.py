@@ -15,7 +15,7 @@ from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE, UNBOUNDED, Nuisanc
 from calibray.fitting.objective import Objective
 from calibray.measurements import Measurements
 from calibray.scenes.obstruction import OUT_OF_SIGHT, WALLS
-from calibray.study import Study
+from calibray.study.model import StudyModel
 from calibray.study.mounting import direct_gain
 from calibray.uncertainty.residual_correlation import fit_correlation
 
@@ -37,7 +37,7 @@ MOST_KRIGED: Final = 1000
 """Most links to krige from: fitting the correlation factors their covariance some hundred times."""
 
 
-def without_scene(study: Study, links: Measurements) -> NDArray[np.float64]:
+def without_scene(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
     """What a model without a scene knows of path loss: the free-space rise over carriers, minus the antennas' gain.
 
     Path loss rises by 20 log10(f / f0) from the study's carrier f0. The gain is that of the stated antennas along the

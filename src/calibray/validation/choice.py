@@ -21,7 +21,7 @@ from calibray.fitting.search import Trail
 from calibray.materials import Material
 from calibray.result.held_out import WITHOUT_MATERIALS, BlockErrors, FittedTerm, Model, PredictionModel
 from calibray.scenes.obstruction import OUT_OF_SIGHT
-from calibray.study import Study
+from calibray.study.model import StudyModel
 from calibray.validation.baselines import (
     OUT_OF_SIGHT_DB,
     log_distance_objective,
@@ -142,7 +142,7 @@ def fit_prediction_model(
     return FittedModel(model, materials, path_loss_db, scene_db)
 
 
-def with_prior_mean(terms: tuple[FittedTerm, ...], study: Study) -> tuple[FittedTerm, ...]:
+def with_prior_mean(terms: tuple[FittedTerm, ...], study: StudyModel) -> tuple[FittedTerm, ...]:
     """The terms of the log-distance model with obstruction, the loss out of sight with the mean of its prior.
 
     The fit takes that mean as known. A nuisance of the study by the same column has no such prior.
@@ -172,7 +172,7 @@ def quantiles(absolute_errors: NDArray[np.float64]) -> tuple[float, ...]:
 
 
 def fitted_terms(
-    objective: Objective, path_loss_db: NDArray[np.float64], study: Study
+    objective: Objective, path_loss_db: NDArray[np.float64], study: StudyModel
 ) -> tuple[FittedTerm, ...]:
     """Nuisance terms with the coefficients that fit best.
 

@@ -33,7 +33,7 @@ from calibray.result.held_out import (
     Model,
     ObservableErrors,
 )
-from calibray.study import Study
+from calibray.study.model import StudyModel
 
 Errors = Mapping[Any, NDArray[np.float64]]
 """Residuals by model, a `Model` or its name [n], [dB]."""
@@ -275,7 +275,9 @@ def held_out_gaps(
     return gaps
 
 
-def observable_errors(gaps: Mapping[str, NDArray[np.float64]], study: Study) -> dict[str, ObservableErrors]:
+def observable_errors(
+    gaps: Mapping[str, NDArray[np.float64]], study: StudyModel
+) -> dict[str, ObservableErrors]:
     """Root mean squares of gaps [3, L] by name of the observable; none without a judged link."""
     found = {}
     for name, gap in gaps.items():

@@ -20,6 +20,7 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.ray_search import maps_rays, search_rays
 from calibray.result.held_out import Model
 from calibray.study import Setup, Study
+from calibray.study.model import StudyModel
 from calibray.support.progress import Progress
 from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.protocol import TracerFactory
@@ -83,7 +84,7 @@ def validate(
     return validate_problem(estimate_noise(leave_out_near_floor(problem)), blocks, by, progress)
 
 
-def check_engine(study: Study) -> None:
+def check_engine(study: StudyModel) -> None:
     """Refuse an engine on which a dozen calibrations would be too expensive.
 
     Args:

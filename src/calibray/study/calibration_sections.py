@@ -1,0 +1,365 @@
+"""The sections of a study file that say what is calibrated and how, each a closed model: an unknown key is an error."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from inspect import Parameter, signature
+from math import isfinite
+from typing import Annotated, Any, Final, Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from calibray.errors import InputError
+from calibray.parameters import Scale, itu_start
+from calibray.support.messages import did_you_mean, shortened
+from calibray.support.strict_models import Section, Text
+
+
+class ObjectiveSection(Section):
+    """``[objective]``: how paths combine to a path loss, and how a link without a path counts.
+
+    Attributes:
+        combining: "power" (sum of path powers), "coherent" (sum of fields) or "band" (coherent power averaged
+            over the bandwidth).
+        no_path: "exclude" leaves a link without a path out of the objective; "censor" counts it with
+            `ceiling_db`.
+        ceiling_db: Largest path loss that can be measured [dB], with "censor" only.
+    """
+
+    combining: Literal["power", "coherent", "band"] = "power"
+    no_path: Literal["exclude", "censor"] = "exclude"
+    ceiling_db: Annotated[float, Field(gt=0)] | None = None
+
+    @model_validator(mode="after")
+    def _ceiling_only_with_censor(self) -> Self:
+        if self.no_path == "censor" and self.ceiling_db is None:
+            raise InputError(
+                "no_path = 'censor' needs ceiling_db [dB], the largest loss that could be measured"
+            )
+        if self.no_path == "exclude" and self.ceiling_db is not None:
+            raise InputError(
+                f"ceiling_db = {self.ceiling_db:g} has no effect; set no_path = 'censor' or leave it out"
+            )
+        return self
+
+
+class PriorSection(Section):
+    """The prior of a parameter: log-normal around a value, or Gaussian around the start value.
+
+    Attributes:
+        itu: ITU-R P.2040 material that gives the value, with or without "@REVISION".
+        value: The value itself, in the field's unit, in place of `itu`.
+        like: Another parameter that this one scatters around, in place of `itu`: they are of one population.
+        spread: Standard deviation of the logarithm: 0.3 is about 30 %.
+        std: Standard deviation of a Gaussian prior around the start value, in the field's unit, in place of the others.
+        shared: Whether `std` is the spread of a population of transmitters, which is estimated if theirs is "auto".
+    """
+
+    itu: Text | None = None
+    value: Annotated[float, Field(gt=0)] | None = None
+    like: Text | None = None
+    spread: Annotated[float, Field(gt=0, le=10)] | None = None
+    std: Annotated[float, Field(gt=0)] | None = None
+    shared: bool = False
+
+    @model_validator(mode="after")
+    def _one_centre(self) -> Self:
+        if self.std is not None:
+            if any(stated is not None for stated in (self.itu, self.value, self.like, self.spread)):
+                raise InputError(
+                    "a prior with std is Gaussian around the start value: leave itu, value, like and spread out"
+                )
+            return self
+        if self.spread is None:
+            raise InputError("a prior needs spread, the standard deviation of its logarithm, or std")
+        if sum(stated is not None for stated in (self.itu, self.value, self.like)) != 1:
+            raise InputError(
+                "a prior is centred on an ITU material, a value or another parameter: give one of itu, value and like"
+            )
+        return self
+
+
+class ParameterSection(Section):
+    """``[parameters]``, one entry: the bounds, start and scale of one parameter.
+
+    Attributes:
+        bounds: Lower and upper bound, in the field's unit.
+        start: Value before calibration, a number, "itu:NAME" or "itu:NAME@REVISION"; if absent, the scene's.
+        scale: "linear" or "log".
+        prior: Its prior; uniform within the bounds if absent.
+        spread: Standard deviation, in the field's unit, of the values of single transmitters around the common one of a
+            parameter such as "tx:*.azimuth", or "auto" to estimate it; if absent, only the common value is calibrated.
+    """
+
+    bounds: tuple[float, float]
+    start: float | str | None = None
+    scale: Scale = "linear"
+    prior: PriorSection | None = None
+    spread: Literal["auto"] | Annotated[float, Field(gt=0)] | None = None
+
+    def centre(self, name: str, frequency: float) -> float:
+        """The value that the prior is centred on, in the field's unit; 1 if it is like another parameter.
+
+        Args:
+            name: The parameter.
+            frequency: The carrier [Hz].
+
+        Raises:
+            InputError: There is no prior, ITU-R P.2040 gives no such value, or a bound or the value is not positive.
+        """
+        if self.prior is None:
+            raise InputError(f"{name}: has no prior")
+        value = self.prior.value if self.prior.like is None else 1.0
+        if value is None:
+            value = itu_start(name, f"itu:{self.prior.itu}", frequency)
+        if not min(value, self.bounds[0]) > 0:
+            raise InputError(
+                f"{name}: a log-normal prior needs a positive value and lower bound, but they are {value:g} and "
+                f"{self.bounds[0]:g}"
+            )
+        return value
+
+
+def _ordered(value: tuple[float, float] | None) -> tuple[float, float] | None:
+    if value is not None and value[0] >= value[1]:
+        raise InputError("the lower bound must be less than the upper")
+    return value
+
+
+@dataclass(frozen=True)
+class NuisanceTerm:
+    """A column of the links times an unknown coefficient, for all links or one per group.
+
+    Attributes:
+        by: "constant", "log_distance" (decades of distance), a column that follows from the scene ("out_of_sight",
+            "walls_crossed", "obstruction_m", "knife_edge_db", "region_m", "clutter_db"), or a numeric column of the
+            links.
+        per: Columns whose joined labels are the groups; one coefficient for all links if there are none.
+        bounds: Lower and upper bound of the coefficient, [dB] per unit of the column; unbounded if None.
+        prior: Standard deviation of a Gaussian prior around zero, in the same unit; flat if None; "auto" around the
+            mean of the groups, its standard deviation estimated.
+    """
+
+    by: str
+    per: tuple[str, ...]
+    bounds: tuple[float, float] | None
+    prior: float | Literal["auto"] | None
+
+
+class OffsetSection(Section):
+    """``[offset]``: the nuisance term "offset", one [dB] for all links or one per group.
+
+    Attributes:
+        per: Column of group labels, or several columns whose labels are joined; one offset for all links if absent.
+        bounds: Lower and upper bound [dB]; unbounded if absent.
+        prior_db: Standard deviation of a Gaussian prior around zero [dB]; flat if absent.
+    """
+
+    per: Text | tuple[Text, ...] | None = None
+    bounds: tuple[float, float] | None = None
+    prior_db: Annotated[float, Field(gt=0)] | None = None
+
+    _ordered = field_validator("bounds")(_ordered)
+
+    def term(self) -> NuisanceTerm:
+        """The nuisance term that this section is the short form of."""
+        per = (self.per,) if isinstance(self.per, str) else self.per or ()
+        return NuisanceTerm("constant", per, self.bounds, self.prior_db)
+
+
+class NuisanceSection(Section):
+    """``[nuisance.NAME]``: a column of the links times an unknown coefficient, for all links or one per group.
+
+    Attributes:
+        by: "constant", "log_distance" (decades of distance), a column that follows from the scene ("out_of_sight",
+            "walls_crossed", "obstruction_m", "knife_edge_db", "region_m", "clutter_db"), or a numeric column of the
+            links.
+        per: Column of group labels; one coefficient for all links if absent.
+        bounds: Lower and upper bound of the coefficient, [dB] per unit of the column; unbounded if absent.
+        prior: Standard deviation of a Gaussian prior around zero, in the same unit; flat if absent. "auto" is a prior
+            around the mean of the groups, whose standard deviation is estimated (a random effect).
+    """
+
+    by: Text
+    per: Text | None = None
+    bounds: tuple[float, float] | None = None
+    prior: Literal["auto"] | Annotated[float, Field(gt=0)] | None = None
+
+    _ordered = field_validator("bounds")(_ordered)
+
+    @model_validator(mode="after")
+    def _random_effect(self) -> Self:
+        if self.prior == "auto" and (self.per is None or self.bounds is not None):
+            raise InputError("prior = 'auto' needs per, the column of the groups, and no bounds")
+        return self
+
+    def term(self) -> NuisanceTerm:
+        """The nuisance term."""
+        return NuisanceTerm(self.by, () if self.per is None else (self.per,), self.bounds, self.prior)
+
+
+class NoiseSection(Section):
+    """``[noise]``: the errors of measured links.
+
+    Attributes:
+        std_db: Standard deviation of a link's error [dB], which weighs the priors; estimated if absent.
+        kind: "gaussian", "student-t", or "auto" for intervals that cover both.
+        range_m: Correlation distance of neighbouring links' errors [m], 0 for none, or "auto".
+        heterogeneity: Between-building spread of a material's constants, 0 for none, or "auto".
+        constants_spread: Standard deviation of the logarithm of thickness, conductivity and scattering coefficient of
+            calibrated materials, where they are no parameters: how well the scene's values are known; 0 if exactly.
+    """
+
+    std_db: Annotated[float, Field(gt=0)] | None = None
+    kind: Literal["auto", "gaussian", "student-t"] = "auto"
+    range_m: Literal["auto"] | Annotated[float, Field(ge=0)] = "auto"
+    heterogeneity: Literal["auto"] | Annotated[float, Field(ge=0, le=2)] = "auto"
+    constants_spread: Annotated[float, Field(ge=0, le=2)] = 0.15
+
+    @model_validator(mode="after")
+    def _one_departure(self) -> Self:
+        stated = []
+        if self.kind == "student-t":
+            stated.append("kind = 'student-t'")
+        if self.range_m not in ("auto", 0):
+            stated.append(f"range_m = {self.range_m}")
+        if self.heterogeneity not in ("auto", 0):
+            stated.append(f"heterogeneity = {self.heterogeneity}")
+        if len(stated) > 1:
+            raise InputError(
+                f"noise: {' and '.join(stated)}: only one of them can be stated; leave the others at 'auto'"
+            )
+        return self
+
+
+class HoldoutSection(Section):
+    """``[holdout]``: links that are not calibrated on, for validation; chosen in one of three ways.
+
+    Attributes:
+        where: Row filter; links that pass it are held out.
+        blocks: Number of spatial blocks, each held out in turn.
+        by: Column of labels; the links of each label are held out in turn.
+    """
+
+    where: Text | None = None
+    blocks: Annotated[int, Field(ge=2, le=100)] | None = None
+    by: Text | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if sum(way is not None for way in (self.where, self.blocks, self.by)) != 1:
+            raise InputError("holdout: give one of where, blocks and by")
+        return self
+
+
+class FidelitySection(Section):
+    """``[fidelity]``: tracing again with the calibrated materials, because paths may depend on them.
+
+    Attributes:
+        tolerance_db: Largest change of a link's path loss [dB] that is accepted.
+        rounds: Largest number of traces, 0 for none.
+    """
+
+    tolerance_db: Annotated[float, Field(gt=0)] = 0.5
+    rounds: Annotated[int, Field(ge=0, le=100)] = 3
+
+
+class MethodSection(Section):
+    """``[method]``: the optimizer.
+
+    Attributes:
+        name: "auto", "sgwo-im", "gwo" or another registered method.
+        seed: Seed of its random numbers.
+        model: The cheap model of an expensive engine: "replay" of the study's scene, or "none".
+        options: Settings of the named method.
+    """
+
+    name: Text = "auto"
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
+    model: Literal["replay", "none"] = "replay"
+    options: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _usable(self) -> Self:
+        check_options(self.name, self.options)
+        return self
+
+
+LARGEST: Final = 10**6
+"""Largest whole number of a setting: no method can keep more candidates in memory."""
+
+LONGEST: Final = 10**4
+"""Largest number of entries of a list, and of characters of a text."""
+
+_NOT_SETTINGS: Final = ("lower", "upper", "seed", "objective", "model")
+_TYPES: Final[Mapping[str, tuple[tuple[type, ...], str]]] = {
+    "bool": ((bool,), "true or false"),
+    "int": ((int,), "a whole number"),
+    "float": ((int, float), "a number"),
+    "str": ((str,), "text in quotes"),
+}
+
+
+def check_options(name: str, options: Mapping[str, Any]) -> None:
+    """Refuse settings that a method does not have; the method itself checks whether their values suit it.
+
+    If the method is unknown or chosen later, only the size of values is checked.
+
+    Raises:
+        InputError: A setting is unknown, of another type, not finite or too large; the message begins with its key.
+    """
+    if not options:
+        return
+    # Optimizers import SciPy; a study without options is read without them.
+    from calibray.optimizers import METHODS
+
+    settings = None
+    if name in METHODS:
+        arguments = signature(METHODS[name]).parameters
+        settings = {key: argument for key, argument in arguments.items() if key not in _NOT_SETTINGS}
+    for key, value in options.items():
+        prefix = f"method.options.{shortened(key)}"
+        if settings is not None and key not in settings:
+            raise InputError(
+                f"{prefix}: the method {name!r} has no such setting; {did_you_mean(key, settings)}"
+            )
+        prefix += f" = {shortened(repr(value))}"
+        _check_size(prefix, value)
+        if settings is not None:
+            _check_type(prefix, settings[key], value)
+
+
+def _check_type(prefix: str, argument: Parameter, value: Any) -> None:
+    """Check the annotation of the constructor's argument; other types, such as arrays, are not checked."""
+    types = [part.strip() for part in str(argument.annotation).split("|")]
+    if not set(types) - {"None"} <= set(_TYPES):
+        return
+    for name in types:
+        allowed, _ = _TYPES.get(name, ((), ""))
+        # In Python, True and False are integers as well.
+        if isinstance(value, allowed) and (isinstance(value, bool) == (name == "bool")):
+            return
+    wanted = " or ".join(_TYPES[name][1] for name in types if name in _TYPES)
+    raise InputError(f"{prefix}: must be {wanted}")
+
+
+def _check_size(prefix: str, value: Any, depth: int = 2) -> None:
+    match value:
+        case bool():
+            pass
+        case int() if abs(value) > LARGEST:
+            raise InputError(f"{prefix}: must be at most {LARGEST:,}")
+        case float() if not isfinite(value):
+            raise InputError(f"{prefix}: must be a finite number")
+        case str() if len(value) > LONGEST:
+            raise InputError(f"{prefix}: must have at most {LONGEST:,} characters")
+        case list() | tuple() if depth and len(value) <= LONGEST:
+            for entry in value:
+                _check_size(prefix, entry, depth - 1)
+        case list() | tuple():
+            raise InputError(f"{prefix}: must be a list of at most {LONGEST:,} entries, or of such lists")
+        case int() | float() | str():
+            pass
+        case _:
+            raise InputError(f"{prefix}: must be a number, a text, true, false, or a list of them")

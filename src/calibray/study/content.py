@@ -1,0 +1,290 @@
+"""The sections of a study file together: a closed model, and the keys that do not go together."""
+
+from __future__ import annotations
+
+from abc import ABC
+from pathlib import Path
+from typing import Any, Final, Self
+
+from pydantic import Field, PrivateAttr, field_validator, model_validator
+
+from calibray.engines.kinds import AnyEngine, default
+from calibray.errors import InputError
+from calibray.materials import DEFAULT_REVISION, itu_material
+from calibray.parameters import Parameter, Parameters, itu_start, split_name
+from calibray.parameters.laws import ROUGHNESS
+from calibray.study.calibration_sections import (
+    FidelitySection,
+    HoldoutSection,
+    MethodSection,
+    NoiseSection,
+    NuisanceSection,
+    ObjectiveSection,
+    OffsetSection,
+    ParameterSection,
+)
+from calibray.study.displacement import RECEIVER, displaces
+from calibray.study.facades import FacadeSection
+from calibray.study.link_obstruction import REGION
+from calibray.study.observables import ObservableSection, by_column
+from calibray.study.regions import PREFIX, RegionSection
+from calibray.study.sections import AntennasSection, LinksSection, MaterialSection, SceneSection, TraceSection
+from calibray.study.validation_errors import dotted
+from calibray.support.messages import did_you_mean
+from calibray.support.strict_models import Section, Text
+from calibray.tracing.mounting import EVERY, POSE, turns
+
+VERSION: Final = 1
+"""The version of the study file that this module reads."""
+
+BUNDLED: Final = "sionna:"
+"""Prefix of the name of a scene bundled with Sionna RT."""
+
+OFFSET: Final = "offset"
+"""Name of the nuisance term that ``[offset]`` is the short form of."""
+
+
+class StudyContent(Section, ABC):
+    """The sections of a study file, with the checks of keys that do not go together."""
+
+    version: int
+    scene: SceneSection
+    objects: dict[str, Text] = Field(default_factory=dict)
+    materials: dict[str, MaterialSection] = Field(default_factory=dict)
+    facades: dict[str, FacadeSection] = Field(default_factory=dict)
+    links: LinksSection
+    antennas: AntennasSection = Field(default_factory=AntennasSection)
+    trace: TraceSection = Field(default_factory=TraceSection)  # type: ignore[valid-type]
+    objective: ObjectiveSection = Field(default_factory=ObjectiveSection)
+    parameters: dict[str, ParameterSection]
+    observables: dict[str, ObservableSection] = Field(default_factory=dict)
+    regions: dict[str, RegionSection] = Field(default_factory=dict)
+    offset: OffsetSection | None = None
+    nuisance: dict[str, NuisanceSection] = Field(default_factory=dict)
+    noise: NoiseSection = Field(default_factory=NoiseSection)
+    holdout: HoldoutSection | None = None
+    fidelity: FidelitySection = Field(default_factory=FidelitySection)
+    method: MethodSection = Field(default_factory=MethodSection)
+    engine: AnyEngine = Field(default_factory=default)
+
+    _path: Path = PrivateAttr(default=Path("study.toml"))
+    _other_engines: dict[str, Any] = PrivateAttr(default_factory=dict)
+
+    @field_validator("version")
+    @classmethod
+    def _known_version(cls, value: int) -> int:
+        if value != VERSION:
+            raise InputError(
+                f"this Calibray reads version {VERSION}; convert the file, or install a Calibray that reads it"
+            )
+        return value
+
+    @field_validator("observables")
+    @classmethod
+    def _one_per_column(cls, value: dict[str, ObservableSection]) -> dict[str, ObservableSection]:
+        return by_column(value)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.objective.combining == "band" and self.scene.bandwidth is None:
+            raise InputError("objective.combining = 'band' needs scene.bandwidth [Hz]")
+        if self.links.quantity == "rsrp" and self.offset is None:
+            raise InputError(
+                "links.quantity = 'rsrp' needs [offset]: the transmitted power is unknown, and is part of the offset"
+            )
+        if self.links.below_floor == "censor" and self.noise.range_m not in ("auto", 0):
+            raise InputError(
+                f"links.below_floor = 'censor' with noise.range_m = {self.noise.range_m:g}: censored links are "
+                "counted as if their errors were independent; leave one of them out"
+            )
+        self._check_rays()
+        self._check_observables()
+        self._check_losses()
+        self._check_poses()
+        self._check_position_errors()
+        if OFFSET in self.nuisance:
+            raise InputError("nuisance.offset: [offset] has this name; choose another")
+        if getattr(self.engine, "rays", None) and (
+            self.links.mountings or self.links.position_error_m is not None
+        ):
+            raise InputError(
+                "engine.rays holds paths of one position and one antenna: leave links.tx_antenna, rx_antenna and "
+                "position_error_m out"
+            )
+        if self.links.mountings and self.engine.name != "replay":
+            end = next(iter(self.links.mountings))
+            raise InputError(
+                f"links.{end}_antenna with engine.name = {self.engine.name!r}: antennas that differ between links are "
+                "applied to stored paths; use engine 'replay'"
+            )
+        self._check_materials()
+        self._check_parameters()
+        return self
+
+    def _check_rays(self) -> None:
+        refused = {
+            f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",
+            "links.frequency": self.links.frequency is not None,
+            "[observables]": bool(self.observables),
+            "coefficients of laws": any(".itu_" in name for name in self.parameters),
+        }
+        for key, stated in refused.items():
+            if self.engine.exports_rays and stated:
+                raise InputError(
+                    "engine.rays = true: powers of rays are compared at one carrier and add up, so it does not go with "
+                    f"{key}; remove one of them"
+                )
+
+    def _check_observables(self) -> None:
+        if not self.observables:
+            return
+        if getattr(self.engine, "compress_db", None) is not None:
+            raise InputError(
+                "engine.compress_db: few weighted paths keep path loss, not the delays and angles of [observables]; "
+                "remove one of them"
+            )
+        if self.links.average is not None and any(each.file is None for each in self.observables.values()):
+            raise InputError(
+                "links.average with [observables]: averages keep the columns of the first sample; average the table "
+                "itself, or remove one of them"
+            )
+        if self.engine.name == "retrace":
+            raise InputError("[observables] with engine.name = 'retrace': use 'replay' or 'command'")
+        unstated = [name for name, section in self.observables.items() if section.std is None]
+        if self.engine.expensive and (unstated or (self.links.std is None and self.noise.std_db is None)):
+            missing = f"observables.{unstated[0]}.std" if unstated else "noise.std_db"
+            raise InputError(
+                f"{missing}: is required, because observables are weighted by their errors, and the engine "
+                f"{self.engine.name!r} has too few calls to estimate them"
+            )
+
+    def _check_losses(self) -> None:
+        for name in self.parameters:
+            region = name.removeprefix(PREFIX).rpartition(".")[0]
+            if name.startswith(PREFIX) and region not in self.regions:
+                raise InputError(
+                    f"parameters: {name!r}: no [regions.{region}]; {did_you_mean(region, self.regions)}"
+                )
+        if self.facades and getattr(self.engine, "rays", None):
+            raise InputError("engine.rays: rays of a table have no walls; remove [facades]")
+        for name, section in self.nuisance.items():
+            if section.by == REGION and not self.regions:
+                raise InputError(
+                    f"nuisance.{name}.by = {REGION!r}: there are no [regions] that lines could cross"
+                )
+        rough = [name for name in self.parameters if name.endswith(f".{ROUGHNESS}")]
+        rough += [
+            f"materials.{name}.{ROUGHNESS}"
+            for name, m in self.materials.items()
+            if m.roughness_mm is not None
+        ]
+        stated = (("[regions]", self.regions), ("[facades]", self.facades), ("".join(rough[:1]), rough))
+        for key, used in stated:
+            if used and self.engine.name != "replay":
+                raise InputError(
+                    f"{key} needs engine.name = 'replay'; the engine {self.engine.name!r} has no paths"
+                )
+            if used and getattr(self.engine, "compress_db", None) is not None:
+                raise InputError(
+                    f"engine.compress_db: few weighted paths do not go with {key}; remove one of them"
+                )
+
+    def _check_position_errors(self) -> None:
+        links = self.links
+        if links.position_error_m is None:
+            return
+        refused = {
+            "links.weight": links.weight is not None,
+            "links.frequency": links.frequency is not None,
+            f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",
+            f"engine.name = {self.engine.name!r}": self.engine.name != "replay",
+        }
+        for key, stated in refused.items():
+            if stated:
+                raise InputError(
+                    f"links.position_error_m: powers at displaced receivers are averaged on replay, at one carrier; it "
+                    f"does not go with {key}"
+                )
+        if links.std is None and self.noise.std_db is None:
+            raise InputError(
+                "links.position_error_m adds to the other errors of a link: give links.std or noise.std_db [dB]"
+            )
+
+    def _check_poses(self) -> None:
+        self._check_displacements()
+        names = [name for name in self.parameters if turns(name)]
+        if names and self.links.tx_antenna is None:
+            raise InputError(
+                f"parameters: {names[0]!r} needs [links.tx_antenna], the stated directions of the transmit antennas"
+            )
+        if names and getattr(self.engine, "compress_db", None) is not None:
+            raise InputError("engine.compress_db: few weighted paths have no direction; remove it")
+
+    def _check_displacements(self) -> None:
+        names, links = [name for name in self.parameters if displaces(name)], self.links
+        refused = {
+            "links.frequency": links.frequency is not None,
+            f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",
+            f"engine.name = {self.engine.name!r}": self.engine.name != "replay",
+            "engine.rays": getattr(self.engine, "rays", None) is not None,
+            "engine.compress_db": getattr(self.engine, "compress_db", None) is not None,
+            "engine.chunk_links": getattr(self.engine, "chunk_links", None) is not None,
+        }
+        for key, stated in refused.items():
+            if names and stated:
+                raise InputError(
+                    f"parameters: {names[0]!r}: path loss between traced positions is interpolated on replay, at one "
+                    f"carrier; it does not go with {key}"
+                )
+        own = [
+            name for name in names if name.startswith(RECEIVER) and not name.startswith(f"{RECEIVER}{EVERY}.")
+        ]
+        if own and links.device is None:
+            raise InputError(
+                f"parameters: {own[0]!r} needs links.device, the column of the devices' names; or displace all, as "
+                f"'{RECEIVER}{EVERY}.dx'"
+            )
+
+    def _check_materials(self) -> None:
+        for name, material in self.materials.items():
+            if material.itu is not None:
+                revision = material.revision or DEFAULT_REVISION
+                try:
+                    itu_material(material.itu, self.scene.frequency, revision=revision)
+                except InputError as error:
+                    raise InputError(f"{dotted(('materials', name))}: {error}") from None
+
+    def _check_parameters(self) -> None:
+        """Check all that does not need the scene; `parameter_set` checks the rest."""
+        frequency, parameters = self.scene.frequency, []
+        for name, entry in self.parameters.items():
+            start = itu_start(name, entry.start, frequency) if isinstance(entry.start, str) else entry.start
+            lower, upper = entry.bounds
+            parameters.append(Parameter(name, lower, upper, lower if start is None else start, entry.scale))
+            if entry.spread is not None and not name.startswith(f"{POSE}{EVERY}."):
+                raise InputError(
+                    f"{name}: spread is that of a population of transmitters; give it to '{POSE}{EVERY}.azimuth' or "
+                    "another field, or leave it out"
+                )
+            if entry.prior is not None and entry.prior.std is not None:
+                if not name.startswith((POSE, RECEIVER)):
+                    raise InputError(f"{name}: prior.std is for antennas; give itu or value, and spread")
+            elif entry.prior is not None:
+                entry.centre(name, frequency)
+                self._check_like(name, entry.prior.like)
+        Parameters(tuple(parameters))
+
+    def _check_like(self, name: str, like: str | None) -> None:
+        if like is None:
+            return
+        other = self.parameters.get(like)
+        if other is None or like == name:
+            raise InputError(
+                f"{name}: prior.like = {like!r}: no other parameter; {did_you_mean(like, self.parameters)}"
+            )
+        if split_name(like)[1] != split_name(name)[1]:
+            raise InputError(f"{name}: prior.like = {like!r}: must be of the same constant")
+        if other.prior is not None and other.prior.like is not None:
+            raise InputError(f"{name}: prior.like = {like!r}: is itself like another; name that one")
+        if not other.bounds[0] > 0:
+            raise InputError(f"{name}: prior.like = {like!r}: its lower bound must be greater than 0")

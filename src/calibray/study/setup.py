@@ -1,0 +1,462 @@
+"""The opened study: one calibration problem with its links, scene and parameters read, and the paths of its links."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, cast, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.engines.protocol import Answering
+from calibray.engines.section import EngineSection, RadioSettings
+from calibray.errors import InputError
+from calibray.materials import Material
+from calibray.measurements import Measurements
+from calibray.parameters import Parameters
+from calibray.paths import Paths, take_links
+from calibray.scenes import Scene, check_material_name, read_scene
+from calibray.scenes.regions import Region
+from calibray.scenes.scene_file import read_content as scene_content
+from calibray.study.displacement import (
+    RECEIVER,
+    Displacement,
+    averaged,
+    check_labels,
+    displaced,
+    displacement_loss,
+    displacements,
+    displaces,
+    mounted_at_displaced,
+    spread_db,
+)
+from calibray.study.facades import (
+    roughness_effects,
+    with_facade_materials,
+    with_facades,
+    without_facade_materials,
+)
+from calibray.study.link_obstruction import with_obstruction
+from calibray.study.model import StudyModel
+from calibray.study.mounting import link_mountings, pose_effects
+from calibray.study.population import with_population
+from calibray.study.regions import region_effects
+from calibray.study.row_steps import scene_place, study_links, study_regions
+from calibray.study.sections import AntennasSection
+from calibray.support.progress import Progress
+from calibray.tracing import cache
+from calibray.tracing.default_tracer import SIONNA
+from calibray.tracing.mounting import POSE, Mounting, mount
+from calibray.tracing.protocol import EnclosedAntennas, Tracer, TracerFactory
+from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.trace_plan import LONG_TRACE_SECONDS
+
+if TYPE_CHECKING:
+    from calibray.fields import Effects
+
+_LOG: Final = logging.getLogger(__name__)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """An opened study: its links, scene and parameters, each read once, and the tracer of its paths.
+
+    Attributes:
+        study: The study.
+        links: All its links, held-out links included.
+        scene: Its scene with the parameters' start values, because materials steer the rays that are followed.
+        parameters: The parameters that a candidate gives values to.
+        held_out: Mask of the held-out links [L].
+        factory: Opens the scene in a ray tracer.
+        placed: Values of the parameters at which paths are traced, if some displace antennas; start values if absent.
+        share: Distance of the neighbouring positions that are traced, as a share of the largest displacement.
+    """
+
+    study: StudyModel
+    links: Measurements
+    scene: Scene
+    parameters: Parameters
+    held_out: NDArray[np.bool_]
+    factory: TracerFactory
+    placed: Mapping[str, float] = field(default_factory=dict)
+    share: float = 1.0
+
+    @classmethod
+    def open(
+        cls, study: StudyModel, tracer: TracerFactory = SIONNA, links: Measurements | None = None
+    ) -> Setup:
+        """Read the files of a study; nothing is traced yet.
+
+        Args:
+            study: The study.
+            tracer: Opens the scene in a ray tracer.
+            links: Links in place of the study's; none of them is held out.
+
+        Returns:
+            The opened study.
+
+        Raises:
+            InputError: The links, the scene, the parameters or the hold-out cannot be used.
+        """
+        held_out = None
+        if links is None:
+            links = study_links(study)
+            if any(entry.spread is not None for entry in study.parameters.values()):
+                study = type(study).from_content(with_population(study, links), study.path)
+            held_out = study.held_out(links)
+            columns = {POSE: study.links.transmitter, RECEIVER: study.links.device}
+            for kind, column in columns.items():
+                check_labels(str(study.path), study.parameters, links, kind, column)
+        scene = _scene_of(study, study.scene.frequency)
+        parameters = study.parameter_set(scene.materials, scene.laws)
+        parameters.check_carriers([frequency for frequency, _ in links.carriers])
+        scene = replace(scene, materials=parameters.materials(parameters.start, scene.materials))
+        if held_out is None:
+            held_out = np.zeros(len(links), dtype=bool)
+        setup = cls(study, links, scene, parameters, held_out, tracer)
+        return setup.with_obstruction() if study.uses_obstruction else setup
+
+    def opened(self) -> Setup:
+        """Itself, so that functions can take a study, opened or not."""
+        return self
+
+    def replace(self, method: str | None = None, seed: int | None = None, engine: str | None = None) -> Setup:
+        """The same with another method, seed or engine; no file is read again (see `Study.replace`).
+
+        Raises:
+            InputError: A value is impossible.
+        """
+        return self._with_tracer(replace(self, study=self.study.replace(method, seed, engine)))
+
+    def at(self, links: Measurements) -> Setup:
+        """The same with other links, none of them held out; no file is read again."""
+        setup = self._with_tracer(replace(self, links=links, held_out=np.zeros(len(links), dtype=bool)))
+        return setup.with_obstruction() if self.study.uses_obstruction else setup
+
+    def with_obstruction(self) -> Setup:
+        """The same with the columns that the scene gives in the links' table (`link_obstruction.COLUMNS`)."""
+        study = self.study
+        links = with_obstruction(
+            self.links, self.scene, study.scene.frequency, self.regions, study.uses_clutter
+        )
+        return self if links is self.links else self._with_tracer(replace(self, links=links))
+
+    def effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
+        """Effects on paths that no constant has: wrong directions of antennas, regions, and rough surfaces.
+
+        Args:
+            paths: The paths of some links.
+            links: Indices of these links among all links; all links if None.
+        """
+        effects = self._pose_and_region_effects(paths, links)
+        return effects + self._displacement_effects(paths, effects)
+
+    def _pose_and_region_effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
+        chosen = np.arange(len(self.links)) if links is None else links
+        poses = pose_effects(self.study, self.mountings, self.links.table, self.parameters, (paths, chosen))
+        study, parameters = self.study, self.parameters
+        extra = region_effects(study.regions, self.regions, parameters, paths, study.scene.frequency)
+        return poses + extra + roughness_effects(study.roughness_mm, parameters, paths)
+
+    @cached_property
+    def regions(self) -> dict[str, Region]:
+        """The regions of extra loss by name."""
+        return study_regions(self.study)
+
+    @cached_property
+    def _displacements(self) -> tuple[Displacement, ...]:
+        if not any(displaces(item.name) for item in self.parameters):
+            return ()
+        columns = {POSE: self.study.links.transmitter, RECEIVER: self.study.links.device}
+        return displacements(self.parameters.items, self.links, columns)
+
+    @property
+    def _placed(self) -> NDArray[np.float64]:
+        """Values of the parameters at which paths are traced."""
+        return np.array([self.placed.get(item.name, item.start) for item in self.parameters])
+
+    def placed_at(self, values: Mapping[str, float], share: float) -> Setup:
+        """The same, traced with antennas at the positions that values of the parameters state.
+
+        Itself if no parameter displaces antennas. The neighbours that path loss is interpolated between are at a
+        `share` of the largest displacement.
+        """
+        if not any(displaces(item.name) for item in self.parameters):
+            return self
+        return self._with_tracer(replace(self, placed=dict(values), share=share))
+
+    @property
+    def _links_in_place(self) -> Measurements:
+        links = self.links
+        for each in self._displacements:
+            links = each.moved(links, (each.weights @ self._placed)[each.group])
+        return links
+
+    def _displacement_effects(self, paths: Paths, others: Effects) -> Effects:
+        """The change of path loss by displacements, from traces at neighbouring positions."""
+        if not self._displacements:
+            return ()
+
+        def traced(links: Measurements) -> tuple[Paths, Effects]:
+            moved = self._with_tracer(replace(self, links=links))
+            paths = moved._mounted(self._trace_links(links, self.scene, None), self.scene)
+            return paths, moved._pose_and_region_effects(paths)
+
+        loss = displacement_loss(
+            self._displacements,
+            self.parameters,
+            self._placed,
+            self.share,
+            self._links_in_place,
+            (paths, others),
+            traced,
+        )
+        return (loss,)
+
+    @property
+    def radio(self) -> RadioSettings:
+        """Carrier, bandwidth, combining and antennas."""
+        study = self.study
+        wanted = tuple(section.wanted(name) for name, section in study.observables.items())
+        return RadioSettings(
+            study.scene.frequency,
+            study.scene.bandwidth,
+            study.objective.combining,
+            study.antenna_pair,
+            wanted,
+        )
+
+    @property
+    def known_antennas(self) -> tuple[Antenna, Antenna] | None:
+        """Transmit and receive antenna, if the study states them; else those of an engine are unknown."""
+        return self.radio.antennas if self.study.antennas != AntennasSection() else None
+
+    @property
+    def trace_settings(self) -> TraceSettings:
+        """Settings of the ray tracer."""
+        return self.study.trace
+
+    @property
+    def engine(self) -> EngineSection:
+        """The section ``[engine]``."""
+        return self.study.engine
+
+    @property
+    def source(self) -> Path:
+        """The study file."""
+        return self.study.path
+
+    @property
+    def tracer_versions(self) -> Mapping[str, str]:
+        """Versions of the ray tracer's parts by name."""
+        return self.factory.versions
+
+    @property
+    def tracer(self) -> Tracer:
+        """The ray tracer with the scene at the study's carrier, loaded on first use."""
+        if "tracer" not in self._loaded:
+            self._loaded["tracer"] = self._open_tracer(self.scene, self.study.scene.frequency)
+        return self._loaded["tracer"]
+
+    @cached_property
+    def _loaded(self) -> dict[str, Tracer]:
+        """The tracer once it is loaded, shared by all setups of one scene."""
+        return {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The state for another process: without the loaded tracer, and independent of the current folder."""
+        state = {item.name: getattr(self, item.name) for item in fields(self)}
+        return state | {"scene": replace(self.scene, path=self.scene.path.absolute())}
+
+    @property
+    def carriers(self) -> dict[float, dict[str, Material]]:
+        """Materials before calibration by carrier [Hz]; empty if all links have the study's carrier."""
+        return self._materials_by_carrier
+
+    @cached_property
+    def _materials_by_carrier(self) -> dict[float, dict[str, Material]]:
+        return {frequency: self._scene_at(frequency).materials for frequency, _ in self.links.carriers}
+
+    @cached_property
+    def enclosed(self) -> EnclosedAntennas | None:
+        """Antennas inside closed bodies of the scene; None if an external program answers."""
+        if self.study.engine.external:
+            return None
+        tracer, links = self.tracer, self.links
+        return EnclosedAntennas.of(links.row, tracer.enclosed(links.tx), tracer.enclosed(links.rx))
+
+    @cached_property
+    def files(self) -> dict[str, str]:
+        """SHA-256 of every file of the scene and the antennas, by the path that the study resolves to."""
+        antennas = [*self.study.stated_antennas.values(), *self.study.antenna_types.values()]
+        gains = [Path(antenna.gain_file) for antenna in antennas if antenna.gain_file is not None]
+        digests = {str(self.scene.path): hashlib.sha256(scene_content(self.scene.path)).hexdigest()}
+        rays = [] if self.study.rays_path is None else [self.study.rays_path]
+        outlines = (*self.study.region_paths.values(), *self.study.facade_paths.values())
+        regions = [file for file in outlines if file is not None]
+        for file in (*cache.mesh_files(self.scene), *gains, *rays, *regions):
+            digests[str(file)] = hashlib.sha256(file.read_bytes()).hexdigest()
+        return digests
+
+    def tracer_at(self, frequency: float) -> Tracer:
+        """A new ray tracer with the scene at another carrier [Hz]."""
+        return self._open_tracer(self._scene_at(frequency), frequency)
+
+    def trace(
+        self, materials: Mapping[str, Material] | None = None, progress: Progress | None = None
+    ) -> Paths:
+        """The paths of the links, from the cache if they were traced before; or from the ray table of the study.
+
+        A program that answers with rays is called once. Links that differ only in their carrier are traced once.
+
+        Args:
+            materials: Constants in place of the scene's, by material name.
+            progress: Called with "tracing" after every launch.
+
+        Returns:
+            The path program.
+
+        Raises:
+            InputError: The tracer cannot be used, or the scene lacks a material.
+            EngineError: The paths do not fit into memory.
+        """
+        for name in materials or {}:
+            check_material_name(name, self.scene.materials, "materials")
+        if self.study.rays_path is not None:
+            return _paths_of_table(self, self.study.rays_path, materials or {})
+        if self.study.engine.exports_rays:
+            return _paths_of_program(self, materials or {}, progress)
+        scene = replace(self.scene, materials={**self.scene.materials, **(materials or {})})
+        if self.links.frequency is None:
+            return self._mounted(self._trace_links(self._links_in_place, scene, progress), scene)
+        ends = np.hstack([self.links.tx, self.links.rx])
+        _, first, pair = np.unique(ends, axis=0, return_index=True, return_inverse=True)
+        distinct = replace(self.links.select(np.isin(np.arange(len(ends)), first)), frequency=None)
+        # `select` keeps the order of the links, `unique` sorts them: `rank` is a pair's index among those selected.
+        rank = np.argsort(np.argsort(first))
+        return self._mounted(
+            take_links(self._trace(distinct, scene, progress), rank[pair.reshape(-1)]), scene
+        )
+
+    def _trace_links(self, links: Measurements, scene: Scene, progress: Progress | None) -> Paths:
+        """Paths of the links, or the mean over displaced receivers if positions have errors."""
+        errors = self._position_error_m
+        if errors is None:
+            return self._trace(links, scene, progress)
+        return averaged(self._trace(displaced(links, errors), scene, progress), links)
+
+    @cached_property
+    def _position_error_m(self) -> NDArray[np.float64] | None:
+        """Standard deviation of the receivers' positions along x and y [L], [m]; None for exact or predicted ones."""
+        stated = self.study.links.position_error_m
+        if stated is None or not self.links.measured:
+            return None
+        errors = self.links.table.numbers(stated)
+        if (errors < 0).any():
+            row = int(np.flatnonzero(errors < 0)[0])
+            place = (
+                self.links.table.cell(row, stated) if isinstance(stated, str) else "links.position_error_m"
+            )
+            raise InputError(f"{place}: {errors[row]:g} must be at least 0 [m]")
+        return errors
+
+    def with_position_noise(self) -> Setup:
+        """The same, its links weighted by the noise that errors of their positions add; itself without such errors.
+
+        The noise is the spread of path loss between displaced receivers at the start values.
+        """
+        errors, links, study = self._position_error_m, self.links, self.study
+        if errors is None:
+            return self
+        paths = self._trace(displaced(links, errors), self.scene, None)
+        from calibray.fields import path_loss
+
+        loss = path_loss(mount(paths, mounted_at_displaced(self.mountings, len(links))))
+        variance = 1 / links.weight if study.links.std is not None else (study.noise.std_db or 0.0) ** 2
+        weight = 1 / (variance + spread_db(loss) ** 2)
+        return self._with_tracer(replace(self, links=replace(links, weight=weight)))
+
+    def _mounted(self, paths: Paths, scene: Scene) -> Paths:
+        """The paths with the fields of the antennas that differ between links, and the materials of facades."""
+        paths, study = mount(paths, self.mountings) if self.mountings else paths, self.study
+        if not study.facades:
+            return paths
+        return with_facades(paths, study.facades, study.facade_paths, scene_place(study), scene.materials)
+
+    @cached_property
+    def mountings(self) -> dict[str, Mounting]:
+        """The antennas at the ends, "tx" or "rx", where they differ between links.
+
+        Raises:
+            InputError: A column is missing or malformed, or names an unknown antenna.
+        """
+        return link_mountings(self.study, self.links)
+
+    def _trace(self, links: Measurements, scene: Scene, progress: Progress | None) -> Paths:
+        study, scene = self.study, without_facade_materials(scene, self.study.facades)
+        digest = cache.trace_digest(
+            self.factory.versions,
+            scene,
+            study.scene.frequency,
+            study.trace,
+            study.antenna_pair,
+            links.tx,
+            links.rx,
+        )
+        paths = cache.load_trace(digest)
+        if paths is None:
+            plan = self.tracer.plan(links)
+            if plan.seconds > LONG_TRACE_SECONDS:
+                _LOG.warning("%s", plan.announcement(len(links)))
+            paths = self.tracer.trace(links, progress, scene.materials)
+            cache.store_trace(digest, paths)
+        return paths
+
+    def _with_tracer(self, changed: Setup) -> Setup:
+        """A changed setup with the same tracer, which depends neither on links nor on methods."""
+        changed.__dict__["_loaded"] = self._loaded
+        if "regions" in self.__dict__:
+            changed.__dict__["regions"] = self.regions
+        return changed
+
+    def _scene_at(self, frequency: float) -> Scene:
+        study, parameters = self.study, self.parameters
+        scene = _scene_of(study, frequency)
+        materials = parameters.materials(parameters.start, scene.materials, frequency)
+        return replace(scene, materials=materials)
+
+    def _open_tracer(self, scene: Scene, frequency: float) -> Tracer:
+        scene = without_facade_materials(scene, self.study.facades)
+        return self.factory(scene, frequency, self.study.trace, *self.study.antenna_pair)
+
+
+def _scene_of(study: StudyModel, frequency: float) -> Scene:
+    """The scene at a carrier [Hz], with the materials of facades."""
+    scene = read_scene(study.scene_source, frequency, study.overrides, study.objects)
+    return with_facade_materials(scene, study.facades, study.facade_constants, frequency)
+
+
+def _paths_of_table(setup: Setup, file: Path, materials: Mapping[str, Material]) -> Paths:
+    """The paths of the study's ray table, whose powers are those at the start values."""
+    from calibray.engines.rays.compile import RaySetting, compile_rays
+    from calibray.engines.rays.files import read_ray_file
+    from calibray.engines.rays.table import RayTable
+
+    paths = compile_rays(RayTable.of(read_ray_file(file)), RaySetting.of(setup))
+    return replace(paths, materials={**paths.materials, **materials})
+
+
+def _paths_of_program(setup: Setup, materials: Mapping[str, Material], progress: Progress | None) -> Paths:
+    """The paths that the study's program answers with, whose powers are those at these materials."""
+    from calibray.engines.rays.export import Exporting
+
+    scene = replace(setup.scene, materials={**setup.scene.materials, **materials})
+    candidate = [getattr(scene.materials[item.material], item.constant) for item in setup.parameters]
+    program = cast(Answering, setup.study.engine.open(setup, None, progress, None))
+    return Exporting(program, replace(setup, scene=scene)).export(np.array(candidate)).paths
