@@ -114,6 +114,36 @@ def test_a_new_street_is_predicted_with_the_mean_and_the_spread(tmp_path):
     assert loaded.prediction.model.terms == result.prediction.model.terms
 
 
+def test_clusters_of_receivers_are_groups_without_a_column(tmp_path):
+    table = planted.campaign(noise_db=0.2)
+    side = float(np.ptp(table.rx_x)) / 3
+    square = [f"{x:.0f} {y:.0f}" for x, y in np.floor(table[["rx_x", "rx_y"]].to_numpy() / side)]
+    shift = {name: 7.0 * (number % 3) for number, name in enumerate(sorted(set(square)))}
+    assert len(shift) >= 3
+    table = table.assign(path_loss_db=table.path_loss_db + [shift[name] for name in square])
+    fixed = {
+        name: {"bounds": [value - 0.1, value + 0.1], "start": value} for name, value in planted.TRUTH.items()
+    }
+    effect = {"patch": {"by": "constant", "per": "cluster", "cluster_m": side, "prior": "auto"}}
+    result = calibrate(planted.study(tmp_path, table, nuisance=effect, parameters=fixed))
+    assert result.nuisance.coefficients["patch"] == pytest.approx(shift, abs=1.0)
+    far = table.head(1).assign(rx_x=table.rx_x.max() + 2 * side)
+    (term,) = result.prediction.model.terms
+    wide, known = result.predict_interval(far), result.predict_interval(table.head(1))
+    assert result.predict(far) == pytest.approx(wide.path_loss_db.to_numpy())
+    assert np.ptp(wide[["lower_db", "upper_db"]].to_numpy()) > 2 * 1.6 * term.spread_db
+    assert np.ptp(known[["lower_db", "upper_db"]].to_numpy()) < term.spread_db
+
+
+def test_squares_of_a_side_need_clusters_and_one_side(tmp_path):
+    plain = {"by": "constant", "per": "street", "cluster_m": 10.0}
+    with pytest.raises(InputError, match="cluster_m needs per = 'cluster'"):
+        planted.study(tmp_path, planted.campaign(), nuisance={"x": plain})
+    terms = {name: plain | {"per": "cluster", "cluster_m": side} for name, side in (("x", 5.0), ("y", 6.0))}
+    with pytest.raises(InputError, match="cluster_m differs between terms"):
+        planted.study(tmp_path, planted.campaign(), nuisance=terms)
+
+
 @pytest.mark.parametrize("keys", [{}, {"per": "half", "bounds": [-3.0, 3.0]}])
 def test_a_random_effect_needs_groups_and_no_bounds(tmp_path, keys):
     with pytest.raises(

@@ -166,7 +166,7 @@ def _column_values(
             values[per] = groups.pop()
     needed = [*([per] if isinstance(per, str) else per or ())]
     for section in study.nuisance.values():
-        needed += [section.per] if section.per is not None else []
+        needed += [section.per] if section.per is not None and section.cluster_m is None else []
         needed += [section.by] if section.by not in (CONSTANT, LOG_DISTANCE, *OBSTRUCTION) else []
     values |= _mounting_values(study, tx, values)
     needed += mounting_columns(study)

@@ -89,7 +89,7 @@ def nuisance_shift(
         terms: The terms.
         links: The links.
         draws: Draws from the posterior by coefficient [draws]; none if None.
-        new_groups: Whether groups without a coefficient are allowed.
+        new_groups: Whether groups without a coefficient are allowed in terms whose spread is not estimated.
 
     Returns:
         The contribution.
@@ -110,7 +110,7 @@ def nuisance_shift(
         labels = np.full(len(links), "") if term.labels is None else term.labels
         position = {label: index for index, label in enumerate(term.coefficients)}
         group = np.array([position.get(str(label), -1) for label in labels])
-        if (group < 0).any() and not new_groups:
+        if (group < 0).any() and term.spread_db is None and not new_groups:
             new_label = str(labels[int(np.argmax(group < 0))])
             raise InputError(
                 f"{links.source}: group {new_label!r} has no calibrated {term.name}; the calibrated groups are "

@@ -26,6 +26,7 @@ from calibray.result.held_out import Model, PredictionModel
 from calibray.result.record import Record
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study import Setup, Study
+from calibray.study.link_obstruction import CLUSTER
 from calibray.study.link_obstruction import COLUMNS as OBSTRUCTION
 from calibray.study.mounting import PORT_POWER, states_port_power
 from calibray.support.progress import Progress
@@ -168,14 +169,14 @@ def check_groups(result: Record, links: Measurements) -> None:
         InputError: A group has no calibrated coefficient, or a column is missing.
     """
     model = result.prediction.model
-    own = tuple(term for term in model.terms if term.by not in OBSTRUCTION)
+    own = tuple(term for term in model.terms if not {term.by, term.per} & {*OBSTRUCTION, CLUSTER})
     nuisance_shift(model_terms(replace(model, terms=own), links), links)
 
 
 def _with_columns(result: Record, setup: Setup) -> Setup:
     """The study with the columns that follow from the scene, if the prediction model has terms by them."""
     model = result.prediction.model
-    used = any(term.by in OBSTRUCTION for term in model.terms)
+    used = any({term.by, term.per} & {*OBSTRUCTION, CLUSTER} for term in model.terms)
     differ = model.blocks is not None and model.blocks.out_of_sight > 1
     return setup.with_obstruction() if used or differ else setup
 

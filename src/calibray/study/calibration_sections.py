@@ -12,6 +12,7 @@ from pydantic import Field, field_validator, model_validator
 
 from calibray.errors import InputError
 from calibray.parameters import Scale, itu_start
+from calibray.study.link_obstruction import CLUSTER
 from calibray.support.messages import did_you_mean, shortened
 from calibray.support.strict_models import Section, Text
 
@@ -175,7 +176,9 @@ class NuisanceSection(Section):
         by: "constant", "log_distance" (decades of distance), a column that follows from the scene ("out_of_sight",
             "walls_crossed", "obstruction_m", "knife_edge_db", "region_m", "clutter_db"), or a numeric column of the
             links.
-        per: Column of group labels; one coefficient for all links if absent.
+        per: Column of group labels; one coefficient for all links if absent. "cluster" needs no column if `cluster_m`
+            is stated.
+        cluster_m: Side of the squares in which receivers form the groups of "cluster" [m].
         bounds: Lower and upper bound of the coefficient, [dB] per unit of the column; unbounded if absent.
         prior: Standard deviation of a Gaussian prior around zero, in the same unit; flat if absent. "auto" is a prior
             around the mean of the groups, whose standard deviation is estimated (a random effect).
@@ -183,6 +186,7 @@ class NuisanceSection(Section):
 
     by: Text
     per: Text | None = None
+    cluster_m: Annotated[float, Field(gt=0)] | None = None
     bounds: tuple[float, float] | None = None
     prior: Literal["auto"] | Annotated[float, Field(gt=0)] | None = None
 
@@ -192,6 +196,8 @@ class NuisanceSection(Section):
     def _random_effect(self) -> Self:
         if self.prior == "auto" and (self.per is None or self.bounds is not None):
             raise InputError("prior = 'auto' needs per, the column of the groups, and no bounds")
+        if self.cluster_m is not None and self.per != CLUSTER:
+            raise InputError(f"cluster_m needs per = {CLUSTER!r}, the squares of that side")
         return self
 
     def term(self) -> NuisanceTerm:

@@ -167,6 +167,8 @@ class StudyContent(Section, ABC):
                 )
         if self.facades and getattr(self.engine, "rays", None):
             raise InputError("engine.rays: rays of a table have no walls; remove [facades]")
+        if len({item.cluster_m for item in self.nuisance.values()} - {None}) > 1:
+            raise InputError("nuisance: cluster_m differs between terms; state one side of squares for all")
         for name, section in self.nuisance.items():
             if section.by == REGION and not self.regions:
                 raise InputError(

@@ -1,4 +1,4 @@
-"""Columns of links that follow from the scene: what is on the straight line, and the clutter that the scene lacks."""
+"""Columns of links that follow from scene and positions: obstruction of the line, clutter, and clusters."""
 
 from __future__ import annotations
 
@@ -23,12 +23,21 @@ REGION: Final = "region_m"
 CLUTTER: Final = "clutter_db"
 """Column of the clutter loss of ITU-R P.2108 at one end [dB]."""
 
+CLUSTER: Final = "cluster"
+"""Column of labels of squares in which receivers form groups."""
+
 COLUMNS: Final = (*OBSTACLES, REGION, CLUTTER)
 """All columns that follow from the scene."""
 
 
 def with_obstruction(
-    links: Measurements, scene: Scene, frequency: float, regions: Mapping[str, Region], clutter: bool
+    links: Measurements,
+    scene: Scene,
+    frequency: float,
+    regions: Mapping[str, Region],
+    *,
+    clutter: bool = False,
+    cluster_m: float | None = None,
 ) -> Measurements:
     """The links with the columns that the scene gives; columns of these names in their table are kept.
 
@@ -38,12 +47,13 @@ def with_obstruction(
         frequency: Carrier [Hz] of the links that state none.
         regions: The regions of extra loss by name; without any, `REGION` is left out.
         clutter: Whether `CLUTTER` is wanted.
+        cluster_m: Side of the squares of `CLUSTER`, a lattice through the scene's origin; left out if None.
 
     Raises:
         InputError: A carrier is outside the range of the clutter loss.
     """
     carrier = frequency if links.frequency is None else links.frequency
-    added: dict[str, NDArray[np.float64]] = {}
+    added: dict[str, NDArray[np.float64] | NDArray[np.str_]] = {}
     if any(name not in links.frame for name in OBSTACLES):
         found = obstruction(read_triangles(scene), links.tx, links.rx)
         added |= found.columns(speed_of_light / np.asarray(carrier))
@@ -51,6 +61,9 @@ def with_obstruction(
         added[REGION] = np.sum([item.length_inside(links.tx, links.rx) for item in regions.values()], axis=0)
     if clutter:
         added[CLUTTER] = clutter_loss_db(links.distance, carrier)
+    if cluster_m is not None:
+        squares = np.floor(links.rx[:, :2] / cluster_m).astype(int)
+        added[CLUSTER] = np.array([f"{column} {row}" for column, row in squares])
     missing = {name: values for name, values in added.items() if name not in links.frame}
     return replace(links, table=links.table.assign(**missing)) if missing else links
 

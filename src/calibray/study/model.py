@@ -198,8 +198,14 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def uses_obstruction(self) -> bool:
-        """Whether a nuisance is by a column that follows from the scene."""
-        return any(section.by in OBSTRUCTION for section in self.nuisance.values())
+        """Whether a nuisance is by a column that follows from the scene, or per cluster of receivers."""
+        by_scene = any(section.by in OBSTRUCTION for section in self.nuisance.values())
+        return by_scene or self.cluster_m is not None
+
+    @property
+    def cluster_m(self) -> float | None:
+        """Side of the squares in which receivers form the groups of a nuisance [m]; None without such a nuisance."""
+        return next((item.cluster_m for item in self.nuisance.values() if item.cluster_m is not None), None)
 
     @property
     def uses_clutter(self) -> bool:

@@ -143,7 +143,12 @@ class Setup:
         """The same with the columns that the scene gives in the links' table (`link_obstruction.COLUMNS`)."""
         study = self.study
         links = with_obstruction(
-            self.links, self.scene, study.scene.frequency, self.regions, study.uses_clutter
+            self.links,
+            self.scene,
+            study.scene.frequency,
+            self.regions,
+            clutter=study.uses_clutter,
+            cluster_m=study.cluster_m,
         )
         return self if links is self.links else self._with_tracer(replace(self, links=links))
 
