@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 
 NOTEBOOKS = Path(__file__).parents[1] / "examples" / "notebooks"
 
@@ -58,7 +59,10 @@ def test_the_third_finds_the_offset_that_was_not_declared(monkeypatch, cache, ca
 
 def test_the_fourth_finds_the_planted_material_and_sets_it(monkeypatch, cache, capsys):
     left = run("4-sionna-notebook.ipynb", monkeypatch, cache)
-    assert left["result"].parameters["marble.relative_permittivity"] == pytest.approx(9.2, rel=0.005)
-    assert np.array(left["marble"].relative_permittivity).item() == pytest.approx(9.2, rel=0.005)
-    assert np.abs(left["difference"]).max() < 0.01
+    assert left["result"].parameters["marble.relative_permittivity"] == pytest.approx(9.2, rel=1e-4)
+    assert np.array(left["marble"].relative_permittivity).item() == pytest.approx(9.2, rel=1e-4)
+    assert np.abs(left["difference"]).max() < 0.001
     assert "planted 9.2" in capsys.readouterr().out
+    # Sionna's own table of hashes loses paths, and with them the agreement.
+    monkeypatch.setattr(SBCandidateGenerator, "MIN_SPEC_COUNT_SIZE", 1_000_000)
+    assert np.abs(left["path_loss_db"](left["scene"]) - left["measured"]).max() > 0.01

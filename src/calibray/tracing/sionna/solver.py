@@ -24,7 +24,6 @@ from sionna.rt.path_solvers import sb_deterministic
 from sionna.rt.path_solvers.field_calculator import FieldCalculator
 from sionna.rt.path_solvers.image_method import ImageMethod
 from sionna.rt.path_solvers.paths_buffer import PathsBuffer
-from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
 
 from calibray.errors import EngineError, InputError
@@ -46,10 +45,6 @@ from calibray.tracing.sionna.buffers import (
     vertices_of,
 )
 from calibray.tracing.sionna.scene import antenna_patterns, load_scene, scattering_pattern, shape_ids
-
-# Sionna drops candidates whose hashes collide in its table. With its million entries it lost 16 of 6,030 (100 receivers
-# in Munich, 25 at once), with this many none. A prime, because the lowest bits of FNV hashes vary least.
-SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = 16_777_213
 
 SCALAR_CONSTANTS: Final = (
     "relative_permittivity",
