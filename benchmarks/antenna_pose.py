@@ -216,6 +216,9 @@ def main() -> None:
         median_error=("error", "median"), median_width=("width", "median"),
     )  # fmt: skip
     print(summary.round(3).to_string())
+    print("coverage where identified")
+    judged = table[table["identified"]].groupby(["posed", "parameter"])["covered"]
+    print(judged.agg(["size", "mean"]).round(3).to_string())
     runs = table.drop_duplicates(["posed", "held_out_db"])
     errors = ["held_out_db", "without_noise_db"]
     print("medians over runs; seconds of processor time of a calibration")
@@ -223,11 +226,11 @@ def main() -> None:
     pairs = runs[errors].to_numpy().reshape(-1, 2, 2)
     measured, true = np.median(pairs[:, 1] - pairs[:, 0], axis=0)
     stated = runs[~runs["posed"]]
-    off, found = (np.concatenate(stated[name].to_list()) for name in ("off", "named"))
+    off, named = (np.concatenate(stated[name].to_list()) for name in ("off", "named"))
     for low, high in ((0, 5), (5, 10), (10, 20)):
         chosen = (low <= off) & (off < high)
         print(
-            f"azimuth off by {low} to {high} deg: {found[chosen].mean():.2f} of {chosen.sum()} sectors are named"
+            f"azimuth off by {low} to {high} deg: {named[chosen].mean():.2f} of {chosen.sum()} sectors are named"
         )
     print(f"directions right: a sector is named in {stated['alarm'].mean():.2f} of {len(stated)} runs")
     print(f"median improvement on held-out blocks: {measured:.2f} dB, without noise {true:.2f} dB")
