@@ -101,15 +101,20 @@ def test_observables_in_hdf5(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "options"), [("vector-surrogate", {"budget": 30}), ("auto", {"budget": 12})]
+    ("name", "budget", "bias"), [("vector-surrogate", 30, {}), ("auto", 12, {"bias": "all"})]
 )
-def test_a_program_is_calibrated_on_both(tmp_path, name, options):
+def test_a_program_is_calibrated_on_both(tmp_path, name, budget, bias):
     """`wood` moves path loss little and delay spreads much; `auto` is space mapping with the replay of the scene."""
-    result = calibrate(study(tmp_path, method={"name": name, "options": options}))
+    sections = {"observables": {"spread": SECTION | bias}}
+    result = calibrate(study(tmp_path, method={"name": name, "options": {"budget": budget}}, **sections))
+    # After the search, the program answers for the start and the calibrated values only, whatever the biases.
+    assert len(set(programs.calls(tmp_path))) <= result.rt_calls + 1 <= budget + 1
     assert result.parameters["wood.relative_permittivity"] == pytest.approx(programs.TRUTH[2], abs=0.3)
     fit = result.fit.observables["spread"]
     assert fit.links == planted.LINKS - 1
     assert fit.rmse < 0.5 < fit.initial_rmse
+    assert len(fit.bias_errors) == len(bias)
+    assert all(0.05 < error < 2 for error in fit.bias_errors.values())
     interval = result.intervals["wood.relative_permittivity"]
     assert interval.upper - interval.lower < 2.0
 

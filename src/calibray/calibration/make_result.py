@@ -20,6 +20,7 @@ from calibray.calibration.held_out_accuracy import (
 )
 from calibray.calibration.link_diagnostics import diagnose_links
 from calibray.calibration.result import Result
+from calibray.engines.protocol import PATH_LOSS
 from calibray.engines.replay import Replay
 from calibray.fitting.cheap_replay import CheapReplay
 from calibray.fitting.fidelity_loop import largest_gap
@@ -49,6 +50,7 @@ from calibray.study.link_obstruction import REGION
 from calibray.study.model import StudyModel
 from calibray.tracing.protocol import EnclosedAntennas
 from calibray.uncertainty.assessment import Certainty
+from calibray.uncertainty.emulator import emulate
 from calibray.uncertainty.noise_models import HEAVY
 from calibray.uncertainty.residual_correlation import shared_errors
 from calibray.validation.baselines import log_distance, without_scene
@@ -138,7 +140,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             **diagnostics.columns,
         }
     )
-    further, further_columns = observable_fits(problem, trail.best, certainty.draws)
+    further, further_columns = observable_fits(run, certainty.draws)
     table = table.assign(**_as_measured(study, links, table), **further_columns)
     if validation is None:
         accuracy, name, residuals = on_held_out_links(problem, trail, models)
@@ -304,26 +306,23 @@ MOST_DRAWS: Final = 64
 
 
 def observable_fits(
-    problem: Problem, best: NDArray[np.float64], draws: Mapping[str, Sequence[float]]
+    run: Run, draws: Mapping[str, Sequence[float]]
 ) -> tuple[dict[str, ObservableFit], dict[str, NDArray[np.float64]]]:
     """The fit of every further observable, and its columns of the table of links.
 
     Args:
-        problem: The problem.
-        best: The calibrated values [d].
+        run: The finished search.
         draws: Draws from the posterior by name of the parameter; may be empty.
 
     Returns:
         The fits by name; and measured, initial and calibrated values, and biases [L] in the unit, by column name.
     """
+    problem = run.problem
     if not problem.observed:
         return {}, {}
     weight, sections = problem.objective.weight, problem.setup.study.observables
-    start = problem.parameters.start
-    names = problem.parameters.names
-    drawn = np.stack([draws[name] for name in names], axis=1) if draws else np.empty((0, len(names)))
-    drawn = drawn[np.linspace(0, len(drawn) - 1, min(len(drawn), MOST_DRAWS)).round().astype(int)]
-    before, after, *spread = problem.respond(np.vstack([start, best, drawn])).observed
+    before, after = problem.respond(np.stack([problem.parameters.start, run.trail.best])).observed
+    spread = _observed_at_draws(run, draws)
     fits, columns = {}, {}
     for index, each in enumerate(problem.observed):
         unit, used = sections[each.name].unit, each.used(weight)
@@ -360,6 +359,21 @@ def observable_fits(
             of_links = np.append(biases[0], np.nan)[each.group]
             columns[f"{each.name}_bias_{unit}"] = np.where(known[each.group], of_links, np.nan)
     return fits, columns
+
+
+def _observed_at_draws(run: Run, draws: Mapping[str, Sequence[float]]) -> tuple[NDArray[np.float64], ...]:
+    """Observables [K, L] at draws, for the errors of biases; those of an expensive engine are emulated."""
+    problem = run.problem
+    if not draws or not any(each.labels for each in problem.observed):
+        return ()
+    if not problem.differentiable:
+        ensemble = emulate(problem, run.trail, run.cheap.model)
+        if ensemble is None:
+            return ()
+        problem = replace(problem, engine=ensemble.mean, observable=PATH_LOSS)
+    drawn = np.stack([draws[name] for name in problem.parameters.names], axis=1)
+    chosen = np.linspace(0, len(drawn) - 1, min(len(drawn), MOST_DRAWS)).round().astype(int)
+    return tuple(problem.respond(drawn[chosen]).observed)
 
 
 def _rms(values: NDArray[np.float64]) -> float:

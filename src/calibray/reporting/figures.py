@@ -298,9 +298,9 @@ def measured_over_modelled(result: Record) -> Figure | None:
         if (bias := f"{name}_bias_{fit.unit}") in result.links:
             measured = measured - result.links[bias].to_numpy(float)
         shown = np.isfinite(measured) & np.isfinite(modelled)
-        for part, color, name in ((~held_out, BLUE, "calibration"), (held_out, ORANGE, "held out")):
+        for part, color, role in ((~held_out, BLUE, "calibration"), (held_out, ORANGE, "held out")):
             if (part & shown).any():
-                axes.scatter(modelled[part & shown], measured[part & shown], s=10, c=color, lw=0, label=name)
+                axes.scatter(modelled[part & shown], measured[part & shown], s=10, c=color, lw=0, label=role)
         if shown.any():
             both = np.concatenate([measured[shown], modelled[shown]])
             ends = [both.min(), both.max()]
