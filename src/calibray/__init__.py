@@ -11,10 +11,9 @@ Example:
     3
 """
 
-from types import ModuleType
 from typing import TYPE_CHECKING
 
-from calibray.support.lazy_imports import after_import, lazy_attributes
+from calibray.support.lazy_imports import lazy_attributes
 
 if TYPE_CHECKING:
     from calibray import engines as engines
@@ -70,16 +69,3 @@ _HOMES = {
 
 __all__ = sorted(_HOMES)
 __getattr__, __dir__ = lazy_attributes(__name__, _HOMES)
-
-
-def _enlarge_hash_table(sionna: ModuleType) -> None:
-    """Give Sionna RT's candidate generator a larger table of hashes.
-
-    It drops candidates whose hashes collide: of 9,099 in Munich (15 receivers) 75 with its million entries, 8 with this
-    many, a prime because the lowest bits of FNV hashes vary least. It does so wherever Calibray is imported, so that
-    values that a notebook simulates have the paths of its study (docs/explanation/fidelity.md).
-    """
-    sionna.SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = 16_777_213
-
-
-after_import("sionna.rt.path_solvers.sb_candidate_generator", _enlarge_hash_table)

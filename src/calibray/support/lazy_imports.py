@@ -1,12 +1,10 @@
-"""Imports on first use: names of a package, so that importing it is fast, optional libraries, and what follows one."""
+"""Imports on first use: names of a package, so that importing it is fast, and optional libraries."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from importlib.abc import MetaPathFinder
-from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from types import ModuleType
 from typing import Any
@@ -60,33 +58,3 @@ def library(name: str, extra: str) -> ModuleType:
         raise InputError(
             f"{package} is not installed ({error}); install it with: pip install 'calibray[{extra}]'"
         ) from None
-
-
-def after_import(name: str, action: Callable[[ModuleType], None]) -> None:
-    """Run an action on a module: now if it is imported already, else once it is. The action must not fail."""
-    if name in sys.modules:
-        action(sys.modules[name])
-    else:
-        sys.meta_path.insert(0, _Watch(name, action))
-
-
-class _Watch(MetaPathFinder):
-    """Waits for the import of one module, and has Python's other finders find it."""
-
-    def __init__(self, name: str, action: Callable[[ModuleType], None]) -> None:
-        self._name, self._action = name, action
-
-    def find_spec(self, fullname: str, *_: object) -> ModuleSpec | None:
-        if fullname != self._name:
-            return None
-        sys.meta_path.remove(self)
-        spec = find_spec(fullname)
-        if spec is not None and spec.loader is not None:
-            execute = spec.loader.exec_module
-
-            def execute_and_act(module: ModuleType) -> None:
-                execute(module)
-                self._action(module)
-
-            spec.loader.exec_module = execute_and_act
-        return spec
