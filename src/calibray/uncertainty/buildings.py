@@ -51,15 +51,7 @@ class SplitReplay:
     building_of: NDArray[np.int64]
 
     def path_loss(self, values: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of buildings that differ.
-
-        Args:
-            values: Values of the parameters, in the fields' units [n, d].
-            factors: Factor of every constant [n, c].
-
-        Returns:
-            Path loss [n, L], [dB].
-        """
+        """Path loss [n, L], [dB] with values of the parameters [n, d] and a factor for every constant [n, c]."""
         return self.engine.path_loss(self._candidates(values, factors))
 
     def respond(

@@ -37,14 +37,7 @@ class _Terms(NamedTuple):
 
 
 def log_survival(error: NDArray[np.float64], freedom: float) -> NDArray[np.float64]:
-    """Log probability of an error larger than the given one.
-
-    Args:
-        error: Errors in units of their scale [...].
-        freedom: Degrees of freedom of Student's t; +inf for a Gaussian.
-
-    Returns:
-        The log probabilities [...].
+    """Log probability of larger errors than given, in units of their scale; Gaussian with infinite degrees of freedom.
 
     Example:
         >>> log_survival(np.array([0.0, 40.0]), np.inf).round(2).tolist()

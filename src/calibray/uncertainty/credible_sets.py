@@ -67,18 +67,7 @@ def credible_sets(
     upper: float,
     levels: Sequence[float],
 ) -> list[tuple[tuple[float, float], ...]]:
-    """Credible sets at several levels from one smoothed density.
-
-    Args:
-        value: Draws of the parameter [n].
-        weight: Their weights [n].
-        lower: Lower bound of the parameter.
-        upper: Upper bound of the parameter.
-        levels: Shares of the posterior to cover.
-
-    Returns:
-        The set of `credible` for every level.
-    """
+    """The sets of `credible` for several levels, from one smoothed density."""
     width = upper - lower
     edges, mass = _masses((value - lower) / width, weight)
     # Intervals by falling density, until the level is reached.

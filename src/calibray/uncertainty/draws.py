@@ -39,16 +39,7 @@ def pooled(draws: Sequence[Draws]) -> Draws:
 def systematic_resampling(
     weight: NDArray[np.float64], count: int, random: np.random.Generator
 ) -> NDArray[np.intp]:
-    """Draw indices by weight with evenly spaced quantiles and a common random shift.
-
-    Args:
-        weight: Weights, with sum one [n].
-        count: Number of indices.
-        random: Random numbers.
-
-    Returns:
-        Indices, ascending [count].
-    """
+    """Draw indices by weight [n] with evenly spaced quantiles and a common random shift, ascending [count]."""
     total = np.cumsum(weight)
     quantile = (np.arange(count) + random.random()) / count * total[-1]
     return np.minimum(np.searchsorted(total, quantile), len(weight) - 1)

@@ -55,11 +55,7 @@ class Tail(NamedTuple):
 
 
 def student(freedom: float | NDArray[np.float64]) -> Tail:
-    """Student's t distribution.
-
-    Args:
-        freedom: Degrees of freedom, one number or one per gap [n].
-    """
+    """Student's t distribution with one number of degrees of freedom, or one per gap [n]."""
     constant = gammaln((freedom + 1) / 2) - gammaln(freedom / 2) - 0.5 * np.log(freedom * np.pi)
     return _student(
         np.asarray(freedom, dtype=np.float64)[..., None], np.asarray(constant, dtype=np.float64)[..., None]
@@ -82,12 +78,7 @@ def _student(freedom: NDArray[np.float64], constant: NDArray[np.float64]) -> Tai
 
 @cache
 def gross(share: float = GROSS_SHARE, times: float = GROSS_RATIO) -> Tail:
-    """Gaussian errors with a share of gross errors.
-
-    Args:
-        share: Share of gross errors.
-        times: Ratio of the standard deviations of gross and ordinary errors.
-    """
+    """Gaussian errors, a share of which is gross, with a standard deviation so many times that of the others."""
     ratio, fall = share / (1.0 - share) / times, 0.5 * (1.0 - 1.0 / times**2)
     constant = float(np.log1p(-share) - 0.5 * np.log(2 * np.pi))
 

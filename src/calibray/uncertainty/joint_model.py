@@ -122,13 +122,9 @@ class JointModel:
         return QuadraticForms.of(self.marginal)
 
     def at_scene_constants(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Log posterior with equal buildings and the scene's constants, averaged over the noise models.
+        """Log posterior [n] at points of the study's search space [n, d], up to a constant.
 
-        Args:
-            points: Points of the study's search space [n, d].
-
-        Returns:
-            Its values up to a constant [n].
+        Buildings are equal, and constants those of the scene. It is averaged over the noise models.
         """
         constants = [item.start for item in self.parameters.items[len(self.study) :]]
         values = np.hstack([self.study.from_search(points), np.tile(constants, (len(points), 1))])
@@ -178,9 +174,6 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
         best: The optimum, a point of the search space [d].
         square: Mean square of the residuals at the optimum [dB^2].
         freedom: Number of links minus unknowns.
-
-    Returns:
-        The model.
     """
     objective, links, section = problem.objective, problem.setup.links, problem.setup.study.noise
     weight, censored = _weights_and_censoring(problem)
@@ -207,9 +200,7 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
     )
     features = link_features(problem)[counted] if structured else None
     ridge = objective.noise_db / nuisance.prior[used] if nuisance.terms else np.zeros(0)
-    marginal = Marginal.of(
-        design[:, used], ridge, scale, position, noise_db, models, censored, features=features
-    )
+    marginal = Marginal.of(design[:, used], ridge, scale, position, noise_db, models, censored, features)
     measured = objective.measured[counted] - design[:, at_bound] @ coefficients[at_bound]
 
     def gap(loss: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -233,16 +224,7 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
         problem.priors,
         gaps_of,
         loss_of,
-        Marginal.of(
-            design[:, used],
-            ridge,
-            scale,
-            position,
-            noise_db,
-            models,
-            censored,
-            link_features(problem)[counted] if structured else None,
-        ),
+        marginal,
         none,
         none,
         none,

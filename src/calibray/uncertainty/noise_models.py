@@ -214,24 +214,16 @@ class Marginal:
         return cls(design * scale[:, None], ridge, scale, noise_db, tuple(models), whiteners, censored)
 
     def without_improbable(self, gap: NDArray[np.float64]) -> Marginal:
-        """The density without models that explain many links far worse than the best one.
-
-        Args:
-            gap: Gaps at the optimum [1, m], [dB].
-        """
+        """The density without models that explain gaps at the optimum [1, m] far worse than the best one."""
         density = self.densities(gap)[0]
         kept = np.flatnonzero(density > density.max() - IMPROBABLE)
         return replace(self, models=tuple(self.models[k] for k in kept)) if len(kept) else self
 
     def densities(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Log density of the measurements plus the log weight, for each model.
+        """Log density of the measurements plus the log weight, for each model [n, models]; -inf without a finite gap.
 
-        Args:
-            gap: Measured minus modelled path loss, without the nuisance, times the square roots of the weights [n, m],
-                [dB].
-
-        Returns:
-            The log densities [n, models]; -inf if a gap is not finite.
+        Gaps are measured minus modelled path loss, without the nuisance, times the square roots of the weights [n, m],
+        [dB].
         """
         log_density = np.full((len(gap), len(self.models)), -np.inf)
         finite = np.asarray((np.isfinite(gap) | (self.censored & (gap < 0))).all(axis=1))
@@ -257,14 +249,7 @@ class Marginal:
         return log_density
 
     def form(self, model: NoiseModel) -> tuple[NDArray[np.float64], float, float]:
-        """The density under Gaussian noise as a power of a quadratic form.
-
-        Args:
-            model: The model, which is not "student-t".
-
-        Returns:
-            The matrix Q [m, m], c and h: the log density of gaps g is c - h log g'Q g.
-        """
+        """The matrix Q [m, m], c and h under Gaussian noise: the log density of gaps g is c - h log g'Q g."""
         design, ridge = self._with_offset(model.offset)
         white, shift = np.eye(len(design)), 0.0
         if model.kind != GAUSSIAN:
@@ -279,14 +264,9 @@ class Marginal:
         return square, _constant(freedom, ridge) - shift, 0.5 * freedom
 
     def heavy(self, gap: NDArray[np.float64], models: Sequence[NoiseModel]) -> NDArray[np.float64]:
-        """Log density under heavy tails, all gaps at once.
+        """Log density of finite gaps [n, m] under their "student-t" models [n], without these models' weights [n].
 
-        Args:
-            gap: The gaps as for `densities`, all finite [n, m].
-            models: The "student-t" model of each gap, either all or none with gross errors [n].
-
-        Returns:
-            The log densities without the models' weights [n].
+        Either all or none of the models have gross errors.
         """
         offset = np.array([model.offset for model in models])
         design, ridge = self._with_offset(bool(offset.any()))

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.uncertainty.noise_models import CORRELATED, GAUSSIAN, HEAVY, STRUCTURED, Marginal
+from calibray.uncertainty.noise_models import HEAVY, Marginal
 
 MAX_LINKS: Final = 300
 """Links up to which the matrices are stored; those of 26 Gaussian models then take 19 MB."""
@@ -28,7 +28,7 @@ class QuadraticForms:
         group: Models that are evaluated together: the index of each Gaussian model, -1 for Student's t, -2 for gross
             errors [models].
         square: Matrix [m, m], constant and exponent of each Gaussian model's form, None for other models. Empty if
-            there are too many links, censored links or other kinds of models.
+            there are too many links, or censored ones.
     """
 
     marginal: Marginal
@@ -40,23 +40,13 @@ class QuadraticForms:
         """Compute the forms of a density."""
         models = marginal.models
         group = [(-2 if model.gross else -1) if model.kind == HEAVY else k for k, model in enumerate(models)]
-        supported = {model.kind for model in models} <= {GAUSSIAN, CORRELATED, STRUCTURED, HEAVY}
-        if len(marginal.column) > MAX_LINKS or marginal.censored.any() or not supported:
+        if len(marginal.column) > MAX_LINKS or marginal.censored.any():
             return cls(marginal, np.array(group), ())
         square = (None if model.kind == HEAVY else marginal.form(model) for model in models)
         return cls(marginal, np.array(group), tuple(square))
 
     def densities(self, gap: NDArray[np.float64], model: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Log density of the measurements, plus the log weight of the model.
-
-        Args:
-            gap: Measured minus modelled path loss, without the nuisance, times the square roots of the weights [n, m],
-                [dB].
-            model: Index of the model of each gap [n].
-
-        Returns:
-            The log densities [n]; -inf if a gap is not finite.
-        """
+        """As `Marginal.densities`, under the model with the given index for each gap [n]."""
         models, log_density = self.marginal.models, np.full(len(gap), -np.inf)
         if not self.square:
             for index in np.unique(model).tolist():

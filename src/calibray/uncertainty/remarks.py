@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from scipy.special import fdtri
 
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import BASINS, Trail, least_squares, relevant_minima
+from calibray.fitting.search import BASINS, Trail, least_squares
 from calibray.result.verdict import CONFIDENCE, Interval, Remark, RemarkKind, Value
 from calibray.result.wording import MOST_ODDS
 from calibray.uncertainty.draws import Draws
@@ -52,14 +52,7 @@ CAUSES: Final = (CORRELATED, STRUCTURED, HEAVY, DIFFERING, GAUSSIAN)
 
 
 def departures(noise: Mapping[str, float]) -> tuple[Remark, ...]:
-    """Noise models that the data favour over independent Gaussian noise.
-
-    Args:
-        noise: Posterior weights of the noise models.
-
-    Returns:
-        A remark for each that is likely.
-    """
+    """A remark for each noise model that the data favour over independent Gaussian noise, from their weights."""
     gaussian, remarks = float(noise.get(GAUSSIAN, 0.0)), []
     for kind, remark in DEPARTURES.items():
         weight = float(noise.get(kind, 0.0))
@@ -70,16 +63,7 @@ def departures(noise: Mapping[str, float]) -> tuple[Remark, ...]:
 
 
 def missed(problem: Problem, posterior: Draws, trail: Trail) -> tuple[Remark, ...]:
-    """Check whether a draw has a lower objective than the best candidate of the method.
-
-    Args:
-        problem: The problem.
-        posterior: The draws.
-        trail: The finished search.
-
-    Returns:
-        A remark, or none.
-    """
+    """A remark if a draw has a lower objective than the best candidate of the method."""
     top = posterior.point[np.argsort(-posterior.density)[:BEST_DRAWS]]
     lowest = float(problem.squares(top).value.min())
     if lowest > trail.best_value - MISSED_DB:
@@ -95,7 +79,7 @@ def outside_interval(
     log_odds: float,
     noise: Mapping[str, float],
 ) -> tuple[Remark, ...]:
-    """Check whether calibrated values lie outside their intervals.
+    """A remark that names the parameters whose calibrated values lie outside their intervals, and the cause.
 
     Args:
         problem: The problem.
@@ -104,9 +88,6 @@ def outside_interval(
         most_probable: The values of the draw of highest density by parameter.
         log_odds: Log density of that draw minus that of the calibrated values.
         noise: Posterior weights of the noise models.
-
-    Returns:
-        A remark that names the parameters and the cause, or none.
     """
     outside = []
     for parameter in problem.parameters:
@@ -128,18 +109,15 @@ def outside_interval(
     return (Remark(RemarkKind.OUTSIDE_INTERVAL, values),)
 
 
-@dataclass(frozen=True, eq=False)
-class UndeclaredOffset:
+class UndeclaredOffset(NamedTuple):
     """An offset for all links, fitted in addition to the study's model.
 
     Attributes:
-        minima: Relevant minima with the offset, the lowest first [k, d].
         offset_db: The best offset [dB]; None if the study declares one, or if the fit does not change.
         error_db: Its standard error [dB].
         remarks: A warning if it is significant.
     """
 
-    minima: NDArray[np.float64]
     offset_db: float | None = None
     error_db: float | None = None
     remarks: tuple[Remark, ...] = ()
@@ -161,24 +139,21 @@ def fit_undeclared_offset(
     """
     objective = problem.objective
     if has_offset(problem) or freedom < 2:
-        return UndeclaredOffset(np.zeros((0, len(problem.parameters))))
+        return UndeclaredOffset()
     terms = (*objective.nuisance.terms, make_term(problem.setup.links, "free offset"))
     trial = replace(problem, objective=replace(objective, nuisance=Nuisance(len(objective.weight), terms)))
-    fit = least_squares(trial, STARTS, minima[:BASINS])
-    value = trial.squares(fit.minima).value
-    relevant = relevant_minima(fit.minima, value**2, freedom - 1)
-    best = int(np.argmin(value))
-    best_loss = trial.modelled(fit.minima[best : best + 1])
-    offset, remaining = float(trial.objective.coefficients(best_loss)[0, -1]), float(value[best] ** 2)
+    best = least_squares(trial, STARTS, minima[:BASINS]).minima
+    value = trial.squares(best).value
+    lowest = int(np.argmin(value))
+    loss, remaining = trial.modelled(best[lowest : lowest + 1]), float(value[lowest] ** 2)
+    offset = float(trial.objective.coefficients(loss)[0, -1])
     # F statistic of one further column: the square of the offset over its standard error.
     ratio = (square - remaining) / remaining * (freedom - 1) if remaining > 0 else np.inf
     if not ratio > 0 or not np.isfinite(ratio):
-        return UndeclaredOffset(relevant)
+        return UndeclaredOffset()
     error = abs(offset) / float(np.sqrt(ratio))
-    remarks: tuple[Remark, ...] = ()
-    if ratio > fdtri(1, freedom - 1, CONFIDENCE) and abs(offset) >= OFFSET_DB:
-        rmse = {"rmse_db": float(np.sqrt(remaining)), "rmse_without_db": float(np.sqrt(square))}
-        remarks = (
-            Remark(RemarkKind.UNDECLARED_OFFSET, {"offset_db": offset, "error_db": float(error), **rmse}),
-        )
-    return UndeclaredOffset(relevant, offset, error, remarks)
+    if ratio <= fdtri(1, freedom - 1, CONFIDENCE) or abs(offset) < OFFSET_DB:
+        return UndeclaredOffset(offset, error)
+    rmse = {"rmse_db": float(np.sqrt(remaining)), "rmse_without_db": float(np.sqrt(square))}
+    remark = Remark(RemarkKind.UNDECLARED_OFFSET, {"offset_db": offset, "error_db": error, **rmse})
+    return UndeclaredOffset(offset, error, (remark,))

@@ -134,15 +134,7 @@ def _restricted(
 
 
 def shared_errors(errors: NDArray[np.float64], position: NDArray[np.float64]) -> Correlation | None:
-    """Fit the correlation of the errors, if it is significant.
-
-    Args:
-        errors: Errors at the best fit [m], [dB].
-        position: Positions of the receivers, or of both ends [m, k], [m].
-
-    Returns:
-        The correlation; None if it is not significant.
-    """
+    """The correlation of errors at the best fit [m], [dB], at positions [m, k], [m]; None if it is not significant."""
     if len(errors) < FEWEST_LINKS:
         return None
     chosen = np.linspace(0, len(errors) - 1, min(len(errors), MOST_LINKS)).round().astype(int)

@@ -244,15 +244,7 @@ def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, 
 
 
 def consistent(interval: Interval, value: float) -> Interval:
-    """The interval with a verdict that does not contradict the calibrated value.
-
-    Args:
-        interval: The interval.
-        value: The value of least RMSE.
-
-    Returns:
-        The interval; ambiguous if it was identified, but does not contain the value.
-    """
+    """The interval; ambiguous if it was identified, but does not contain the value of least RMSE."""
     identified = interval.verdict in (VerdictName.IDENTIFIED, VerdictName.WEAKLY_IDENTIFIED)
     if not identified or interval.contains(value, 1e-9 * abs(value)):
         return interval

@@ -22,7 +22,6 @@ EXACT: Final = 600
 NEAREST: Final = 20
 """Neighbours in Vecchia's approximation."""
 
-
 CHUNK: Final = 500
 """Links whose neighbourhoods are solved together."""
 
@@ -48,11 +47,7 @@ class Whitener:
 
 
 def pairwise(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances between links [m, m], [m]; beyond `EXACT` links those of an evenly spaced subset.
-
-    Args:
-        position: Positions of the links' ends [n, k], [m].
-    """
+    """Distances between positions [n, k] of links; beyond `EXACT` links those of an evenly spaced subset [m, m]."""
     subset = position[:: max(1, len(position) // EXACT)]
     return np.asarray(cdist(subset, subset), dtype=np.float64)
 
@@ -88,14 +83,7 @@ def whitener(
 
 
 def nearest_earlier(position: NDArray[np.float64]) -> Neighbours:
-    """A random order of links, which gives near and far neighbours among the earlier ones, and the nearest of these.
-
-    Args:
-        position: Positions of the links' ends [m, k], [m].
-
-    Returns:
-        The neighbours.
-    """
+    """A random order of links at positions [m, k], so that some earlier ones are near, some far; and the nearest."""
     order = np.random.default_rng(0).permutation(len(position))
     shuffled, near = position[order], np.full((len(order), NEAREST), -1)
     for index in range(1, len(order)):

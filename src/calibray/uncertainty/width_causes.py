@@ -25,14 +25,9 @@ NOTABLE: Final = 0.85
 
 
 def remaining_widths(model: JointModel, posterior: Posterior) -> list[dict[Cause, float]]:
-    """The share of every interval's width that is left without each cause.
+    """By parameter of the study, the shares of its interval's width that are left without each cause.
 
-    Args:
-        model: The joint model.
-        posterior: Its draws.
-
-    Returns:
-        By parameter of the study, the shares of the causes that make its interval notably wide, the smallest first.
+    Only causes that make it notably wide are listed, the smallest share first.
     """
     draws, width = posterior.means, len(model.study)
     models = [model.marginal.models[index] for index in posterior.model]
