@@ -7,6 +7,10 @@ Each run draws all unknowns of the joint model from its prior in one district: p
 study's prior, and the constants that the scene fixes. Noise is Gaussian with a standard deviation of 3 dB. If sampler
 and model are right, a 90 % set contains its parameter in 90 % of the runs (S. Talts et al., arXiv 1804.06788).
 
+Where the data say little, a set is that of the prior, and contains the truths that happen to lie in the middle of the
+prior. Of 100 independent truths these are 84 to 96 in 19 of 20 cases, whatever the sampler does. The truths of a
+parameter are therefore a Latin hypercube: one in each of as many equally probable parts of its prior as there are runs.
+
 With `--reference`, the distribution function of every parameter is compared with that of so many draws from the prior,
 weighted by the likelihood: an independent computation of the same posterior. Path loss of these draws is computed once
 for each district. The distance is the largest one between both functions; it counts where the reference has more than
@@ -25,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats.qmc import LatinHypercube
 
 import districts
 from calibray import engines
@@ -41,6 +46,10 @@ from calibray.uncertainty.sequential_monte_carlo import BUDGET, draw_posterior
 NOISE_DB = 3.0
 LEVEL = 0.9
 BATCH = 4096
+QUANTILES = 100_000
+"""Draws from the prior whose quantiles are truths."""
+MOST = 20
+"""Most parameters and constants of a district."""
 EFFECTIVE = 1000
 """Effective draws below which a reference does not count."""
 
@@ -63,9 +72,12 @@ def five_parameters(name: str, folder: Path) -> Problem:
     return Problem.of(opened, engines.make(opened))
 
 
-def planted(problem: Problem, model: JointModel, random: np.random.Generator) -> tuple[Problem, np.ndarray]:
-    """The problem with measurements of a truth from the prior, and the truth in the unit cube."""
-    truth = model.draw_prior(1, random)
+def planted(
+    problem: Problem, model: JointModel, levels: np.ndarray, random: np.random.Generator
+) -> tuple[Problem, np.ndarray]:
+    """The problem with measurements of a truth, and the truth in the unit cube, at given quantiles of its prior."""
+    drawn = model.draw_prior(QUANTILES, random)
+    truth = np.array([[np.quantile(column, level) for column, level in zip(drawn.T, levels, strict=False)]])
     gap = model.gaps(truth, np.zeros((1, len(model.parameter_of))))[0]
     measured = problem.objective.measured.copy()
     measured[problem.objective.weight > 0] -= gap - NOISE_DB * random.standard_normal(len(gap))
@@ -113,12 +125,14 @@ class Reference:
         return share / share.sum()
 
 
-def run(problem: Problem, number: int, seed: int, reference: Reference | None, budget: int) -> dict[str, Any]:
+def run(
+    problem: Problem, levels: np.ndarray, number: int, seed: int, reference: Reference | None, budget: int
+) -> dict[str, Any]:
     """One truth: whether the sets contain it, and the distance from the reference."""
     random = np.random.default_rng([seed, number])
     parameters, width = problem.parameters, len(problem.parameters)
     start = parameters.to_search(parameters.start)
-    problem, truth = planted(problem, joint_model(problem, start, NOISE_DB**2, 10), random)
+    problem, truth = planted(problem, joint_model(problem, start, NOISE_DB**2, 10), levels, random)
     lower, upper = parameters.search_bounds
     trail = search(problem, LeastSquares(lower, upper, starts=32, seed=number))
     started = time.process_time()
@@ -173,6 +187,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="append one line of JSON per run")
     given = parser.parse_args()
     names, lines = districts.named(given.districts), []
+    levels = LatinHypercube(MOST, rng=np.random.default_rng(given.seed)).random(given.runs)
     # District by district, since the reference of one takes the memory of all.
     order = sorted(range(given.runs), key=lambda number: number % len(names))
     made: tuple[str, Problem, Reference | None] | None = None
@@ -182,7 +197,7 @@ def main() -> None:
             made = None  # frees the memory first
             problem = five_parameters(name, given.folder)
             made = name, problem, Reference.of(problem, given.reference) if given.reference else None
-        line = run(made[1], number, given.seed, made[2], given.budget)
+        line = run(made[1], levels[number], number, given.seed, made[2], given.budget)
         lines.append(line | {"district": name})
         if given.out is not None:
             with given.out.open("a") as file:
