@@ -18,6 +18,21 @@ def _quiet():
     optuna.logging.set_verbosity(optuna.logging.ERROR)
 
 
+@pytest.fixture
+def storage(tmp_path):
+    """Opens the same database anew at every call; Optuna itself leaves closing to the garbage collector."""
+    opened = []
+
+    def again():
+        opened.append(optuna.storages.RDBStorage(f"sqlite:///{tmp_path / 'study.db'}"))
+        return opened[-1]
+
+    yield again
+    for storage in opened:
+        storage.remove_session()
+        storage.engine.dispose()
+
+
 def loss(a, b):
     return float((a - 4.0) ** 2 + (b - 7.0) ** 2 + np.sin(3.0 * a))
 
@@ -47,24 +62,26 @@ def test_a_study_goes_the_way_of_ask_and_tell_and_stops_after_225_evaluations():
     assert points(study) == reference(4)
 
 
-def test_a_stored_study_resumes_where_it_stopped(tmp_path):
-    storage = f"sqlite:///{tmp_path / 'study.db'}"
+def test_a_stored_study_resumes_where_it_stopped(storage):
     study = optuna.create_study(
-        storage=storage, study_name="s", sampler=SGWOIMSampler(SPACE, seed=2, **SMALL)
+        storage=storage(), study_name="s", sampler=SGWOIMSampler(SPACE, seed=2, **SMALL)
     )
     study.optimize(objective, n_trials=9)
-    again = optuna.load_study(storage=storage, study_name="s", sampler=SGWOIMSampler(SPACE, seed=2, **SMALL))
+    again = optuna.load_study(
+        storage=storage(), study_name="s", sampler=SGWOIMSampler(SPACE, seed=2, **SMALL)
+    )
     again.optimize(objective)
     assert points(again) == reference(2, **SMALL)
 
 
-def test_a_candidate_lost_with_its_process_is_handed_out_again(tmp_path):
-    storage = f"sqlite:///{tmp_path / 'study.db'}"
+def test_a_candidate_lost_with_its_process_is_handed_out_again(storage):
     study = optuna.create_study(
-        storage=storage, study_name="s", sampler=SGWOIMSampler(SPACE, seed=2, **SMALL)
+        storage=storage(), study_name="s", sampler=SGWOIMSampler(SPACE, seed=2, **SMALL)
     )
     lost = study.ask(SPACE)  # never told: its process was killed
-    again = optuna.load_study(storage=storage, study_name="s", sampler=SGWOIMSampler(SPACE, seed=2, **SMALL))
+    again = optuna.load_study(
+        storage=storage(), study_name="s", sampler=SGWOIMSampler(SPACE, seed=2, **SMALL)
+    )
     again.optimize(objective, n_trials=200)
     finished = [trial for trial in again.trials if trial.number != lost.number]
     assert len(finished) == 20
