@@ -17,7 +17,7 @@ demo: setup
 	$(BIN)/calibray demo
 
 test: setup
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --doctest-modules src tests
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --doctest-modules src tests
 
 # The tests that trace little, in about 90 seconds.
 quick: setup

@@ -35,6 +35,20 @@ def pytest_configure(config: pytest.Config) -> None:
                 pass
 
 
+LONGEST = (
+    "test_browser", "test_report_browser", "test_ledger", "test_derivatives", "test_ctrl_c", "test_dask",
+    "test_command", "test_octave", "test_program_with_rays", "test_emulator", "test_calibrate", "test_notebooks",
+    "test_compression",
+)  # fmt: skip
+"""Files that take longest. They run first, so that no worker is left with one of them at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long files first; `make test` keeps this order, where xdist would put files of few tests last."""
+    rank = {name: index for index, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _no_lines_of_progress():
     """No lines of progress on stderr, however busy the machine is."""
