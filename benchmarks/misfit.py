@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
-from calibray.calibration.antenna_directions import directions_remark
+from calibray.calibration.link_diagnostics import directions_remark
 from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares
 from calibray.result.held_out import Model

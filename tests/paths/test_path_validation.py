@@ -10,7 +10,7 @@ import pytest
 import synthetic
 from calibray.errors import InputError
 from calibray.paths import Paths, seal
-from calibray.support import limited_process
+from calibray.support import memory
 
 
 @pytest.fixture
@@ -29,13 +29,13 @@ def resealed(paths: Paths, file: Path) -> Path:
 
 def count_processes(monkeypatch, program: str = "") -> list[str]:
     """The programs that are started from then on; `program` runs in place of the validation, if given."""
-    started, run = [], limited_process.subprocess.run
+    started, run = [], memory.subprocess.run
 
     def counted(command, **options):
         started.append(command[-1])
         return run([*command[:-1], program or command[-1]], **options)
 
-    monkeypatch.setattr(limited_process.subprocess, "run", counted)
+    monkeypatch.setattr(memory.subprocess, "run", counted)
     return started
 
 
@@ -62,7 +62,7 @@ def test_a_path_file_that_hangs_or_crashes_the_library_is_refused(
     paths, tmp_path, monkeypatch, program, message
 ):
     file = resealed(paths, tmp_path / "foreign.h5")
-    monkeypatch.setattr(limited_process, "SECONDS", 2.0)
+    monkeypatch.setattr(memory, "SECONDS", 2.0)
     count_processes(monkeypatch, program)
     with pytest.raises(InputError, match=message):
         Paths.load(file)

@@ -7,7 +7,7 @@ import pytest
 
 import planted
 from calibray.measurements.observables import KINDS, Statistic
-from calibray.prediction.observable_choice import CHOICES, ERROR_DB, RELATIVE_ERROR, worth_measuring
+from calibray.prediction.observables import CHOICES, ERROR_DB, RELATIVE_ERROR, worth_measuring
 
 LINK = 3
 

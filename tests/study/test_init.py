@@ -22,9 +22,8 @@ from calibray.measurements import SourceTable, column_names
 from calibray.scenes.authoring import Footprints, Terrain, make_plan_scene, make_scene, read_plan
 from calibray.scenes.checks import SceneSurfaces
 from calibray.study import Study
-from calibray.study.draft import draft
+from calibray.study.draft import draft, schema_text
 from calibray.study.link_checks import count_unknowns
-from calibray.study.schema import schema_text
 from calibray.study.toml_file import study_text
 
 REPOSITORY = Path(__file__).parents[2]

@@ -13,7 +13,7 @@ import two_ray
 from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.study import Setup, Study
-from calibray.study.population import with_spreads
+from calibray.study.mounting import with_spreads
 from two_ray import COLUMNS, TwoRay
 
 SECTORS, EACH, NOISE_DB = 8, 14, 2.0

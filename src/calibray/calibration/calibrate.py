@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from calibray import engines
-from calibray.calibration.antenna_directions import directions_remark
-from calibray.calibration.link_diagnostics import unreached_remark
+from calibray.calibration.link_diagnostics import directions_remark, unreached_remark
 from calibray.calibration.make_result import Run, Timing, make_result
 from calibray.calibration.result import Result
 from calibray.engines.cluster.workers import Workers

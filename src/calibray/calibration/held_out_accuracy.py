@@ -35,7 +35,7 @@ from calibray.validation.validation import Validation
 from calibray.validation.variants import add_nuisance, initial_objective
 
 FEWEST_HELD_OUT: Final = 8
-"""Held-out links from which a standard deviation of residuals is computed; with fewer, that of the fit is used."""
+"""Held-out links, or links without a path, from which errors are computed; with fewer, those of the fit are used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,9 +189,6 @@ def _out_of_sight(problem: Problem, errors: NDArray[np.float64], links: NDArray[
     return out_of_sight_ratio(errors, table.numbers(OUT_OF_SIGHT)[links] > 0)
 
 
-FEWEST: Final = 8
-"""Links without a path, or held-out links, from which errors are computed; as for the prediction model."""
-
 WITHOUT_PATH: Final = "without a path"
 """Name of the term with the mean residual of the links without a path."""
 
@@ -219,13 +216,13 @@ def fit_fallback(
     for excluded in (links.censored, problem.faint):
         usable = usable if excluded is None else usable & ~excluded
     count = int(usable.sum())
-    if count >= FEWEST:
+    if count >= FEWEST_HELD_OUT:
         mean_db = float(residuals[usable].mean())
         terms += (FittedTerm(WITHOUT_PATH, CONSTANT, "", {"": mean_db}),)
         # The error of each link if the mean is that of the others.
         errors = (residuals[usable] - mean_db) * count / (count - 1)
         basis = f"errors of {count} links without a path"
-    elif len(held_out_db) >= FEWEST:
+    elif len(held_out_db) >= FEWEST_HELD_OUT:
         errors = held_out_db
     else:
         counted = objective.weight > 0

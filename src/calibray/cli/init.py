@@ -61,8 +61,8 @@ def init(
         from calibray.reporting.position_plot import save_positions
         from calibray.reporting.scene_tables import assumptions, warning_lines
         from calibray.study.draft import draft as draft_study
+        from calibray.study.draft import schema_text
         from calibray.study.link_checks import count_unknowns
-        from calibray.study.schema import schema_text
         from calibray.study.toml_file import SCHEMA_FILE
         from calibray.tables.text import render
 
@@ -106,6 +106,6 @@ def _position(text: str) -> list[float]:
 
 def schema() -> None:
     """Print the JSON schema of study files, with which editors complete and check them."""
-    from calibray.study.schema import schema_text
+    from calibray.study.draft import schema_text
 
     echo(schema_text(), nl=False)

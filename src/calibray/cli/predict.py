@@ -13,6 +13,7 @@ import typer
 
 from calibray.cli.console import AllowChangedInputs, Overwrite, Scheduler, Workers, echo, log, print_costs
 from calibray.errors import InputError
+from calibray.tables import Column, Table, numbers
 
 if TYPE_CHECKING:
     import numpy as np
@@ -139,9 +140,9 @@ def _collect_warnings(
     for number, remarks in zip(row.tolist(), predictions["remark"].tolist(), strict=True):
         for remark in filter(None, remarks.split(", ")):
             rows.setdefault(remark, []).append(number)
-    for warning, numbers in rows.items():
+    for warning, numbers_of_rows in rows.items():
         # An array takes 8 bytes per row, so a million rows take 8 MB; a list of integers would take 36 MB.
-        warnings.setdefault(warning, array("q")).extend(numbers)
+        warnings.setdefault(warning, array("q")).extend(numbers_of_rows)
 
 
 def _warn(warning: str, rows: Sequence[int], count: int) -> None:
@@ -194,7 +195,6 @@ def suggest(
         from calibray.measurements.table_files import read_table
         from calibray.prediction.predict import as_links
         from calibray.prediction.suggestion import suggest as suggest_links
-        from calibray.prediction.suggestion_tables import suggestion_tables
         from calibray.support.output_tables import check_table, write_table
         from calibray.tables.text import render
 
@@ -214,3 +214,46 @@ def suggest(
     )
     if out is not None:
         write_table(out, suggestion)
+
+
+def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
+    """Suggestions as tables for the terminal.
+
+    Args:
+        suggestions: The suggestions, from `suggest`.
+
+    Returns:
+        A table of positions, and a table of the gain expected from each suggestion and those above it.
+    """
+    from calibray.prediction.position_checks import POSITION_COLUMNS
+
+    grouped = ["group"] if "group" in suggestions else []
+    columns = (
+        numbers("rank"),
+        numbers("row"),
+        *(numbers(name, "m") for name in POSITION_COLUMNS),
+        *map(Column, grouped),
+        numbers("path loss", "dB"),
+        numbers("draws differ by", "dB"),
+    )
+    rows, gains = [], []
+    for rank, row in enumerate(suggestions.to_dict("records"), start=1):
+        losses = (f"{row['path_loss_db']:.1f}", f"{row['spread_db']:.1f}")
+        position = (f"{row[name]:.2f}" for name in POSITION_COLUMNS)
+        rows.append((str(rank), str(row["row"]), *position, *(str(row[name]) for name in grouped), *losses))
+        gains.append((str(rank), row["gain"]))
+    expected = Table(
+        "Expected 95 % intervals once it and those above are measured",
+        (numbers("rank"), Column("gain")),
+        tuple(gains),
+    )
+    tables = Table("Where to measure next", columns, tuple(rows)), expected
+    if "observable" not in suggestions:
+        return tables
+    worth = suggestions[["observable", "observable_gain"]].itertuples(index=False)
+    further = Table(
+        "What to measure there besides path loss",
+        (numbers("rank"), Column("observable"), Column("expected 95 % intervals, relative to those above")),
+        tuple((str(rank), *map(str, row)) for rank, row in enumerate(worth, start=1)),
+    )
+    return *tables, further

@@ -29,7 +29,7 @@ from calibray.fitting.observed import with_errors
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import least_squares
 from calibray.study import Study
-from calibray.study.population import estimated_fields, with_spreads
+from calibray.study.mounting import estimated_fields, with_spreads
 from calibray.support.progress import Progress
 from calibray.tracing.mounting import NEW, POSE
 

@@ -16,8 +16,7 @@ from calibray.measurements.delimited_text import SUFFIXES, parse_text, read_text
 from calibray.measurements.excel import sheet_text
 from calibray.measurements.source_table import SourceTable
 from calibray.support.lazy_imports import library
-from calibray.support.limited_process import run_limited
-from calibray.support.memory import available_memory
+from calibray.support.memory import available_memory, run_limited
 from calibray.support.messages import first_line, shortened
 from calibray.support.output_files import exists
 

@@ -28,7 +28,7 @@ from calibray.materials import FIELDS, Material, constants_matrix
 from calibray.paths.file_format import BLOCK, DATASETS, Content, read, verify, write, write_checksum
 from calibray.paths.interactions import Diffraction, Diffuse, Kind
 from calibray.support.cache_folder import Store, cache_folder
-from calibray.support.limited_process import run_limited
+from calibray.support.memory import run_limited
 from calibray.support.messages import first_line
 from calibray.support.output_files import check_file, exists, replacing
 

@@ -24,7 +24,7 @@ from calibray.prediction.experiment_design import (
     choose_candidates,
     initial_range_probability,
 )
-from calibray.prediction.observable_choice import Worth, worth_measuring
+from calibray.prediction.observables import Worth, worth_measuring
 from calibray.prediction.position_checks import POSITION_COLUMNS
 from calibray.prediction.predict import as_links, check_inputs, traced_materials, with_constants
 from calibray.result.record import Record

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,12 @@ from calibray.study.model import StudyModel
 from calibray.study.sections import MountingSection
 from calibray.support.messages import did_you_mean
 from calibray.tracing.antennas import AntennaPattern
-from calibray.tracing.mounting import EVERY, POSE, Mounting, Pose, stated_jones, turns
+from calibray.tracing.mounting import EVERY, NEW, POSE, Mounting, Pose, stated_jones, turns
 from calibray.tracing.settings import Antenna
 
 if TYPE_CHECKING:
     from calibray.fields import Effects
+
 
 PORT_POWER: Final = "tx_port_power_dbm"
 """Column of the links: the power that their transmitters feed into the antenna [dBm]."""
@@ -204,3 +205,45 @@ def largest_gain_dbi(antenna: Antenna) -> float:
     """Largest gain of an antenna over all directions on a grid of one degree [dBi]."""
     zenith, azimuth = np.meshgrid(np.radians(np.arange(181.0)), np.radians(np.arange(-180.0, 180.0)))
     return float(20 * np.log10(AntennaPattern.of(antenna).amplitude(zenith, azimuth).max()))
+
+
+FIRST_SPREAD: Final = 0.25
+"""Spread before it is estimated, as a share of the width of the bounds: nearly that of a uniform distribution, 0.29."""
+
+
+def estimated_fields(study: StudyModel) -> tuple[str, ...]:
+    """The fields of transmitters whose spread is estimated."""
+    return tuple(
+        name.rpartition(".")[2] for name, entry in study.parameters.items() if entry.spread == "auto"
+    )
+
+
+def with_population(study: StudyModel, links: Measurements) -> dict[str, Any]:
+    """The content of a study with a parameter of every transmitter for each `spread`.
+
+    One more stands for transmitters without measured links: its prior, which no link narrows, is the population.
+
+    Raises:
+        InputError: The column of transmitters is missing.
+    """
+    content = study.content()
+    labels = np.unique(links.table.labels(study.links.transmitter)).tolist()
+    for name, entry in study.parameters.items():
+        if entry.spread is None:
+            continue
+        lower, upper = entry.bounds
+        std = FIRST_SPREAD * (upper - lower) if entry.spread == "auto" else entry.spread
+        for label in (*labels, NEW):
+            own = {"bounds": [lower, upper], "prior": {"std": std, "shared": True}}
+            content["parameters"].setdefault(f"{POSE}{label}.{name.rpartition('.')[2]}", own)
+    return content
+
+
+def with_spreads(study: StudyModel, spreads: Mapping[str, float]) -> dict[str, Any]:
+    """The content of a study with standard deviations of the transmitters' values by field."""
+    content = study.content()
+    for name, entry in content["parameters"].items():
+        field = name.rpartition(".")[2]
+        if field in spreads and entry.get("prior", {}).get("shared"):
+            entry["prior"]["std"] = spreads[field]
+    return content

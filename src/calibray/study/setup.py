@@ -43,8 +43,7 @@ from calibray.study.facades import (
 )
 from calibray.study.link_obstruction import with_obstruction
 from calibray.study.model import StudyModel
-from calibray.study.mounting import link_mountings, pose_effects
-from calibray.study.population import with_population
+from calibray.study.mounting import link_mountings, pose_effects, with_population
 from calibray.study.regions import region_effects
 from calibray.study.row_steps import scene_place, study_links, study_regions
 from calibray.study.sections import AntennasSection
