@@ -117,7 +117,7 @@ def _choice(
         name: (path_loss_db - objective.measured)[judged] for name, path_loss_db in modelled.items()
     }
     finite = np.isfinite(np.stack(list(errors.values()))).all(axis=0)
-    errors, count = {name: each[finite] for name, each in errors.items()}, int(finite.sum())
+    errors, count = {name: values[finite] for name, values in errors.items()}, int(finite.sum())
     if count >= FEWEST_HELD_OUT:
         name = choose(errors, setup.links.rx[judged][finite])
         rms_db, basis = float(np.sqrt(np.mean(errors[name] ** 2))), f"errors of {count} links held out"

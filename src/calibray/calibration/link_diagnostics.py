@@ -252,7 +252,7 @@ def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Rema
     if not directions:
         return ()
     numbers = {
-        f"{name}_deg": [float(getattr(each, name)) for each in directions.values()]
+        f"{name}_deg": [float(getattr(direction, name)) for direction in directions.values()]
         for name in Direction._fields
     }
     return (Remark(RemarkKind.ANTENNA_DIRECTIONS, {"transmitters": list(directions), **numbers}),)

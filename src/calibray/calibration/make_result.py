@@ -324,47 +324,53 @@ def observable_fits(
     before, after = problem.respond(np.stack([problem.parameters.start, run.trail.best])).observed
     spread = _observed_at_draws(run, draws)
     fits, columns = {}, {}
-    for index, each in enumerate(problem.observed):
-        unit, used = sections[each.name].unit, each.used(weight)
-        initial, _ = each.residuals(before[index][None], weight)
-        residuals, biases = each.residuals(after[index][None], weight)
-        groups = np.unique(each.group[used]) if each.labels else np.zeros(0, dtype=np.int64)
-        count = np.bincount(each.group[used], minlength=len(each.labels))[groups] if each.labels else groups
+    for index, observable in enumerate(problem.observed):
+        unit, used = sections[observable.name].unit, observable.used(weight)
+        initial, _ = observable.residuals(before[index][None], weight)
+        residuals, biases = observable.residuals(after[index][None], weight)
+        groups = np.unique(observable.group[used]) if observable.labels else np.zeros(0, dtype=np.int64)
+        count = (
+            np.bincount(observable.group[used], minlength=len(observable.labels))[groups]
+            if observable.labels
+            else groups
+        )
         of_draws = (
-            each.residuals(np.stack([values[index] for values in spread]), weight)[1] if spread else biases
+            observable.residuals(np.stack([values[index] for values in spread]), weight)[1]
+            if spread
+            else biases
         )
         # The error of a mean, and that of the parameters.
         errors = np.sqrt(
-            each.std**2 / np.maximum(count, 1) + np.mean((of_draws - biases)[:, groups] ** 2, axis=0)
+            observable.std**2 / np.maximum(count, 1) + np.mean((of_draws - biases)[:, groups] ** 2, axis=0)
         )
-        labels = [each.labels[group] for group in groups]
-        fits[each.name] = ObservableFit(
-            kind=each.statistic.kind,
+        labels = [observable.labels[group] for group in groups]
+        fits[observable.name] = ObservableFit(
+            kind=observable.statistic.kind,
             unit=unit,
             links=len(used),
             rmse=_rms(residuals),
             initial_rmse=_rms(initial),
-            mean_rmse=float(np.std(each.measured[used])),
-            error=each.std,
+            mean_rmse=float(np.std(observable.measured[used])),
+            error=observable.std,
             biases=dict(zip(labels, biases[0, groups].tolist(), strict=True)),
             bias_errors=dict(zip(labels, errors.tolist(), strict=True)),
         )
         columns |= {
-            f"{each.name}_measured_{unit}": each.measured,
-            f"{each.name}_before_{unit}": before[index] / each.scale,
-            f"{each.name}_after_{unit}": after[index] / each.scale,
+            f"{observable.name}_measured_{unit}": observable.measured,
+            f"{observable.name}_before_{unit}": before[index] / observable.scale,
+            f"{observable.name}_after_{unit}": after[index] / observable.scale,
         }
-        if each.labels:
-            known = np.append(np.isin(np.arange(len(each.labels)), groups), False)
-            of_links = np.append(biases[0], np.nan)[each.group]
-            columns[f"{each.name}_bias_{unit}"] = np.where(known[each.group], of_links, np.nan)
+        if observable.labels:
+            known = np.append(np.isin(np.arange(len(observable.labels)), groups), False)
+            of_links = np.append(biases[0], np.nan)[observable.group]
+            columns[f"{observable.name}_bias_{unit}"] = np.where(known[observable.group], of_links, np.nan)
     return fits, columns
 
 
 def _observed_at_draws(run: Run, draws: Mapping[str, Sequence[float]]) -> tuple[NDArray[np.float64], ...]:
     """Observables [K, L] at draws, for the errors of biases; those of an expensive engine are emulated."""
     problem = run.problem
-    if not draws or not any(each.labels for each in problem.observed):
+    if not draws or not any(observable.labels for observable in problem.observed):
         return ()
     if not problem.differentiable:
         ensemble = emulate(problem, run.trail, run.cheap.model)

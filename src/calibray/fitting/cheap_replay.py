@@ -201,7 +201,7 @@ class ProblemRows:
         """See `Rows.known`; False for rows of priors, which the model does not predict."""
         weight = self.problem.objective.weight
         priors = int((self.problem.objective.nuisance.prior < np.inf).sum()) + len(self.problem.priors)
-        further = [reached[each.used(weight)] for each in self.problem.observed]
+        further = [reached[observable.used(weight)] for observable in self.problem.observed]
         return np.concatenate([reached[weight > 0], np.zeros(priors, dtype=bool), *further])
 
     def residuals(

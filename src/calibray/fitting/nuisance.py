@@ -331,17 +331,17 @@ class Nuisance:
             coefficients: The coefficients [q].
             determined: Mask of those that the links determine [q].
         """
-        found: dict[str, dict[str, float]] = {}
+        coefficient: dict[str, dict[str, float]] = {}
         first = 0
         for term in self.terms:
             last = first + len(term.labels)
-            shared = found.get(term.around, {}).get("", 0.0)
+            shared = coefficient.get(term.around, {}).get("", 0.0)
             values = zip(term.labels, coefficients[first:last].tolist(), determined[first:last], strict=True)
-            found[term.around or term.name] = {
+            coefficient[term.around or term.name] = {
                 label: shared + value for label, value, known in values if known
             }
             first = last
-        return found
+        return coefficient
 
     def _per_column(self, values: list[float]) -> NDArray[np.float64]:
         return np.repeat(np.array(values, dtype=np.float64), [len(term.labels) for term in self.terms])

@@ -179,11 +179,13 @@ def with_errors(
         weight: Weights of the links [L].
     """
     updated = []
-    for each, values in zip(every, modelled, strict=True):
-        if each.stated:
-            updated.append(each)
+    for observable, values in zip(every, modelled, strict=True):
+        if observable.stated:
+            updated.append(observable)
             continue
-        residuals, _ = each.residuals(values[None], weight)
-        std = float(np.sqrt(np.sum(residuals**2) / max(each.freedom(weight), 1)))
-        updated.append(replace(each, std=max(std, LEAST * float(np.nanstd(each.measured)), 1e-300)))
+        residuals, _ = observable.residuals(values[None], weight)
+        std = float(np.sqrt(np.sum(residuals**2) / max(observable.freedom(weight), 1)))
+        updated.append(
+            replace(observable, std=max(std, LEAST * float(np.nanstd(observable.measured)), 1e-300))
+        )
     return tuple(updated)

@@ -118,7 +118,7 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
     study = problem.setup.study
     stated = study.noise.std_db is not None or study.links.std is not None
     random_effects = any(term.around for term in problem.objective.nuisance.terms)
-    unstated = not all(each.stated for each in problem.observed)
+    unstated = not all(observable.stated for observable in problem.observed)
     if not problem.has_priors or (stated and not unstated and not random_effects):
         return problem
     if not stated and (not problem.differentiable or problem.freedom < 1):
@@ -153,7 +153,10 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
         changes = [abs(noise_db / before - 1)]
         spreads = problem.objective.nuisance.prior
         changes += np.abs(spreads[spreads < np.inf] / old_spreads[spreads < np.inf] - 1).tolist()
-        changes += [abs(each.std / old.std - 1) for each, old in zip(problem.observed, errors, strict=True)]
+        changes += [
+            abs(observable.std / old.std - 1)
+            for observable, old in zip(problem.observed, errors, strict=True)
+        ]
         if max(changes) <= TOLERANCE:
             break
     return _with_noise(problem, noise_db)
@@ -264,9 +267,9 @@ def group_spread(
         return GroupSpread(0.0, float(np.std(residuals)))
     all_columns = np.column_stack([basis, residuals])
     products, groups = all_columns.T @ all_columns, int(group.max()) + 1
-    sums = np.stack([np.bincount(group, column * each, groups) for each in all_columns.T])
+    sums = np.stack([np.bincount(group, column * values, groups) for values in all_columns.T])
     square = np.bincount(group, column**2, groups)
-    best, found = np.inf, GroupSpread(0.0, 0.0)
+    best, spread = np.inf, GroupSpread(0.0, 0.0)
     for ratio in RATIOS:
         # V = I + ratio Z Z' is a block per group, so that its inverse is a rank-one update (Sherman and Morrison).
         weighted = products - (sums * (ratio / (1.0 + ratio * square))) @ sums.T
@@ -275,8 +278,8 @@ def group_spread(
         variance = max(variance, 1e-12)
         deviance = freedom * np.log(variance) + np.log1p(ratio * square).sum() + np.linalg.slogdet(inner)[1]
         if deviance < best:
-            best, found = deviance, GroupSpread(float(np.sqrt(ratio * variance)), float(np.sqrt(variance)))
-    return found
+            best, spread = deviance, GroupSpread(float(np.sqrt(ratio * variance)), float(np.sqrt(variance)))
+    return spread
 
 
 ROUNDS: Final = 20

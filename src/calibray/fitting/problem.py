@@ -118,7 +118,7 @@ class Problem:
         further = observed(setup, engine) if observable is PATH_LOSS else ()
         if further and isinstance(engine, Observing):
             # On an expensive engine one call answers for path loss and all observables.
-            statistics = tuple(each.statistic for each in further)
+            statistics = tuple(observable.statistic for observable in further)
             before = engine.respond(engine.parameters.start[None], statistics).path_loss[0]
         else:
             before = observable.modelled(engine, engine.parameters.start[None])[0]
@@ -145,7 +145,7 @@ class Problem:
     @property
     def statistics(self) -> tuple[Statistic, ...]:
         """What the further observables are."""
-        return tuple(each.statistic for each in self.observed)
+        return tuple(observable.statistic for observable in self.observed)
 
     @property
     def num_links(self) -> int:
@@ -338,16 +338,16 @@ class Problem:
         """Rows of every further observable [n, m], in units of the errors of path loss."""
         weight, noise_db = self.objective.weight, self.objective.noise_db
         return [
-            noise_db / each.std * each.residuals(observed[:, index], weight)[0]
-            for index, each in enumerate(self.observed)
+            noise_db / observable.std * observable.residuals(observed[:, index], weight)[0]
+            for index, observable in enumerate(self.observed)
         ]
 
     def _further_slopes(self, slope: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """Derivatives of these rows [n, m, k] from those of the observables [n, K, L, k]."""
         weight, noise_db = self.objective.weight, self.objective.noise_db
         return [
-            noise_db / each.std * each.slopes(slope[:, index], weight)
-            for index, each in enumerate(self.observed)
+            noise_db / observable.std * observable.slopes(slope[:, index], weight)
+            for index, observable in enumerate(self.observed)
         ]
 
     @property

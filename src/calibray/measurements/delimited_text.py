@@ -140,7 +140,7 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
 def _layout(text: str, separator: str | None) -> _Layout:
     """The first line from which on all lines have equally many cells, and the mark that gives the most cells."""
     for above in range(_MOST_ABOVE + 1):
-        found: list[tuple[int, _Layout]] = []
+        layouts: list[tuple[int, _Layout]] = []
         head = list(islice(io.StringIO(text, newline=""), above, above + 4 * _HEAD))
         if above and (len(head) < 2 or not head[0].strip()):
             continue
@@ -153,12 +153,14 @@ def _layout(text: str, separator: str | None) -> _Layout:
             # A row of values is no header. What stands above a header is no row of its table.
             if above and (len(records) < 2 or any(map(_is_number, records[0][0]))):
                 continue
-            found.append((width, _Layout(mark, above, *_unit_row(records))))
-        marks = {layout.separator for _, layout in found}
-        if found and marks != {" "}:
-            return max((each for each in found if each[1].separator != " "), key=lambda each: each[0])[1]
-        if found and not any(mark in head[0] for mark in ",;\t"):
-            return found[0][1]
+            layouts.append((width, _Layout(mark, above, *_unit_row(records))))
+        marks = {layout.separator for _, layout in layouts}
+        if layouts and marks != {" "}:
+            return max(
+                (layout for layout in layouts if layout[1].separator != " "), key=lambda layout: layout[0]
+            )[1]
+        if layouts and not any(mark in head[0] for mark in ",;\t"):
+            return layouts[0][1]
     header = next((line for line in io.StringIO(text) if line.strip()), "")
     return _Layout(separator or next((mark for mark in ";\t" if mark in header and "," not in header), ","))
 

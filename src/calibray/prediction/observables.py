@@ -72,10 +72,10 @@ def further_observables(
     best, draws = replayed.values[:1], replayed.values[1:] if level is not None else replayed.values[:0]
     draws = draws[np.linspace(0, len(draws) - 1, min(len(draws), MOST_DRAWS)).round().astype(int)]
     statistics = tuple(section.statistic for section in sections.values())
-    found = replayed.engine.respond(np.vstack([best, draws]), statistics).observed
+    answers = replayed.engine.respond(np.vstack([best, draws]), statistics).observed
     columns: list[NDArray[np.float64]] = []
     for index, (name, section) in enumerate(sections.items()):
-        value, drawn = found[0, index] / section.scale, found[1:, index] / section.scale
+        value, drawn = answers[0, index] / section.scale, answers[1:, index] / section.scale
         columns.append(value)
         if level is None:
             continue

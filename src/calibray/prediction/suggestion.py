@@ -371,7 +371,7 @@ def _width(result: Record, name: str, narrowed: float) -> float:
     log = section.scale == "log"
     middle, half, seen_half = (
         (np.log(ends) if log else ends).mean(),
-        *(np.ptp(np.log(each) if log else each) / 2 for each in (ends, seen)),
+        *(np.ptp(np.log(bounds) if log else bounds) / 2 for bounds in (ends, seen)),
     )
     half = min(float(np.hypot(np.sqrt(max(half**2 - seen_half**2, 0.0)), narrowed * seen_half)), half)
     after = np.array([middle - half, middle + half])

@@ -198,10 +198,10 @@ def _missing_region(result: Record) -> pd.DataFrame:
         return pd.DataFrame()
     known = links[OUT_OF_SIGHT].to_numpy(float) if OUT_OF_SIGHT in links else np.zeros(len(links))
     excess_db = links["measured_db"].to_numpy(float) - links["predicted_db"].to_numpy(float)
-    found = _searched(np.column_stack([*ends, excess_db, known]).tobytes())
-    if found is None:
+    region = _searched(np.column_stack([*ends, excess_db, known]).tobytes())
+    if region is None:
         return pd.DataFrame()
-    row = asdict(found)
+    row = asdict(region)
     west, south, east, north = row.pop("box")
     return pd.DataFrame([{"west": west, "south": south, "east": east, "north": north, **row}])
 

@@ -118,9 +118,9 @@ def missing_region(
     for height in HEIGHTS:
         length = _lengths(tx, rx, corner, cell, lowest + height)
         inside = length - basis @ (basis.T @ length)
-        found = list(_rectangles(orders @ inside, inside.T @ inside))
-        chance = np.maximum(chance, np.max([each.chance for each in found], axis=0))
-        top = max(found, key=lambda each: each.explained)
+        rectangles = list(_rectangles(orders @ inside, inside.T @ inside))
+        chance = np.maximum(chance, np.max([rectangle.chance for rectangle in rectangles], axis=0))
+        top = max(rectangles, key=lambda rectangle: rectangle.explained)
         if top.explained / square > (0.0 if best is None else best.share):
             (west, south), (east, north) = (corner + cell * top.cells).tolist()
             crossing = length.reshape(-1, GRID, GRID)[:, slice(*top.cells[:, 0]), slice(*top.cells[:, 1])]

@@ -143,7 +143,9 @@ class StudyContent(Section, ABC):
                 "engine.compress_db: few weighted paths keep path loss, not the delays and angles of [observables]; "
                 "remove one of them"
             )
-        if self.links.average is not None and any(each.file is None for each in self.observables.values()):
+        if self.links.average is not None and any(
+            section.file is None for section in self.observables.values()
+        ):
             raise InputError(
                 "links.average with [observables]: averages keep the columns of the first sample; average the table "
                 "itself, or remove one of them"

@@ -79,7 +79,7 @@ def displacements(
     Raises:
         InputError: A column is missing.
     """
-    found = []
+    displacements = []
     for field in AXES:
         named = [(k, item) for k, item in enumerate(items) if displaces(item.name) and item.field == field]
         kind = POSE if field == "height" else RECEIVER
@@ -96,8 +96,8 @@ def displacements(
         for number, item in named:
             weights[concerned(names, item.material.removeprefix(kind), own), number] = 1.0
         largest = np.array([max(abs(item.lower), abs(item.upper)) for item in items])
-        found.append(Displacement(field, weights, group.reshape(-1), (weights * largest).max(axis=1)))
-    return tuple(found)
+        displacements.append(Displacement(field, weights, group.reshape(-1), (weights * largest).max(axis=1)))
+    return tuple(displacements)
 
 
 def check_labels(
@@ -154,17 +154,17 @@ def displacement_loss(
         return replay.path_loss(values[None])[0]
 
     stated_db, slopes, curvatures = path_loss_db(*here), [], []
-    for each in displacements:
-        distance = (share * each.reach)[each.group]
-        sides = [path_loss_db(*traced(each.moved(links, side * distance))) for side in (1.0, -1.0)]
+    for displacement in displacements:
+        distance = (share * displacement.reach)[displacement.group]
+        sides = [path_loss_db(*traced(displacement.moved(links, side * distance))) for side in (1.0, -1.0)]
         with np.errstate(invalid="ignore"):  # inf - inf where no path reaches
             slope, curvature = polynomial(np.array(sides) - stated_db, distance)
         slopes.append(slope)
         curvatures.append(curvature)
     return DisplacementLoss(
         here[0].link,
-        tuple(each.group for each in displacements),
-        tuple(each.weights[:, parameters.of_effects] for each in displacements),
+        tuple(displacement.group for displacement in displacements),
+        tuple(displacement.weights[:, parameters.of_effects] for displacement in displacements),
         values[parameters.of_effects],
         np.array(slopes),
         np.array(curvatures),

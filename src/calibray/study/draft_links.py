@@ -435,11 +435,11 @@ class LinksDraft:
         return groups
 
     def _add_flight_times(self) -> None:
-        found = column_names.find_flight_time(self._table.frame)
+        flight_time = column_names.find_flight_time(self._table.frame)
         # Averages of samples keep the observables of the first one.
-        if found is None or "average" in self.section or "wide" in self.section:
+        if flight_time is None or "average" in self.section or "wide" in self.section:
             return
-        column, kind, unit = found
+        column, kind, unit = flight_time
         transmitter = self.section.get("transmitter")
         bias = transmitter if transmitter in self._table.frame else "all"
         self.observables["flight"] = {

@@ -218,8 +218,8 @@ def _walls(
     normal = np.cross(walls[:, 1] - walls[:, 0], walls[:, 2] - walls[:, 0])
     tree = shapely.STRtree(shapely.linestrings(ends))
     nearest = np.zeros(len(point), dtype=np.int64)
-    query, found = tree.query_nearest(shapely.points(point[:, :2]), all_matches=False)
-    nearest[query] = found
+    query, wall = tree.query_nearest(shapely.points(point[:, :2]), all_matches=False)
+    nearest[query] = wall
     start, step = ends[nearest, 0], ends[nearest, 1] - ends[nearest, 0]
     length = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
     along = np.clip(((point[:, :2] - start) * step).sum(axis=1) / length**2, 0.0, 1.0)

@@ -55,8 +55,8 @@ def with_obstruction(
     carrier = frequency if links.frequency is None else links.frequency
     added: dict[str, NDArray[np.float64] | NDArray[np.str_]] = {}
     if any(name not in links.frame for name in OBSTACLES):
-        found = obstruction(read_triangles(scene), links.tx, links.rx)
-        added |= found.columns(speed_of_light / np.asarray(carrier))
+        obstacles = obstruction(read_triangles(scene), links.tx, links.rx)
+        added |= obstacles.columns(speed_of_light / np.asarray(carrier))
     if regions:
         added[REGION] = np.sum([item.length_inside(links.tx, links.rx) for item in regions.values()], axis=0)
     if clutter:

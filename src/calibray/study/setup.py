@@ -198,8 +198,8 @@ class Setup:
     @property
     def _links_in_place(self) -> Measurements:
         links = self.links
-        for each in self._displacements:
-            links = each.moved(links, (each.weights @ self._placed)[each.group])
+        for displacement in self._displacements:
+            links = displacement.moved(links, (displacement.weights @ self._placed)[displacement.group])
         return links
 
     def _displacement_effects(self, paths: Paths, others: Effects) -> Effects:

@@ -185,7 +185,7 @@ def fitted_terms(
         The terms. Groups whose coefficient no link determines are left out.
     """
     coefficients = objective.coefficients(path_loss_db[None])[0]
-    found, terms = objective.nuisance.by_term(coefficients, objective.determined), []
+    by_term, terms = objective.nuisance.by_term(coefficients, objective.determined), []
     spreads = {term.around: term.prior for term in objective.nuisance.terms if term.around}
     grouped = {term.around or term.name: term for term in objective.nuisance.terms}
     for name, term in grouped.items():
@@ -195,6 +195,6 @@ def fitted_terms(
             per = "transmitter"
         else:
             per = OFFSET if name == OFFSET else str(study.nuisance[name].per)
-        if found[name]:
-            terms.append(FittedTerm(name, term.by, per, found[name], term.centre, spreads.get(name)))
+        if by_term[name]:
+            terms.append(FittedTerm(name, term.by, per, by_term[name], term.centre, spreads.get(name)))
     return tuple(terms)

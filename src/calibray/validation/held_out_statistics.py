@@ -265,13 +265,14 @@ def held_out_gaps(
         return {}
     modelled = problem.respond(best[None]).observed[0]
     weight, links, gaps = problem.objective.weight, problem.setup.links, {}
-    for each, values in zip(problem.observed, modelled, strict=True):
-        features = [values / each.scale, np.zeros(len(links)), _law(each, links)]
+    for observable, values in zip(problem.observed, modelled, strict=True):
+        features = [values / observable.scale, np.zeros(len(links)), _law(observable, links)]
         predicted = [
-            _with_biases(each, feature, weight, slope=index == 2) for index, feature in enumerate(features)
+            _with_biases(observable, feature, weight, slope=index == 2)
+            for index, feature in enumerate(features)
         ]
-        judged = held_out & np.isfinite(each.measured) & np.isfinite(values)
-        gaps[each.name] = np.where(judged, np.stack(predicted) - each.measured, np.nan)
+        judged = held_out & np.isfinite(observable.measured) & np.isfinite(values)
+        gaps[observable.name] = np.where(judged, np.stack(predicted) - observable.measured, np.nan)
     return gaps
 
 
@@ -279,38 +280,38 @@ def observable_errors(
     gaps: Mapping[str, NDArray[np.float64]], study: StudyModel
 ) -> dict[str, ObservableErrors]:
     """Root mean squares of gaps [3, L] by name of the observable; none without a judged link."""
-    found = {}
+    errors = {}
     for name, gap in gaps.items():
         judged = gap[:, np.isfinite(gap).all(axis=0)]
         if judged.shape[1]:
             rms = np.sqrt(np.mean(judged**2, axis=1)).tolist()
-            found[name] = ObservableErrors(study.observables[name].unit, judged.shape[1], *rms)
-    return found
+            errors[name] = ObservableErrors(study.observables[name].unit, judged.shape[1], *rms)
+    return errors
 
 
-def _law(each: Observed, links: Measurements) -> NDArray[np.float64]:
+def _law(observable: Observed, links: Measurements) -> NDArray[np.float64]:
     distance = np.linalg.norm(links.tx - links.rx, axis=1)
-    if each.statistic.kind in (TIME_OF_FLIGHT, ROUND_TRIP):
+    if observable.statistic.kind in (TIME_OF_FLIGHT, ROUND_TRIP):
         return distance
     return np.log10(np.maximum(distance, 1e-3))
 
 
 def _with_biases(
-    each: Observed, feature: NDArray[np.float64], weight: NDArray[np.float64], *, slope: bool
+    observable: Observed, feature: NDArray[np.float64], weight: NDArray[np.float64], *, slope: bool
 ) -> NDArray[np.float64]:
     """The feature, or its best multiple, plus the biases of the links with a weight; a new group gets their mean."""
-    used = each.used(weight)
+    used = observable.used(weight)
     used = used[np.isfinite(feature[used])]
     # The model has a bias only where the study states one; the mean and the law always have a constant.
     constant = slope or not np.any(feature)
-    if each.labels:
-        groups = np.unique(each.group[used])
-        design = (each.group[:, None] == groups).astype(np.float64)
+    if observable.labels:
+        groups = np.unique(observable.group[used])
+        design = (observable.group[:, None] == groups).astype(np.float64)
         design[design.sum(axis=1) == 0] = 1.0 / max(len(groups), 1)
     else:
         design = np.ones((len(feature), 1 if constant else 0))
     if slope:
         columns = np.column_stack([design, feature])
-        return columns @ np.linalg.lstsq(columns[used], each.measured[used], rcond=None)[0]
-    bias = np.linalg.lstsq(design[used], (each.measured - feature)[used], rcond=None)[0]
+        return columns @ np.linalg.lstsq(columns[used], observable.measured[used], rcond=None)[0]
+    bias = np.linalg.lstsq(design[used], (observable.measured - feature)[used], rcond=None)[0]
     return feature + design @ bias

@@ -128,7 +128,7 @@ def validate_problem(
     block, labels = _divide(problem, blocks, by)
     all_link_minima = {name: minima for name, (_, minima) in fit_variants(problem, known_minima).items()}
     errors: dict[str, NDArray[np.float64]] = {}
-    gaps = {each.name: np.full((len(MODELS), len(links)), np.nan) for each in problem.observed}
+    gaps = {observable.name: np.full((len(MODELS), len(links)), np.nan) for observable in problem.observed}
     for number in range(len(labels)):
         held_out = block == number
         weight = np.where(held_out, 0.0, objective.weight)

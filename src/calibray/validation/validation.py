@@ -47,9 +47,9 @@ def observables_table(observables: Mapping[str, ObservableErrors]) -> Table:
         Column(), numbers("links"), numbers("RMSE"), numbers("RMSE of the mean"), numbers("RMSE of a law of distance"),
     )  # fmt: skip
     rows = tuple(
-        (f"{name} [{each.unit}]", str(each.links), f"{each.rmse:.3g}", f"{each.mean_rmse:.3g}",
-         f"{each.distance_rmse:.3g}")
-        for name, each in observables.items()
+        (f"{name} [{errors.unit}]", str(errors.links), f"{errors.rmse:.3g}", f"{errors.mean_rmse:.3g}",
+         f"{errors.distance_rmse:.3g}")
+        for name, errors in observables.items()
     )  # fmt: skip
     return Table("Observables of links held out", columns, rows)
 

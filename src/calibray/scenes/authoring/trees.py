@@ -142,8 +142,8 @@ def read_trees(path: str | Path, frame: Frame) -> Trees:
             kinds.append(kind)
     except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:
         raise InputError(f"extract {path}: cannot be read ({error}); give an .osm or .osm.pbf file") from None
-    heights = [_stated(each, "height", TALLEST) for each in tags]
-    crowns = [_stated(each, "diameter_crown", WIDEST_CROWN) for each in tags]
+    heights = [_stated(tag, "height", TALLEST) for tag in tags]
+    crowns = [_stated(tag, "diameter_crown", WIDEST_CROWN) for tag in tags]
     top = np.array(
         [height or HEIGHTS[kind] for height, kind in zip(heights, kinds, strict=True)], dtype=float
     )
@@ -204,18 +204,18 @@ def read_canopy(
     a, b, c, d, e, f = (float(value) for value in tuple(affine)[:6])
     row, column = (int(value) for value in first)
     window = type(affine)(a, b, c + a * column + b * row, d, e, f + d * column + e * row)
-    found = [
+    polygons = [
         (shapely.from_geojson(json.dumps(shape)), value * STEP)
         for shape, value in rasterio.features.shapes(classes, classes * STEP >= LEAST, transform=window)
     ]
     outline = (
-        project(np.array([polygon for polygon, _ in found], dtype=object), frame, crs)
-        if found
+        project(np.array([polygon for polygon, _ in polygons], dtype=object), frame, crs)
+        if polygons
         else np.zeros(0)
     )
-    inside = shapely.intersects(outline, shapely.box(*bounds)) if found else np.zeros(0, dtype=bool)
+    inside = shapely.intersects(outline, shapely.box(*bounds)) if polygons else np.zeros(0, dtype=bool)
     if not inside.any():
         raise InputError(
             f"canopy {path}: has no trees of {LEAST:g} m or more within the scene; give one that covers it"
         )
-    return outline[inside], np.array([top for _, top in found])[inside]
+    return outline[inside], np.array([top for _, top in polygons])[inside]
