@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from calibray.errors import InputError
-from calibray.measurements import SourceTable, column_names
+from calibray.measurements import SourceTable, column_names, transmitter_columns
 
 GEOGRAPHIC = ("Longitude", "Latitude")
 
@@ -300,13 +300,13 @@ def test_base_stations_in_camel_case_are_transmitters():
     ],
 )  # fmt: skip
 def test_wide_columns_are_found_next_to_other_quantities(header, names, columns):
-    assert column_names.find_wide_columns(pd.DataFrame(columns=header.split(",")), names) == columns
+    assert transmitter_columns.find_wide_columns(pd.DataFrame(columns=header.split(",")), names) == columns
 
 
 def test_columns_of_unknown_transmitters_are_named():
     frame = pd.DataFrame(columns=["X", "AP1 RSS(dBm)", "AP2 RSS(dBm)", "AP13 RSS(dBm)", "AP13 RTT(mm)"])
-    columns = column_names.find_wide_columns(frame, ["AP1", "AP2"])
-    assert column_names.find_unknown_wide_columns(frame, columns) == ["AP13 RSS(dBm)"]
+    columns = transmitter_columns.find_wide_columns(frame, ["AP1", "AP2"])
+    assert transmitter_columns.find_unknown_wide_columns(frame, columns) == ["AP13 RSS(dBm)"]
 
 
 @pytest.mark.parametrize(

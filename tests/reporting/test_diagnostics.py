@@ -11,7 +11,7 @@ import shown
 from calibray.calibration.link_diagnostics import _depth_and_power
 from calibray.calibration.result import Result
 from calibray.fields import path_gains
-from calibray.reporting.diagnostics import diagnostics_table
+from calibray.reporting.wording import diagnostics_table
 from calibray.scenes.regions import Region
 from changed import changed
 from made_up_report import made_up

@@ -77,8 +77,8 @@ def predict(
         from calibray.engines import open_workers
         from calibray.measurements import PiecedTable
         from calibray.prediction.batches import predict_batches
-        from calibray.prediction.observables import observable_columns
-        from calibray.prediction.predict import as_links, as_measured
+        from calibray.prediction.observables import as_measured, observable_columns
+        from calibray.prediction.predict import as_links
         from calibray.support.output_tables import check_table, growing_table
 
         print_costs()

@@ -20,6 +20,7 @@ from scipy import sparse
 
 from calibray.errors import InputError
 from calibray.measurements import Measurements
+from calibray.study.model import StudyModel
 
 CONSTANT: Final = "constant"
 LOG_DISTANCE: Final = "log_distance"
@@ -345,3 +346,30 @@ class Nuisance:
 
     def _per_column(self, values: list[float]) -> NDArray[np.float64]:
         return np.repeat(np.array(values, dtype=np.float64), [len(term.labels) for term in self.terms])
+
+
+def study_nuisance(study: StudyModel, links: Measurements) -> Nuisance:
+    """Make the nuisance that a study declares: its offset, for all links or per group, and its further terms.
+
+    Args:
+        study: The study.
+        links: All its links.
+
+    Returns:
+        The nuisance.
+
+    Raises:
+        InputError: A term's column or groups cannot be used.
+    """
+    terms, offset = [], study.offset
+    if offset is not None:
+        terms.append(
+            make_term(links, OFFSET, labels=links.group, bounds=offset.bounds, prior=offset.prior_db)
+        )
+    for name, term in study.nuisance.items():
+        if isinstance(term.prior, str):
+            terms += random_effect(links, name, term.by, links.table.labels(str(term.per)))
+        else:
+            labels = None if term.per is None else links.table.labels(term.per)
+            terms.append(make_term(links, name, term.by, labels=labels, bounds=term.bounds, prior=term.prior))
+    return Nuisance(len(links), tuple(terms))

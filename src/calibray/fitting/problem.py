@@ -20,7 +20,7 @@ from calibray.engines.protocol import (
     Responses,
 )
 from calibray.errors import InputError
-from calibray.fitting.nuisance import OFFSET, Nuisance, make_term, random_effect
+from calibray.fitting.nuisance import study_nuisance
 from calibray.fitting.objective import Objective, make_objective
 from calibray.fitting.observed import Observed, observed
 from calibray.fitting.sums_of_squares import Share, rows, total
@@ -363,33 +363,6 @@ class Problem:
                 "only; use 'replay' or 'command'"
             )
         return self.engine
-
-
-def study_nuisance(study: StudyModel, links: Measurements) -> Nuisance:
-    """Make the nuisance that a study declares: its offset, for all links or per group, and its further terms.
-
-    Args:
-        study: The study.
-        links: All its links.
-
-    Returns:
-        The nuisance.
-
-    Raises:
-        InputError: A term's column or groups cannot be used.
-    """
-    terms, offset = [], study.offset
-    if offset is not None:
-        terms.append(
-            make_term(links, OFFSET, labels=links.group, bounds=offset.bounds, prior=offset.prior_db)
-        )
-    for name, term in study.nuisance.items():
-        if isinstance(term.prior, str):
-            terms += random_effect(links, name, term.by, links.table.labels(str(term.per)))
-        else:
-            labels = None if term.per is None else links.table.labels(term.per)
-            terms.append(make_term(links, name, term.by, labels=labels, bounds=term.bounds, prior=term.prior))
-    return Nuisance(len(links), tuple(terms))
 
 
 def _noise(study: StudyModel, links: Measurements) -> float:

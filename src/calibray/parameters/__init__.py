@@ -9,7 +9,8 @@ from calibray.parameters.parameter import (
     make_parameter,
     split_name,
 )
-from calibray.parameters.space import NO_PRIOR, LogNormal, Parameters
+from calibray.parameters.priors import NO_PRIOR, LogNormal
+from calibray.parameters.space import Parameters
 
 __all__ = [
     "NO_PRIOR",

@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Final, NamedTuple, cast
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from calibray.engines.protocol import Engine, Observing
+from calibray.measurements import Measurements
 from calibray.measurements.observables import (
     ARRIVAL_SPREAD,
     DELAY_SPREAD,
@@ -20,6 +22,7 @@ from calibray.measurements.observables import (
 )
 from calibray.result.record import Record
 from calibray.study import Study
+from calibray.study.mounting import PORT_POWER, states_port_power
 
 MOST_DRAWS: Final = 64
 """Most posterior draws for the width of an interval; the error of a standard deviation from them is 9 %."""
@@ -159,3 +162,44 @@ def worth_measuring(
 def _deviation(information: NDArray[np.float64]) -> NDArray[np.float64]:
     """Standard deviation of every parameter [..., d]."""
     return np.sqrt(np.diagonal(np.linalg.inv(information), axis1=-2, axis2=-1))
+
+
+def as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
+    """Predictions in the quantity that the study's links were measured in.
+
+    Args:
+        study: The study.
+        links: The links.
+        table: Their path_loss_db and, if they have an interval, lower_db and upper_db.
+
+    Returns:
+        Path gain [dB], received power or RSRP [dBm] and the ends of its interval [links], by column name, as
+        `received_power_dbm`, `received_power_lower_dbm` and `received_power_upper_dbm`. Empty if path loss was
+        measured, or the transmitted power of these links is unknown.
+    """
+    quantity = study.links.quantity
+    reference = _reference_level(study, links)
+    if reference is None:
+        return {}
+    unit = "db" if quantity == "path_gain" else "dbm"
+    # The upper end of path loss is the lower end of power.
+    ends = {"path_loss_db": "", "upper_db": "_lower", "lower_db": "_upper"}
+    return {
+        f"{quantity}{end}_{unit}": reference - table[name].to_numpy(float)
+        for name, end in ends.items()
+        if name in table
+    }
+
+
+def _reference_level(study: Study, links: Measurements) -> NDArray[np.float64] | None:
+    """The level that path loss is subtracted from [links], [dBm] or [dB]; None where it is unknown."""
+    section = study.links
+    if section.quantity == "path_loss":
+        return None
+    if section.quantity != "received_power":
+        # Path gain is 0 dB minus path loss. The transmitted power of RSRP is part of the offset.
+        return np.zeros(len(links))
+    power = PORT_POWER if states_port_power(study) else section.tx_power_dbm
+    if isinstance(power, str):
+        return links.table.numbers(power) if power in links.frame else None
+    return None if power is None else np.full(len(links), float(power))

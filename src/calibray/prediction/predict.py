@@ -19,16 +19,15 @@ from calibray.measurements import Measurements, SourceTable
 from calibray.parameters import fixed_constant, split_name
 from calibray.prediction.fallback import fill_missing
 from calibray.prediction.nuisance_shift import model_terms, nuisance_shift
-from calibray.prediction.observables import Replayed, further_observables
+from calibray.prediction.observables import Replayed, as_measured, further_observables
 from calibray.prediction.position_checks import POSITION_COLUMNS, remarks
 from calibray.prediction.residual_field import calibration_residuals, krige_residuals
 from calibray.result.held_out import Model, PredictionModel
 from calibray.result.record import Record
 from calibray.scenes.obstruction import OUT_OF_SIGHT
-from calibray.study import Setup, Study
+from calibray.study import Setup
 from calibray.study.link_obstruction import CLUSTER
 from calibray.study.link_obstruction import COLUMNS as OBSTRUCTION
-from calibray.study.mounting import PORT_POWER, states_port_power
 from calibray.support.progress import Progress
 from calibray.validation.baselines import without_scene
 
@@ -308,47 +307,6 @@ def with_constants(result: Record, setup: Setup) -> Setup:
         items += [] if item is None else [item]
     parameters = replace(setup.parameters, items=(*setup.parameters.items, *items))
     return replace(setup, parameters=parameters)
-
-
-def as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
-    """Predictions in the quantity that the study's links were measured in.
-
-    Args:
-        study: The study.
-        links: The links.
-        table: Their path_loss_db and, if they have an interval, lower_db and upper_db.
-
-    Returns:
-        Path gain [dB], received power or RSRP [dBm] and the ends of its interval [links], by column name, as
-        `received_power_dbm`, `received_power_lower_dbm` and `received_power_upper_dbm`. Empty if path loss was
-        measured, or the transmitted power of these links is unknown.
-    """
-    quantity = study.links.quantity
-    reference = _reference_level(study, links)
-    if reference is None:
-        return {}
-    unit = "db" if quantity == "path_gain" else "dbm"
-    # The upper end of path loss is the lower end of power.
-    ends = {"path_loss_db": "", "upper_db": "_lower", "lower_db": "_upper"}
-    return {
-        f"{quantity}{end}_{unit}": reference - table[name].to_numpy(float)
-        for name, end in ends.items()
-        if name in table
-    }
-
-
-def _reference_level(study: Study, links: Measurements) -> NDArray[np.float64] | None:
-    """The level that path loss is subtracted from [links], [dBm] or [dB]; None where it is unknown."""
-    section = study.links
-    if section.quantity == "path_loss":
-        return None
-    if section.quantity != "received_power":
-        # Path gain is 0 dB minus path loss. The transmitted power of RSRP is part of the offset.
-        return np.zeros(len(links))
-    power = PORT_POWER if states_port_power(study) else section.tx_power_dbm
-    if isinstance(power, str):
-        return links.table.numbers(power) if power in links.frame else None
-    return None if power is None else np.full(len(links), float(power))
 
 
 def _draws(result: Record) -> dict[str, list[float]]:

@@ -15,9 +15,6 @@ from calibray.reporting.link_survey import POSITION_COLUMNS, measured_quantity, 
 from calibray.reporting.missing_region import MissingRegion, missing_region
 from calibray.result.record import Record
 from calibray.scenes.obstruction import OUT_OF_SIGHT
-from calibray.support.messages import percent
-from calibray.tables import Column, Table
-from calibray.tables.text import rows_text
 from calibray.uncertainty.residual_correlation import variogram
 from calibray.validation.held_out_statistics import spatial_blocks
 
@@ -27,23 +24,12 @@ CLASSES: Final = 6
 MOST_UNKNOWNS: Final = 300
 """Most unknowns whose draws are compared pair by pair."""
 
-TRADE_OFF: Final = 0.7
-"""Correlation of the draws from which two unknowns are reported as compensating for each other."""
-
-DECIDING: Final = 0.5
-"""Leverage above which a link is reported as determining an unknown almost alone."""
-
-CLEAR: Final = 2.0
-"""Standard errors above which a difference counts as significant."""
 
 FEWEST: Final = 8
 """Fewest links for which trends are tested."""
 
 STREETS: Final = 12
 """Most groups of neighbouring receivers."""
-
-EVEN_DB: Final = 0.1
-"""Mean residual [dB] below which no class of links is reported."""
 
 
 def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
@@ -75,31 +61,7 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
     return {name: table for name, table in tables.items() if len(table)}
 
 
-def diagnostics_table(result: Record) -> Table:
-    """Summarize the diagnostics in a line each.
-
-    Returns:
-        A table: the subject, and the finding.
-    """
-    tables = diagnostics(result)
-    findings = {
-        "power": _power_text(tables),
-        "over distance": _distance_text(result),
-        "by depth": _class_text(tables, "depth", "paths of {} interactions"),
-        "by group": _class_text(tables, "group", "group {}"),
-        "by obstruction": _obstruction_text(tables),
-        "by street": _class_text(tables, "streets", "{}"),
-        "missing region": _missing_region_text(tables),
-        "neighbours": _neighbours_text(tables),
-        "leverage": _leverage_text(tables),
-        "trade-offs": _trade_offs_text(tables),
-        "largest change": _moved_text(tables),
-    }
-    rows = tuple((name, text) for name, text in findings.items() if text)
-    return Table("Diagnostics", (Column(), Column()), rows)
-
-
-def _calibration_links(result: Record) -> tuple[pd.DataFrame, NDArray[np.float64]]:
+def calibration_links(result: Record) -> tuple[pd.DataFrame, NDArray[np.float64]]:
     """The calibration links with a path, and their residuals in the measured quantity [dB]."""
     residuals, links = residual(result.links, measured_quantity(result).sign), result.links
     used = links["has_path"].to_numpy(bool) | (result.study.objective.no_path == "censor")
@@ -115,14 +77,15 @@ def _ends(links: pd.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float64]
     return positions[:, :3], positions[:, 3:]
 
 
-def _distance(links: pd.DataFrame) -> NDArray[np.float64] | None:
+def link_distance(links: pd.DataFrame) -> NDArray[np.float64] | None:
+    """Length of the links [L], [m]; None without positions."""
     ends = _ends(links)
     return None if ends is None else np.linalg.norm(ends[1] - ends[0], axis=1)
 
 
 def _by_distance(result: Record) -> pd.DataFrame:
-    links, residuals = _calibration_links(result)
-    distance = _distance(links)
+    links, residuals = calibration_links(result)
+    distance = link_distance(links)
     if distance is None or len(residuals) < FEWEST:
         return pd.DataFrame()
     classes = np.array_split(np.argsort(distance, kind="stable"), min(CLASSES, len(residuals) // 4))
@@ -139,7 +102,7 @@ def _by_distance(result: Record) -> pd.DataFrame:
 
 
 def _by(result: Record, column: str) -> pd.DataFrame:
-    links, residuals = _calibration_links(result)
+    links, residuals = calibration_links(result)
     if column not in links:
         return pd.DataFrame()
     values = links[column].to_numpy()
@@ -149,7 +112,7 @@ def _by(result: Record, column: str) -> pd.DataFrame:
 
 def _by_obstruction(result: Record) -> pd.DataFrame:
     """Links in sight, and classes of links out of sight by the length of the straight line below roofs."""
-    links, residuals = _calibration_links(result)
+    links, residuals = calibration_links(result)
     if not {OUT_OF_SIGHT, "obstruction_m"} <= set(links.columns) or len(residuals) < FEWEST:
         return pd.DataFrame()
     blocked, length = links[OUT_OF_SIGHT].to_numpy(float) > 0, links["obstruction_m"].to_numpy(float)
@@ -171,7 +134,7 @@ def _by_obstruction(result: Record) -> pd.DataFrame:
 
 def _by_street(result: Record) -> pd.DataFrame:
     """Groups of neighbouring receivers, named by the position of their middle."""
-    links, residuals = _calibration_links(result)
+    links, residuals = calibration_links(result)
     ends = _ends(links)
     if ends is None or len(residuals) < 2 * FEWEST:
         return pd.DataFrame()
@@ -192,7 +155,7 @@ def _by_street(result: Record) -> pd.DataFrame:
 
 
 def _missing_region(result: Record) -> pd.DataFrame:
-    links, _ = _calibration_links(result)
+    links, _ = calibration_links(result)
     ends = _ends(links)
     if ends is None:
         return pd.DataFrame()
@@ -222,7 +185,7 @@ def _statistics(residuals: NDArray[np.float64]) -> dict[str, float]:
 
 
 def _leverage(result: Record) -> pd.DataFrame:
-    links, residuals = _calibration_links(result)
+    links, residuals = calibration_links(result)
     if "leverage" not in links or not np.isfinite(links["leverage"]).any():
         return pd.DataFrame()
     leverage = links["leverage"].to_numpy(float)
@@ -260,7 +223,7 @@ def _scaled_draws(result: Record, name: str) -> NDArray[np.float64]:
 
 
 def _neighbours(result: Record) -> pd.DataFrame:
-    links, residuals = _calibration_links(result)
+    links, residuals = calibration_links(result)
     ends = _ends(links)
     if ends is None or len(residuals) < FEWEST:
         return pd.DataFrame()
@@ -288,117 +251,3 @@ def _moved(result: Record) -> pd.DataFrame:
             }
         )
     return pd.DataFrame(rows)
-
-
-def _power_text(tables: dict[str, pd.DataFrame]) -> str:
-    if "power" not in tables:
-        return ""
-    rows = tables["power"].head(5).to_dict("records")
-    shares = (
-        f"{row['material']} {row['interaction']} {percent(float(row['share']))}".replace("  ", " ")
-        for row in rows
-    )
-    return f"mean share of a link's power: {', '.join(shares)}"
-
-
-def _distance_text(result: Record) -> str:
-    links, residuals = _calibration_links(result)
-    distance = _distance(links)
-    if distance is None or len(residuals) < FEWEST or np.ptp(distance) == 0:
-        return ""
-    decades = np.log10(distance) - np.log10(distance).mean()
-    slope = float(decades @ residuals / (decades @ decades))
-    rest = residuals - residuals.mean() - slope * decades
-    error = float(np.sqrt(rest @ rest / (len(residuals) - 2) / (decades @ decades)))
-    verdict = "a trend" if abs(slope) > CLEAR * error else "no trend"
-    return f"{verdict}: the residuals change by {slope:+.1f} dB per decade, standard error {error:.1f} dB"
-
-
-def _class_text(tables: dict[str, pd.DataFrame], column: str, wording: str) -> str:
-    """The class of links with the largest mean residual."""
-    if column not in tables or len(tables[column]) < 2:
-        return ""
-    table = tables[column][tables[column]["links"] >= 3]
-    if not len(table):
-        return ""
-    worst = table.iloc[int(np.argmax(table["mean_db"].abs()))]
-    if abs(worst["mean_db"]) < EVEN_DB:
-        return ""
-    name = f"{worst[column]:g}" if isinstance(worst[column], float) else str(worst[column])
-    clear = abs(worst["mean_db"]) > CLEAR * worst["standard_deviation_db"] / np.sqrt(worst["links"])
-    return (
-        f"largest mean residual: {worst['mean_db']:+.1f} dB, {wording.format(name)}, {worst['links']:.0f} links"
-        + ("" if clear else " (not significant)")
-    )
-
-
-def _obstruction_text(tables: dict[str, pd.DataFrame]) -> str:
-    """Mean residual of links in sight, and of those out of sight by the length of the line below roofs."""
-    if "obstruction" not in tables:
-        return ""
-    parts = [
-        f"{row.mean_db:+.1f} dB "
-        + (f"with {row.from_m:.0f} to {row.to_m:.0f} m below roofs" if row.out_of_sight else "in sight")
-        + f" ({row.links} links)"
-        for row in tables["obstruction"].itertuples()
-    ]
-    return f"mean residual: {', '.join(parts)}"
-
-
-def _missing_region_text(tables: dict[str, pd.DataFrame]) -> str:
-    """Where a region of extra loss would explain residuals, if it explains more than chance."""
-    if "missing_region" not in tables:
-        return ""
-    row = tables["missing_region"].iloc[0]
-    if not row["significant"]:
-        return "no region of extra loss, such as trees, would explain more of the residuals than chance"
-    return (
-        f"losses of {row['attenuation']:.2g} dB/m within x = {row['west']:.0f} to {row['east']:.0f} m, "
-        f"y = {row['south']:.0f} to {row['north']:.0f} m, up to z = {row['height']:.0f} m, on the straight line of "
-        f"{row['links']} links, would explain {percent(float(row['share']))} of the mean square of the residuals "
-        f"(chance alone {percent(float(row['chance']))}): see whether trees stand there, and give them as [regions]"
-    )
-
-
-def _neighbours_text(tables: dict[str, pd.DataFrame]) -> str:
-    if "neighbours" not in tables or len(tables["neighbours"]) < 3:
-        return ""
-    table = tables["neighbours"]
-    nearest, sill = table.iloc[0], float(table["semivariance_db2"].iloc[len(table) // 2 :].mean())
-    share = 1.0 - nearest["semivariance_db2"] / sill if sill > 0 else 0.0
-    # The relative standard error of a semivariance of n independent pairs is sqrt(2 / n).
-    if share < CLEAR * np.sqrt(2.0 / nearest["pairs"]):
-        return f"the errors of links {nearest['distance_m']:.0f} m apart are not correlated"
-    return f"links {nearest['distance_m']:.0f} m apart share {percent(share)} of the variance of their errors"
-
-
-def _leverage_text(tables: dict[str, pd.DataFrame]) -> str:
-    if "leverage" not in tables:
-        return ""
-    table = tables["leverage"]
-    deciding = table[table["leverage"] > DECIDING]
-    if len(deciding):
-        links = "1 link determines" if len(deciding) == 1 else f"{len(deciding)} links determine"
-        rows = rows_text(deciding["row"].tolist())
-        return f"{links} an unknown almost alone (leverage above {DECIDING:g}): {rows}"
-    largest = table.iloc[int(np.argmax(table["leverage"]))]
-    return f"no link determines an unknown alone; the largest is {largest['leverage']:.2f}, in row {largest['row']:.0f}"
-
-
-def _trade_offs_text(tables: dict[str, pd.DataFrame]) -> str:
-    if "trade_offs" not in tables:
-        return ""
-    table = tables["trade_offs"]
-    strong = table[table["correlation"].abs() > TRADE_OFF].head(3)
-    if not len(strong):
-        return f"no two unknowns have a correlation above {TRADE_OFF:g}"
-    return "; ".join(f"{row.first} and {row.second} ({row.correlation:+.2f})" for row in strong.itertuples())
-
-
-def _moved_text(tables: dict[str, pd.DataFrame]) -> str:
-    if "moved" not in tables:
-        return ""
-    table = tables["moved"]
-    row = table.iloc[int(np.argmax(table["moved"].abs()))]
-    moved = percent(abs(row["moved"]))
-    return f"{row['parameter']}, from {row['before']:.4g} to {row['after']:.4g}: {moved} of its range"

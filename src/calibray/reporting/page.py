@@ -26,13 +26,12 @@ from matplotlib.figure import Figure
 from calibray.doctor import versions
 from calibray.errors import EngineError, InputError
 from calibray.reporting import result_tables as tables
-from calibray.reporting.diagnostics import diagnostics_table
 from calibray.reporting.figures import result_figures
 from calibray.reporting.link_map import Plan, marks, plan, ramp, ramp_limit
 from calibray.reporting.link_survey import Survey, in_measured_quantity, measured_quantity, residual, survey
 from calibray.reporting.summary import summary
 from calibray.reporting.viewer import TRIANGLES, Rays, packed, rays
-from calibray.reporting.wording import held_out_text
+from calibray.reporting.wording import diagnostics_table, held_out_text
 from calibray.result.held_out import Model
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict

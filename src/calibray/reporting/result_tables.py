@@ -9,7 +9,7 @@ from typing import Final
 
 from calibray.fitting.nuisance import OFFSET
 from calibray.parameters.laws import PARAMETER_BOUNDS
-from calibray.reporting.diagnostics import diagnostics_table
+from calibray.reporting.wording import diagnostics_table
 from calibray.result import wording
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict

@@ -5,9 +5,14 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+import pandas as pd
 
+from calibray.reporting.diagnostics import FEWEST, calibration_links, diagnostics, link_distance
 from calibray.result.held_out import HeldOutErrors, Model
 from calibray.result.record import Record
+from calibray.support.messages import percent
+from calibray.tables import Column, Table
+from calibray.tables.text import rows_text
 
 SCENE_ALONE_DB: Final = 0.05
 """Difference between the exported scene and the predictions that is not reported."""
@@ -114,3 +119,157 @@ def held_out_text(record: Record) -> str:
 def block_sentence(held_out: HeldOutErrors) -> str:
     """How many blocks were held out."""
     return f"{len(held_out.labels)} blocks of links were held out in turn."
+
+
+TRADE_OFF: Final = 0.7
+"""Correlation of the draws from which two unknowns are reported as compensating for each other."""
+
+
+DECIDING: Final = 0.5
+"""Leverage above which a link is reported as determining an unknown almost alone."""
+
+
+CLEAR: Final = 2.0
+"""Standard errors above which a difference counts as significant."""
+
+
+EVEN_DB: Final = 0.1
+"""Mean residual [dB] below which no class of links is reported."""
+
+
+def diagnostics_table(result: Record) -> Table:
+    """Summarize the diagnostics in a line each.
+
+    Returns:
+        A table: the subject, and the finding.
+    """
+    tables = diagnostics(result)
+    findings = {
+        "power": _power_text(tables),
+        "over distance": _distance_text(result),
+        "by depth": _class_text(tables, "depth", "paths of {} interactions"),
+        "by group": _class_text(tables, "group", "group {}"),
+        "by obstruction": _obstruction_text(tables),
+        "by street": _class_text(tables, "streets", "{}"),
+        "missing region": _missing_region_text(tables),
+        "neighbours": _neighbours_text(tables),
+        "leverage": _leverage_text(tables),
+        "trade-offs": _trade_offs_text(tables),
+        "largest change": _moved_text(tables),
+    }
+    rows = tuple((name, text) for name, text in findings.items() if text)
+    return Table("Diagnostics", (Column(), Column()), rows)
+
+
+def _power_text(tables: dict[str, pd.DataFrame]) -> str:
+    if "power" not in tables:
+        return ""
+    rows = tables["power"].head(5).to_dict("records")
+    shares = (
+        f"{row['material']} {row['interaction']} {percent(float(row['share']))}".replace("  ", " ")
+        for row in rows
+    )
+    return f"mean share of a link's power: {', '.join(shares)}"
+
+
+def _distance_text(result: Record) -> str:
+    links, residuals = calibration_links(result)
+    distance = link_distance(links)
+    if distance is None or len(residuals) < FEWEST or np.ptp(distance) == 0:
+        return ""
+    decades = np.log10(distance) - np.log10(distance).mean()
+    slope = float(decades @ residuals / (decades @ decades))
+    rest = residuals - residuals.mean() - slope * decades
+    error = float(np.sqrt(rest @ rest / (len(residuals) - 2) / (decades @ decades)))
+    verdict = "a trend" if abs(slope) > CLEAR * error else "no trend"
+    return f"{verdict}: the residuals change by {slope:+.1f} dB per decade, standard error {error:.1f} dB"
+
+
+def _class_text(tables: dict[str, pd.DataFrame], column: str, wording: str) -> str:
+    """The class of links with the largest mean residual."""
+    if column not in tables or len(tables[column]) < 2:
+        return ""
+    table = tables[column][tables[column]["links"] >= 3]
+    if not len(table):
+        return ""
+    worst = table.iloc[int(np.argmax(table["mean_db"].abs()))]
+    if abs(worst["mean_db"]) < EVEN_DB:
+        return ""
+    name = f"{worst[column]:g}" if isinstance(worst[column], float) else str(worst[column])
+    clear = abs(worst["mean_db"]) > CLEAR * worst["standard_deviation_db"] / np.sqrt(worst["links"])
+    return (
+        f"largest mean residual: {worst['mean_db']:+.1f} dB, {wording.format(name)}, {worst['links']:.0f} links"
+        + ("" if clear else " (not significant)")
+    )
+
+
+def _obstruction_text(tables: dict[str, pd.DataFrame]) -> str:
+    """Mean residual of links in sight, and of those out of sight by the length of the line below roofs."""
+    if "obstruction" not in tables:
+        return ""
+    parts = [
+        f"{row.mean_db:+.1f} dB "
+        + (f"with {row.from_m:.0f} to {row.to_m:.0f} m below roofs" if row.out_of_sight else "in sight")
+        + f" ({row.links} links)"
+        for row in tables["obstruction"].itertuples()
+    ]
+    return f"mean residual: {', '.join(parts)}"
+
+
+def _missing_region_text(tables: dict[str, pd.DataFrame]) -> str:
+    """Where a region of extra loss would explain residuals, if it explains more than chance."""
+    if "missing_region" not in tables:
+        return ""
+    row = tables["missing_region"].iloc[0]
+    if not row["significant"]:
+        return "no region of extra loss, such as trees, would explain more of the residuals than chance"
+    return (
+        f"losses of {row['attenuation']:.2g} dB/m within x = {row['west']:.0f} to {row['east']:.0f} m, "
+        f"y = {row['south']:.0f} to {row['north']:.0f} m, up to z = {row['height']:.0f} m, on the straight line of "
+        f"{row['links']} links, would explain {percent(float(row['share']))} of the mean square of the residuals "
+        f"(chance alone {percent(float(row['chance']))}): see whether trees stand there, and give them as [regions]"
+    )
+
+
+def _neighbours_text(tables: dict[str, pd.DataFrame]) -> str:
+    if "neighbours" not in tables or len(tables["neighbours"]) < 3:
+        return ""
+    table = tables["neighbours"]
+    nearest, sill = table.iloc[0], float(table["semivariance_db2"].iloc[len(table) // 2 :].mean())
+    share = 1.0 - nearest["semivariance_db2"] / sill if sill > 0 else 0.0
+    # The relative standard error of a semivariance of n independent pairs is sqrt(2 / n).
+    if share < CLEAR * np.sqrt(2.0 / nearest["pairs"]):
+        return f"the errors of links {nearest['distance_m']:.0f} m apart are not correlated"
+    return f"links {nearest['distance_m']:.0f} m apart share {percent(share)} of the variance of their errors"
+
+
+def _leverage_text(tables: dict[str, pd.DataFrame]) -> str:
+    if "leverage" not in tables:
+        return ""
+    table = tables["leverage"]
+    deciding = table[table["leverage"] > DECIDING]
+    if len(deciding):
+        links = "1 link determines" if len(deciding) == 1 else f"{len(deciding)} links determine"
+        rows = rows_text(deciding["row"].tolist())
+        return f"{links} an unknown almost alone (leverage above {DECIDING:g}): {rows}"
+    largest = table.iloc[int(np.argmax(table["leverage"]))]
+    return f"no link determines an unknown alone; the largest is {largest['leverage']:.2f}, in row {largest['row']:.0f}"
+
+
+def _trade_offs_text(tables: dict[str, pd.DataFrame]) -> str:
+    if "trade_offs" not in tables:
+        return ""
+    table = tables["trade_offs"]
+    strong = table[table["correlation"].abs() > TRADE_OFF].head(3)
+    if not len(strong):
+        return f"no two unknowns have a correlation above {TRADE_OFF:g}"
+    return "; ".join(f"{row.first} and {row.second} ({row.correlation:+.2f})" for row in strong.itertuples())
+
+
+def _moved_text(tables: dict[str, pd.DataFrame]) -> str:
+    if "moved" not in tables:
+        return ""
+    table = tables["moved"]
+    row = table.iloc[int(np.argmax(table["moved"].abs()))]
+    moved = percent(abs(row["moved"]))
+    return f"{row['parameter']}, from {row['before']:.4g} to {row['after']:.4g}: {moved} of its range"

@@ -23,6 +23,7 @@ from calibray.measurements import (
     column_names,
     read_table,
     select_rows,
+    transmitter_columns,
 )
 from calibray.measurements.column_names import PositionColumns, ValueColumn
 from calibray.measurements.planner_columns import find_powers
@@ -174,13 +175,13 @@ class LinksDraft:
         if self._sites is None or self.transmitters is None:
             return
         self.section["transmitters"] = self.relative(self.transmitters)
-        name = column_names.find_shared_key(self._table.frame, self._sites.frame)
+        name = transmitter_columns.find_shared_key(self._table.frame, self._sites.frame)
         if name is not None:
             self.section["transmitter"] = self._transmitter_key = name
             self.assume("links.transmitter", name, "a column of both tables with common values")
             self._leave_out_unknown_transmitters(name, self._sites.frame[name])
             return
-        key = column_names.find_naming_key(self._table.frame, self._sites.frame)
+        key = transmitter_columns.find_naming_key(self._table.frame, self._sites.frame)
         if key is not None:
             name, of_table = key
             self.section["transmitter"] = self._transmitter_key = name
@@ -188,8 +189,8 @@ class LinksDraft:
             self.assume("links.transmitter", name, reason)
             self._leave_out_unknown_transmitters(name, self._sites.frame[of_table])
             return
-        name = column_names.find_transmitter_names(self._sites.frame)
-        columns = column_names.find_wide_columns(self._table.frame, self._sites.labels(name).tolist())
+        name = transmitter_columns.find_transmitter_names(self._sites.frame)
+        columns = transmitter_columns.find_wide_columns(self._table.frame, self._sites.labels(name).tolist())
         if not columns:
             raise InputError(
                 f"{self.links}: no column names the transmitter of a row, and no columns are named like the "
@@ -198,13 +199,13 @@ class LinksDraft:
         self.section |= {"wide": columns, "transmitter": name}
         self._transmitter_key = name
         reason = f"named as in {self.transmitters.name}"
-        if unknown := column_names.find_unknown_wide_columns(self._table.frame, columns):
+        if unknown := transmitter_columns.find_unknown_wide_columns(self._table.frame, columns):
             reason += f", which lacks the transmitters of {', '.join(unknown)}: left out"
         self.assume("links.wide", ", ".join(columns), reason)
         codes = find_codes(self._table.frame[list(columns)].apply(pd.to_numeric, errors="coerce"))
         self._assume_codes(codes, ", ".join(columns))
         steps = Preparation(wide=columns, transmitter=name)
-        self._table = select_rows(self._table, steps, column_names.name_melted_values(columns))
+        self._table = select_rows(self._table, steps, transmitter_columns.name_melted_values(columns))
 
     def _leave_out_unknown_transmitters(self, key: str, names_of_sites: pd.Series) -> None:
         """Draft a filter for rows whose transmitter the table of transmitters lacks."""
@@ -369,7 +370,7 @@ class LinksDraft:
         """The column that names transmitters whose positions are in the links."""
         if len(self._table.frame[[tx.x, tx.y]].drop_duplicates()) < 2:
             return
-        name = column_names.find_transmitter_of_positions(self._table.frame, [tx.x, tx.y])
+        name = transmitter_columns.find_transmitter_of_positions(self._table.frame, [tx.x, tx.y])
         if name is not None:
             self.section["transmitter"] = name
             self.assume("links.transmitter", name, "each of its names has one transmitter position")
@@ -428,7 +429,7 @@ class LinksDraft:
             self.assume("offset", "one for all links", "the values include cables and unknown antenna gains")
             return []
         name = self.section.get("transmitter")
-        groups = [*([name] if name else []), *column_names.find_devices(self._table.frame)]
+        groups = [*([name] if name else []), *transmitter_columns.find_devices(self._table.frame)]
         groups = list(dict.fromkeys(groups))
         reason = "each transmitter and each receiver has its own gain"
         self.assume("offset.per", ", ".join(groups) or "one", reason)

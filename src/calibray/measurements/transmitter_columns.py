@@ -1,0 +1,167 @@
+"""Columns that join a table of links with one of transmitters, or that hold the values of a transmitter each."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final
+
+import pandas as pd
+
+from calibray.errors import InputError
+from calibray.measurements.column_names import is_named_value, matches, words
+from calibray.measurements.selection import comparison, naming_column
+
+MAX_DEVICES: Final = 12
+"""Largest number of receiving devices; a column with more values probably holds something else, such as a location."""
+
+
+def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[str, str]:
+    """Find the columns of a wide table, and the transmitter of each.
+
+    Their names differ only in the name of the transmitter, between separators. Of several quantities, received power or
+    path loss is chosen. Nothing is found if there are fewer than two.
+
+    Example:
+        >>> find_wide_columns(pd.DataFrame({"x": [1.0], "rss_a": [-50.0], "rss_b": [-60.0]}), ["a", "b"])
+        {'rss_a': 'a', 'rss_b': 'b'}
+        >>> list(find_wide_columns(pd.DataFrame(columns=["A RTT(mm)", "B RTT(mm)", "A RSS", "B RSS"]), ["A", "B"]))
+        ['A RSS', 'B RSS']
+    """
+    # By the rest of the name, such as " RSS(dBm)" of "AP1 RSS(dBm)".
+    families: dict[tuple[str, str], dict[str, str]] = {}
+    for name in transmitters:
+        pattern = re.compile(rf"(|.*[^a-z0-9]){re.escape(name.lower())}(|[^a-z0-9].*)")
+        for column in frame:
+            if match := pattern.fullmatch(str(column).lower()):
+                families.setdefault((match[1], match[2]), {})[str(column)] = name
+    measured = {
+        rest: columns
+        for rest, columns in families.items()
+        if len(columns) > 1 and not matches(" ".join(rest), "another quantity")
+    }
+    return max(
+        measured.values(),
+        key=lambda columns: (all(is_named_value(column) for column in columns), len(columns)),
+        default={},
+    )
+
+
+def find_unknown_wide_columns(frame: pd.DataFrame, columns: Mapping[str, str]) -> list[str]:
+    """Find columns of a wide table that are named like those of transmitters, but of none in the table of them.
+
+    Example:
+        >>> table = pd.DataFrame(columns=["x", "rss_a", "rss_b", "rss_c"])
+        >>> find_unknown_wide_columns(table, {"rss_a": "a", "rss_b": "b"})
+        ['rss_c']
+        >>> table = pd.DataFrame(columns=["x", "WAP1", "WAP2", "WAP13"])
+        >>> find_unknown_wide_columns(table, {"WAP1": "WAP1", "WAP2": "WAP2"})
+        ['WAP13']
+    """
+    column, name = next(iter(columns.items()))
+    before, _, after = column.lower().rpartition(name.lower())
+    # Where columns have no other words, those differ from the transmitters' in digits alone.
+    middle = r"[^ _]+" if before + after else re.sub(r"\d+", r"\\d+", re.escape(name.lower()))
+    pattern = re.compile(rf"{re.escape(before)}{middle}{re.escape(after)}")
+    return [str(other) for other in frame if other not in columns and pattern.fullmatch(str(other).lower())]
+
+
+def name_melted_values(columns: Iterable[str]) -> str:
+    """Name the column of values that at least one column of a wide table becomes, after a word they share.
+
+    Example:
+        >>> name_melted_values(["RSS AP1", "RSS AP2"])
+        'rss_value'
+    """
+    shared = frozenset.intersection(*map(words, columns))
+    terms = ("rsrp", "rss", "rssi", "loss", "pl", "gain")
+    return next((term for term in terms if term in shared), "rss") + "_value"
+
+
+def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | None:
+    """Find the column by which two tables name the transmitter, if any.
+
+    It is the first column of both tables in which every value of the links appears once among the transmitters; else
+    the first that is named like transmitters in which some values appear.
+    """
+    partial = None
+    for name in transmitters:
+        compared = comparison(transmitters[name])
+        values = set(compared(transmitters[name]))
+        if name not in links or len(values) != len(transmitters):
+            continue
+        labels = set(compared(links[name].dropna()))
+        if labels <= values:
+            return str(name)
+        if partial is None and labels & values and matches(name, "transmitter", "name of a transmitter"):
+            partial = str(name)
+    return partial
+
+
+def find_naming_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> tuple[str, str] | None:
+    """Find the column of the links that names the transmitter, and that of another name in the table of transmitters.
+
+    Columns that are named like transmitters come first, then other columns of texts.
+
+    Example:
+        >>> links = pd.DataFrame({"gateway_id": ["a", "b", "a"], "rssi": [-80, -90, -85]})
+        >>> find_naming_key(links, pd.DataFrame({"id": ["a", "b", "c"], "x": [0, 50, 90]}))
+        ('gateway_id', 'id')
+    """
+    for name in sorted(links, key=lambda name: not matches(name, "transmitter")):
+        labels = links[name].dropna().drop_duplicates()
+        is_likely = matches(name, "transmitter") or not pd.api.types.is_numeric_dtype(labels)
+        if is_likely and len(labels):
+            of_table = naming_column(transmitters, labels)
+            if of_table is not None:
+                return str(name), of_table
+    return None
+
+
+def find_transmitter_of_positions(frame: pd.DataFrame, position: Sequence[str]) -> str | None:
+    """Find the column that names the transmitters whose positions are in columns of the same table.
+
+    Each of its labels has one position, and there are as many labels as positions or more.
+
+    Example:
+        >>> links = pd.DataFrame({"cell": ["a", "b", "a"], "tx_x": [0, 50, 0], "tx_y": 0, "rsrp": [-80, -90, -85]})
+        >>> find_transmitter_of_positions(links, ["tx_x", "tx_y"])
+        'cell'
+    """
+    positions = frame.groupby(list(position), dropna=False).ngroup()
+    quantities = ("x", "y", "longitude", "latitude", "height", "power", "frequency", "another quantity")
+    for name in frame:
+        is_name = pd.api.types.is_integer_dtype(frame[name]) or not pd.api.types.is_numeric_dtype(frame[name])
+        if not is_name or not matches(name, "transmitter") or name in position:
+            continue
+        is_quantity = matches(name, *quantities) and not matches(name, "name of a transmitter")
+        if not is_quantity and positions.groupby(frame[name], dropna=False).nunique().max() == 1:
+            return str(name)
+    return None
+
+
+def find_transmitter_names(transmitters: pd.DataFrame) -> str:
+    """Find the column of names of a table of transmitters, one per row.
+
+    Raises:
+        InputError: No column with such a name distinguishes the transmitters.
+    """
+    for name in transmitters:
+        is_named_so = matches(name, "name of a transmitter", "transmitter")
+        if is_named_so and transmitters[name].nunique() == len(transmitters):
+            return str(name)
+    raise InputError(
+        f"transmitters: no column names them ({', '.join(map(str, transmitters))}); call it 'transmitter'"
+    )
+
+
+def find_devices(frame: pd.DataFrame) -> list[str]:
+    """Columns that distinguish receiving devices."""
+    coordinates = ("x", "y", "longitude", "latitude", "height", "altitude or floor")
+    return [
+        str(name)
+        for name in frame
+        if matches(name, "receiving device")
+        and not matches(name, *coordinates)
+        and 1 < frame[name].nunique() <= MAX_DEVICES
+    ]

@@ -1,0 +1,127 @@
+"""Priors of parameters: log-normal around a value, Gaussian for antennas, or like another parameter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+
+from calibray.parameters.space import Parameters
+
+
+@dataclass(frozen=True)
+class LogNormal:
+    """Gaussian priors of the logarithms of k parameters, or of the values of some of them.
+
+    Attributes:
+        index: Numbers of the parameters that have a prior.
+        centre: Medians, in the parameters' units; of those in `like`, relative to the value of the other parameter.
+        spread: Standard deviations of the logarithms: 0.3 is about 30 %; of the values of those in `linear`.
+        linear: Numbers of the parameters whose prior is Gaussian in the value itself, which can be negative.
+        like: Number of a parameter with a prior, and of the one that it is like: members of a population scatter around
+            their common value.
+
+    Example:
+        >>> prior = LogNormal((0,), (4.0,), (0.3,))
+        >>> prior.residuals(np.array([[4.0, 1.0], [8.0, 1.0]])).round(2).tolist()
+        [[0.0], [2.31]]
+    """
+
+    index: tuple[int, ...] = ()
+    centre: tuple[float, ...] = ()
+    spread: tuple[float, ...] = ()
+    linear: tuple[int, ...] = ()
+    like: tuple[tuple[int, int], ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def extended(self, index: Sequence[int], centre: Sequence[float], spread: float) -> LogNormal:
+        """These priors, and independent ones of further parameters with one spread of their logarithms."""
+        return replace(
+            self,
+            index=(*self.index, *index),
+            centre=(*self.centre, *centre),
+            spread=(*self.spread, *(spread for _ in index)),
+        )
+
+    def residuals(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The priors as residuals of a least-squares problem: (log value - log centre) / spread [n, k].
+
+        Candidates [n, d] are in the fields' units, greater than 0 unless `linear`.
+        """
+        values, centre, linear = candidates[:, self._columns], np.array(self.centre), self._linear
+        logarithm = np.log(np.where(linear, 1.0, values)) - np.log(np.where(linear, 1.0, centre))
+        for row, reference in self._pairs:
+            logarithm[:, row] -= np.log(candidates[:, reference])
+        return np.where(linear, values - centre, logarithm) / self.spread
+
+    def jacobian(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives of the residuals with respect to the parameters [n, k, d]; arguments as for `residuals`."""
+        jacobian = np.zeros((len(candidates), len(self), candidates.shape[1]))
+        slope = np.where(self._linear, 1.0, candidates[:, self._columns])
+        jacobian[:, np.arange(len(self)), self._columns] = 1.0 / (slope * self.spread)
+        for row, reference in self._pairs:
+            jacobian[:, row, reference] = -1.0 / (candidates[:, reference] * self.spread[row])
+        return jacobian
+
+    def log_normalization(
+        self, candidates: NDArray[np.float64], parameters: Parameters
+    ) -> NDArray[np.float64]:
+        """Logarithm of the integral of exp(-residual^2 / 2) over the bounds of the parameters in `like` [n].
+
+        It depends on the parameters that they are like. The density is one of the search space.
+        """
+        total = np.zeros(len(candidates))
+        for row, reference in self._pairs:
+            middle, low, high, tilt = self._interval(row, candidates[:, reference], parameters)
+            total += tilt * (middle - tilt * self.spread[row] ** 2 / 2)
+            total += np.log(np.maximum(ndtr(high) - ndtr(low), 1e-300))
+        return total
+
+    def draw_like(
+        self, candidates: NDArray[np.float64], parameters: Parameters, random: np.random.Generator
+    ) -> NDArray[np.float64]:
+        """Candidates [n, d] with the parameters in `like` drawn given those that they are like."""
+        drawn = candidates.copy()
+        for row, reference in self._pairs:
+            middle, low, high, _ = self._interval(row, candidates[:, reference], parameters)
+            level = ndtr(low) + random.random(len(drawn)) * (ndtr(high) - ndtr(low))
+            logarithm = middle + self.spread[row] * ndtri(np.clip(level, 1e-300, 1 - 1e-16))
+            item = parameters.items[self.index[row]]
+            drawn[:, self.index[row]] = np.clip(np.exp(logarithm), item.lower, item.upper)
+        return drawn
+
+    def _interval(
+        self, row: int, reference: NDArray[np.float64], parameters: Parameters
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
+        """Mean of the logarithm [n], and the bounds in standard deviations from there [n] each.
+
+        Returned too is 1 if the search space is that of the value, where exp(-residual^2 / 2) has another mean than in
+        that of the logarithm, else 0.
+        """
+        item, spread = parameters.items[self.index[row]], self.spread[row]
+        tilt = 0.0 if item.scale == "log" else 1.0
+        middle = np.log(reference) + np.log(self.centre[row]) + tilt * spread**2
+        low, high = ((np.log(bound) - middle) / spread for bound in (item.lower, item.upper))
+        return middle, low, high, tilt
+
+    @property
+    def _pairs(self) -> tuple[tuple[int, int], ...]:
+        """Number of the prior and of the parameter that it is around."""
+        return tuple((self.index.index(parameter), reference) for parameter, reference in self.like)
+
+    @property
+    def _linear(self) -> NDArray[np.bool_]:
+        return np.isin(self._columns, self.linear)
+
+    @property
+    def _columns(self) -> NDArray[np.int64]:
+        return np.array(self.index, dtype=np.int64)
+
+
+NO_PRIOR: Final = LogNormal()
