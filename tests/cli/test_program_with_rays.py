@@ -50,7 +50,7 @@ RIPPLE = "gain += math.sin(3 * permittivity + number)"
 ISOTROPIC = {"pattern": "iso", "polarization": "H"}
 
 
-def write_study(folder: Path, ripple: str = "pass", antennas: dict | None = None) -> Path:
+def write_study(folder: Path, ripple: str = "pass", antennas: dict | None = None, **sections: dict) -> Path:
     """A study whose program differs from replay in thickness, conductivity, polarization and antenna gain."""
     folder.mkdir()
     (folder / "program.py").write_text(
@@ -59,7 +59,7 @@ def write_study(folder: Path, ripple: str = "pass", antennas: dict | None = None
     command = [sys.executable, "-I", "-S", "program.py"]
     content = two_ray.study(
         folder, links=16, antennas=antennas or {}, objective={"combining": "power"}, holdout={"blocks": 2},
-        engine={"name": "command", "command": command, "rays": True, "retries": 0},
+        engine={"name": "command", "command": command, "rays": True, "retries": 0}, **sections,
     ).content()  # fmt: skip
     write_study_file(folder, content)
     study = cb.Study.load(folder / "study.toml")
@@ -132,7 +132,8 @@ def test_predictions_and_the_page_show_the_rays_of_the_program(
 
 
 def test_a_program_of_other_physics_is_not_understood(tmp_path: Path) -> None:
-    study = write_study(tmp_path / "study", RIPPLE, {"tx": ISOTROPIC, "rx": ISOTROPIC})
+    method = {"name": "auto", "options": {"budget": 9}}
+    study = write_study(tmp_path / "study", RIPPLE, {"tx": ISOTROPIC, "rx": ISOTROPIC}, method=method)
     ran = run("run", study, "--out", tmp_path / "out")
     (remark,) = (
         each for each in Result.load(tmp_path / "out").uncertainty.remarks if each.kind == "ray mapping"
