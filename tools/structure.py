@@ -154,6 +154,30 @@ def single_importers(graph: Graph) -> int:
     return sum(len(by) == 1 for path, by in importers.items() if not path.endswith("__init__.py"))
 
 
+WALKS = {
+    "credible interval": "uncertainty/assessment.py",
+    "offset": "fitting/objective.py",
+    "measured row": "measurements/reading.py",
+    "blocks": "validation/validate.py",
+}
+"""The module that a topic starts from."""
+
+
+def walks(graph: Graph) -> dict[str, int]:
+    """Number of modules of its room that a topic leads through; without circles of files, it returns to none."""
+    lengths = {}
+    for topic, start in WALKS.items():
+        reached: set[str] = set()
+        waiting = [start]
+        while waiting:
+            path = waiting.pop()
+            if path not in reached and room(path) == room(start):
+                reached.add(path)
+                waiting += graph.get(path, ())
+        lengths[topic] = len(reached)
+    return lengths
+
+
 def constants(trees: dict[str, ast.Module]) -> int:
     """Number of numeric constants at the top level of modules."""
     return sum(
@@ -262,6 +286,7 @@ def table(checkout: Path, static: bool = False) -> list[tuple[str, str]]:
         ("import arrows between rooms", f"{sum(map(len, rooms_imports.values()))}"),
         ("circles of rooms", f"{len(circles(rooms_imports))}"),
         ("circles of files", f"{len(circles(graph))}"),
+        *((f"modules of {topic}", f"{count}") for topic, count in walks(graph).items()),
         ("modules with one importer", f"{single_importers(graph)}"),
         ("functions with more than six arguments", f"{many_arguments(trees)}"),
         ("numeric constants", f"{constants(trees)}"),

@@ -29,9 +29,6 @@ START_INTERACTIONS: Final = 4_000_000
 def check_method(name: str) -> None:
     """Check that a method exists.
 
-    Args:
-        name: The method.
-
     Raises:
         InputError: There is no such method.
     """
@@ -60,9 +57,6 @@ def choose(problem: Problem, model: CheapModel | None = None) -> Optimizer:
 
 def check_fit(setup: Setup) -> None:
     """Check that a study's method and options work on its engine, before any expensive call or output.
-
-    Args:
-        setup: The opened study.
 
     Raises:
         InputError: The method does not exist, needs derivatives that the engine does not give, or its options cannot
@@ -102,9 +96,5 @@ def _make(
 
 
 def local_searches(interactions: int) -> int:
-    """Number of starting points of a multi-start method: fewer on larger path programs.
-
-    Args:
-        interactions: Interactions of the path program.
-    """
+    """Number of starting points of a multi-start method: fewer on larger path programs."""
     return int(np.clip(START_INTERACTIONS // max(interactions, 1), *STARTS))

@@ -168,9 +168,6 @@ def random_effect(links: Measurements, name: str, by: str, labels: ArrayLike) ->
 def transmitters(links: Measurements) -> NDArray[np.str_]:
     """Label each link's transmitter by its position to the centimetre.
 
-    Args:
-        links: The links.
-
     Returns:
         A label for each link [L].
     """
@@ -350,13 +347,6 @@ class Nuisance:
 
 def study_nuisance(study: StudyModel, links: Measurements) -> Nuisance:
     """Make the nuisance that a study declares: its offset, for all links or per group, and its further terms.
-
-    Args:
-        study: The study.
-        links: All its links.
-
-    Returns:
-        The nuisance.
 
     Raises:
         InputError: A term's column or groups cannot be used.

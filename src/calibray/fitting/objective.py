@@ -178,9 +178,6 @@ class Objective:
     def shares(self, chunks: Sequence[NDArray[np.int64]]) -> list[Share]:
         """Split the objective by chunks of links, each of which can be summed by itself.
 
-        Args:
-            chunks: Links of every chunk.
-
         Returns:
             The share of every chunk.
         """

@@ -97,10 +97,6 @@ class Observed:
 def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
     """The observables that a study states.
 
-    Args:
-        setup: The opened study.
-        engine: Its engine.
-
     Raises:
         InputError: A column cannot be used, too few links have a value, or the engine gives path loss only.
     """

@@ -165,10 +165,6 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
 def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tuple[Problem, float]:
     """The problem with the spreads of its random effects estimated at a point of the search space [d].
 
-    Args:
-        problem: The problem.
-        point: The point.
-
     Returns:
         The problem, and the standard deviation of a link's error within the groups of the last effect [dB].
     """
@@ -198,10 +194,6 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
 
 def with_estimated_errors(problem: Problem, point: NDArray[np.float64]) -> Problem:
     """The problem with errors of its further observables estimated at a point of the search space [d].
-
-    Args:
-        problem: The problem.
-        point: The point.
 
     Returns:
         The problem; unchanged without further observables.

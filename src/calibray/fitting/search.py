@@ -35,10 +35,6 @@ RELEVANT: Final = 20.0
 def rounds(optimizer: Optimizer, evaluate: Evaluate) -> Iterator[tuple[NDArray[np.float64], Evaluation]]:
     """Run an optimizer until it is done.
 
-    Args:
-        optimizer: The optimizer.
-        evaluate: Evaluates its candidates.
-
     Yields:
         The candidates of every round, as points of the search space [n, d], and their evaluation.
     """
@@ -188,10 +184,6 @@ def _hits(engine: Engine) -> int:
 
 def find_minima(problem: Problem, trail: Trail) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Collect the known minima of a problem; search for more if the method kept only its best.
-
-    Args:
-        problem: The problem.
-        trail: Its finished search.
 
     Returns:
         Points of the search space, the calibrated one first [k, d], and their mean squares [k].

@@ -114,11 +114,6 @@ class Parameter:
 def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:
     """A parameter for a constant that a scene fixes, within four standard deviations of its logarithm.
 
-    Args:
-        name: Material and constant, as "walls.thickness".
-        value: The scene's value.
-        spread: Standard deviation of the logarithm.
-
     Returns:
         The parameter; None if the constant is 0 or cannot take such values.
 

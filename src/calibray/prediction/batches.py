@@ -163,13 +163,7 @@ LOG: Final = logging.getLogger(__name__)
 
 
 def announce(result: Record, links: int, what: str = "links") -> None:
-    """Log how many links are traced, and about how long that takes.
-
-    Args:
-        result: The calibration.
-        links: Number of links.
-        what: What they are.
-    """
+    """Log how many links are traced, and about how long that takes."""
     if result.prediction.model.parameters is None:
         LOG.info("%s %s, predicted without a trace: the log-distance model uses no scene", f"{links:,}", what)
         return

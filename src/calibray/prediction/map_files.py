@@ -174,14 +174,7 @@ def geotiff(coverage: CoverageMap, path: Path) -> None:
 
 @styled()
 def figure(coverage: CoverageMap) -> Figure:
-    """Draw a map over the outlines of buildings, with a second panel for half the width of the interval.
-
-    Args:
-        coverage: The map.
-
-    Returns:
-        The figure.
-    """
+    """Draw a map over the outlines of buildings, with a second panel for half the width of the interval."""
     best, *ends = coverage.layers.values()
     panels: list[tuple[str, NDArray[np.float64], str]] = [
         ("Path loss [dB]", best, LOSS_COLORS)

@@ -52,10 +52,6 @@ class Shift(NamedTuple):
 def model_terms(model: PredictionModel, links: Measurements) -> Iterator[TermAtLinks]:
     """Terms of the prediction model.
 
-    Args:
-        model: The model.
-        links: The new links.
-
     Yields:
         The terms.
 

@@ -31,10 +31,6 @@ def remarks(result: Record, setup: Setup) -> NDArray[np.str_]:
 
     Indoors, where most calibrated receivers are inside a building, that remark is omitted.
 
-    Args:
-        result: The calibration.
-        setup: Its study, opened for the links.
-
     Returns:
         A remark for every link [links]; empty where the positions are plausible.
     """
@@ -57,10 +53,6 @@ def remarks(result: Record, setup: Setup) -> NDArray[np.str_]:
 
 def is_indoors(result: Record, triangles: Triangles) -> bool:
     """Whether most calibrated receivers are inside a building.
-
-    Args:
-        result: The calibration.
-        triangles: Its scene.
 
     Returns:
         True if they are; False if their positions are unknown.

@@ -160,10 +160,6 @@ def traced_materials(result: Record, materials: dict[str, Material] | None) -> d
 def check_groups(result: Record, links: Measurements) -> None:
     """Refuse links of groups without a coefficient, before anything is traced.
 
-    Args:
-        result: The calibration.
-        links: The links.
-
     Raises:
         InputError: A group has no calibrated coefficient, or a column is missing.
     """
@@ -289,10 +285,6 @@ def _residual_db(result: Record, links: Measurements, ratio: float) -> NDArray[n
 def with_constants(result: Record, setup: Setup) -> Setup:
     """The study with the constants of its scene that vary in the draws as further parameters.
 
-    Args:
-        result: The calibration.
-        setup: Its study, opened.
-
     Returns:
         The study with these parameters, after its own; without them for a program that answers with rays, whose own
         constants vary in the draws.
@@ -359,11 +351,6 @@ def _residual_field(result: Record, links: Measurements) -> tuple[NDArray[np.flo
 
 def check_inputs(result: Record, setup: Setup, allow_changed: bool) -> None:
     """Refuse a scene or an antenna that differs from the calibrated one.
-
-    Args:
-        result: The calibration.
-        setup: The opened study.
-        allow_changed: Allow changes.
 
     Raises:
         InputError: A file changed since the calibration.

@@ -84,9 +84,6 @@ def _krige(
 def calibration_residuals(links: pd.DataFrame) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Residuals of the prediction model at the calibration links.
 
-    Args:
-        links: A result's table of links.
-
     Returns:
         Rows of the calibration links that have a path [m], and their measured minus modelled path loss [m], [dB].
     """

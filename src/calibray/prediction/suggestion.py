@@ -164,9 +164,6 @@ class _ReplayedDraws:
     def at(self, setup: Setup) -> tuple[NDArray[np.float64], NDArray[np.float64], Errors]:
         """Predict the candidates.
 
-        Args:
-            setup: The study, opened for the candidates.
-
         Returns:
             Path loss for every value [m, candidates], [dB]; its derivatives with respect to the coordinates of the unit
             cube for the draws [n, candidates, d], [dB]; and the expected errors of measurements.

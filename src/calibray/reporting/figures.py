@@ -204,9 +204,6 @@ def residual_over_distance(survey: Survey) -> Figure:
 def residual_by_group(survey: Survey) -> Figure:
     """Draw the residuals of each group.
 
-    Args:
-        survey: The links, which have groups.
-
     Returns:
         The figure: quartiles as a box, the median as a line, and whiskers that contain 90 % of the links.
     """
@@ -275,9 +272,6 @@ MOST: Final = 6
 @styled()
 def measured_over_modelled(result: Record) -> Figure | None:
     """Draw measured over modelled values of the observables, with biases of devices taken off.
-
-    Args:
-        result: The calibration.
 
     Returns:
         The figure; None without further observables.

@@ -62,9 +62,6 @@ def _listed(names: Sequence[str]) -> str:
 def findings(check: SceneCheck) -> list[Table]:
     """The size of a scene and its defects.
 
-    Args:
-        check: The check of the scene.
-
     Returns:
         A table of size and verdict, and a table of the findings in the order of the check, if there are any.
     """
@@ -95,14 +92,7 @@ def findings(check: SceneCheck) -> list[Table]:
 
 
 def objects(check: SceneCheck) -> Table:
-    """The objects of a scene, with the numbers of their faces and of defects.
-
-    Args:
-        check: The check of the scene.
-
-    Returns:
-        One row per object.
-    """
+    """The objects of a scene, with the numbers of their faces and of defects."""
     columns = (
         Column("object"), Column("material"), numbers("faces"), numbers("open edges"), numbers("unwelded edges"),
         numbers("flipped faces"), numbers("empty faces"), numbers("repeated faces"),

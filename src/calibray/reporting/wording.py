@@ -86,11 +86,7 @@ def scene_alone_text(record: Record) -> str:
 
 
 def sampling_text(record: Record) -> str:
-    """Why the exported scene can give another path loss than the reported one; empty if it cannot.
-
-    Returns:
-        One or two sentences.
-    """
+    """Why the exported scene can give another path loss than the reported one; empty if it cannot."""
     trace, model = record.study.trace, record.prediction.model
     calibrated = model.parameters is None or model.parameters == record.parameters
     causes = []

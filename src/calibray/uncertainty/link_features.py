@@ -26,9 +26,6 @@ def link_features(problem: Problem) -> NDArray[np.float64]:
     of the path with the fewest interactions. Their mean square over all links and features is one over the number of
     features, so that the distance of two links is about the square root of two.
 
-    Args:
-        problem: The problem.
-
     Returns:
         The features that differ between links [L, k].
     """

@@ -87,9 +87,6 @@ def validate(
 def check_engine(study: StudyModel) -> None:
     """Refuse an engine on which a dozen calibrations would be too expensive.
 
-    Args:
-        study: The study.
-
     Raises:
         InputError: The engine is not "replay".
     """

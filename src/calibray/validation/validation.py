@@ -37,9 +37,6 @@ from calibray.validation.held_out_statistics import choose, compare, interval_ha
 def observables_table(observables: Mapping[str, ObservableErrors]) -> Table:
     """Held-out errors of further observables, each in its unit.
 
-    Args:
-        observables: The errors by name.
-
     Returns:
         The table; without rows if there are none.
     """
@@ -64,14 +61,7 @@ class Validation(HeldOutErrors):
 
     @classmethod
     def of(cls, errors: HeldOutErrors) -> Validation:
-        """The validation of held-out errors.
-
-        Args:
-            errors: The errors.
-
-        Returns:
-            The validation.
-        """
+        """The validation of held-out errors."""
         if isinstance(errors, Validation):
             return errors
         return cls(
@@ -134,9 +124,6 @@ class Validation(HeldOutErrors):
     def scale(self, name: str) -> float:
         """Standard deviation of a model's residuals on new links.
 
-        Args:
-            name: The model.
-
         Returns:
             Root mean square of its held-out residuals [dB].
         """
@@ -144,10 +131,6 @@ class Validation(HeldOutErrors):
 
     def levels(self, name: str, links: Measurements) -> BlockErrors | None:
         """Held-out residuals of a model within and between blocks.
-
-        Args:
-            name: The model.
-            links: The links.
 
         Returns:
             The errors in two levels; None if there are too few links.
@@ -157,9 +140,6 @@ class Validation(HeldOutErrors):
 
     def sizes(self, name: str) -> NDArray[np.float64]:
         """Absolute held-out residuals of a model.
-
-        Args:
-            name: The model.
 
         Returns:
             Absolute residuals, ascending [dB].

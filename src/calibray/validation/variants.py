@@ -167,15 +167,7 @@ def add_nuisance(objective: Objective, path_loss_db: NDArray[np.float64]) -> NDA
 
 
 def initial_objective(objective: Objective, setup: Setup) -> Objective:
-    """The objective of the initial materials: with an offset of all links, unless the study declares one.
-
-    Args:
-        objective: The study's objective.
-        setup: The opened study.
-
-    Returns:
-        The objective.
-    """
+    """The objective of the initial materials: with an offset of all links, unless the study declares one."""
     return _with_term(objective, CONSTANT, setup)
 
 

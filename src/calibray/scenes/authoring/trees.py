@@ -112,13 +112,6 @@ def read_trees(path: str | Path, frame: Frame) -> Trees:
 
     The tags `height` and `diameter_crown` are used where they are stated, else `HEIGHTS` and `CROWN`.
 
-    Args:
-        path: The extract, .osm or .osm.pbf.
-        frame: The scene's frame.
-
-    Returns:
-        The trees, possibly none.
-
     Raises:
         InputError: The file cannot be read, or pyosmium is not installed.
     """
