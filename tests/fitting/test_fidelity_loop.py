@@ -9,6 +9,9 @@ import pytest
 import planted
 from calibray import engines
 from calibray.calibration.calibrate import calibrate
+from calibray.fitting.fidelity_loop import with_interpolation_error
+from calibray.fitting.nuisance import Nuisance
+from calibray.fitting.objective import Objective
 from calibray.paths import take
 from calibray.tracing.settings import TraceSettings
 from calibray.tracing.trace_plan import plan_trace
@@ -105,3 +108,22 @@ def test_a_link_lost_by_the_new_trace_is_left_out_and_reported(tmp_path):
     assert result.links["has_path"].sum() == planted.LINKS - 1
     assert np.isfinite(result.rmse_db)
     assert np.isfinite(result.fit.retrace_gap_db)
+
+
+def test_links_whose_interpolation_errs_count_less():
+    random = np.random.default_rng(3)
+    residual, gap = random.normal(0.0, 2.0, 400), np.where(np.arange(400) < 100, 6.0, 0.0)
+    stated = np.ones(400)
+    stated[:2], gap[2] = 0.0, np.inf
+    objective = Objective(residual, stated, Nuisance(400, ()), noise_db=2.0)
+    weighted = with_interpolation_error(objective, np.zeros(400), gap)
+    counted = stated > 0
+    counted[2] = False
+    # The median of squares of a normal variable is 0.455 times its variance.
+    variance = np.median(residual[counted] ** 2) / 0.45494
+    assert variance == pytest.approx(4.0, rel=0.2)
+    assert not weighted.weight[:2].any()
+    np.testing.assert_allclose(weighted.weight[3:100], variance / (variance + 36.0), rtol=1e-4)
+    np.testing.assert_array_equal(weighted.weight[100:], 1.0)
+    # The error of a link without a gap stays 2 dB.
+    assert weighted.noise_db**2 * weighted.weight[counted].mean() == pytest.approx(4.0)

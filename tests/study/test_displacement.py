@@ -85,6 +85,24 @@ def test_path_loss_is_exact_at_the_traced_neighbours_and_its_derivatives_everywh
         assert np.abs(jacobian[0, :, index]).max() > 1e-3
 
 
+def test_a_displacement_beyond_the_neighbours_counts_up_to_twice_their_distance(folder: Path) -> None:
+    setup = Setup.open(study(folder, "stated.csv", {"tx:A.height": [-8, 8]}), tracer=TwoRay)
+    near = setup.placed_at({GROUND: 3.0, "tx:A.height": 1.0}, 0.25)
+    engine = engines.make(near)
+    heights = np.array([-1.0, 1.0, 3.0, 8.0, -8.0])
+    candidates = np.column_stack([np.full(5, 3.0), heights])
+    loss = engine.path_loss(candidates)
+    # Through the traces at -1, 1 and 3 m goes one parabola. 8 m lies 5 m beyond: 2 + 5 * 2 / (2 + 5) m from the middle.
+    for row, effective in ((3, 1 + 2 + 10 / 7), (4, 1 - 2 - 14 / 9)):
+        parabola = np.polyfit(heights[:3], loss[:3], 2)
+        np.testing.assert_allclose(loss[row], [np.polyval(each, effective) for each in parabola.T], atol=1e-8)
+    _, jacobian = engine.path_loss_and_jacobian(candidates[3:])
+    step = np.array([0.0, 1e-4])
+    difference = engine.path_loss(candidates[3:] + step) - engine.path_loss(candidates[3:] - step)
+    np.testing.assert_allclose(jacobian[..., 1], difference / 2e-4, rtol=1e-5, atol=1e-6)
+    assert np.abs(jacobian[..., 1]).max() > 1e-3
+
+
 @pytest.fixture(scope="module")
 def result(folder: Path) -> cb.Result:
     return cb.calibrate(study(folder, "stated.csv"), tracer=TwoRay)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial, reduce
-from typing import Protocol
+from typing import Final, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.fields.program import GroupedProgram
+
+TINY: Final = 1e-12
+"""Keeps 0 / 0 from links that are not displaced [m]."""
 
 
 class Effect(Protocol):
@@ -120,7 +123,7 @@ class RoughSurfaces:
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["link", "group", "weights", "origin", "slope", "curvature"],
+    data_fields=["link", "group", "weights", "origin", "slope", "curvature", "distance"],
     meta_fields=[],
 )
 @dataclass(frozen=True, eq=False)
@@ -134,6 +137,8 @@ class DisplacementLoss:
         origin: Values of the effect parameters at which the paths were traced [e].
         slope: First-order coefficient of every link [K, L], [dB/m].
         curvature: Second-order coefficient of every link [K, L], [dB/m^2].
+        distance: Distance of the traced neighbours of every link [K, L], [m]. Beyond it, displacements count less and
+            less, up to twice the distance: a polynomial is no extrapolation.
     """
 
     link: jax.Array | NDArray[np.integer]
@@ -142,6 +147,7 @@ class DisplacementLoss:
     origin: NDArray[np.float64]
     slope: NDArray[np.float64]
     curvature: NDArray[np.float64]
+    distance: NDArray[np.float64]
 
     def ordered(self, order: NDArray[np.int64]) -> DisplacementLoss:
         """See `Effect.ordered`."""
@@ -151,7 +157,10 @@ class DisplacementLoss:
         """See `Effect.apply`."""
         loss_db = jnp.zeros(self.slope[0].shape)
         for axis, (group, weights) in enumerate(zip(self.group, self.weights, strict=True)):
-            displacement = (jnp.asarray(weights) @ (values - self.origin))[group]
+            stated, most = (jnp.asarray(weights) @ (values - self.origin))[group], self.distance[axis]
+            inside = jnp.clip(stated, -most, most)
+            beyond = stated - inside
+            displacement = inside + beyond * most / (most + jnp.abs(beyond) + TINY)
             loss_db += (self.slope[axis] + self.curvature[axis] * displacement) * displacement
         return scaled(program, jnp.exp(-np.log(10) / 20 * loss_db)[self.link])
 

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from calibray.engines.kinds.replay import ReplaySection, replay
 from calibray.engines.protocol import Chunked
 from calibray.fitting.methods import AUTO, choose
+from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, search
 from calibray.study.displacement import displaces
 from calibray.support.progress import Progress, with_stage
+
+ROUNDS: Final = 3
+"""Default number of traces if paths are sampled by the materials."""
+DISPLACED_ROUNDS: Final = 6
+"""Default number of traces if positions are parameters: planted ones are approached to 0.3 m in 4 to 6."""
+NEAREST: Final = 0.125
+"""Smallest distance of neighbours, as a share of the largest displacement: 1 m for bounds of 8 m."""
 
 
 def retrace(
@@ -38,13 +48,15 @@ def retrace(
     study, parameters = problem.setup.study, problem.parameters
     section = study.engine
     sampled = study.trace.refraction or study.trace.diffuse_reflection
-    if not isinstance(section, ReplaySection) or section.rays or study.fidelity.rounds == 0:
+    displaced = any(displaces(name) for name in parameters.names)
+    rounds = study.fidelity.rounds
+    if rounds is None:
+        rounds = DISPLACED_ROUNDS if displaced else ROUNDS
+    if not isinstance(section, ReplaySection) or section.rays or rounds == 0 or not (sampled or displaced):
         return problem, trail, None
-    if not (sampled or any(displaces(name) for name in parameters.names)):
-        return problem, trail, None
-    gap = None
-    for turn in range(study.fidelity.rounds):
-        setup = problem.setup.placed_at(parameters.named(trail.best), 0.5 ** (turn + 1))
+    gap, stated = None, problem.objective
+    for turn in range(rounds):
+        setup = problem.setup.placed_at(parameters.named(trail.best), max(0.5 ** (turn + 1), NEAREST))
         materials = parameters.materials(trail.best, problem.engine.materials)
         stage = with_stage(progress, "checking")
         if isinstance(problem.engine, Chunked):
@@ -54,14 +66,42 @@ def retrace(
         gap = path_loss_change(engine.path_loss(trail.best[None])[0], trail.best_modelled)
         objective = problem.objective
         settled = np.abs(gap[objective.weight > 0]).max() <= study.fidelity.tolerance_db
-        if settled or study.method.name != AUTO or turn == study.fidelity.rounds - 1:
+        if settled or study.method.name != AUTO or turn == rounds - 1:
             break
+        if displaced:
+            weight = np.where(objective.weight > 0, stated.weight, 0.0)
+            objective = with_interpolation_error(replace(stated, weight=weight), trail.best_modelled, gap)
         # Links without a path in the new trace are left out of the next calibration.
         if objective.ceiling_db is None:
             objective = replace(objective, weight=np.where(np.isfinite(gap), objective.weight, 0.0))
         problem = replace(problem, setup=setup, engine=engine, objective=objective)
         trail = search(problem, choose(problem), progress)
     return problem, trail, gap
+
+
+def with_interpolation_error(
+    objective: Objective, modelled: NDArray[np.float64], gap: NDArray[np.float64]
+) -> Objective:
+    """The objective with errors of interpolated path loss in the weights of the links.
+
+    Interpolation errs most where paths appear or vanish between the traced positions. The gap after tracing again is
+    taken as the standard deviation of this error, in addition to that of the link's other errors.
+
+    Args:
+        objective: The objective without such errors.
+        modelled: Interpolated path loss at the best values [L], [dB].
+        gap: Path loss traced there minus `modelled` [L], [dB].
+    """
+    counted = (objective.weight > 0) & np.isfinite(gap)
+    residual = (objective.model(modelled[None])[0] - objective.measured)[counted]
+    # Relative to the mean weight; the median is not moved by the links whose interpolation is bad.
+    relative = objective.weight[counted] / objective.weight[counted].mean()
+    variance = np.median(residual**2 * relative) / chi2.ppf(0.5, 1) / relative
+    weight = objective.weight.copy()
+    weight[counted] *= variance / (variance + gap[counted] ** 2)
+    # The standard deviation at the mean weight follows that weight.
+    noise_db = objective.noise_db * np.sqrt(objective.weight[counted].mean() / weight[counted].mean())
+    return replace(objective, weight=weight, noise_db=float(noise_db))
 
 
 def path_loss_change(after: NDArray[np.float64], before: NDArray[np.float64]) -> NDArray[np.float64]:

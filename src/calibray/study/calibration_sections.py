@@ -264,11 +264,11 @@ class FidelitySection(Section):
 
     Attributes:
         tolerance_db: Largest change of a link's path loss [dB] that is accepted.
-        rounds: Largest number of traces, 0 for none.
+        rounds: Largest number of traces, 0 for none; 3 if absent, or 6 if positions are parameters.
     """
 
     tolerance_db: Annotated[float, Field(gt=0)] = 0.5
-    rounds: Annotated[int, Field(ge=0, le=100)] = 3
+    rounds: Annotated[int, Field(ge=0, le=100)] | None = None
 
 
 class MethodSection(Section):

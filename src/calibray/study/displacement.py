@@ -153,7 +153,7 @@ def displacement_loss(
         replay = Replay(replace(paths, materials=materials), parameters, batch=1, effects=effects)
         return replay.path_loss(values[None])[0]
 
-    stated_db, slopes, curvatures = path_loss_db(*here), [], []
+    stated_db, slopes, curvatures, distances = path_loss_db(*here), [], [], []
     for displacement in displacements:
         distance = (share * displacement.reach)[displacement.group]
         sides = [path_loss_db(*traced(displacement.moved(links, side * distance))) for side in (1.0, -1.0)]
@@ -161,6 +161,7 @@ def displacement_loss(
             slope, curvature = polynomial(np.array(sides) - stated_db, distance)
         slopes.append(slope)
         curvatures.append(curvature)
+        distances.append(distance)
     return DisplacementLoss(
         here[0].link,
         tuple(displacement.group for displacement in displacements),
@@ -168,6 +169,7 @@ def displacement_loss(
         values[parameters.of_effects],
         np.array(slopes),
         np.array(curvatures),
+        np.array(distances),
     )
 
 
