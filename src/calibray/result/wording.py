@@ -277,8 +277,8 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     ),
     RemarkKind.OUTSIDE_INTERVAL: _outside_interval,
     RemarkKind.FEW_DRAWS: lambda values: (
-        "Independent populations of draws disagree. The intervals are rough, and a range that fits may be missing. "
-        "Calibrate fewer parameters, or give them priors."
+        "Independent populations of draws disagree. The intervals are rough, and a range that fits may be missing, so "
+        "no parameter is more than weakly identified. Calibrate fewer parameters, or give them priors."
     ),
     RemarkKind.APPROXIMATE_INTERVALS: _approximate_intervals,
     RemarkKind.RAY_MAPPING: _ray_mapping,

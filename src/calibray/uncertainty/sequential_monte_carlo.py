@@ -4,8 +4,8 @@ A population drawn from the prior follows the prior times a power of the likelih
 Moral, A. Doucet and A. Jasra, J. Royal Statistical Society B 68, 2006). Each step raises the power until half of the
 population is effective, resamples the population, and moves its members (`population_moves.py`).
 
-Two populations are independent. If they disagree, two more are drawn, as far as the budget allows. All populations
-count by their estimates of the evidence, which are unbiased.
+Two populations are independent. While the halves of all disagree, as many more are drawn, as far as the budget allows.
+All populations count by their estimates of the evidence, which are unbiased.
 """
 
 from __future__ import annotations
@@ -29,6 +29,11 @@ BUDGET: Final = 1_000_000_000
 
 EVALUATIONS: Final = 100
 """Evaluations that a member takes, about: steps times moves."""
+
+POPULATIONS: Final = (2, 4, 8)
+"""Independent populations, more as long as the halves of them disagree. Where the slabs' fringes fit, means of one
+population of 256 scatter by 0.2 posterior standard deviations; in three development districts the draws of two or four
+populations agreed for half of the truths."""
 
 SWEEPS: Final = 4
 """Sweeps per step; a sweep moves every member in each way. The share of one of two distant ranges in five dimensions
@@ -130,24 +135,23 @@ def draw_posterior(
     gaps, model = model.gaps, replace(model, gaps=counted)
     populations: list[Population] = []
     evidences: list[float] = []
-    for number in range(4):
-        if number == 2:
-            spent = 2 * EVALUATIONS * model.interactions * size
-            if 2 * spent > budget or _distance(model, populations) < _apart(size):
-                break
-        random = np.random.default_rng([seed, number])
+    agree = False
+    for total in POPULATIONS:
+        if populations and (agree or total * EVALUATIONS * model.interactions * size > budget):
+            break
+        for number in range(len(populations), total):
 
-        def stepped(power: float, number: int = number) -> None:
-            if progress is not None:
-                progress((number % 2 + power) / 2)
+            def stepped(power: float, number: int = number) -> None:
+                if progress is not None:
+                    progress((number % 2 + power) / 2)
 
-        population, evidence = _anneal(model, size, random, stepped)
-        populations.append(population)
-        evidences.append(evidence)
-    half, members = len(populations) // 2, len(populations[0].spread)
-    agree = _distance(model, [_together(populations[:half]), _together(populations[half:])]) < _apart(
-        size * half
-    )
+            population, evidence = _anneal(model, size, np.random.default_rng([seed, number]), stepped)
+            populations.append(population)
+            evidences.append(evidence)
+        half = total // 2
+        distance = _distance(model, [_together(populations[:half]), _together(populations[half:])])
+        agree = distance < _apart(size * half)
+    members = len(populations[0].spread)
     # Populations that disagree count alike: the estimates of their evidence are then unreliable.
     share = _weights(np.array(evidences)) if agree else np.full(len(populations), 1.0 / len(populations))
     posterior = _posterior(model, _together(populations), np.repeat(share, members) / members, agree)

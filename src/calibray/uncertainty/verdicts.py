@@ -157,7 +157,8 @@ def verdicts(
             reason = Reason(ReasonKind.AT_BOUND, {"side": ends[0], "value": float(other_end)})
             name = VerdictName.AT_BOUND
         else:
-            name = VerdictName.IDENTIFIED if share <= IDENTIFIED else VerdictName.WEAKLY_IDENTIFIED
+            sure = share <= IDENTIFIED and draws.agree
+            name = VerdictName.IDENTIFIED if sure else VerdictName.WEAKLY_IDENTIFIED
             others = _outlying_pieces(index, pieces, reported, draws, axes)
             reason = Reason(ReasonKind.WIDTH, {"share": float(share), **range_}, others)
         result.append(Verdict(reported, name, reason, seen_reported))
