@@ -44,6 +44,9 @@ def test_an_undetermined_parameter_covers_its_bounds():
     assert [verdict.name for verdict in judged] == ["identified", "not identifiable"]
     assert "no link's path loss changes by more than 0.0 dB" in reason_text(judged[1].reason)
     assert judged[0].lower == pytest.approx(3.0 - 1.96 * 0.2, abs=0.08)
+    # Draws that disagree identify nothing, however narrow they are.
+    rough = verdicts(replace(draws, agree=False), lambda x: x, Axes(NAMES, lower, upper), 1.0)
+    assert [verdict.name for verdict in rough] == ["weakly identified", "not identifiable"]
 
 
 def test_gaps_between_draws_of_a_parameter_without_effect_are_chance():

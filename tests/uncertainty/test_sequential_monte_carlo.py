@@ -284,6 +284,19 @@ def test_populations_that_disagree_are_reported():
     assert posterior.means.weight[:half].sum() == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize(("interactions", "pairs"), [(1, 4), (30_000, 2), (LARGE, 1)])
+def test_more_populations_are_drawn_while_their_halves_disagree(monkeypatch, interactions, pairs):
+    """The halves agree at the third comparison, of eight populations, if the budget allows as many."""
+    distances = iter([1.0, 1.0, 0.0])
+    monkeypatch.setattr(module, "_distance", lambda *_: next(distances))
+    monkeypatch.setattr(module, "SIZE", (64, 64))
+    model = _model(_parameters(), _uninformative, 4, buildings=0, interactions=interactions)
+    draws = draw_posterior(model, seed=1).means
+    assert draws.agree == (pairs == 4)
+    monkeypatch.setattr(module, "_distance", lambda *_: 0.0)
+    assert len(draws.weight) == pairs * len(draw_posterior(model, seed=1).means.weight)
+
+
 def test_each_step_leaves_half_of_the_members_effective():
     log_likelihood = 30.0 * np.random.default_rng(10).standard_normal(1000)
     power = module._next_power(log_likelihood, 0.1)

@@ -42,11 +42,7 @@ loss alone is. The same compiled program then serves all fits."""
 
 
 def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...]:
-    """Compare what path loss and the further observables say of the parameters.
-
-    Args:
-        problem: The problem, with further observables.
-        minima: Its relevant minima [k, d].
+    """Compare what path loss and the further observables of a problem with minima [k, d] say of the parameters.
 
     Returns:
         Remarks with both answers and the conflict in standard errors; none without a conflict.

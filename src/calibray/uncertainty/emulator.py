@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.protocol import Responses
-from calibray.fitting.cheap_replay import ReplayedModel, StoredPaths
+from calibray.fitting.cheap_replay import ReplayedModel
 from calibray.fitting.observed import Observed
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
@@ -309,7 +309,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
     stretch = max(
         1.0, standardized_error(process, better), standardized_error(process, np.arange(len(calls.value)))
     )
-    cost = calls.rows.size + (0 if replayed is None else _interactions(replayed.engine))
+    cost = calls.rows.size + (0 if replayed is None else int(getattr(replayed.engine, "interactions", 1)))
     functions = [
         sample_function(process, random, 0.0),
         *(sample_function(process, random, stretch) for _ in range(FUNCTIONS)),
@@ -380,10 +380,6 @@ def _replayed(model: ReplayedModel, rows: ResponseRows) -> ReplayedModel | None:
     """The replay with responses as residuals; None if it predicts no link."""
     replayed = ReplayedModel(model.engine, model.count, rows)
     return replayed if replayed.known.any() else None
-
-
-def _interactions(engine: StoredPaths) -> int:
-    return int(getattr(engine, "interactions", 1))
 
 
 def _steepness(unit: NDArray[np.float64]) -> float:

@@ -20,14 +20,11 @@ OBSTRUCTION: Final = ("out_of_sight", "walls_crossed", "obstruction_m", "knife_e
 
 
 def link_features(problem: Problem) -> NDArray[np.float64]:
-    """Standardized features of the links that have a weight.
+    """Standardized features of the links that have a weight, of these the ones that differ between links [L, k].
 
     They are the logarithm of the distance, what stands between the ends, and interactions and mean cosine of incidence
     of the path with the fewest interactions. Their mean square over all links and features is one over the number of
     features, so that the distance of two links is about the square root of two.
-
-    Returns:
-        The features that differ between links [L, k].
     """
     setup = problem.setup.with_obstruction()
     table, links = setup.links.table, setup.links
