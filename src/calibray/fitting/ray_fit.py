@@ -193,28 +193,37 @@ def _polarized(fit: Understanding, slants: tuple[float | None, float | None]) ->
 
 
 def _refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: int) -> Understanding:
-    """Least squares of all ratios, from an explanation."""
+    """Least squares of all ratios, from an explanation; values that change no ratio stay as they are."""
     lower, upper = fit.model.bounds
+    start = np.clip(fit.values, lower, upper)
+    size = np.linalg.norm(_errors(replace(fit, values=start), ratios, last)[1], axis=0)
+    free = np.flatnonzero(size > 1e-9 * size.max(initial=1e-9))
+    lower, upper, values = lower[free] - 1e-9, upper[free] + 1e-9, start[free]
     kept: dict[bytes, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+
+    def complete(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        everything = start.copy()
+        everything[free] = values
+        return everything
 
     def evaluate(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         if (key := values.tobytes()) not in kept:
             kept.clear()
-            kept[key] = _errors(replace(fit, values=values), ratios, last)
+            errors, slopes = _errors(replace(fit, values=complete(values)), ratios, last)
+            kept[key] = errors, slopes[:, free]
         return kept[key]
 
     # SciPy's stubs know no function as Jacobian.
     slopes = cast(Any, lambda values: evaluate(values)[1])
     weights = np.concatenate([ratio.weight for ratio in ratios])
     scale = ray_scan.ROBUST_DB * float(np.sqrt(weights.mean()))
-    values = np.clip(fit.values, lower, upper)
     for loss in ("soft_l1", "linear"):  # paths near a resonance count less at first
         values = least_squares(
-            lambda values: evaluate(values)[0], values, slopes, bounds=(lower - 1e-9, upper + 1e-9), x_scale="jac",
+            lambda values: evaluate(values)[0], values, slopes, bounds=(lower, upper), x_scale="jac",
             loss=loss, f_scale=scale, max_nfev=evaluations, xtol=1e-10, ftol=1e-8,
         ).x  # fmt: skip
     misfit = float(np.linalg.norm(evaluate(values)[0]) / np.sqrt(weights.sum()))
-    return replace(fit, values=values, misfit_db=misfit)
+    return replace(fit, values=complete(values), misfit_db=misfit)
 
 
 def _errors(

@@ -97,8 +97,8 @@ def scan(
         calls: The ratios to earlier calls.
         known: Whether the antennas are known; there is one pair of polarizations then.
     """
-    everything = [last, *(call.materials for call in calls)]
-    grid = _grid(name, fields, [materials[name] for materials in everything], paths.frequency)
+    everything = [materials[name] for materials in (last, *(call.materials for call in calls))]
+    grid = _grid(fields, everything, paths.materials[name].thickness, paths.frequency)
     square, weight = [], sum(call.weight.sum() for call in calls)
     for start in range(0, len(grid), BATCH):
         part = np.exp(grid[start : start + BATCH])
@@ -120,10 +120,11 @@ def chosen(paths: Paths, subset: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.sort(subset[np.lexsort((-paths.spreading[subset], depth))[:SCANNED]])
 
 
-def _grid(name: str, fields: list[str], materials: list[Material], frequency: float) -> NDArray[np.float64]:
-    """Logarithms of the scanned constants [n, c]."""
+def _grid(
+    fields: list[str], materials: list[Material], declared: float, frequency: float
+) -> NDArray[np.float64]:
+    """Logarithms of the scanned constants [n, c], around the thickness that the study declares [m]."""
     root = np.sqrt(max(item.relative_permittivity for item in materials))
-    declared = materials[0].thickness
     conductivities = CONDUCTIVITIES
     if "conductivity" not in fields:
         conductivities = np.array([max(min(item.conductivity for item in materials), CONDUCTIVITIES[0])])
@@ -134,7 +135,7 @@ def _grid(name: str, fields: list[str], materials: list[Material], frequency: fl
         deepest = min(max(THICKEST, 2 * declared), max(DECAYED / attenuation, 2 * THINNEST))
         thickness = np.append(np.arange(THINNEST, deepest, step), HALF_SPACE)
         if "thickness" not in fields:
-            thickness = np.array([declared])
+            thickness = np.array([materials[0].thickness])
         rows.append(np.stack([thickness, np.full(len(thickness), conductivity)], axis=1))
     return np.log(np.concatenate(rows))[:, [("thickness", "conductivity").index(field) for field in fields]]
 
