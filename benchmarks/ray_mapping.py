@@ -14,11 +14,13 @@ import argparse
 import json
 import tempfile
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
+import jax
 import numpy as np
 import pandas as pd
 
@@ -59,12 +61,16 @@ ENGINES: Final[dict[str, tuple[Any, Any]]] = {
     "polarization": (TURNED, lambda m, _: changed(m, thickness=1.6, conductivity=3.0)),
     "scattering": (SAME, lambda m, _: replace(changed(m, thickness=0.8), scattering_coefficient=0.4)),
     "conductivity": (OTHER, lambda m, _: changed(m, conductivity=10.0)),
+    "thinner": (
+        OTHER,
+        lambda m, _: changed(m, thickness=0.5, conductivity=1 / 3, relative_permittivity=1.2),
+    ),
     "ITU law": (
         OTHER,
         lambda m, f: replace(m, conductivity=itu_material("concrete", f).conductivity, thickness=0.25),
     ),
 }
-"""Antennas, and materials from the study's at a carrier [Hz]."""
+"""Antennas, and materials from the study's at a carrier [Hz]; calibrated constants are those of the candidate."""
 
 
 @dataclass(frozen=True)
@@ -208,37 +214,65 @@ def repetition(place: Place, name: str, seed: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run the repetitions and print the quantiles."""
+    """Run the repetitions that the file lacks, and print the quantiles of all of them."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--first", type=int, default=100)
     parser.add_argument("--districts", type=int, default=2)
     parser.add_argument("--offices", type=int, default=0)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--engines", default=",".join(ENGINES))
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--out", type=Path, help="file of the repetitions; a run that was stopped goes on")
     options = parser.parse_args()
-    rows, engines = [], options.engines.split(",")
-    places = [(district, options.first + number) for number in range(options.districts)]
-    offices = [(office, options.first + number) for number in range(options.offices)]
-    # Districts and offices in turn, so that a run that is stopped has seen both.
-    order = sorted([*enumerate(places), *enumerate(offices)], key=lambda item: item[0])
+    engines, rows = options.engines.split(","), []
+    if options.out is not None and options.out.exists():
+        rows = [json.loads(line) for line in options.out.read_text().splitlines()]
+    done = {(row["place"], row["engine"], row["seed"]) for row in rows}
+    counts = {district: options.districts, office: options.offices}
+    numbers = range(options.first, options.first + max(counts.values()))
+    order = [(make, k) for k in numbers for make, count in counts.items() if k < options.first + count]
     with tempfile.TemporaryDirectory() as folder:
-        for _, (make, number) in order:
-            try:
-                place = make(number, Path(folder))
-            except InputError as error:  # some draw a carrier for which P.2040 has no constants
-                print(f"{make.__name__} {number} left out: {error}", flush=True)
-                continue
-            rough = with_diffuse(place) if "scattering" in engines else place
-            for name, seed in product(engines, range(options.seeds)):
-                rows.append(repetition(rough if name == "scattering" else place, name, seed))
+        made = Places(Path(folder))
+        # In every round each place meets another engine, so that a run that is stopped has seen all of both.
+        for turn, (index, (make, number)) in product(range(len(engines)), enumerate(order)):
+            name = engines[(index + turn) % len(engines)]
+            seeds = [k for k in range(options.seeds) if (f"{make.__name__}-{number}", name, k) not in done]
+            place = made.get(make, number, name == "scattering") if seeds else None
+            jax.clear_caches()  # the functions of the place before
+            for seed in seeds if place is not None else []:
+                rows.append(repetition(place, name, seed))
                 print(json.dumps(rows[-1]), flush=True)
                 if options.out is not None:
                     with options.out.open("a") as file:
                         file.write(json.dumps(rows[-1]) + "\n")
     for name in engines:
-        print(f"{name:14} {_summary([row for row in rows if row['engine'] == name])}")
+        if chosen := [row for row in rows if row["engine"] == name]:
+            print(f"{name:14} {_summary(chosen)}")
     print(f"{'all':14} {_summary(rows)}")
+
+
+@dataclass(frozen=True)
+class Places:
+    """Districts and offices, each made once.
+
+    Attributes:
+        folder: Folder of their files.
+        made: Those made; None for one left out.
+    """
+
+    folder: Path
+    made: dict[tuple[str, int, bool], Place | None] = field(default_factory=dict)
+
+    def get(self, make: Callable[[int, Path], Place], number: int, rough: bool) -> Place | None:
+        """A place, with diffuse paths if it is rough."""
+        key = make.__name__, number, rough
+        if key not in self.made:
+            try:
+                place = self.get(make, number, False) if rough else make(number, self.folder)
+                self.made[key] = with_diffuse(place) if rough and place is not None else place
+            except InputError as error:  # some draw a carrier for which P.2040 has no constants
+                print(f"{make.__name__} {number} left out: {error}", flush=True)
+                self.made[key] = None
+        return self.made[key]
 
 
 def _summary(rows: list[dict[str, Any]]) -> str:

@@ -12,10 +12,11 @@ from calibray.engines import Replay
 from calibray.engines.rays.compile import RaySetting, compile_rays, powers, rays_of
 from calibray.engines.rays.export import Export
 from calibray.engines.rays.table import RayTable
+from calibray.fitting import ray_fit
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_fit import understand
 from calibray.fitting.ray_mapping import RayMap, map_rays
-from calibray.fitting.ray_model import HALF_SPACE, Call
+from calibray.fitting.ray_model import ANGLES, HALF_SPACE, Call, RayModel
 from calibray.materials import Material
 from calibray.paths import Paths
 from calibray.study import Setup
@@ -92,6 +93,19 @@ def test_a_slab_is_found_among_its_resonances(foreign: Foreign) -> None:
     assert found.misfit_db < 0.01
     assert constants["ground.thickness"] == pytest.approx(0.437, rel=1e-3)
     assert constants["ground.conductivity"] == pytest.approx(0.004, rel=0.05)
+
+
+def test_values_that_no_ratio_shows_stay(foreign: Foreign) -> None:
+    """Without polarization no power depends on a slant; a value that drifts would be where the next scan starts."""
+    calls = [Call(np.array([value]), foreign(np.array([value]))) for value in (4.0, 9.0)]
+    model = RayModel.of(foreign.problem.parameters, calls[-1].export.paths, False)
+    slants = len(model.assumed) + np.array([0, ANGLES])
+    start = model.start.copy()
+    start[slants] = 0.3
+    fit = ray_fit.Understanding(model, start, (False, False), np.inf)
+    refined = ray_fit.refined(fit, ray_fit.ratios_of(calls), calls[-1], 12)
+    np.testing.assert_array_equal(refined.values[slants], 0.3)
+    assert not np.array_equal(refined.values, start)
 
 
 def test_an_engine_of_other_physics_is_not_understood(foreign: Foreign) -> None:

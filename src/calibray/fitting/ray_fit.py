@@ -100,7 +100,7 @@ def understand(
     if not len(model.start):
         return replace(first, misfit_db=float(np.linalg.norm(_errors(first, ratios, last)[0])))
     if before is not None and before.model.assumed == model.assumed:
-        before = _refined(replace(before, model=model), ratios, last, EVALUATIONS[1])
+        before = refined(replace(before, model=model), ratios, last, EVALUATIONS[1])
         if before.misfit_db <= KNOWN_DB:
             return before
     return _search(first, ratios, last, before)
@@ -116,15 +116,15 @@ def _search(
         done[material] = True
         shown = np.logical_not((meets & ~done).any(axis=1))
         part = [ratio for each in ratios if len((ratio := each.on(shown)).here)]
-        new = _scanned(fits[0], part, last, material, meets[:, material] & shown)
+        new = _scanned(fits, part, last, material, meets[:, material] & shown)
         if part:
-            fits = _best([_refined(fit, part, last, EVALUATIONS[0]) for fit in [*fits, *new]])
-    fits = _best([_refined(fit, ratios, last, EVALUATIONS[1]) for fit in fits] + ([before] if before else []))
+            fits = _best([refined(fit, part, last, EVALUATIONS[0]) for fit in [*fits, *new]])
+    fits = _best([refined(fit, ratios, last, EVALUATIONS[1]) for fit in fits] + ([before] if before else []))
     for material in order:
         if fits[0].misfit_db <= EXACT_DB:
             break
-        new = _scanned(fits[0], ratios, last, material, meets[:, material])
-        fits = _best([*fits, *(_refined(fit, ratios, last, EVALUATIONS[1]) for fit in new)])
+        new = _scanned(fits[:1], ratios, last, material, meets[:, material])
+        fits = _best([*fits, *(refined(fit, ratios, last, EVALUATIONS[1]) for fit in new)])
     return fits[0]
 
 
@@ -143,45 +143,50 @@ def _meetings(model: RayModel) -> tuple[NDArray[np.bool_], list[int]]:
 
 
 def _scanned(
-    fit: Understanding, ratios: list[Ratio], last: Call, material: int, wanted: NDArray[np.bool_]
+    fits: list[Understanding], ratios: list[Ratio], last: Call, material: int, wanted: NDArray[np.bool_]
 ) -> list[Understanding]:
-    """Explanations with other constants of one material, from a scan on some of the paths [P]."""
-    model = fit.model
+    """Explanations with other constants of one material, from scans on some of the paths [P].
+
+    A scan with upright antennas of all polarizations starts from the first explanation; others, with the antennas that
+    each explanation has, take tilts into account.
+    """
+    model, first = fits[0].model, np.isinf(fits[0].misfit_db)
     name = list(model.paths.materials)[material]
     fields = [
         field for owner, field in model.assumed if owner == name and field in ("thickness", "conductivity")
     ]
     where = [model.assumed.index((name, field)) for field in fields]
-    calls, index = [], np.flatnonzero(wanted)
+    index = np.flatnonzero(wanted)
     for ratio in ratios:
         index = np.intersect1d(index, ratio.here)
     index = ray_scan.chosen(model.paths, index)
     if not len(index) or not where:
         return []
-    for ratio in ratios:
-        at = np.searchsorted(ratio.here, index)
-        materials = model.materials(ratio.call.candidate, fit.values)
-        calls.append(ray_scan.Observed(materials, ratio.weight[at], ratio.observed[at]))
-    found = ray_scan.scan(
-        take(model.paths, index),
-        name,
-        fields,
-        model.materials(last.candidate, fit.values),
-        calls,
-        model.known,
-    )
-    new, first = [], np.isinf(fit.misfit_db)
-    pairs = np.argsort(found.misfit[:, 0], kind="stable")[:KEPT].tolist()
-    for rank, pair in enumerate(pairs):
-        for number in range(int(np.isfinite(found.misfit[pair]).sum())):
-            moved = fit.values.copy()
-            moved[where] = found.values[pair, number]
-            if rank == 0 and not first:
-                new.append(replace(fit, values=moved))
-            if not model.known and (first or number == 0):
-                new.append(_polarized(replace(fit, values=moved), ray_scan.POLARIZATIONS[pair]))
-            elif first:
-                new.append(replace(fit, values=moved))
+
+    def scan(fit: Understanding, paths: Paths, known: bool) -> ray_scan.Scan:
+        calls = []
+        for ratio in ratios:
+            at = np.searchsorted(ratio.here, index)
+            materials = model.materials(ratio.call.candidate, fit.values)
+            calls.append(ray_scan.Observed(materials, ratio.weight[at], ratio.observed[at]))
+        materials = model.materials(last.candidate, fit.values)
+        return ray_scan.scan(take(paths, index), name, fields, materials, calls, known)
+
+    def moved(fit: Understanding, constants: NDArray[np.float64]) -> Understanding:
+        values = fit.values.copy()
+        values[where] = constants
+        return replace(fit, values=values)
+
+    new = []
+    if not model.known:
+        found = scan(fits[0], model.paths, False)
+        for pair in np.argsort(found.misfit[:, 0], kind="stable")[:KEPT].tolist():
+            for constants in found.lowest(pair)[: None if first else 1]:
+                new.append(_polarized(moved(fits[0], constants), ray_scan.POLARIZATIONS[pair]))
+    for fit in fits if model.known or not first else []:
+        paths = model.replay_paths(last.candidate, fit.values, fit.linear)
+        found = scan(fit, replace(paths, materials=model.paths.materials), True)
+        new += [moved(fit, constants) for constants in found.lowest(0)]
     return new
 
 
@@ -192,7 +197,7 @@ def _polarized(fit: Understanding, slants: tuple[float | None, float | None]) ->
     return replace(fit, values=values, linear=(slants[0] is not None, slants[1] is not None))
 
 
-def _refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: int) -> Understanding:
+def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: int) -> Understanding:
     """Least squares of all ratios, from an explanation; values that change no ratio stay as they are."""
     lower, upper = fit.model.bounds
     start = np.clip(fit.values, lower, upper)

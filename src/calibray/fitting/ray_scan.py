@@ -83,6 +83,10 @@ class Scan:
     values: NDArray[np.float64]
     misfit: NDArray[np.float64]
 
+    def lowest(self, pair: int) -> NDArray[np.float64]:
+        """The constants of a pair's minima [k, c]."""
+        return self.values[pair, np.isfinite(self.misfit[pair])]
+
 
 def scan(
     paths: Paths, name: str, fields: list[str], last: dict[str, Material], calls: list[Observed], known: bool
