@@ -20,7 +20,7 @@ from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 from sionna.rt.radio_materials import scattering_pattern_registry
 
 # The solver tells repeated paths by hashes, and loses paths whose hashes collide in its table of a million.
-SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = 16_777_213
+SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = 67_108_859
 
 FOLDER = Path(__file__).resolve().parent
 LANES = 20_000_000  # rays x interactions x receivers of one call, which take some 800 MB

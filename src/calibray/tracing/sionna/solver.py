@@ -47,9 +47,12 @@ from calibray.tracing.sionna.buffers import (
 )
 from calibray.tracing.sionna.scene import antenna_patterns, load_scene, scattering_pattern, shape_ids
 
-# Sionna drops candidates whose hashes collide: of 9,099 in Munich (15 receivers) 75 with its million entries, 8 with
-# this many. A prime, because the lowest bits of FNV hashes vary least.
-SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = 16_777_213
+HASHES: Final = (16_777_213, 67_108_859)
+"""Entries of Sionna's table of hashes in small and in large launches. It drops candidates whose hashes collide: of
+31,430 of a launch to 25 receivers 1,067 with its own million entries, 36 with 16 million, 4 with 67 million, which take
+0.5 GB and 0.3 s of a launch. Primes, because the lowest bits of its hashes vary least."""
+SMALL_LAUNCH: Final = 5_000_000
+"""Lanes of a small launch, which find some thousand candidates at most."""
 
 SCALAR_CONSTANTS: Final = (
     "relative_permittivity",
@@ -150,7 +153,7 @@ class Solver:
         # At most one candidate per ray, interaction and target, and the direct paths.
         most = (rays.count * settings.max_depth + 1) * num_targets + 2
         while True:
-            with _ray_directions(rays.directions):
+            with _ray_directions(rays.directions), _hash_table(HASHES[most > SMALL_LAUNCH]):
                 buffer = self._generate_candidates(
                     mi_scene=mitsuba_scene,
                     src_positions=source,
@@ -274,6 +277,17 @@ class Solver:
             normal_n=normal_n,
             edge_lengths=edge_lengths,
         )
+
+
+@contextmanager
+def _hash_table(entries: int) -> Iterator[None]:
+    """Give Sionna's table of hashes a number of entries."""
+    own = SBCandidateGenerator.MIN_SPEC_COUNT_SIZE
+    SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = entries
+    try:
+        yield
+    finally:
+        SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = own
 
 
 @contextmanager
