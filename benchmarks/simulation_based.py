@@ -36,7 +36,7 @@ from calibray import engines
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares
-from calibray.study import Study
+from calibray.study import Setup, Study
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import render
 from calibray.uncertainty.credible_sets import credible
@@ -59,7 +59,7 @@ def five_parameters(name: str, folder: Path) -> Problem:
     study = districts.make(name, folder).problem.setup.study
     content = study.model_dump(mode="json", by_alias=True, exclude_unset=True)
     walls, windows = ("concrete", "glass") if name == districts.DEMO else ("walls", "windows")
-    setup = study.opened()
+    setup = Setup.open(study)
     for material in (walls, windows):
         thickness = setup.scene.materials[material].thickness
         content["parameters"][f"{material}.thickness"] = {
