@@ -89,6 +89,26 @@ def test_a_cell_equals_the_prediction_at_its_centre(result, coverage):
     assert (coverage.lower_db < coverage.path_loss_db)[inside].all()
 
 
+def test_further_observables_are_layers_with_the_predictions_at_the_cells(result, tmp_path):
+    content = result.study.content()
+    content["observables"] = {"flight": {"kind": "time_of_flight", "column": "flight_ns", "unit": "ns"}}
+    observed = replace(result, study=cb.Study.from_content(content, result.study.path))
+    coverage = cb.coverage_map(observed, TX, cell=30.0, bounds=AREA, columns=WEST, level=None)
+    (name,) = coverage.observables
+    layer = coverage.observables[name]
+    assert name == "flight_ns"
+    assert layer.shape == coverage.path_loss_db.shape
+    row, column = np.nonzero(np.isfinite(coverage.path_loss_db))
+    predicted = observed.predict_interval(links(coverage.x[column], coverage.y[row]), None)
+    np.testing.assert_allclose(layer[row, column], predicted[name].to_numpy(float), atol=0.05)
+    assert np.nanmax(layer) > np.nanmin(layer) + 1.0
+    coverage.save(tmp_path)
+    table = pd.read_csv(tmp_path / "map.csv")
+    assert table[name].to_numpy() == pytest.approx(layer.reshape(-1), abs=0.01, nan_ok=True)
+    with rasterio.open(tmp_path / "map.tif") as file:
+        assert name in file.descriptions
+
+
 def test_cells_of_the_model_with_obstruction_have_what_blocks_their_line(result):
     coefficients = {"constant": 50.0, "log_distance": 30.0, "out_of_sight": 9.0, "obstruction_m": 0.3}
     terms = tuple(FittedTerm(name, name, "", {"": value}) for name, value in coefficients.items())
