@@ -19,6 +19,7 @@ from calibray.measurements import (
     measured_links,
     read_measurements,
     read_table,
+    table_files,
 )
 from calibray.measurements.table_files import PiecedTable
 
@@ -155,6 +156,16 @@ def test_a_row_with_a_missing_value_does_not_pass_a_filter(tmp_path):
 
 
 @pytest.mark.parametrize("column", ["zeros", "text"])
+def test_metadata_that_end_the_library_are_looked_at_in_another_process(tmp_path, monkeypatch):
+    """Damaged histograms of levels abort pyarrow's process (fuzz suite, seed 612, case 605)."""
+    path = tmp_path / "links.parquet"
+    pd.DataFrame({"x": [1.0, 2.0]}).to_parquet(path)
+    monkeypatch.setattr(table_files, "run_limited", lambda code, *_: "group.column" not in code)
+    monkeypatch.setattr(pq, "ParquetFile", lambda *_, **__: pytest.fail("opened in this process"))
+    with pytest.raises(InputError, match="its library fails while it reads it; export it again"):
+        read_table(path)
+
+
 def test_a_parquet_file_that_decompresses_to_gigabytes_is_refused_before_it_is_read(
     tmp_path, monkeypatch, column
 ):

@@ -48,6 +48,18 @@ except Exception as error:
     refuse("not a Parquet file (" + " ".join(str(error).split())[:300] + "); export it again")
 """
 
+_METADATA: Final = """
+from pyarrow import parquet
+try:
+    with parquet.ParquetFile({path!r}, pre_buffer=False) as file:
+        for number in range(file.metadata.num_row_groups):
+            group = file.metadata.row_group(number)
+            for index in range(group.num_columns):
+                group.column(index).statistics
+except Exception as error:
+    refuse("not a Parquet file (" + " ".join(str(error).split())[:300] + "); export it again")
+"""
+
 _decoded: Final[set[tuple[str | int, ...]]] = set()
 """Files that were decoded before, in their present form."""
 
@@ -190,14 +202,22 @@ def _decode_elsewhere(path: Path, size: int, limit: int, whole: bool) -> None:
     Raises:
         InputError: The file takes more memory or time, or is damaged.
     """
+    code = _DECODE.format(path=str(path.resolve()), limit=limit, whole=whole, rows=PIECE_ROWS)
+    _run_elsewhere(path, code, size)
+
+
+def _run_elsewhere(path: Path, code: str, size: int) -> None:
+    """Run code on a file in a process with limits, once for each code and form of the file.
+
+    Raises:
+        InputError: The file takes more memory or time, or is damaged.
+    """
     status = path.stat()
-    key = (str(path.resolve()), status.st_mtime_ns, status.st_size, status.st_ino, limit, whole)
+    key = (code, status.st_mtime_ns, status.st_size, status.st_ino)
     if key in _decoded:
         return
     try:
-        is_read = run_limited(
-            _DECODE.format(path=key[0], limit=limit, whole=whole, rows=PIECE_ROWS), DECODING_MEMORY, size
-        )
+        is_read = run_limited(code, DECODING_MEMORY, size)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except TimeoutError as error:
@@ -210,6 +230,8 @@ def _decode_elsewhere(path: Path, size: int, limit: int, whole: bool) -> None:
 def _open_parquet(path: Path) -> Any:
     from pyarrow import parquet
 
+    # The library ends the process where damaged metadata contradict themselves.
+    _run_elsewhere(path, _METADATA.format(path=str(path.resolve())), path.stat().st_size)
     try:
         # With pre_buffer, pyarrow reads ahead and keeps every row group in memory.
         return parquet.ParquetFile(path, pre_buffer=False)
