@@ -11,6 +11,7 @@ import drjit as dr
 import numpy as np
 import pytest
 import sionna.rt
+from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 from sionna.rt.utils import fibonacci_lattice
 
 import calibray as cb
@@ -20,6 +21,7 @@ from calibray.paths import Paths
 from calibray.scenes import read_scene
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Trace, Tracer
+from calibray.tracing.sionna.solver import HASHES
 from calibray.tracing.trace_plan import lattice_directions
 from small_scenes import block, write_scene
 
@@ -323,3 +325,22 @@ def test_a_refused_trace_writes_no_file(tmp_path: Path, monkeypatch: pytest.Monk
     with pytest.raises(InputError):
         cb.trace("absent.xml", links([0, 0, 9], [[1, 0, 1]]), frequency=FREQUENCY)
     assert not list(tmp_path.iterdir())
+
+
+def test_large_launches_have_more_hashes_and_sionna_keeps_its_own(canyon: Tracer, monkeypatch) -> None:
+    own, entries = SBCandidateGenerator.MIN_SPEC_COUNT_SIZE, []
+    generate = canyon.solver._generate_candidates
+
+    def recorded(**arguments: object) -> object:
+        entries.append(SBCandidateGenerator.MIN_SPEC_COUNT_SIZE)
+        return generate(**arguments)
+
+    monkeypatch.setattr(canyon.solver, "_generate_candidates", recorded)
+    ends = [
+        links(MAST, np.tile([5.0, 0.0, 1.5], (count, 1)) + np.arange(count)[:, None] / 100)
+        for count in (1, 300)
+    ]
+    for few_or_many in ends:
+        canyon.find_paths(few_or_many)
+    assert entries == list(HASHES)
+    assert own == SBCandidateGenerator.MIN_SPEC_COUNT_SIZE

@@ -1,4 +1,4 @@
-"""Positions that are parameters: heights of transmitters, and shifts of the receivers of a device.
+"""Positions that are parameters, heights of transmitters and shifts of devices, and errors of receivers' positions.
 
 Path loss is traced at the stated positions and at displaced ones. Between them its change is a polynomial of second
 order in the displacement [dB], for every link and direction.
