@@ -23,6 +23,9 @@ def street() -> rt.Scene:
     """The bundled street with two transmitters of one antenna, and receivers along it."""
     scene = rt.load_scene(rt.scene.simple_street_canyon)
     scene.frequency = 3.5e9
+    # The marble has 0.018 S/m, which hardly damp its slab: where it is half a wavelength thick, little is reflected
+    # and the single precision of Sionna RT errs by 6e-4 in power.
+    scene.radio_materials["marble"].conductivity = 0.3
     scene.tx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="tr38901", polarization="V")
     scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="dipole", polarization="cross")
     for number, x in enumerate((-35.0, 0.0)):
@@ -62,7 +65,7 @@ def study(measured: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> cb.
 def test_sionna_and_the_study_agree_and_materials_are_set(study: cb.Study, measured: np.ndarray) -> None:
     """`examples/notebooks/4-sionna-notebook.ipynb` calibrates; here the materials are the planted ones."""
     scene, paths = street(), cb.trace(study)
-    assert np.abs(path_loss_db(scene) - measured).max() > 0.5
+    assert np.abs(path_loss_db(scene) - measured).max() > 0.3
     planted = {
         name: replace(paths.materials[name], relative_permittivity=value) for name, value in PLANTED.items()
     }
@@ -117,11 +120,9 @@ def test_observables_equal_those_of_sionnas_impulse_responses(study: cb.Study) -
     assert set(expected) == set(KINDS)
     for kind, row in zip(KINDS, found, strict=True):
         wanted = expected[kind].T.ravel()
-        # Sionna computes in single precision: a spread of zero is one of some 1e-7 rad, and the power of paths with two
-        # reflections differs by up to 4e-4 (0.002 dB).
-        absolute = 0.002 if KINDS[kind] == "dB" else 1e-6 * np.abs(wanted).max()
-        np.testing.assert_allclose(row, wanted, rtol=4e-4, atol=absolute, err_msg=kind)
-        assert np.isclose(row, wanted, rtol=1e-4, atol=absolute).sum() >= 14
+        # 1e-4 of a power are 4.3e-4 dB. Sionna computes in single precision: a spread of zero is one of some 1e-7 rad.
+        absolute = 4.3e-4 if KINDS[kind] == "dB" else 1e-6 * np.abs(wanted).max()
+        np.testing.assert_allclose(row, wanted, rtol=1e-4, atol=absolute, err_msg=kind)
 
 
 def test_a_study_can_be_saved_and_loaded(study: cb.Study) -> None:
