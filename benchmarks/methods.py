@@ -68,8 +68,8 @@ def main() -> None:
     )
     chosen = parser.parse_args()
     chosen.out.mkdir(parents=True, exist_ok=True)
-    sections = ["# Methods compared\n\nWritten by `benchmarks/methods.py` from "
-                f"{chosen.seeds} seeds, with {chosen.budget} RT calls unless the method's name states otherwise."]  # fmt: skip
+    sections = ["# Methods compared\n\nWritten by `benchmarks/methods.py` from " f"{chosen.seeds} seeds, with "
+                f"{chosen.budget} RT calls unless the method's name states otherwise."]  # fmt: skip
     for name in chosen.problems:
         title, open_problem = PROBLEMS[name]
         with progress_bars(log()) as progress:
