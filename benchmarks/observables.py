@@ -291,7 +291,7 @@ def report(rows: list[dict[str, Any]]) -> None:
     summary = judged.groupby(["data", "parameter"]).agg(
         count=("covered", "size"), coverage=("covered", "mean"),
         identified=("label", lambda labels: (labels == "identified").mean()),
-        weakly=("label", lambda labels: (labels == "weakly identifiable").mean()),
+        weakly=("label", lambda labels: (labels == "weakly identified").mean()),
         median_width=("width", "median"),
     )  # fmt: skip
     print(summary.round(3).to_string())
