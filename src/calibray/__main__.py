@@ -1,4 +1,4 @@
-"""`python -m calibray` is `calibray`, where the command is not on the path."""
+"""`python -m calibray` runs `calibray` where the command is not on the path."""
 
 from calibray.cli import main
 

@@ -1,8 +1,8 @@
 """The position of a scene on the globe.
 
-A scene has a local frame, with x to the east and y to the north of an origin. Map projections distort lengths (UTM by
-up to 0.4 m per kilometre), so the default frame is a projection centred on the scene: PROJ's azimuthal equidistant
-projection (`aeqd`), whose lengths are right to 1 mm per kilometre over several kilometres.
+A scene has a local frame: x points east and y points north from an origin. Map projections distort lengths (UTM by up
+to 0.4 m per kilometre). The default frame is therefore a projection centred on the scene: PROJ's azimuthal equidistant
+projection (`aeqd`), whose lengths are accurate to 1 mm per kilometre over several kilometres.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ DATUM_SHIFT: Final = 3000.0
 
 @dataclass(frozen=True)
 class Frame:
-    """A scene's frame: a projection in metres, and its point that is the scene's origin.
+    """The frame of a scene: a projection in metres, and the point in it that is the scene's origin.
 
     Attributes:
         crs: The projection, anything that PROJ reads: `EPSG:32632`, a `+proj` string, WKT.
@@ -56,13 +56,13 @@ class Frame:
         units = {axis.unit_name for axis in projection.axis_info[:2]}
         if not projection.is_projected or units != {"metre"}:
             raise InputError(
-                f"crs = {self.crs!r}: {projection.name} is not a projection in metres; "
-                "name one, such as the UTM zone EPSG:326xx, or leave it out for a local one"
+                f"crs = {self.crs!r}: {projection.name} is not a projection in metres; name one, such as the UTM zone "
+                f"EPSG:326xx, or omit it for a local one"
             )
 
     @classmethod
     def local(cls, longitude: float, latitude: float, height: float = 0.0) -> Frame:
-        """The frame centred on a point: distances from that point are true.
+        """The frame centred on a point; distances from this point are not distorted.
 
         Args:
             longitude: East of Greenwich [deg].
@@ -189,7 +189,7 @@ def transformer(source: object, target: object) -> Transformer:
 def find_projection(
     x: NDArray[np.float64], y: NDArray[np.float64], frame: Frame, low: Sequence[float], high: Sequence[float]
 ) -> str | None:
-    """Find the map projection in which positions lie on a scene.
+    """Find the map projection that places positions on a scene.
 
     Candidates are the UTM zone of the scene, Web Mercator, and the projections of the EPSG that cover the scene.
 
@@ -200,8 +200,7 @@ def find_projection(
         low: West and south end of the scene [2], [m].
         high: East and north end [2], [m].
 
-    Returns:
-        The projection with the most positions on the scene; None if no projection has half of them there.
+    Returns: The projection with the most positions on the scene; None if no projection places half of them there.
 
     Example:
         >>> frame = Frame.local(11.5755, 48.1374)

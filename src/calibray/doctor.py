@@ -1,7 +1,7 @@
 """Whether tracing and replay work on this machine, and what to do if not.
 
-Versions alone prove nothing, so Dr.Jit, Sionna RT and JAX each run a small piece of real work. They run in
-subprocesses, because a libLLVM that Dr.Jit cannot use kills the process.
+Versions alone do not show this, so Dr.Jit, Sionna RT and JAX each run a small test. The tests run in subprocesses,
+because a libLLVM that Dr.Jit cannot use kills the process.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ class Check:
     Attributes:
         name: The library.
         passed: Whether it works.
-        detail: The finding, or how it failed.
-        remedy: What to do if it failed.
+        detail: What the check found, or how it failed.
+        remedy: The remedy if it failed.
     """
 
     name: str
@@ -85,9 +85,9 @@ class Diagnosis:
     Attributes:
         versions: Python, Calibray and each package with its version, or with the command that installs it.
         variant: The Mitsuba variant that is used for tracing.
-        cuda_devices: Number of GPUs that Mitsuba can trace on.
+        cuda_devices: Number of GPUs on which Mitsuba can trace.
         libraries: Every libLLVM on this machine.
-        checks: The checks; each depends on the ones before.
+        checks: The checks; each depends on the earlier ones.
     """
 
     versions: tuple[tuple[str, str], ...]
@@ -119,7 +119,7 @@ class Diagnosis:
 
 
 def examine() -> Diagnosis:
-    """Check this machine, which takes some seconds; one that cannot be used raises no exception."""
+    """Check this machine, which takes some seconds; an unusable machine raises no exception."""
     variant = llvm.mitsuba_variant()
     return Diagnosis(
         versions=versions(),
@@ -133,7 +133,7 @@ def examine() -> Diagnosis:
 def check_tracing(variant: str) -> tuple[Check, ...]:
     """Check what tracing with a Mitsuba variant needs: libLLVM on the CPU, then Dr.Jit, then Sionna RT.
 
-    Returns the checks up to the first that failed; later ones depend on it.
+    Returns the checks up to the first failure; later checks depend on it.
     """
     remedy = "update the NVIDIA driver, or set CUDA_VISIBLE_DEVICES= to trace on the CPU"
     checks = []
@@ -154,7 +154,7 @@ def check_tracing(variant: str) -> tuple[Check, ...]:
 def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> Check:
     """Run Python code in a subprocess to check a library.
 
-    The code prints what it found, or fails with an exception, an exit status or a signal. The check's detail is the
+    The code prints its findings, or fails with an exception, an exit status or a signal. The check's detail is the
     output, or the line that names the cause of the failure.
     """
     command = [sys.executable, "-c", code, *arguments]
@@ -176,7 +176,7 @@ def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> 
 def versions() -> tuple[tuple[str, str], ...]:
     """Versions of Python, of Calibray and of each package that Calibray's metadata requires, by name.
 
-    For a missing package it is the command that installs it.
+    For a missing package, the value is the command that installs it.
     """
     packages = {"calibray": "pip install calibray"}
     requirements = metadata.requires("calibray") if _version("calibray") else None

@@ -204,7 +204,7 @@ def test_responses_that_are_no_files_of_a_sensible_size(tmp_path, script, messag
     [
         (
             "-85.2",
-            r"path_loss_db\[1\] = -85.2; must be a number between 20 and 300 dB.*does it answer gains\?",
+            r"path_loss_db\[1\] = -85.2; must be a number between 20 and 300 dB.*does the program answer with gains\?",
         ),
         ("19.9", r"= 19.9; must be a number between 20 and 300 dB, or infinite without a path$"),
         ("300.1", "= 300.1; must be a number between 20 and 300 dB"),

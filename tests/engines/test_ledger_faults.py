@@ -128,7 +128,7 @@ def test_damaged_entries_are_left_out_of_the_table(path, caplog):
             "its table 'answers' has the columns id, text, must have",
         ),
         ("CREATE TABLE claims (who)", "its table 'claims' has the columns who, must have"),
-        ("PRAGMA user_version = 3", "ledger of version 3, this Calibray uses 2"),
+        ("PRAGMA user_version = 3", "ledger of version 3, but this Calibray uses 2"),
     ],
 )
 def test_another_database_is_refused_and_left_as_it_is(tmp_path, script, message):

@@ -169,7 +169,7 @@ def test_the_command_prints_and_writes_the_suggestions(folder, result, table):
     assert [row["rx_x"] for row in json.loads(run.stdout)] == pytest.approx(suggestions.rx_x.tolist())
     printed = CliRunner().invoke(app, [*command, "--observables"]).stdout
     assert "Where to measure next" in printed
-    assert "What to measure there besides path loss" in printed
+    assert "Further observables to measure there" in printed
     assert " of its width" in printed
     assert "(now " in printed
 

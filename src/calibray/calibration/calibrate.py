@@ -35,7 +35,8 @@ from calibray.validation.validate import check_engine, validate_problem
 from calibray.validation.variants import NO_MINIMA
 
 MINIMA_WITHOUT_MULTISTART: Final = 2
-"""Minima that a method without multi-start returns at most, which are too few starting points for a validation."""
+"""If a method has no multi-start, it returns at most this many minima, which are too few starting points for a
+validation."""
 
 
 # Ctrl-C during an import leaves half-initialized modules, whose errors would hide the interruption.
@@ -60,16 +61,16 @@ def calibrate(
         study: The study, opened or not.
         method: Method instead of the study's: "auto", "sgwo-im", "gwo", ...
         seed: Seed instead of the study's.
-        out: Folder to save the result in, which is checked before anything is computed. The ledger of RT calls is
-            written there, so that an interrupted run repeats none of them when it is started again.
-        engine: Engine over all links of the study; made from the study, with a ledger, if None.
+        out: Folder to save the result in. It is checked before any computation. The ledger of RT calls is written
+            there, so that an interrupted run repeats no call when it is started again.
+        engine: Engine over all links of the study; if None, it is made from the study, with a ledger.
         workers: Workers (`engines.open_workers`) that run the calls of a batch on the engine "command", or chunks of
-            links on the engine "replay"; this process if None.
+            links on the engine "replay"; if None, this process runs them.
         progress: Called with the name of each stage, the work done and the total.
-        tracer: Opens the scene in a ray tracer; an opened study brings its own.
-        overwrite: Replace files in `out` that Calibray did not write; the study's own are never replaced.
-        cheap_model: A study of the same links and materials whose replay is the cheap model of an expensive engine;
-            the study itself if None.
+        tracer: Opens the scene in a ray tracer; an opened study has its own.
+        overwrite: Replace files in `out` that Calibray did not write; input files are never replaced.
+        cheap_model: A study with the same links and materials whose replay is the cheap model of an expensive engine;
+            if None, the study itself.
 
     Returns:
         The result.

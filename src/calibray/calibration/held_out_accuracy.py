@@ -1,8 +1,8 @@
 """Accuracy on held-out links, chosen by a filter or in blocks, and the prediction model that they choose.
 
-It has the study's nuisances and is fitted to the calibration links, like the rival in the validation. Links that no
-path reaches are mostly behind obstacles, so their path loss exceeds what this fit gives. Where the study has enough of
-them, their mean residual is added, and the fallback's errors are theirs.
+It has the study's nuisances and is fitted to the calibration links, like the baseline in the validation. Links without
+a path are mostly behind obstacles, so their path loss exceeds the prediction of this fit. If the study has enough of
+these links, their mean residual is added, and their errors are the errors of the fallback.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ from calibray.validation.validation import Validation
 from calibray.validation.variants import add_nuisance, initial_objective
 
 FEWEST_HELD_OUT: Final = 8
-"""Held-out links, or links without a path, from which errors are computed; with fewer, those of the fit are used."""
+"""Number of held-out links, or of links without a path, that is needed to compute errors; with fewer, the errors of the
+fit are used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +104,7 @@ def on_held_out_links(
 def _choice(
     problem: Problem, trail: Trail, models: Models, judged: NDArray[np.bool_]
 ) -> tuple[str, HeldOutResiduals]:
-    """The model that held-out links choose, and its residuals there; the calibrated model if they are too few."""
+    """The model that held-out links choose, and its residuals there; with too few links, the calibrated model."""
     objective, setup = problem.objective, problem.setup
     modelled = {
         Model.INITIAL: add_nuisance(initial_objective(objective, setup), problem.before),
@@ -181,7 +182,7 @@ def on_blocks(
 
 
 def _out_of_sight(problem: Problem, errors: NDArray[np.float64], links: NDArray[np.int64]) -> float:
-    """How much larger errors of links out of sight are; 1 if the study states that they differ between groups."""
+    """Factor by which errors of links out of sight are larger; 1 if the study states this difference."""
     terms = problem.objective.nuisance.terms
     table = problem.setup.with_obstruction().links.table
     if any(term.around and term.by == OUT_OF_SIGHT for term in terms) or OUT_OF_SIGHT not in table.frame:
@@ -190,7 +191,7 @@ def _out_of_sight(problem: Problem, errors: NDArray[np.float64], links: NDArray[
 
 
 WITHOUT_PATH: Final = "without a path"
-"""Name of the term with the mean residual of the links without a path."""
+"""Name of the term for the mean residual of links without a path."""
 
 
 def fit_fallback(
@@ -205,8 +206,8 @@ def fit_fallback(
         basis: What these links are.
 
     Returns:
-        The log-distance model. Its errors are those of links without a path; of held-out links if there are too few; of
-        the calibration links if there are too few of these as well.
+        The log-distance model. Its errors come from links without a path; if these are too few, from held-out links;
+        and if these are too few as well, from the calibration links.
     """
     setup, links = problem.setup, problem.setup.links
     objective, known_db = log_distance_objective(links, problem.objective, without_scene(setup.study, links))

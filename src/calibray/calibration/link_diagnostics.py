@@ -22,7 +22,7 @@ from calibray.support.progress import Progress
 from calibray.tracing.mounting import EVERY, POSE
 
 DENSE: Final = 20_000_000
-"""Entries of a nuisance's design up to which leverage is computed; the dense matrix then takes 160 MB."""
+"""Number of entries of a nuisance's design up to which leverage is computed; the dense matrix then takes 160 MB."""
 
 DIRECT: Final = "line of sight"
 """Name of the power share of paths without interactions."""
@@ -49,10 +49,9 @@ def diagnose_links(problem: Problem, best: NDArray[np.float64], paths: Paths | N
     Args:
         problem: The problem.
         best: The calibrated values [d].
-        paths: The paths of the calibration, at the study's carrier; None if not available.
+        paths: The paths of the calibration, at the study's carrier; None if unavailable.
 
-    Returns:
-        The diagnostics; columns that the engine does not allow are left out.
+    Returns: The diagnostics, without columns that the engine cannot provide.
     """
     columns: dict[str, NDArray[np.float64]] = {}
     if problem.differentiable:
@@ -80,11 +79,11 @@ def _leverage(problem: Problem, best: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def leverage(jacobian: NDArray[np.float64], design: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Leverage of each link: how far its model follows its own measurement.
+    """Leverage of each link: how much its model follows its own measurement.
 
     Args:
-        jacobian: Derivatives of the residuals by the parameters, nuisance eliminated [m, d].
-        design: Columns of the nuisance at the same links, scaled as the residuals [m, q].
+        jacobian: Derivatives of the residuals with respect to the parameters, with the nuisance eliminated [m, d].
+        design: Columns of the nuisance at the same links, scaled like the residuals [m, q].
 
     Returns:
         Diagonal of the projection onto both [m]: 0 for a link without influence, 1 for a link that alone determines an
@@ -133,17 +132,17 @@ def _depth_and_power(
 
 
 SHARE: Final = 0.02
-"""Share of the links without a path from which the switches are tried: with fewer, the fit hardly changes."""
+"""Share of links without a path above which the switches are tried; with a smaller share, the fit hardly changes."""
 
 FEWEST: Final = 5
-"""Links without a path from which the switches are tried; the table of rows names fewer ones."""
+"""Number of links without a path above which the switches are tried; the table of rows names smaller numbers."""
 
 SAMPLE: Final = 50
 """Links that are traced again for each switch."""
 
 
 def unreached_remark(problem: Problem, progress: Progress | None = None) -> tuple[Remark, ...]:
-    """Count the links without a path, and try on a sample which switches of the tracer reach them.
+    """Count the links without a path, and test on a sample which switches of the tracer reach them.
 
     Args:
         problem: The problem, on stored paths.
@@ -191,20 +190,21 @@ def _reached(setup: Setup, sample: NDArray[np.int64], change: dict[str, Any]) ->
 
 
 FEWEST_OF_TRANSMITTER: Final = 10
-"""Links of a transmitter from which its direction is tested: five for each of two angles."""
+"""Number of links per transmitter needed to test its direction: five for each of two angles."""
 
 MOST: Final = 50
-"""Transmitters that are tested, those with the most links: each takes three derivatives of all links."""
+"""Number of transmitters that are tested, those with the most links: each takes three derivatives of all links."""
 
 SIGNIFICANCE: Final = 0.01
 """Probability of a remark about any transmitter if all directions are right and errors are independent."""
 
 SMALLEST_DB: Final = 0.05
-"""Improvement of the RMSE from which a direction is reported [dB]; less changes no prediction that one would notice."""
+"""Smallest improvement of the RMSE for which a direction is reported [dB]; a smaller one does not change predictions
+noticeably."""
 
 
 class Direction(NamedTuple):
-    """What would explain the residuals of a transmitter: changes of its stated angles with standard errors [deg]."""
+    """Changes of the stated angles of a transmitter that would explain its residuals, with standard errors [deg]."""
 
     azimuth: float
     azimuth_error: float
@@ -213,10 +213,10 @@ class Direction(NamedTuple):
 
 
 def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Remark, ...]:
-    """Test whether other directions of transmit antennas than the stated ones would explain residuals.
+    """Test whether other directions than the stated ones would explain the residuals of transmit antennas.
 
-    For each transmitter, an F test of two columns: the derivatives of path loss by azimuth and downtilt at the
-    calibrated values, in addition to the parameters, the nuisance and a gain of that transmitter.
+    For each transmitter, this is an F test of two columns: the derivatives of path loss with respect to azimuth and
+    downtilt at the calibrated values, in addition to the parameters, the nuisance and a gain of that transmitter.
 
     Args:
         problem: The problem, on stored paths.
@@ -261,7 +261,7 @@ def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Rema
 def _derivatives(
     problem: Problem, engine: Replay, best: NDArray[np.float64], transmitters: list[str]
 ) -> tuple[Evaluation, dict[str, int]]:
-    """Residuals and derivatives at the calibrated values, also by the directions and gains of transmitters; columns."""
+    """Residuals and derivatives at the calibrated values, also by directions and gains of transmitters; columns."""
     content = problem.setup.study.content()
     poses = {
         f"{POSE}{label}.{field}": {"bounds": [-1.0, 1.0], "start": 0.0}
@@ -284,7 +284,7 @@ def _derivatives(
 def _direction(
     evaluation: Evaluation, columns: dict[str, int], label: str, freedom: int, significance: float
 ) -> Direction | None:
-    """The direction of one transmitter that explains the residuals; None if it is not significant."""
+    """The direction that explains the residuals of one transmitter; None if it is not significant."""
     residuals, slopes = evaluation.residuals[0], evaluation.slopes[0]
     own = [columns[f"{POSE}{label}.{field}"] for field in ("azimuth", "downtilt", "gain")]
     common = [column for name, column in columns.items() if not name.startswith(POSE)]

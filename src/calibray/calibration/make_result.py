@@ -58,15 +58,15 @@ from calibray.validation.choice import fit_prediction_model
 from calibray.validation.validation import Validation
 
 FAINT: Final = "predicted too near the noise floor, left out"
-"""Cause, in the counts of rows, for links that the model predicts near the noise floor."""
+"""Name, in the counts of rows, for links that the model predicts near the noise floor."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Time that parts of a calibration took [s].
+    """Time of parts of a calibration [s].
 
     Attributes:
-        search: Search by the method, without tracing.
+        search: The search by the method, without tracing.
         trace: Tracing and loading before the search.
     """
 
@@ -79,11 +79,11 @@ class Run:
     """A finished search.
 
     Attributes:
-        problem: The problem, on the last trace.
+        problem: The problem, with the paths of the last trace.
         trail: The search.
         retrace_gap_db: Change of every link's path loss when traced again [links], [dB]; None if not traced again.
         cheap: The cheap model, if the method had one.
-        enclosed: Antennas inside closed bodies; None where this was not checked.
+        enclosed: Antennas inside closed bodies; None if this was not checked.
         on_links: Remarks on ray mapping, on links without a path and on directions of antennas.
         timing: Time of its parts.
     """
@@ -210,7 +210,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
 
 
 def _not_judged(study: StudyModel, accuracy: Accuracy) -> tuple[Remark, ...]:
-    """A remark if no link was held out, although replay could hold blocks out at little cost."""
+    """A remark that no link was held out, if replay could hold out blocks at little cost."""
     if accuracy.judgement is None and (not study.engine.expensive or study.engine.exports_rays):
         return (Remark(RemarkKind.NOT_JUDGED),)
     return ()
@@ -228,7 +228,7 @@ def _residual_field(
 ) -> ResidualField | None:
     """The correlated part of the prediction model's residuals.
 
-    None where they are uncorrelated, or where predictions of held-out blocks do not gain by it.
+    None if they are uncorrelated, or if predictions of held-out blocks do not improve by it.
     """
     if validation is not None and Model.RESIDUAL_FIELD in validation.errors:
         rmse_db = validation.table["rmse_db"]
@@ -272,7 +272,7 @@ def _positions(links: Measurements) -> dict[str, NDArray[Any]]:
 
 
 def _obstruction(setup: Setup) -> dict[str, NDArray[np.float64]]:
-    """What is on the straight lines of the links, as columns."""
+    """Obstruction of the straight lines of the links, as columns."""
     table = setup.with_obstruction().links.table
     names = (OUT_OF_SIGHT, "obstruction_m", *([REGION] if setup.study.regions else []))
     return {name: table.numbers(name) for name in names}
@@ -281,7 +281,7 @@ def _obstruction(setup: Setup) -> dict[str, NDArray[np.float64]]:
 def _as_measured(
     study: StudyModel, links: Measurements, table: pd.DataFrame
 ) -> dict[str, NDArray[np.float64]]:
-    """Columns in the measured quantity, path gain or received power; none where path loss was measured."""
+    """Columns in the measured quantity, path gain or received power; none if path loss was measured."""
     quantity, column = study.links.quantity, study.links.value
     if quantity == "path_loss" or column not in links.frame:
         return {}
@@ -302,7 +302,7 @@ def _replayed_paths(problem: Problem) -> Paths | None:
 
 
 MOST_DRAWS: Final = 64
-"""Most posterior draws for the errors of biases; the error of a standard deviation from them is 9 %."""
+"""Largest number of posterior draws for the errors of biases; the error of a standard deviation from them is 9 %."""
 
 
 def observable_fits(
@@ -368,7 +368,7 @@ def observable_fits(
 
 
 def _observed_at_draws(run: Run, draws: Mapping[str, Sequence[float]]) -> tuple[NDArray[np.float64], ...]:
-    """Observables [K, L] at draws, for the errors of biases; those of an expensive engine are emulated."""
+    """Observables [K, L] at draws, for the errors of biases; an emulator replaces an expensive engine."""
     problem = run.problem
     if not draws or not any(observable.labels for observable in problem.observed):
         return ()

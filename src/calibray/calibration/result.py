@@ -44,24 +44,25 @@ class Result(Record):
 
         Args:
             folder: The folder.
-            allow_changed_inputs: Read it although its files were changed after they were written.
+            allow_changed_inputs: Read the result although its files were changed after they were written.
 
         Returns:
             The result.
 
         Raises:
-            InputError: The folder has no result, or one of another version, or one that was damaged or edited.
+            InputError: The folder contains no result, or a result of another version, or one that was damaged or
+                edited.
         """
         return cls(**files.read(folder, allow_changed_inputs=allow_changed_inputs))
 
     @cached_property
     def validation(self) -> Validation | None:
-        """The validation, where blocks were held out in turn; None otherwise."""
+        """The validation, if blocks were held out in turn; None otherwise."""
         return None if self.held_out is None else Validation.of(self.held_out)
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Warnings and advice, the judgement on held-out links, and why predictions use their model."""
+        """Warnings and advice, the judgement on held-out links, and the reason for the prediction model."""
         return wording.remarks(self, "" if self.validation is None else self.validation.choice)
 
     @property
@@ -70,16 +71,16 @@ class Result(Record):
         return diagnostics.diagnostics(self)
 
     def content(self) -> dict[str, Any]:
-        """The result as plain values, as in `result.json`."""
+        """The result as a dictionary, as in `result.json`."""
         return files.content(self, self.remarks)
 
     def save(self, folder: str | Path, overwrite: bool = False) -> None:
         """Write `result.json`, `result-links.csv`, `result-history.csv` and the calibrated `result-scene.xml`.
 
-        After a validation, `result-validation.json` as well. No file is ever half-written.
+        After a validation, it also writes `result-validation.json`. Every file is written completely or not at all.
 
         Args:
-            folder: Folder to write into; made if absent.
+            folder: Folder to write into; created if absent.
             overwrite: Replace files that Calibray did not write.
 
         Raises:
@@ -98,18 +99,18 @@ class Result(Record):
         """Predict path loss at new links.
 
         Args:
-            links: The links, or a table with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], or with those that
-                the study names for positions, and with its group column, if it has one. The study's column of
-                frequencies gives the carriers; without it all links have the scene's.
+            links: The links, or a table with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], or with the position
+                columns that the study names, and with its group column, if it has one. The study's column of
+                frequencies gives the carriers; without it, all links have the scene's carrier.
             progress: Called with the stage "tracing" after every launch.
-            allow_changed_inputs: Predict although a file of the scene or an antenna changed since the calibration.
+            allow_changed_inputs: Predict although a file of the scene or an antenna has changed since the calibration.
 
         Returns:
             Path loss with nuisances [links], [dB]; +inf for a link without a path.
 
         Raises:
             InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of
-                the scene or an antenna changed since the calibration.
+                the scene or an antenna has changed since the calibration.
         """
         from calibray.prediction.predict import predict
 
@@ -123,21 +124,20 @@ class Result(Record):
         *,
         allow_changed_inputs: bool = False,
     ) -> pd.DataFrame:
-        """Predict path loss at new links, with the interval that contains a measurement there.
+        """Predict path loss at new links, with an interval for a measurement there.
 
         Args:
-            links: The links, or a table, as for `predict`; groups need not have been measured.
-            level: Probability that the interval contains a measurement.
+            links: The links, or a table, as for `predict`; their groups need no measurements.
+            level: Probability that a measurement lies in the interval.
             progress: Called with the stage "tracing" after every launch.
-            allow_changed_inputs: Predict although a file of the scene or an antenna changed since the calibration.
+            allow_changed_inputs: Predict although a file of the scene or an antenna has changed since the calibration.
 
-        Returns:
-            One row per link: path_loss_db, lower_db, upper_db [dB]; basis, the source of the interval; the three in
-            the measured quantity if that is not path loss; and remark, on a position where no antenna should be.
+        Returns: One row per link: path_loss_db, lower_db, upper_db [dB]; basis, the source of the interval; the three
+            in the measured quantity if that is not path loss; and remark, a warning about an unlikely antenna position.
 
         Raises:
-            InputError: What `predict` refuses except unknown groups, the level is not between 0 and 1, or the
-                calibration had too few links to estimate the size of residuals.
+            InputError: `predict` would refuse the input, except for unknown groups; the level is not between 0 and 1;
+                or the calibration had too few links to estimate the size of residuals.
         """
         from calibray.prediction.predict import predict_interval
 

@@ -1,7 +1,8 @@
 """The commands, and how their failures are reported.
 
-Data go to stdout, progress and messages to stderr. The exit status is 0 for success, 1 for a failure while running, 2
-for bad input and 130 for Ctrl-C. Commands import what they need when they run, so that `--version` answers at once.
+Data go to stdout, and progress and messages go to stderr. The exit status is 0 for success, 1 for a failure while
+running, 2 for bad input and 130 for Ctrl-C. Commands import what they need when they run, so that `--version` responds
+at once.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from calibray.support.interruption import INTERRUPTED, ensure_interruption
 from calibray.support.memory import check_address_space
 
 LONGEST: Final = 4096
-"""Most characters of an argument; paths on Linux are no longer."""
+"""Largest number of characters of an argument; paths on Linux are not longer."""
 
 
 class Commands(TyperGroup):
@@ -42,11 +43,11 @@ class Commands(TyperGroup):
                 ctx.fail(f"an argument has {len(argument)} characters, but the most is {LONGEST}")
             # An empty name of a folder would be the current one.
             if not argument.strip():
-                ctx.fail("an argument is empty; give a value, or leave the option out")
+                ctx.fail("an argument is empty; give a value, or omit the option")
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command, and turn errors into exit statuses.
+        """Run the command, and convert errors to exit statuses.
 
         Raises:
             typer.Exit: 2 on bad input; 1 when an engine failed or a file could not be read or written; 130 on Ctrl-C.
@@ -92,7 +93,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-"""All commands; a new one is a module with a function, listed below."""
+"""All commands; a new one is a module with a function and is listed below."""
 
 
 def _print_version(requested: bool) -> None:

@@ -18,7 +18,7 @@ def compare(
             "--out",
             "-o",
             metavar="DIR",
-            help="Folder for the tables and the figure; finished runs are kept in it.",
+            help="Folder for the tables and the figure; it also keeps finished runs.",
         ),
     ],
     methods: Annotated[
@@ -56,7 +56,7 @@ def compare(
     parsed = parse_methods(names, budget)
     calls = seeds * sum(method.budget for method in parsed)
     echo(
-        f"{seeds * len(parsed):,} runs with {calls:,} RT calls in total; runs kept in {out} are not repeated",
+        f"{seeds * len(parsed):,} runs with {calls:,} RT calls in total; runs are kept in {out} are not repeated",
         err=True,
     )
     with progress_bars(log()) as progress:

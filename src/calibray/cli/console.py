@@ -29,7 +29,7 @@ def log() -> Console:
 
 
 def echo(text: str, err: bool = False, nl: bool = True) -> None:
-    """Print text, with control characters escaped: names in it come from files and must not steer the terminal."""
+    """Print text with control characters escaped: names in it come from files and must not control the terminal."""
     from calibray.support.messages import printable
 
     typer.echo(printable(text, keep="\n\t"), err=err, nl=nl)
@@ -67,11 +67,11 @@ AllowChangedInputs = Annotated[
         help="Continue although a file of the result, the scene or an antenna has changed.",
     ),
 ]
-"""Whether a result is used although its inputs have changed."""
+"""Whether a result may be used although its inputs have changed."""
 
 Workers = Annotated[
     int | None,
-    typer.Option(metavar="N", help="Number of local processes that chunks of links are distributed to."),
+    typer.Option(metavar="N", help="Number of local processes among which chunks of links are distributed."),
 ]
 
 Scheduler = Annotated[

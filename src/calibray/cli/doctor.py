@@ -19,7 +19,7 @@ def doctor(
         str | None,
         typer.Argument(
             metavar="SUBJECT",
-            help="A scene (FILE.xml or sionna:NAME) or a study file; by default, this machine is checked.",
+            help="A scene (FILE.xml or sionna:NAME) or a study file; by default, the command checks this machine.",
             show_default=False,
         ),
     ] = None,
@@ -88,7 +88,7 @@ def cache(
 ) -> None:
     """Show where traces and compiled programs are kept between runs, or remove them.
 
-    The environment variable CALIBRAY_CACHE sets the folder. If it is set but empty, nothing is kept.
+    The environment variable CALIBRAY_CACHE sets the folder. If it is set but empty, Calibray keeps nothing.
     """
     from calibray.support.cache_folder import cache_folder, compiled_programs
     from calibray.tables import Column, Table, numbers

@@ -24,7 +24,7 @@ def init(
     out: Annotated[
         Path,
         typer.Option(
-            "--out", "-o", metavar="FILE", help="Study file to write; an existing one is never replaced."
+            "--out", "-o", metavar="FILE", help="Study file to write; an existing file is never replaced."
         ),
     ] = Path("study.toml"),
     transmitters: Annotated[
@@ -34,7 +34,7 @@ def init(
         Path | None, typer.Option(metavar="FILE", help="GPX track with the position of each row over time.")
     ] = None,
     antennas: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder of MSI files, named like the antennas.")
+        Path | None, typer.Option(metavar="DIR", help="Folder of MSI files named after the antennas.")
     ] = None,
     tx: Annotated[
         str | None, typer.Option(metavar="X,Y,Z", help="Transmitter position in the scene frame [m].")
@@ -54,7 +54,7 @@ def init(
     from calibray.support.output_files import check_file, write_text
 
     if out.exists() or out.is_symlink():
-        raise InputError(f"{out}: exists already; choose another file with --out, or remove it")
+        raise InputError(f"{out}: already exists; choose another file with --out, or remove it")
     inputs = [links, *(file for file in (transmitters, track) if file)]
     check_file(out, inputs)
     with progress_bars(log()) as progress:
@@ -105,7 +105,7 @@ def _position(text: str) -> list[float]:
 
 
 def schema() -> None:
-    """Print the JSON schema of study files, with which editors complete and check them."""
+    """Print the JSON schema of study files, which editors use to complete and check them."""
     from calibray.study.draft import schema_text
 
     echo(schema_text(), nl=False)

@@ -20,7 +20,7 @@ def map(
         tuple[float, float, float] | None,
         typer.Option(
             metavar="X Y Z",
-            help="Transmitter position [m]; by default that of the links, if they have only one.",
+            help="Transmitter position [m]; by default that of the links, if they have only one transmitter.",
         ),
     ] = None,
     height: Annotated[
@@ -48,14 +48,14 @@ def map(
         str | None,
         typer.Option(
             metavar="N|auto",
-            help="Number of rays instead of the study's. Time grows with it; too few rays miss paths.",
+            help="Number of rays, in place of the study's. The time grows with this number; too few rays miss paths.",
         ),
     ] = None,
     column: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=VALUE",
-            help="Value of a group or frequency column of the links for this transmitter; may be repeated.",
+            help="Value of a group or frequency column of the links for this transmitter; can be repeated.",
         ),
     ] = None,
     out: Annotated[
@@ -69,7 +69,7 @@ def map(
 ) -> None:
     """Predict path loss over an area and write map.tif (GeoTIFF), map.png and map.csv.
 
-    Where no path leads, the log-distance model predicts; these cells are hatched.
+    For cells without a path, the log-distance model predicts; the map hatches these cells.
     """
     from calibray.cli.progress_bars import progress_bars
 
@@ -129,7 +129,7 @@ def _samples(text: str) -> int | Literal["auto"]:
 
 
 def _columns(entries: list[str]) -> dict[str, object]:
-    """Values by column, as numbers where they are numbers."""
+    """Values by column, as numbers if they are numeric."""
     columns: dict[str, object] = {}
     for entry in entries:
         name, equals, value = entry.partition("=")

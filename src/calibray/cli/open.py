@@ -13,14 +13,16 @@ from calibray.errors import InputError
 
 def open(
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="Folder of the study; it is made if it does not exist.")
+        Path,
+        typer.Argument(metavar="FOLDER", help="Folder of the study; it is created if it does not exist."),
     ] = Path(),
     port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="Port; 0 for a free one.")] = 0,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Only print the address.")] = False,
 ) -> None:
-    """Open a study's folder in the browser: from a map and measurements to predictions, without a terminal.
+    """Open a study's folder in the browser, from a map and measurements to predictions without a terminal.
 
-    The page is served on this machine only, at an address with a token. Ctrl-C ends it, but not commands in progress.
+    The page is served on this machine only, at an address with a token. Ctrl-C ends the server, but not commands in
+    progress.
 
     Raises:
         InputError: NiceGUI is not installed, or the folder or the port cannot be used.

@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 
 PREDICTIONS: Final = ("path_loss_db", "lower_db", "upper_db")
-"""Columns that `predict` adds, those after the first only with --level. Other measured quantities add more."""
+"""Columns that `predict` adds; all except the first need --level. Other measured quantities add more."""
 
 UNREACHED: Final = "no path leads to"
 """The warning about links without a path."""
 
 TEXTS: Final = ("basis", "remark")
-"""Text columns that are added, the remark only with --level."""
+"""Text columns that are added; the remark needs --level."""
 
 
 def predict(
@@ -47,7 +47,7 @@ def predict(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", "-o", metavar="FILE", help="CSV or Parquet file to write instead of CSV on stdout."
+            "--out", "-o", metavar="FILE", help="CSV or Parquet file to write, in place of CSV on stdout."
         ),
     ] = None,
     level: Annotated[
@@ -55,7 +55,7 @@ def predict(
         typer.Option(
             metavar="P",
             help="Add the interval that contains a measurement with this probability, such as 0.9: columns lower_db "
-            "and upper_db, and a remark where an antenna is inside a building or outside the scene.",
+            "and upper_db, and a remark if an antenna is inside a building or outside the scene.",
         ),
     ] = None,
     workers: Workers = None,
@@ -65,7 +65,7 @@ def predict(
 ) -> None:
     """Predict path loss at new links with the calibrated scene.
 
-    The column basis says what predicted: where no path leads, the log-distance model.
+    The column basis names the model of each prediction: the log-distance model for links without a path.
     """
     from calibray.cli.progress_bars import progress_bars
 
@@ -115,7 +115,7 @@ def predict(
 
 @contextmanager
 def _printer() -> Iterator[Callable[[pd.DataFrame], None]]:
-    """A function that prints tables as CSV, with a header before the first."""
+    """A function that prints tables as CSV, with a header before the first table."""
     from calibray.support.output_tables import csv_text
 
     header = True
@@ -153,7 +153,7 @@ def _warn(warning: str, rows: Sequence[int], count: int) -> None:
 
 
 def _renamed_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -> dict[str, str]:
-    """New names of the table's columns that have the name of a prediction, such as measured path losses."""
+    """New names for columns of the table that have the name of a prediction, such as measured path loss."""
     renamed = {name: f"input_{name}" for name in columns if name in frame}
     for name, new in renamed.items():
         if new in frame:
@@ -181,7 +181,7 @@ def suggest(
     ] = None,
     observables: Annotated[
         bool,
-        typer.Option("--observables", help="Also say which further observable is worth measuring there."),
+        typer.Option("--observables", help="Also report which further observable is worth measuring there."),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
     allow_changed_inputs: AllowChangedInputs = False,
@@ -222,8 +222,7 @@ def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
     Args:
         suggestions: The suggestions, from `suggest`.
 
-    Returns:
-        A table of positions, and a table of the gain expected from each suggestion and those above it.
+    Returns: A table of positions, and a table of the gain expected from each suggestion together with those above it.
     """
     from calibray.prediction.position_checks import POSITION_COLUMNS
 
@@ -243,7 +242,7 @@ def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
         rows.append((str(rank), str(row["row"]), *position, *(str(row[name]) for name in grouped), *losses))
         gains.append((str(rank), row["gain"]))
     expected = Table(
-        "Expected 95 % intervals once it and those above are measured",
+        "Expected 95 % intervals after measuring this link and those above",
         (numbers("rank"), Column("gain")),
         tuple(gains),
     )
@@ -252,7 +251,7 @@ def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
         return tables
     worth = suggestions[["observable", "observable_gain"]].itertuples(index=False)
     further = Table(
-        "What to measure there besides path loss",
+        "Further observables to measure there",
         (numbers("rank"), Column("observable"), Column("expected 95 % intervals, relative to those above")),
         tuple((str(rank), *map(str, row)) for rank, row in enumerate(worth, start=1)),
     )

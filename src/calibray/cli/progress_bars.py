@@ -16,15 +16,15 @@ from calibray.support import interruption
 from calibray.support.progress import Progress
 
 LINE_INTERVAL: Final = 4.0
-"""Time between two lines without a terminal [s]; shorter work prints none."""
+"""Time between two lines without a terminal [s]; shorter work prints no line."""
 
 STARTING: Final = "starting"
-"""The stage shown before the first one that counts: reading, importing, compiling."""
+"""The stage shown before the first stage with a count: reading, importing, compiling."""
 
 
 @contextmanager
 def progress_bars(console: Console, every: float | None = None) -> Iterator[Progress]:
-    """Show progress by stage: bars on a terminal, else lines, at least `every` seconds apart.
+    """Show progress by stage: bars on a terminal, otherwise lines at least `every` seconds apart.
 
     Yields a function of the stage, the amount done and the total (None if unknown).
     """
@@ -95,7 +95,7 @@ class _State:
 
 @contextmanager
 def _lines(console: Console, every: float) -> Iterator[Progress]:
-    """Lines from a separate thread, so that they also appear while the work reports nothing."""
+    """Prints lines from a separate thread, so that they also appear while the work reports nothing."""
     state, finished = _State(), Event()
 
     def print_lines() -> None:

@@ -30,8 +30,8 @@ def run(
         int | None,
         typer.Option(
             metavar="N",
-            help="Number of local processes that chunks of links are distributed to, or of simultaneous programs of "
-            "the engine 'command'.",
+            help="Number of local processes among which chunks of links are distributed, or of simultaneous programs "
+            "of the engine 'command'.",
         ),
     ] = None,
     scheduler: Annotated[
@@ -84,7 +84,7 @@ def run(
 
 
 def _kept_text(out: Path) -> str:
-    """What is kept of an interrupted run, and how to continue."""
+    """What an interrupted run has kept, and how to continue."""
     from contextlib import closing, suppress
 
     from calibray.engines import open_ledger
@@ -100,11 +100,11 @@ def _kept_text(out: Path) -> str:
     if stored_traces():
         parts.append(f"finished traces in {cache_folder()}")
     kept = f"Kept: {' and '.join(parts)}." if parts else "Nothing was finished, so nothing is kept."
-    return f"{kept} Start the same command again to continue; what is kept is not computed again."
+    return f"{kept} Start the same command again to continue; results that are kept are not computed again."
 
 
 def _write_report(result: Result, out: Path, figures: bool, overwrite: bool) -> list[str]:
-    """Write the report next to the result; a failure is a warning only, since the result is already saved."""
+    """Write the report next to the result; a failure is only a warning, because the result is already saved."""
     from calibray.cli.progress_bars import progress_bars
 
     try:

@@ -29,7 +29,7 @@ Terrain = Annotated[
 ]
 Spacing = Annotated[
     float | None,
-    typer.Option(metavar="M", help="Width of the ground's cells [m]; by default that of the height model."),
+    typer.Option(metavar="M", help="Cell width of the ground [m]; by default that of the height model."),
 ]
 Origin = Annotated[
     str | None,
@@ -175,7 +175,7 @@ def plan(
     ],
     out: Out,
     height: Annotated[
-        float, typer.Option(metavar="M", help="Height of walls without one in the plan [m].")
+        float, typer.Option(metavar="M", help="Height of walls for which the plan states none [m].")
     ] = 3.0,
     unit: Annotated[
         float, typer.Option(metavar="M", help="Unit of length of the plan [m]; 0.001 for mm.")
@@ -185,7 +185,7 @@ def plan(
     merge: Annotated[bool, typer.Option(help="Merge two parallel lines into one wall.")] = True,
     material: Annotated[
         list[str] | None,
-        typer.Option(metavar="TYPE=ITU[:M]", help="Material of one type of wall; may be repeated."),
+        typer.Option(metavar="TYPE=ITU[:M]", help="Material of one type of wall; can be repeated."),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -302,7 +302,7 @@ def _types(entries: list[str]) -> dict[str, SurfaceMaterial]:
             raise InputError(f"--material {entry}: must be TYPE=ITU, such as drywall=plasterboard:0.1")
         if kind in types:
             raise InputError(
-                f"--material {entry}: the type {kind!r} has a material already; give one for each type"
+                f"--material {entry}: the type {kind!r} already has a material; give one for each type"
             )
         name, taken = material_name(kind), {other.name for other in types.values()}
         while name in taken:

@@ -1,4 +1,4 @@
-"""`calibray trace`: trace the links of a study and store the paths, or check that there are enough rays."""
+"""`calibray trace`: trace the links of a study and store the paths, or check whether there are enough rays."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def trace(
         typer.Option(
             "--check",
             help="Trace again with twice the samples and another seed, and show the changes. If the samples are "
-            "'auto', show the changes by the last round of rays.",
+            "'auto', show the changes caused by the last round of rays.",
         ),
     ] = False,
     workers: Workers = None,
     scheduler: Scheduler = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Trace the links of a study and store the paths, or check that there are enough rays."""
+    """Trace the links of a study and store the paths, or check whether there are enough rays."""
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
@@ -74,7 +74,7 @@ def trace(
 def _trace(
     setup: Setup, out: Path | None, overwrite: bool, trace_again: bool, progress: Progress
 ) -> tuple[Paths, Convergence | None]:
-    """Trace all links at once, store the paths, and trace again as a check if requested."""
+    """Trace all links together, store the paths, and trace again as a check if requested."""
     from functools import partial
 
     from calibray.fields import path_loss

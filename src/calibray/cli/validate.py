@@ -19,14 +19,14 @@ def validate(
             metavar="N",
             min=2,
             max=100,
-            help="Number of blocks, each held out in turn; by default that of the study, or 4.",
+            help="Number of blocks, each held out in turn; by default the study's number, or 4.",
         ),
     ] = None,
     by: Annotated[
         str | None,
         typer.Option(
             metavar="COLUMN",
-            help="Hold out the links of each value of a column in turn; tx for each transmitter.",
+            help="Hold out the links of each value of a column in turn; use tx for each transmitter.",
         ),
     ] = None,
     out: Annotated[
@@ -35,7 +35,7 @@ def validate(
             "--out",
             "-o",
             metavar="DIR",
-            help="Write the validation into this folder of a result, for `calibray report DIR` to show it.",
+            help="Write the validation into this folder of a result, so that `calibray report DIR` shows it.",
         ),
     ] = None,
     workers: Workers = None,

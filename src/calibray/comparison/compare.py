@@ -27,7 +27,7 @@ from calibray.support.output_files import check_folder
 from calibray.support.progress import Progress
 
 ROUNDING_DB: Final = 1e-7
-"""Difference below which objectives are equal."""
+"""Difference below which two objectives are equal."""
 
 OPTIMUM: Final[RunKey] = ("optimum", 0, 0)
 """Key of the reference search among the runs."""
@@ -36,7 +36,7 @@ REFERENCE: Final = "least-squares"
 """Method of the reference search."""
 
 OPTIMUM_STARTS: Final = {False: 2048, True: 64}
-"""Its local searches on small and on large path programs."""
+"""Number of its local searches on small and on large path programs."""
 
 OpenProblem = Callable[[], ComparisonProblem]
 
@@ -53,12 +53,12 @@ def compare(
 ) -> Comparison:
     """Run methods from seeds 0, 1, ... on one problem at equal budgets of RT calls.
 
-    Every finished run is appended to `runs.jsonl` in `out` at once. Runs of the same problem, optimizer code, method,
-    budget and seed that are in the file are not repeated.
+    Every finished run is appended to `runs.jsonl` in `out` at once. If the file contains a run of the same problem,
+    optimizer code, method, budget and seed, it is not repeated.
 
     Args:
-        open_problem: Makes the problem; picklable for several workers, each of which calls it once.
-        names: Methods, each with the common budget or another one as in "gwo@600".
+        open_problem: Makes the problem; picklable for several workers, which call it once each.
+        names: Methods, each with the common budget or its own, as in "gwo@600".
         seeds: Number of runs of each method.
         budget: RT calls of a run.
         out: Folder that keeps the runs.
@@ -111,7 +111,7 @@ def parse_methods(names: Sequence[str], budget: int) -> tuple[BudgetedMethod, ..
 
 
 def _search_optimum(problem: ComparisonProblem) -> MethodRun:
-    """Least squares from many starts, enough for its result to count as the global optimum."""
+    """Least squares from enough starting points for its result to count as the global optimum."""
     starts = OPTIMUM_STARTS[problem.large]
 
     def make() -> Optimizer:
@@ -125,7 +125,7 @@ def _search_optimum(problem: ComparisonProblem) -> MethodRun:
 def _lowest(
     earlier: float, reference: MethodRun, runs: dict[str, tuple[MethodRun, ...]]
 ) -> tuple[float, str]:
-    """The lowest objective of all searches, and the first of them that reached it within rounding."""
+    """The lowest objective of all searches, and the first search that reached it within rounding."""
     ends = [(reference.at(reference.evaluations), "many-start least squares"), (earlier, "earlier searches")]
     for name, finished in runs.items():
         ends += [(run.at(run.evaluations), f"{name}, seed {run.seed}") for run in finished]

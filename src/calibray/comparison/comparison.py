@@ -1,4 +1,4 @@
-"""The result of a comparison: excess of every method over RT calls, as numbers, tables, files and a figure.
+"""The result of a comparison: the excess of every method over RT calls, as numbers, tables, files and a figure.
 
 The excess is the best objective so far minus the global optimum of the same data. The optimum comes from least squares
 with many starts, or from a run that reached a lower value.
@@ -23,10 +23,10 @@ from calibray.support.output_tables import write_table
 from calibray.tables import Column, Table, display, numbers
 
 CALLS: Final = (30, 60, 225)
-"""RT calls after which the excess is tabulated, in addition to the end."""
+"""Numbers of RT calls for which the excess is tabulated, in addition to the end."""
 
 EXCESSES_DB: Final = (0.05, 0.02, 0.01)
-"""Levels of excess; the table shows how many RT calls reach each [dB]."""
+"""Levels of excess; the table shows how many RT calls each needs [dB]."""
 
 COLUMNS: Final = (
     Column("method"), Column("uses"), numbers("RT calls"),
@@ -60,7 +60,7 @@ class Comparison:
     def excess(self, name: str, calls: int) -> NDArray[np.float64]:
         """Excess [seeds], [dB], after a number of RT calls; a run that ended earlier keeps its last value.
 
-        It is +inf before the first evaluation.
+        The excess is +inf before the first evaluation.
         """
         return np.array([run.at(calls) for run in self.runs[name]]) - self.optimum
 
@@ -77,8 +77,8 @@ class Comparison:
         """One row per method: excesses after some RT calls, and RT calls to some excesses.
 
         Median, quartiles and worst excess after 30, 60 and 225 RT calls and at the end; the median RT calls to an
-        excess over all runs (empty if half of them or more never reached it) and how many reached it; failed runs;
-        median seconds per run.
+        excess over all runs (empty if at least half of them did not reach it) and how many runs reached it; failed
+        runs; median seconds per run.
         """
         return pd.DataFrame([self._row(method) for method in self.methods])
 
@@ -138,7 +138,7 @@ class Comparison:
 
 
 def quantile(values: NDArray[np.float64], share: float) -> float:
-    """A quantile of values [n], by linear interpolation; +inf if an infinite order statistic takes part.
+    """A quantile of values [n], by linear interpolation; +inf if it involves an infinite order statistic.
 
     Example:
         >>> import numpy as np
@@ -159,7 +159,7 @@ def table(comparison: Comparison) -> Table:
 
 
 def optimum_text(comparison: Comparison) -> str:
-    """The optimum from which excesses are counted, as a line of text."""
+    """The optimum to which excesses refer, as a line of text."""
     return f"Optimum {comparison.optimum:.6g} dB, found by {comparison.found_by}"
 
 
@@ -194,13 +194,13 @@ def _summary(comparison: Comparison) -> tuple[Table | str, ...]:
         tuple(whole.columns[k] for k in columns),
         tuple(tuple(row[k] for k in columns) for row in whole.rows),
     )
-    heading = f"Methods on {comparison.name}, excess over the optimum with all RT calls spent"
+    heading = f"Methods on {comparison.name}, excess over the optimum after all RT calls"
     return heading, short, optimum_text(comparison)
 
 
 FILES: Final = ("compare.csv", "runs.csv", "compare.png")
 FLOOR_DB: Final = 1e-4
-"""Smallest excess that is drawn [dB]; lower ones are drawn at this value."""
+"""Smallest excess that is drawn [dB]; smaller values are drawn at this value."""
 
 
 def write(comparison: Comparison, folder: Path) -> None:

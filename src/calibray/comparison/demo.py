@@ -1,7 +1,7 @@
 """The experiment of the paper: the demo district calibrated by GWO, SGWO-IM, space mapping and `auto`.
 
-Space mapping runs on the ray tracer itself, which traces again for every candidate, with a trace of fewer interactions
-as its cheap model. This is how an engine without stored paths is calibrated. `auto` runs on stored paths.
+Space mapping runs on the ray tracer itself, which traces again for every candidate. Its cheap model is a trace with
+fewer interactions. This represents an engine without stored paths. `auto` runs on stored paths.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ FILES: Final = (RECORD, *FIGURES, page.FILE)
 """Files of the experiment, in addition to a folder for each method."""
 
 MAPPING_CALLS: Final = 8
-"""RT calls of space mapping, each a trace."""
+"""RT calls of space mapping; each is a trace."""
 
 CHEAP_DEPTH: Final = 2
-"""Largest number of interactions in its cheap model; the study has twice as many."""
+"""Largest number of interactions in its cheap model; the study allows twice as many."""
 
 
 def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = None) -> Demo:
     """Run the experiment on "replay" (trace once) or "retrace" (trace for every RT call, as in the paper).
 
-    `progress` is called with every stage, which begins with the name of the method.
+    `progress` is called for every stage, whose name begins with the method.
 
     Raises:
         InputError: The engine or the seed is invalid.
@@ -73,7 +73,7 @@ def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = 
 def write_demo(demo: Demo, out: Path) -> Path:
     """Write the experiment: its record, figures, a folder for each method, and the report of `auto`.
 
-    Returns the report, an HTML file.
+    Returns the path of the report, an HTML file.
     """
     out.mkdir(parents=True, exist_ok=True)
     black_box = {method: demo.results[method] for method in METHODS}
@@ -139,7 +139,7 @@ class Demo:
         results: Results by method, `auto` last; space mapping runs on the engine "retrace".
         optimum_db: RMSE of the global optimum [dB], found by `auto` on stored paths.
         truth: Planted mean permittivities by material.
-        engine: The engine of the paper's methods.
+        engine: Engine used by the paper's methods.
         trace_seconds: Time to load and trace the district, which replay needs once [s].
     """
 
@@ -160,7 +160,7 @@ class Demo:
         return f"The paper's experiment, engine {self.engine}"
 
     def content(self) -> dict[str, Any]:
-        """The experiment as plain values, with the paper's results."""
+        """The experiment as a dictionary, with the paper's results."""
         return {
             "engine": self.engine,
             "optimum_db": self.optimum_db,
@@ -197,7 +197,7 @@ def cost(demo: Demo) -> Table:
 
 
 def permittivity(demo: Demo) -> Table:
-    """Permittivities of every method, the planted ones, and those of the paper at its own site."""
+    """Permittivities of every method, the planted values, and those of the paper at its own site."""
     columns = (
         Column("material"),
         Column("before"),

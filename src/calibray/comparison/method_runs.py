@@ -1,4 +1,4 @@
-"""A problem that methods are compared on; runs of methods with a budget, their records, and a file that keeps them."""
+"""A problem for the comparison of methods; runs of methods with a budget, their records, and a file that keeps them."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ class ComparisonProblem:
 
     Attributes:
         name: Its name.
-        fingerprint: Digest of everything that an evaluation depends on.
+        fingerprint: Digest of everything that determines an evaluation.
         lower: Lower bounds of the search space [d].
         upper: Upper bounds [d].
-        start: Starting point given by the user [d]; None without one.
-        starts: Number of further starting points of methods that use several; None for their default.
+        start: Starting point from the user [d]; None if there is none.
+        starts: Number of further starting points for methods that use several; None for their default.
         large: Whether evaluations are too expensive for a reference search with many starts.
         minimum: Lowest objective known in advance; +inf if unknown.
         evaluate: The function to minimise.
-        cheap_model: Makes a cheap model of the function; None without one.
+        cheap_model: Makes a cheap model of the function; None if there is none.
         wrong_constants: Whether the cheap model has wrong constants.
     """
 
@@ -62,7 +62,7 @@ class ComparisonProblem:
 
 
 def study_problem(path: str | Path) -> ComparisonProblem:
-    """Make a problem of a study file on its stored paths, which are traced if they are not in the cache.
+    """Make a problem of a study file on its stored paths, which are traced if the cache does not contain them.
 
     Raises:
         InputError: The study cannot be used, or its engine is an external program.
@@ -102,7 +102,7 @@ def study_problem(path: str | Path) -> ComparisonProblem:
 
 
 LIMITS: Final = {"seeds": 10_000, "workers": 1_000, "budget": 1_000_000}
-"""Largest accepted numbers; a comparison with more would not end in useful time."""
+"""Largest accepted numbers; a comparison with larger ones would not end in useful time."""
 
 RunKey = tuple[str, int, int]
 """Method, budget and seed, which identify a run on a problem."""
@@ -115,7 +115,7 @@ class BudgetedMethod:
     Attributes:
         name: Its name in tables, as requested.
         method: Its name in `METHODS`.
-        budget: RT calls that it may use.
+        budget: Number of RT calls that it may use.
     """
 
     name: str
@@ -156,7 +156,7 @@ class BudgetedMethod:
         return self.method, self.budget, seed
 
     def optimizer(self, problem: ComparisonProblem, seed: int) -> Optimizer:
-        """Make the optimizer of a run, which keeps to the budget or stops by itself.
+        """Make the optimizer of a run, which respects the budget or stops by itself.
 
         Raises:
             InputError: The method does not fit the problem, or its library is not installed.
@@ -173,7 +173,7 @@ class BudgetedMethod:
         )
 
     def run(self, problem: ComparisonProblem, seed: int) -> MethodRun:
-        """Run the method; an error ends the run and its message is recorded."""
+        """Run the method; if an error ends the run, its message is recorded."""
         return run_optimizer(problem, self.key(seed), lambda: self.optimizer(problem, seed))
 
 
@@ -183,10 +183,10 @@ class MethodRun:
 
     Attributes:
         method: The method.
-        budget: RT calls that it was allowed.
+        budget: Number of RT calls that it was allowed.
         seed: Its seed.
         evaluations: RT calls that it used.
-        calls: Numbers of the RT calls that improved on all before them.
+        calls: Numbers of the RT calls that improved on all earlier ones.
         best: Objectives there, [dB].
         seconds: Duration [s].
         failure: The error that ended it; empty if it finished.
@@ -215,7 +215,7 @@ class MethodRun:
 
 
 def run_optimizer(problem: ComparisonProblem, key: RunKey, make: Callable[[], Optimizer]) -> MethodRun:
-    """Run an optimizer to its end; an error ends it and its message is recorded."""
+    """Run an optimizer to its end; if an error ends it, the message is recorded."""
     calls: list[int] = []
     best: list[float] = []
     evaluations, failure, started = 0, "", time.perf_counter()
@@ -236,11 +236,11 @@ def run_optimizer(problem: ComparisonProblem, key: RunKey, make: Callable[[], Op
 class RunFile:
     """Finished runs of one problem, in a file of JSON lines that can also contain runs of other problems.
 
-    Runs are appended one by one, so a comparison that was killed continues where it stopped.
+    Runs are appended one by one, so an interrupted comparison continues where it stopped.
 
     Args:
         path: The file; created when the first run is added.
-        problem: Digest of everything that a run depends on apart from method, budget and seed.
+        problem: Digest of everything that determines a run apart from method, budget and seed.
 
     Raises:
         InputError: The file contains something else.

@@ -1,14 +1,14 @@
-"""Engines: what turns candidates into path loss.
+"""Engines compute the path loss of candidates.
 
 - `Replay` evaluates stored paths, with derivatives, in microseconds per candidate.
 - `ReplayCarriers` does so at several carriers.
-- `ChunkedReplay` replays chunks of links in this process or on workers; only sums come back.
+- `ChunkedReplay` replays chunks of links in this process or on workers, which return only sums.
 - `Retrace` runs the ray tracer again for every candidate, as the paper does.
 - `Command` calls an external program.
-- `Recorded` puts a `Ledger` in front of the latter two, so that no RT call is paid for twice.
+- `Recorded` adds a `Ledger` to the last two, so that no RT call is paid for twice.
 
-A run of one candidate over all links is an RT call. It is counted here, where the engine runs. `engines.kinds` states
-what a study file may say about engines and is imported with the study; engines themselves are loaded when used.
+One RT call is a run of one candidate over all links. Calls are counted here, where the engine runs. `engines.kinds`
+defines the engine sections of a study file and is imported with the study; the engines are loaded when used.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""Compression: few weighted paths replace tens of thousands, within a stated error of path loss.
+"""Compression replaces tens of thousands of paths by few weighted ones, within a stated error of path loss.
 
 The power of a link is a sum over its paths, P(x) = sum_p p_p(x), of functions of the candidate x. Within the bounds of
 a few parameters these functions span a space of few dimensions, so few of them with weights w >= 0 suffice:
@@ -6,8 +6,8 @@ sum_p w_p p_p(x) is fitted to P(x) at training candidates by non-negative least 
 the fit is good enough (C. Farhat, T. Chapman, P. Avery, Int. J. Numer. Methods Eng. 102 (2015) 1077).
 
 Weights are non-negative and the paths are physical, so a compressed link behaves as a link between the training
-candidates as well. Still, the error is measured at new candidates, many of them on the faces of the bounds. A link that
-exceeds half the tolerance there is fitted again to more candidates, or keeps all its paths.
+candidates as well. The error is nevertheless measured at new candidates, many of them on faces of the bounds. If a
+link's error there exceeds half the tolerance, it is fitted again to more candidates, or keeps all its paths.
 """
 
 from __future__ import annotations
@@ -31,31 +31,32 @@ TOLERANCE_DB: Final = 0.01
 """Default of the largest error of a link's path loss [dB]."""
 
 MIN_PATHS: Final = 64
-"""A link with fewer paths is not compressed: there is little to gain."""
+"""A link with fewer paths is not compressed, because the gain would be small."""
 
 FIT_SHARE: Final = 0.1
-"""Share of the tolerance that the fit may use; the rest is for candidates between the training candidates."""
+"""Share of the tolerance that the fit may use; the rest allows for candidates between the training candidates."""
 
 CHECK_SHARE: Final = 0.5
-"""Share of the tolerance that the error at new candidates must stay within; the rest is for candidates not checked."""
+"""Largest error at new candidates as a share of the tolerance; the rest allows for candidates that are not checked."""
 
 TRAINING: Final = 16
-"""Random training candidates of the first fit per parameter, plus as many once; corners of the bounds come on top."""
+"""Number of random training candidates per parameter in the first fit, plus the same number once; corners of the bounds
+are added."""
 
 CORNER_PARAMETERS: Final = 5
-"""Number of parameters whose corners are all fitted; further parameters stay in the middle there."""
+"""Number of parameters whose corners are all fitted; further parameters have their middle value there."""
 
 CHECKED: Final = 48
 """New candidates of every check."""
 
 ROUNDS: Final = 6
-"""Fits of a link before it keeps all its paths."""
+"""Number of fits of a link before it keeps all its paths."""
 
 RANKING: Final = 16
 """Candidates that rank the paths by power."""
 
 POOL: Final = 2000
-"""Strongest paths of a link that may be kept, and as many random others."""
+"""Number of strongest paths of a link that may be kept, and of random other paths."""
 
 BATCH_POWERS: Final = 400_000_000
 """Largest number of powers, paths times candidates, in memory at once."""
@@ -73,10 +74,10 @@ class Compressed:
     """A compressed program.
 
     Attributes:
-        paths: The program over the same links. The weights are part of its paths' spreading, so it is valid for the sum
-            of powers only, not for delays or sums of fields.
+        paths: The program over the same links. The weights are part of the spreading factors of its paths, so it is
+            valid only for the sum of powers, not for delays or sums of fields.
         error_db: Largest difference of path loss from the full program at the checked candidates [L], [dB].
-        candidates: Number of candidates that every compressed link was checked at, without being fitted to them.
+        candidates: Number of candidates, not used in the fit, at which every compressed link was checked.
     """
 
     paths: Paths
@@ -133,10 +134,10 @@ def compress(
 
 
 def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
-    """A program without the paths that together carry at most a share of their link's power, for sums of powers.
+    """A program without the paths that together carry at most a share of a link's power, for sums of powers.
 
-    Their power is the sum over candidates that are spread over the parameters' bounds, so that at a single one of them
-    the paths left out carry less. Raises InputError if a parameter's material is not in the paths.
+    The power is the sum over candidates that are spread over the parameters' bounds, so the share of the omitted paths
+    at a single candidate is smaller. Raises InputError if a parameter's material is not in the paths.
     """
     candidates = parameters.from_unit(qmc.Sobol(len(parameters), rng=0).random(RANKING))
     _, strength, _ = _evaluate_all(paths, parameters, [candidates], FIRST_INTERVALS)
@@ -149,7 +150,7 @@ def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
 def _candidate_sets(parameters: Parameters, seed: int) -> list[NDArray[np.float64]]:
     """Training candidates with corners of the bounds, and then the candidates of every check [n, d].
 
-    A fit fails first where it extrapolates, so half of the candidates of a check lie on faces of the bounds.
+    A fit fails first where it extrapolates, so half of the candidates of a check are on faces of the bounds.
     """
     d, random = len(parameters), np.random.default_rng(seed)
     corners = np.full((2 ** min(d, CORNER_PARAMETERS), d), 0.5)
@@ -187,7 +188,7 @@ def _evaluate_all(
 
 
 def _pool(paths: Paths, strength: NDArray[np.float64], seed: int) -> NDArray[np.int64]:
-    """Paths that may be kept, ascending: of every link with many paths the strongest, and as many random others."""
+    """Paths that may be kept, ascending: of every link with many paths the strongest and as many random others."""
     random, pool = np.random.default_rng(seed), []
     for of_link in np.split(np.arange(paths.num_paths), np.flatnonzero(np.diff(paths.link)) + 1):
         if len(of_link) > MIN_PATHS:
@@ -199,7 +200,7 @@ def _pool(paths: Paths, strength: NDArray[np.float64], seed: int) -> NDArray[np.
 def _batches(
     links: NDArray[np.integer], size: NDArray[np.int64], candidates: int
 ) -> list[NDArray[np.integer]]:
-    """Links whose pools' powers fit into memory together."""
+    """Links whose candidate paths' powers fit into memory together."""
     batch = np.cumsum(size[links]) * candidates // BATCH_POWERS
     return [part for part in np.split(links, np.flatnonzero(np.diff(batch)) + 1) if len(part)]
 
@@ -227,9 +228,9 @@ class _Powers:
 def _fit_link(
     powers: _Powers, paths: slice, totals: list[NDArray[np.float64]], tolerance_db: float
 ) -> tuple[NDArray[np.float64], float] | None:
-    """Weights of the paths in a link's pool, and the largest error at new candidates; None if that is too large.
+    """Weights of the candidate paths of a link, and the largest error at new candidates; None if that is too large.
 
-    Candidates without power, for instance without scattering, are left out: no weight changes a zero.
+    Candidates without power, for instance without scattering, are left out, because no weight changes a zero.
     """
     bound = FIT_SHARE * tolerance_db * np.log(10) / 10
     shares, first = [], None
@@ -252,7 +253,7 @@ def sparse_weights(
 ) -> NDArray[np.float64]:
     """Sparse weights w >= 0 [P] with sum_p w_p share_p = 1 in every row of `share` [n, P].
 
-    Each row's residual is within the bound, unless non-negative weights cannot meet it. The search begins with the
+    Each row's residual is within the bound, unless non-negative weights cannot meet it. The search starts with the
     paths `first`.
     """
     norm = np.linalg.norm(share, axis=0)

@@ -1,1 +1,1 @@
-"""Links in blocks, and the processes and machines that work on them."""
+"""Chunks of links, and the processes and machines that work on them."""

@@ -1,7 +1,7 @@
 """Replay of links in chunks: each chunk is traced and compiled on one worker, and stays there.
 
-Candidates are sent out, and what is wanted of a chunk's path loss comes back; with `reducing` these are a few sums,
-however many links there are. Chunks depend on the study alone, never on the workers, and so does every number.
+Candidates are sent to the workers, which return path loss of their chunks; with `reducing` they return a few sums, for
+any number of links. Chunks, and thus all numbers, depend only on the study and not on the workers.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from calibray.measurements.observables import Statistic
 from calibray.support.progress import Progress
 
 Open = Callable[[OpenedStudy, Mapping[str, Material]], Differentiable]
-"""Opens the engine over a chunk: the opened study of its links, and materials to trace with."""
+"""Opens the engine over a chunk from the opened study of its links and the materials for the trace."""
 
 _TRACING: Final = Lock()
 """A process traces one chunk at a time."""
@@ -45,7 +45,7 @@ class ChunkRecipe:
     Attributes:
         shared: The opened study.
         links: The chunk's links.
-        materials: Materials to trace with in place of the scene's, by name.
+        materials: Materials for the trace in place of the scene's, by name.
         open: Opens the engine over the links.
     """
 
@@ -57,7 +57,7 @@ class ChunkRecipe:
 
 @final
 class Chunk:
-    """Links that are traced and replayed together. Pickling a chunk sends its recipe, not its paths.
+    """Links that are traced and replayed together. Pickling a chunk sends its recipe instead of its paths.
 
     Args:
         recipe: What it is made from.
@@ -74,21 +74,21 @@ class Chunk:
 
 @final
 class ChunkedReplay:
-    """Links in chunks on workers, evaluated for any candidate; all chunks are opened at once.
+    """Links in chunks on workers, evaluated for any candidate; all chunks are opened together.
 
     Args:
         workers: Keep the chunks.
         study: The opened study.
-        chunks: Indices of every chunk's links; together they hold every link once.
+        chunks: Indices of every chunk's links; together they contain every link once.
         opening: Opens the engine over a chunk's links; picklable.
-        materials: Materials to trace with in place of the scene's, by name.
+        materials: Materials for the trace in place of the scene's, by name.
         progress: Called with "tracing" after every chunk.
 
     Attributes:
         chunks: Indices of every chunk's links.
         calls: Candidates evaluated.
-        parameters: The parameters that a candidate gives values to.
-        materials: The materials before calibration, as traced with.
+        parameters: The parameters whose values a candidate contains.
+        materials: The materials before calibration, as in the trace.
     """
 
     def __init__(

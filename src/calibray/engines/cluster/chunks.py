@@ -1,7 +1,7 @@
-"""Links cut into chunks, and work that is done once per chunk on the workers: tracing, replay, prediction.
+"""Divides links into chunks, and runs work once per chunk on the workers: tracing, replay, prediction.
 
-The cut depends on the links and the study alone, never on the workers. Chunks that one command has traced are therefore
-found in the cache by the next.
+The division depends only on the links and the study, never on the workers. The cache therefore contains chunks that an
+earlier command has traced.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ Content = TypeVar("Content")
 Answer = TypeVar("Answer")
 
 CHUNK_LINKS: Final = 1000
-"""Links of a chunk if there are workers and the study does not state a number."""
+"""Links per chunk if there are workers and the study states no number."""
 
 MOST_CHUNKS: Final = 64
-"""Most chunks of such a study: each one compiles a program and returns its own sums."""
+"""Largest number of chunks of such a study: each compiles a program and returns its own sums."""
 
 _SHARED: WeakValueDictionary[bytes, Shared[Any]] = WeakValueDictionary()
 
 _LATEST: Final[deque[Shared[Any]]] = deque(maxlen=1)
-"""Keeps the content that was unpacked last alive: between two chunks nothing else may refer to it."""
+"""Keeps the last unpacked content alive: between two chunks, nothing else may refer to it."""
 
 
 @final
@@ -46,7 +46,8 @@ class Shared(Generic[Content]):
     """Content that all chunks share, for instance an opened study; a process unpacks it once.
 
     Args:
-        content: The content. Of an opened study, few links suffice, because each chunk brings its own.
+        content: The content. If the content is an opened study, few of its links suffice, because each chunk has its
+            own.
     """
 
     def __init__(self, content: Content) -> None:
@@ -87,14 +88,14 @@ def for_each_chunk(
     size: int,
     progress: Progress | None = None,
 ) -> list[tuple[NDArray[np.int64], Answer]]:
-    """Do some work, a picklable function of the shared content and a chunk's links, once for every chunk.
+    """Run a picklable function of the shared content and a chunk's links once for every chunk.
 
-    Whatever the work loads into `content` stays on the worker; a chunk whose worker dies is done again. `progress` is
-    called with "tracing", the links done and all links, after every chunk. Returns the indices of every chunk's links,
-    and the answer of the work.
+    Objects that the work loads into `content` stay on the worker; if a worker dies, its chunk is done again. After
+    every chunk, `progress` is called with "tracing", the links done and all links. Returns the indices of every chunk's
+    links, and the results of the work.
 
     Raises:
-        EngineError: Workers keep dying, or none is left.
+        EngineError: Workers die repeatedly, or none is left.
     """
     chunks, shared = cut(links, size), Shared(content)
     tasks = [_Task(work, shared, select_links(links, chunk)) for chunk in chunks]
@@ -108,7 +109,7 @@ def _do_task(task: _Task[Any, Any]) -> Any:
 
 
 def identity(value: Content) -> Content:
-    """The argument itself: what is kept with a chunk is the answer, or is sent as it is."""
+    """The argument itself, if the object kept with a chunk is already the answer or is sent as it is."""
     return value
 
 
@@ -136,7 +137,7 @@ def stated_chunk_size(study: OpenedStudy) -> int | None:
 
 
 def cut(links: Measurements, size: int) -> list[NDArray[np.int64]]:
-    """Cut links into chunks of about equal size, each with few positions to launch rays from.
+    """Divide links into chunks of about equal size, each with few positions from which rays are launched.
 
     Returns the indices of every chunk's links, in ascending order.
 
@@ -167,14 +168,14 @@ def seconds_to_trace(study: OpenedStudy, chunks: Sequence[NDArray[np.int64]]) ->
 def trace_in_chunks(
     study: OpenedStudy, workers: Workers, *, check: bool = False, progress: Progress | None = None
 ) -> tuple[Paths, Convergence | None]:
-    """Trace a study's links in the same chunks as a calibration, or take them from the cache.
+    """Trace a study's links in the same chunks as a calibration, or read them from the cache.
 
     With `check`, every chunk is traced again with twice the samples, unless samples are added in rounds. Returns the
     path program of all links, and the changes of path loss when traced again, if `check`.
 
     Raises:
         InputError: The links cannot be traced.
-        EngineError: The paths do not fit into memory, or workers keep dying.
+        EngineError: The paths do not fit into memory, or workers die repeatedly.
     """
     links, size = study.links, chunk_size(stated_chunk_size(study), len(study.links))
     one_link = study.at(select_links(links, np.array([0])))

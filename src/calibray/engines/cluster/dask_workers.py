@@ -21,22 +21,22 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 SCHEDULER_WAIT = 30.0
-"""Longest wait for a scheduler to answer [s]."""
+"""Longest wait for the answer of a scheduler [s]."""
 
 POLL: Final = 0.5
 """Interval between checks for dead workers [s]."""
 
 REPLACEMENT_WAIT: Final = 10.0
-"""Longest wait for the replacement of a dead worker, before other workers take its chunks [s]."""
+"""Longest wait for the replacement of a dead worker before other workers get its chunks [s]."""
 
 NO_WORKER_WAIT: Final = 600.0
 """Longest wait for a worker if none is left [s]."""
 
 MOST_DEATHS: Final = 4
-"""Workers that die with a chunk before the run ends: the chunk itself is probably too large."""
+"""Number of workers that die on a chunk before the run ends; the chunk is then probably too large."""
 
 FETCH_WAIT: Final = 30.0
-"""Longest time for an answer to arrive before it is requested again [s]."""
+"""Longest wait for an answer before it is requested again [s]."""
 
 Answered = Callable[[int], None]
 """Called with a chunk's number after its answer."""
@@ -49,7 +49,7 @@ _LOG: Final = logging.getLogger(__name__)
 
 @dataclass(eq=False)
 class _KeptRemotely:
-    """Objects on workers: for each chunk the worker that made its object last, and Dask's reference to it."""
+    """Objects on workers: for each chunk, the worker that last made its object, and Dask's reference to it."""
 
     make: Callable[[Any], Any]
     sources: list[Any]
@@ -63,12 +63,12 @@ class _KeptRemotely:
 class DaskWorkers:
     """The workers of a Dask cluster, opened on first use.
 
-    A chunk stays on one worker, its home. If that worker dies, its replacement takes the chunk, or another worker if no
-    replacement comes, and makes the chunk's objects again. Paths then come from the cache, if workers share its folder.
+    A chunk stays on one worker, its home. If that worker dies, its replacement, or another worker, gets the chunk and
+    makes its objects again. Paths then come from the cache, if workers share its folder.
 
     Args:
         connect: Returns Dask's client.
-        open_executor: Returns what runs the calls of an external program.
+        open_executor: Returns an executor for the calls of an external program.
     """
 
     def __init__(self, connect: Callable[[], Client], open_executor: Callable[[], Executor]) -> None:
@@ -78,7 +78,7 @@ class DaskWorkers:
         self._most_workers = 0
 
     def executor(self) -> Executor:
-        """What runs the calls of an external program; see `Workers.executor`."""
+        """An executor for the calls of an external program; see `Workers.executor`."""
         return self._open_executor()
 
     @cached_property
@@ -150,10 +150,10 @@ class DaskWorkers:
         return True
 
     def _move_from_dead(self, waiting: dict[int, Future]) -> list[int]:
-        """Give the chunks of dead workers a new home.
+        """Assign the chunks of dead workers to other workers.
 
         Raises:
-            EngineError: Too many workers died with one chunk, or no worker is left.
+            EngineError: Too many workers died on one chunk, or no worker is left.
         """
         living = self._living()
         lost = [index for index in waiting if self._homes[index] not in living]
@@ -186,10 +186,10 @@ class DaskWorkers:
                 load[self._homes[index]] += 1
 
     def _living(self, at_least: int = 0) -> list[str]:
-        """Addresses of the living workers; waits a while for more if there are too few.
+        """Addresses of the living workers; waits for more if there are too few.
 
         Raises:
-            EngineError: No worker came in `NO_WORKER_WAIT`.
+            EngineError: No worker appeared within `NO_WORKER_WAIT`.
         """
         start, warned = time.monotonic(), False
         while True:

@@ -1,7 +1,7 @@
-"""Workers on this machine: processes that are reached by pipes alone.
+"""Workers on this machine: processes that communicate through pipes only.
 
-A pipe is inherited by the process that it leads to. There is no port, so no other user of the machine can send work,
-which is code, to a worker or to the main process.
+A pipe is inherited by its process. No port is open, so no other user of the machine can send code to a worker or to the
+main process.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from calibray.engines.cluster.dask_workers import MOST_DEATHS, POLL, Answered
 from calibray.errors import EngineError, InputError
 
 ALWAYS_ALLOWED: Final = 8
-"""Worker processes that may be asked for on any machine, however few cores it has."""
+"""Number of worker processes that is allowed on any machine, even with few cores."""
 
 END_WAIT: Final = 5.0
 """Longest wait for a process to end before it is killed [s]."""
@@ -41,13 +41,13 @@ ObjectKey = tuple[int, int]
 
 @dataclass(frozen=True)
 class _Question:
-    """What a worker is asked about a chunk.
+    """A question to a worker about a chunk.
 
     Attributes:
         function: The function to call.
         arguments: Its last arguments.
         keys: The objects that are its first arguments.
-        recipes: How objects are made that the worker does not have yet.
+        recipes: How to make objects that the worker does not have yet.
         handles: Handles that are still in use; objects of others are dropped.
     """
 
@@ -72,7 +72,7 @@ class _KeptInProcesses:
 
 @dataclass(eq=False)
 class _Worker:
-    """A process, the pipe to it, the objects that it has made, and the chunk that it works on."""
+    """A process, the pipe to it, the objects that it has made, and its current chunk."""
 
     process: SpawnProcess
     pipe: Connection
@@ -84,11 +84,11 @@ class _Worker:
 class LocalWorkers:
     """Processes on this machine, started on first use, each with its share of the processor cores.
 
-    A chunk stays in one process. If that process dies, another takes its place and makes the chunk's objects again.
+    A chunk stays in one process. If a process dies, another one replaces it and makes the chunk's objects again.
 
     Args:
         count: Number of processes.
-        open_executor: Returns what runs the calls of an external program.
+        open_executor: Returns an executor for the calls of an external program.
     """
 
     def __init__(self, count: int, open_executor: Callable[[], Executor]) -> None:
@@ -99,7 +99,7 @@ class LocalWorkers:
         self._lock = Lock()
 
     def executor(self) -> Executor:
-        """What runs the calls of an external program; see `Workers.executor`."""
+        """An executor for the calls of an external program; see `Workers.executor`."""
         return self._open_executor()
 
     def keep(self, make: Callable[[Any], Any], sources: Sequence[Any]) -> Sized:
@@ -172,10 +172,10 @@ class LocalWorkers:
         self._workers.clear()
 
     def _start_all(self) -> None:
-        """Start the processes that do not run yet.
+        """Start the processes that are not running yet.
 
         Raises:
-            InputError: There are more processes than this machine can use.
+            InputError: The number of processes exceeds the limit of this machine.
         """
         most = max(os.cpu_count() or 1, ALWAYS_ALLOWED)
         if self._count > most:
@@ -218,7 +218,7 @@ class LocalWorkers:
             worker.pipe.send_bytes(content)
 
     def _receive(self) -> list[tuple[int, tuple[Any, Exception | None] | None]]:
-        """The answers that have come, with the number of their worker; None for a worker that died."""
+        """The answers received, with the number of their worker; None for a worker that died."""
         homes = {worker.pipe: home for home, worker in enumerate(self._workers)}
         answers: list[tuple[int, tuple[Any, Exception | None] | None]] = []
         for pipe in cast(list[Connection], wait(list(homes), POLL)):
@@ -229,16 +229,16 @@ class LocalWorkers:
         return answers
 
     def _replace(self, home: int) -> None:
-        """Start a process in place of a dead one.
+        """Start a process that replaces a dead one.
 
         Raises:
-            EngineError: Too many processes died with the same chunk.
+            EngineError: Too many processes died on the same chunk.
         """
         dead = self._workers[home]
         dead.pipe.close()
         dead.process.join(END_WAIT)
         _LOG.warning(
-            "worker %d ended (exit status %s); another takes its place", home + 1, dead.process.exitcode
+            "worker %d ended (exit status %s) and is being replaced", home + 1, dead.process.exitcode
         )
         if dead.chunk is not None:
             self._deaths[dead.chunk] = self._deaths.get(dead.chunk, 0) + 1
@@ -277,7 +277,7 @@ def _serve(pipe: Connection, home: int, count: int) -> None:
 
 
 def _sendable(error: Exception) -> Exception:
-    """An error that the main process can read."""
+    """An error that can be sent to the main process."""
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:  # whatever a foreign class raises
@@ -286,9 +286,9 @@ def _sendable(error: Exception) -> Exception:
 
 
 def _pin(home: int, count: int) -> None:
-    """Give a process its share of the cores, before any library that counts cores is loaded.
+    """Assign a process its share of the cores, before any library that counts cores is loaded.
 
-    Without it, the thread pools of Dr.Jit and XLA in every process take all cores and slow each other down.
+    Otherwise, the thread pools of Dr.Jit and XLA in every process use all cores and slow each other down.
     """
     if _CAN_PIN:
         cores = sorted(os.sched_getaffinity(0))

@@ -1,7 +1,8 @@
-"""Workers: they keep chunks of links for replay, and run the calls of an external program.
+"""Workers keep chunks of links for replay, and run the calls of an external program.
 
-Whatever is kept with a chunk is made on one worker and stays there. Functions are sent to it, and only their answers
-come back. Chunks are numbered and answers come in that order, so sums over chunks do not depend on the workers.
+Objects that are kept with a chunk are made on one worker and stay there. Functions are sent to the worker, which
+returns only their results. Chunks are numbered and results return in that order, so sums over chunks do not depend on
+the workers.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from calibray.support.memory import available_memory
 
 
 class Workers(Protocol):
-    """What does the work of an engine: this process, processes on this machine, or a Dask cluster."""
+    """Runs the work of an engine: this process, processes on this machine, or a Dask cluster."""
 
     def executor(self) -> Executor | None:
-        """What runs the calls of an external program; None to run one call after the other."""
+        """An executor for the calls of an external program; None to run one call after the other."""
         ...
 
     def keep(self, make: Callable[[Any], Any], sources: Sequence[Any]) -> Sized:
         """Make an object for every chunk and keep it on the chunk's worker until the returned handle is deleted.
 
-        `make` makes the object from its source and is picklable.
+        The picklable function `make` creates the object from its source.
         """
         ...
 
@@ -40,13 +41,13 @@ class Workers(Protocol):
         *arguments: Any,
         answered: Answered | None = None,
     ) -> list[Any]:
-        """Call a picklable function on the objects that are kept with every chunk; the answers by chunk.
+        """Call a picklable function on the objects that are kept with every chunk, and return the results by chunk.
 
-        The objects, by their handles from `keep`, are the function's first arguments; the further ones are the same for
-        all chunks. `answered` is called with a chunk's number after its answer.
+        The first arguments of the function are the objects, given by their handles from `keep`; the other arguments are
+        the same for all chunks. `answered` is called with a chunk's number after its answer.
 
         Raises:
-            EngineError: Workers keep dying, or none is left.
+            EngineError: Workers die repeatedly, or none is left.
         """
         ...
 
@@ -57,7 +58,7 @@ class InProcess:
 
     Args:
         at_most: Largest number of chunks to keep; other chunks are made again for each question. If None, chunks are
-            kept until half of the memory that was free at first is used.
+            kept until they use half of the memory that was free at the start.
     """
 
     def __init__(self, at_most: int | None = None) -> None:
@@ -96,7 +97,7 @@ class InProcess:
 
 @dataclass(eq=False)
 class _KeptHere:
-    """Objects that are made on first use and kept while there is room."""
+    """Objects that are made on first use and kept as long as memory suffices."""
 
     make: Callable[[Any], Any]
     sources: list[Any]
@@ -121,7 +122,7 @@ def open_workers(workers: int | None = None, scheduler: str | None = None) -> It
 
     Args:
         workers: Number of workers on this machine: processes that keep chunks of links, or external programs that run
-            at once.
+            in parallel.
         scheduler: Address of a Dask scheduler, for instance "tcp://10.0.0.1:8786". Its workers need Calibray and must
             see the study's folder under the same path.
 
@@ -129,10 +130,11 @@ def open_workers(workers: int | None = None, scheduler: str | None = None) -> It
         The workers; None if neither is given.
 
     Raises:
-        InputError: Both are given, the number is not positive, Dask is not installed, or no scheduler answers.
+        InputError: Both arguments are given, the number is not positive, Dask is not installed, or no scheduler
+            answers.
     """
     if workers is not None and scheduler is not None:
-        raise InputError("--workers and --scheduler: give one of them; a cluster has its own workers")
+        raise InputError("--workers and --scheduler: give only one of them; a cluster has its own workers")
     if workers is not None and workers < 1:
         raise InputError(f"--workers {workers}: must be at least 1")
     with ExitStack() as opened:

@@ -1,4 +1,4 @@
-"""The engine "command": an external program, called once for every candidate, one after the other or in parallel."""
+"""The engine "command" calls an external program once for every candidate, one after the other or in parallel."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ _LOG: Final = logging.getLogger(__name__)
 class Command:
     """An external program, called once for every candidate.
 
-    If all attempts of a call fail, only that candidate is lost: its links count as links without a path. If every
+    If all attempts of a call fail, only this candidate is lost: its links count as links without a path. If every
     candidate of the first batch fails, or many successive calls fail, the run ends, because the program must be at
     fault.
 
     Args:
         program: How the program is called.
         study: The opened study.
-        give_up_after: Number of successive failed calls that ends the run.
-        executor: Runs the calls of a batch; one call after the other if None.
+        give_up_after: Number of successive failed calls after which the run ends.
+        executor: Executor for the calls of a batch; if None, one call runs after the other.
         progress: Called with "running" after every candidate of a batch.
     """
 
@@ -70,13 +70,13 @@ class Command:
         """Path loss and further observables of every link, as the program answers; see `Observing.respond`.
 
         Raises:
-            InputError: The program was not asked for these, or derivatives are wanted.
+            InputError: The program does not compute these observables, or derivatives are requested.
         """
         first = not self.calls
         values = check_candidates(candidates, len(self.parameters))
         if derivatives or wanted != tuple(each.statistic for each in self._study.radio.observables):
             raise InputError(
-                f"{self._source}: the program answers the study's [observables] alone, without derivatives"
+                f"{self._source}: the program answers only the study's [observables], without derivatives"
             )
         return gather_responses(self.answers(values), (len(values), self.num_links), len(wanted), first)
 
@@ -110,7 +110,7 @@ class Command:
                 )
 
     def _with_path_loss(self, outcome: Outcome) -> Outcome:
-        """The outcome with the path loss of its rays, or with what is wrong with them."""
+        """The outcome with the path loss of its rays, or with the error in them."""
         from calibray.engines.rays.export import Export
 
         try:

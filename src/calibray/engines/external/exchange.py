@@ -33,12 +33,12 @@ _WITHOUT_PATH: Final = (None, "inf", "Infinity")
 
 
 class Unusable(ValueError):
-    """An answer that is missing, malformed, of the wrong length, or not a number."""
+    """The answer is missing, malformed, of the wrong length, or not a number."""
 
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """One RT call, as it is sent to a program.
+    """One RT call in the form that is sent to a program.
 
     Attributes:
         radio: Carrier, bandwidth, combining and antennas.
@@ -134,10 +134,10 @@ def read_answer(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Read a program's response: path loss [L], [dB], and further observables [K, L], in their units.
 
-    Path loss is +inf where a link has no path; an observable is NaN where a link has none.
+    Path loss is +inf for a link without a path; an observable is NaN for a link without a value.
 
     Raises:
-        Unusable: The file is missing or malformed, or does not hold one number per link.
+        Unusable: The file is missing or malformed, or does not contain one number per link.
     """
     read = _read_json if file_format == "json" else _read_hdf5
     response = _read_bytes(path, RESPONSE_BYTES[0] + RESPONSE_BYTES[1] * num_links)
@@ -148,15 +148,19 @@ def read_answer(
         values = values.reshape(-1)
     if values.shape != (num_links,):
         raise Unusable(
-            f"its response holds {ANSWER} of shape {values.shape}, must be ({num_links},): one per link"
+            f"its response contains {ANSWER} of shape {values.shape}, must be ({num_links},): one per link"
         )
     lower, upper = PATH_LOSS_DB
     wrong = ~((values >= lower) & (values <= upper) | np.isposinf(values))
     if wrong.any():
         link = int(np.argmax(wrong))
-        hint = "; path loss is positive: does it answer gains?" if -upper <= values[link] < 0 else ""
+        hint = (
+            "; path loss is positive; does the program answer with gains?"
+            if -upper <= values[link] < 0
+            else ""
+        )
         raise Unusable(
-            f"its response holds {ANSWER}[{link}] = {values[link]:g}; must be a number between {lower:g} and "
+            f"its response contains {ANSWER}[{link}] = {values[link]:g}; must be a number between {lower:g} and "
             f"{upper:g} dB, or infinite without a path{hint}"
         )
     shape = num_observables, num_links
@@ -167,7 +171,8 @@ def read_answer(
         observed = observed.reshape(shape)
     if observed.shape != shape:
         raise Unusable(
-            f"its response holds {OBSERVABLES} of shape {observed.shape}, must be {shape}: a list with one value per "
+            f"its response contains {OBSERVABLES} of shape {observed.shape}, must be {shape}: a list with one value "
+            f"per "
             "link for each observable, in the order of the request"
         )
     return values, np.where(np.isfinite(observed), observed, np.nan)
@@ -177,7 +182,7 @@ def read_rays(path: Path, num_links: int) -> bytes:
     """The response of a program that answers with a ray table.
 
     Raises:
-        Unusable: The file is missing, no regular file, or too large.
+        Unusable: The file is missing, not a regular file, or too large.
     """
     return _read_bytes(path, RAYS_BYTES[0] + RAYS_BYTES[1] * num_links)
 
@@ -219,7 +224,7 @@ def _read_json(response: bytes, name: str, _: int) -> NDArray[np.float64]:
         rows = [[_number(entry, name) for entry in row] for row in entries]
         if len({len(row) for row in rows}) != 1:
             raise Unusable(
-                f"its response holds {name} with lists of different lengths; must be one value per link"
+                f"its response contains {name} with lists of different lengths; must be one value per link"
             )
         return np.array(rows)
     return np.array([_number(entry, name) for entry in entries])
@@ -230,11 +235,11 @@ def _number(entry: Any, name: str) -> float:
         return np.inf
     if isinstance(entry, bool) or not isinstance(entry, int | float):
         text = json.dumps(entry) if isinstance(entry, str | bool) else reprlib.repr(entry)
-        raise Unusable(f"its response holds {text[:80]} in {name}, which is not a number")
+        raise Unusable(f"its response contains {text[:80]} in {name}, which is not a number")
     try:
         return float(entry)
     except OverflowError:
-        raise Unusable(f"its response holds a number in {name} that is too large") from None
+        raise Unusable(f"its response contains a number in {name} that is too large") from None
 
 
 def _read_hdf5(response: bytes, name: str, size: int) -> NDArray[np.float64]:
@@ -253,7 +258,7 @@ def _read_hdf5(response: bytes, name: str, size: int) -> NDArray[np.float64]:
             # Checked before it is read, because a small compressed file may unpack to any size.
             if dataset.size != size:
                 raise Unusable(
-                    f"its response holds {name} of shape {dataset.shape}, must hold {size} numbers"
+                    f"its response contains {name} of shape {dataset.shape}, must hold {size} numbers"
                 )
             return np.asarray(dataset[()], dtype=float)
     except Unusable:

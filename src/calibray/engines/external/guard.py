@@ -1,9 +1,9 @@
-"""The guard of an external program: runs it to its end, limits its output, and kills all processes it started.
+"""The guard of an external program runs it to its end, limits its output, and kills all processes that it started.
 
-A script of its own, `python -I -S guard.py LIBRARIES TIMEOUT FOLDER WORD...`, that imports nothing of Calibray. It is
-a process between Calibray and the program for two reasons. On Linux it adopts orphans (PR_SET_CHILD_SUBREAPER), so that
-it finds processes that left the program's group and session. And it outlives Calibray: when its standard input ends,
-Calibray was killed, and the guard kills the program and removes the folder.
+This is a separate script, `python -I -S guard.py LIBRARIES TIMEOUT FOLDER WORD...`, that imports no part of Calibray.
+It is a process between Calibray and the program for two reasons. First, on Linux it adopts orphans
+(PR_SET_CHILD_SUBREAPER), so that it finds processes that left the program's group and session. Second, it outlives
+Calibray: when its standard input ends, Calibray was killed, and the guard kills the program and removes the folder.
 
 It prints one JSON object: `ended` ("status", "timeout", "stopped" or "unstarted"), `status` and `output`.
 """
@@ -47,7 +47,7 @@ class Output:
         self.tail = (self.tail + part[-TAIL:])[-TAIL:]
 
     def text(self) -> str:
-        """The output as text without control characters, which would garble a terminal; a long middle is left out."""
+        """The output as text without control characters, which would garble a terminal, and without a long middle."""
         left_out = self.length - len(self.head) - len(self.tail)
         middle = f" ... ({left_out} bytes left out) ... ".encode() if left_out else b""
         text = (self.head + middle + self.tail).decode("utf-8", "replace").replace("\r\n", "\n").strip()
@@ -87,7 +87,7 @@ def main(timeout: float, words: list[str]) -> dict[str, object]:
 
 
 def _prctl():
-    """The system call that sets who adopts orphans and who dies with whom; it does nothing except on Linux."""
+    """The system call that sets who adopts orphans and who dies with whom; on Linux only."""
     if sys.platform != "linux":
         return lambda option, value: None
     library = ctypes.CDLL(None)
@@ -95,7 +95,7 @@ def _prctl():
 
 
 def _signal_pipe() -> int:
-    """A pipe that receives the number of every signal that ends a child or asks this process to end."""
+    """A pipe that receives the number of every signal that ends a child or requests this process to end."""
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
@@ -145,7 +145,7 @@ def _kill_tree(process: subprocess.Popen) -> None:
 
 
 def _drain(reader: int, output: Output) -> None:
-    """Read what is left in a pipe, even if another process still holds its other end."""
+    """Read the remaining content of a pipe, even if another process still has its other end open."""
     os.set_blocking(reader, False)
     with suppress(BlockingIOError):
         while part := os.read(reader, 1 << 16):

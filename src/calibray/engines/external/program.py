@@ -46,11 +46,11 @@ Response = tuple[NDArray[np.float64], NDArray[np.float64]] | bytes
 
 
 class Unstartable(Unusable):
-    """A program that does not exist or cannot be executed: another attempt would fail too."""
+    """The program does not exist or cannot be executed, so another attempt would fail too."""
 
 
 class Stopped(Exception):
-    """A call that was ended from outside before it answered."""
+    """The call was ended from outside before it answered."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +58,11 @@ class Outcome:
     """How the attempts at one candidate ended.
 
     Attributes:
-        path_loss_db: Path loss [L], [dB]; +inf without a path, and for all links if the attempts failed.
+        path_loss_db: Path loss [L], [dB]; +inf for a link without a path, and for all links if the attempts failed.
         seconds: Time of all attempts together [s].
         failure: Error of the last attempt; empty if it succeeded.
-        rays: The response of a program that answers with rays, from which path loss follows; or further observables
-            [K, L] in SI units as little-endian doubles; else empty.
+        rays: The response of a program that answers with rays, from which path loss follows, or further observables [K,
+            L] in SI units as little-endian doubles; otherwise empty.
     """
 
     path_loss_db: NDArray[np.float64]
@@ -73,16 +73,16 @@ class Outcome:
 
 @dataclass(frozen=True)
 class ExternalProgram:
-    """How an external program is called; it can be sent to other processes and machines.
+    """How to call an external program; it can be sent to other processes and machines.
 
     Attributes:
-        words: The program and its arguments. `{request}` and `{response}` are replaced by the files' paths, and
-            appended if absent.
+        words: The program and its arguments. The files' paths replace `{request}` and `{response}`, and are appended if
+            these are absent.
         folder: Folder to run it in.
         timeout: Time limit of one attempt [s].
-        retries: How often to try again after a failure.
+        retries: Number of further attempts after a failure.
         file_format: "json" or "hdf5".
-        rays: Whether it answers with a ray table in place of path loss.
+        rays: Whether it answers with a ray table instead of path loss.
 
     Raises:
         InputError: A word contains a NUL character, which the system does not pass to programs.
@@ -104,13 +104,13 @@ class ExternalProgram:
                 )
 
     def run(self, request: Request, stop: Event | None = None) -> Outcome:
-        """Call the program for one candidate, and again after a failure until no attempts are left.
+        """Call the program for one candidate, and after a failure again until no attempts are left.
 
-        A failure is returned, not raised, so that it costs one candidate and not the batch. `stop` is set from outside
-        to kill the program.
+        A failure is returned instead of raised, so that it costs one candidate and not the batch. Another thread sets
+        `stop` to kill the program.
 
         Raises:
-            Stopped: `stop` was set before there was an answer.
+            Stopped: `stop` was set before the program answered.
             EngineError: The files cannot be written, which is not the program's fault.
         """
         num_links = len(request.tx)
@@ -213,7 +213,7 @@ class ExternalProgram:
 
 
 def _last_report(guard: subprocess.Popen) -> bytes:
-    """The report of a guard that was asked to end; it kills its program first."""
+    """The report of a guard that was asked to end; it first kills its program."""
     try:
         return guard.communicate(timeout=GUARD_WAIT)[0]
     except subprocess.TimeoutExpired:

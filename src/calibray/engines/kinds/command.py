@@ -1,4 +1,4 @@
-"""Command: an external program answers for every candidate."""
+"""Command: an external program computes path loss for every candidate."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class CommandSection(EngineSection):
     Attributes:
         name: "command".
         command: The program to call, and its arguments.
-        timeout: Time that one attempt of the program may take [s].
-        retries: How often the program is tried again after a failure.
+        timeout: Time limit of one attempt of the program [s].
+        retries: Number of further attempts after a failure.
         format: Format of the files exchanged with the program: "json" or "hdf5".
-        give_up_after: Number of successive failed calls that ends the run.
-        rays: Whether the program answers with a ray table in place of path loss.
+        give_up_after: Number of successive failed calls after which the run ends.
+        rays: Whether the program answers with a ray table instead of path loss.
     """
 
     expensive: ClassVar[bool] = True

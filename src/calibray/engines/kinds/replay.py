@@ -32,10 +32,11 @@ class ReplaySection(EngineSection):
 
     Attributes:
         name: "replay".
-        compress_db: Replay few weighted paths in place of all, with this largest error of path loss [dB]; all if None.
-        chunk_links: Largest number of links that are traced and replayed together. If None, all links at once, or with
+        compress_db: Replay few weighted paths instead of all, with this largest error of path loss [dB]; all paths if
+            None.
+        chunk_links: Largest number of links that are traced and replayed together. If None, all links together, or with
             workers `chunks.CHUNK_LINKS` links in at most `chunks.MOST_CHUNKS` chunks.
-        rays: Ray table with the paths of another engine, in place of tracing.
+        rays: Ray table with the paths of another engine, in place of a trace.
     """
 
     expensive: ClassVar[bool] = False
@@ -62,7 +63,7 @@ class ReplaySection(EngineSection):
         """The replay of a study's links; see `EngineSection.open`.
 
         Raises:
-            InputError: Compression does not suit the study, or its links cannot be traced.
+            InputError: The study does not allow compression, or its links cannot be traced.
         """
         # Refuse before anything is traced.
         self._check_compressible(study)
@@ -100,14 +101,14 @@ class ReplaySection(EngineSection):
 def trace_and_replay(
     compress_db: float | None, study: OpenedStudy, materials: Mapping[str, Material]
 ) -> Replay | ReplayCarriers:
-    """The replay of a chunk's links on paths traced with the materials given; a worker can be sent this function."""
+    """The replay of a chunk's links on paths traced with the given materials; this function can be sent to a worker."""
     return replay(study, study.trace(materials), compress_db)
 
 
 def replay(study: OpenedStudy, paths: Paths, compress_db: float | None = None) -> Replay | ReplayCarriers:
     """The replay of an opened study on stored paths, with one program per carrier.
 
-    `compress_db` is the largest error of path loss [dB] if few weighted paths approximate all.
+    If few weighted paths approximate all, `compress_db` is the largest error of path loss [dB].
     """
     from calibray.engines.compression import compress
     from calibray.engines.replay import CarrierPaths, Replay, ReplayCarriers

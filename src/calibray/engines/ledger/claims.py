@@ -1,7 +1,7 @@
-"""Claims: which run works on which candidate, so that two runs with one ledger do not both pay for it.
+"""Claims state which run works on which candidate, so that two runs with one ledger do not both pay for it.
 
-A claim lasts while its run renews it, and ends at once if the run's process has certainly ended. Renewals are observed
-with the clock of the observer, because the clocks of two machines may differ by hours.
+A claim is valid while its run renews it, and ends at once if the run's process has certainly ended. Each observer uses
+its own clock to time renewals, because the clocks of two machines may differ by hours.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ RENEWAL: Final = 60.0  # interval between renewals [s]
 RELEASE_WAIT: Final = 500  # longest wait of `release` for other writers [ms]
 _active_runs: set[str] = set()  # the runs of this process
 _observed: dict[tuple[str, bytes, str], tuple[float, float]] = {}
-"""Claims of other runs: their `expires` when it last changed, and this process's clock at that time [s]."""
+"""Claims of other runs: their `expires` at its last change, and this process's clock at that time [s]."""
 
 
 def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Sequence[bytes]) -> list[bytes]:
-    """Claim candidates, within a transaction of the caller; those that no other run has claimed."""
+    """Claim candidates within a transaction of the caller, and return those that no other run has claimed."""
     now, owner = time.time(), json.dumps(ProcessOwner.current().record())
     _active_runs.add(run)
     claimed = []
@@ -52,10 +52,10 @@ def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Se
 
 
 def _is_valid(claimed: tuple[str, bytes, str], owner: object, expires: object, now: float) -> bool:
-    """Whether a claim of another run still holds.
+    """Whether a claim of another run is still valid.
 
-    It does not if the process has ended, or gave no sign of life for `EXPIRY`. `expires` and `now` are [s since 1970],
-    by the clock of its machine and of this one.
+    A claim is invalid if its process has ended, or has not renewed it for `EXPIRY`. `expires` and `now` are times [s
+    since 1970] by the clocks of its machine and of this one.
     """
     if not isinstance(expires, float) or not abs(expires - now) <= SKEW + EXPIRY:
         return False
@@ -75,7 +75,7 @@ def _is_valid(claimed: tuple[str, bytes, str], owner: object, expires: object, n
 
 
 def release(connection: sqlite3.Connection, run: str) -> None:
-    """Give up all claims of a run; if the ledger cannot be written, they end with the process."""
+    """Release all claims of a run; if the ledger cannot be written, they end with the process."""
     _active_runs.discard(run)
     with suppress(sqlite3.Error):
         (timeout,) = connection.execute("PRAGMA busy_timeout").fetchone()

@@ -30,7 +30,7 @@ from calibray.engines.ledger import claims
 from calibray.errors import InputError
 
 RANGE_DB: Final = (-100.0, 10_000.0)
-"""Range of path loss that no engine leaves [dB]; other values are damage."""
+"""Range of path loss that every engine respects [dB]; other values indicate damage."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class LedgerEntry:
     """One RT call of a ledger.
 
     Attributes:
-        path_loss_db: Path loss [L], [dB]; +inf where a link has no path.
+        path_loss_db: Path loss [L], [dB]; +inf for a link without a path.
         seconds: Time of the call [s].
         failure: Error message; empty if the call succeeded.
         rays: The response with its rays, as the program wrote it; empty without rays.
@@ -65,7 +65,7 @@ class LedgerEntry:
 
     @property
     def fault(self) -> str:
-        """Why an engine cannot have given this answer; empty if it can."""
+        """The reason why an engine cannot have given this answer; empty if it can."""
         values, (lower, upper) = self.path_loss_db, RANGE_DB
         outside = ~((values >= lower) & (values <= upper) | np.isposinf(values))
         if outside.any():
@@ -78,7 +78,7 @@ class LedgerEntry:
 def read_entry(
     problem: str, candidate: bytes, columns: tuple[object, ...], num_links: int | None = None
 ) -> LedgerEntry | str:
-    """Read an entry from a row of a ledger: path loss as bytes, seconds, failure, digest and rays; or its damage."""
+    """Read an entry from a row of a ledger (path loss as bytes, seconds, failure, digest, rays), or its damage."""
     blob, seconds, failure, digest, rays = columns
     if not (isinstance(problem, str) and isinstance(candidate, bytes) and isinstance(blob, bytes)):
         return "a value of another type"
@@ -93,7 +93,7 @@ def read_entry(
 
 
 def key(candidate: NDArray[np.float64]) -> bytes:
-    """A candidate [d] as the ledger keeps it: little-endian doubles, with -0.0 as 0.0."""
+    """A candidate [d] in the form of the ledger: little-endian doubles, with -0.0 as 0.0."""
     return (np.asarray(candidate, dtype="<f8") + 0.0).tobytes()
 
 
@@ -117,14 +117,14 @@ _COLUMNS: Final = {
 
 
 def check_own_file(path: Path) -> None:
-    """Refuse a ledger that is another file under this name: SQLite would follow it, and write there.
+    """Refuse a ledger whose path leads to another file: SQLite would follow it, and write there.
 
     Args:
         path: The SQLite file, which need not exist.
 
     Raises:
-        InputError: It, or a file that SQLite keeps next to it, is a link, a folder, a device or a FIFO, or has further
-            names (hard links).
+        InputError: The file, or a file that SQLite keeps next to it, is a link, a folder, a device or a FIFO, or has
+            other names (hard links).
     """
     for ending in ENDINGS:
         file = path.with_name(path.name + ending)
@@ -171,7 +171,7 @@ def _set_up(connection: sqlite3.Connection, path: Path) -> None:
     tables = {name for (name,) in run("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if version not in (0, VERSION):
         raise InputError(
-            f"{path}: is a ledger of version {version}, this Calibray uses {VERSION}; name another folder"
+            f"{path}: is a ledger of version {version}, but this Calibray uses {VERSION}; name another folder"
         )
     if version == 0 and tables - set(_COLUMNS):
         raise InputError(
@@ -199,14 +199,14 @@ def _set_up(connection: sqlite3.Connection, path: Path) -> None:
 def insert_problem(
     connection: sqlite3.Connection, problem: str, engine: str, parameters: Sequence[str]
 ) -> None:
-    """Write the names that a problem's candidates are listed with, unless they are there."""
+    """Write the parameter names of a problem's candidates, unless they are there."""
     connection.execute(
         "INSERT OR IGNORE INTO problems VALUES (?, ?, ?)", (problem, engine, json.dumps(list(parameters)))
     )
 
 
 def insert_answer(connection: sqlite3.Connection, problem: str, candidate: bytes, entry: LedgerEntry) -> None:
-    """Write an answer, unless there is one."""
+    """Write an answer, unless there already is one."""
     now = datetime.now(UTC).isoformat(timespec="milliseconds")
     digest = entry.digest(problem, candidate)
     connection.execute(
@@ -232,7 +232,7 @@ def transaction(connection: sqlite3.Connection) -> Iterator[None]:
 
 
 def explain(error: sqlite3.Error | OSError) -> str:
-    """An error of a ledger as a text with its remedy."""
+    """The text of a ledger error, with its remedy."""
     # The lower byte is the kind of error; the upper ones are details.
     code = (getattr(error, "sqlite_errorcode", None) or 0) & 0xFF
     damaged = "move it away and start again, or recover its contents with `sqlite3 FILE .recover`"
@@ -240,7 +240,7 @@ def explain(error: sqlite3.Error | OSError) -> str:
         sqlite3.SQLITE_FULL: "make room on the disk and start again",
         sqlite3.SQLITE_IOERR: "make room on the disk, or repair it, and start again",
         sqlite3.SQLITE_BUSY: f"another program has locked it for {LOCK_WAIT:g} s: end that and start again",
-        sqlite3.SQLITE_LOCKED: "another program has locked it: end that and start again",
+        sqlite3.SQLITE_LOCKED: "another program has locked it; end that program and start again",
         sqlite3.SQLITE_READONLY: "make it and its folder writable and start again",
         sqlite3.SQLITE_CANTOPEN: "make its folder writable and start again",
         sqlite3.SQLITE_CORRUPT: damaged,

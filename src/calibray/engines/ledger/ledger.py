@@ -1,8 +1,8 @@
-"""The ledger: every RT call that was paid for, in one SQLite file.
+"""The ledger stores every RT call that was paid for, in one SQLite file.
 
-An answer is committed before the optimizer sees it, so a run that was killed finds its answers when it is started
-again. Several runs may write to one ledger at once. It must be on a local disk, because SQLite's write-ahead log needs
-one. If the ledger cannot take an answer, a rescue file does (see `rescue`).
+An answer is committed before the optimizer sees it, so a killed run finds its answers when it is started again. Several
+runs may write to one ledger at the same time. The ledger must be on a local disk, because SQLite's write-ahead log
+needs one. If the ledger cannot store an answer, a rescue file does (see `rescue`).
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ class Ledger:
         read_only: Whether the file cannot be written.
 
     Raises:
-        InputError: The file cannot be opened, is not a ledger, is a link or has further names, is damaged, or has
-            another version.
+        InputError: The file cannot be opened, is not a ledger, is a link or has other names, is damaged, or has another
+            version.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -119,7 +119,7 @@ class Ledger:
             self._copy.cleanup()
 
     def describe(self, problem: str, engine: str, parameters: Sequence[str]) -> None:
-        """Write the names that a problem's candidates are listed with.
+        """Write the parameter names of a problem's candidates.
 
         Raises:
             EngineError: The ledger cannot be written.
@@ -150,7 +150,7 @@ class Ledger:
         return None
 
     def claim(self, problem: str, candidates: Sequence[bytes], num_links: int) -> list[bytes]:
-        """Claim candidates that this run will pay for; `commit` and the end of `working` end the claims.
+        """Claim candidates that this run will pay for; `commit` and the end of `working` release the claims.
 
         Returns the candidates without an answer that no other run has claimed.
 
@@ -172,7 +172,7 @@ class Ledger:
 
     @contextmanager
     def working(self) -> Iterator[None]:
-        """Renew this run's claims while its engine works, and give them up afterwards."""
+        """Renew this run's claims while its engine works, and release them afterwards."""
         try:
             with claims.renewing(self.path, self._run):
                 yield
@@ -180,10 +180,10 @@ class Ledger:
             claims.release(self._connection, self._run)
 
     def commit(self, problem: str, candidate: bytes, entry: LedgerEntry) -> LedgerEntry:
-        """Write an entry, unless another run has written one first; returns the entry that is on disk.
+        """Write an entry, unless another run has written one first; return the stored entry.
 
         Raises:
-            EngineError: The ledger cannot take it; `rescue` keeps it in a file.
+            EngineError: The ledger cannot store it; `rescue` keeps it in a file.
         """
         with self._errors(), transaction(self._connection):
             earlier = self.find(problem, candidate, len(entry.path_loss_db))
@@ -202,7 +202,7 @@ class Ledger:
         parameters: Sequence[str],
         answers: Sequence[tuple[bytes, LedgerEntry]],
     ) -> str:
-        """Keep answers that the ledger could not take in a rescue file; returns a sentence that names it."""
+        """Keep answers that the ledger could not store in a rescue file, and return a sentence that names it."""
 
         def fill(connection: sqlite3.Connection) -> None:
             set_up(connection, self.path)
@@ -214,7 +214,7 @@ class Ledger:
         return _describe_rescue(write_rescue_file(self.path, fill), len(answers))
 
     def forget_failures(self, problem: str | None = None) -> int:
-        """Delete failed calls of a problem, or of all, so that they are run again; their number.
+        """Delete failed calls of a problem, or of all problems, so that they run again, and return their number.
 
         Raises:
             InputError: The ledger is read-only.
@@ -262,7 +262,7 @@ class Ledger:
 
     @contextmanager
     def _errors(self) -> Iterator[None]:
-        """Turn errors of SQLite into errors with a remedy."""
+        """Convert errors of SQLite to errors with a remedy."""
         try:
             yield
         except sqlite3.Error as error:
@@ -280,10 +280,10 @@ class Ledger:
 
 
 def open_ledger(folder: str | Path) -> Ledger:
-    """The ledger of a folder that `calibray run` has written to.
+    """The ledger of a folder that `calibray run` has written.
 
     Raises:
-        InputError: There is none, or it cannot be read.
+        InputError: The folder contains no ledger, or it cannot be read.
     """
     path = Path(folder) / LEDGER_FILE
     if not path.is_file():
