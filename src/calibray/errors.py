@@ -1,15 +1,15 @@
-"""The two ways in which Calibray refuses: bad input, and an engine that failed while running."""
+"""The two exceptions of Calibray: for bad input, and for an engine that failed while running."""
 
 from __future__ import annotations
 
 from typing import Final
 
 LONGEST_MESSAGE: Final = 4000
-"""Characters of a message at most; a value from the input may have any length."""
+"""Largest number of characters of a message; a value from the input may have any length."""
 
 
 def _bounded(message: str) -> str:
-    """The start and the end of a message that is too long, because the end states the remedy."""
+    """The start and the end of a message that is too long; the end states the remedy."""
     if len(message) <= LONGEST_MESSAGE:
         return message
     return f"{message[: LONGEST_MESSAGE - 1000]} ... {message[-900:]}"
@@ -27,7 +27,7 @@ class InputError(ValueError):
 
 
 class EngineError(RuntimeError):
-    """An engine that failed while running; whatever was computed before is kept. The command line exits with 1."""
+    """An engine that failed while running; everything computed before is kept. The command line exits with 1."""
 
     def __str__(self) -> str:
         return _bounded(super().__str__())

@@ -84,7 +84,7 @@ def test_arrays_of_several_places_are_refused() -> None:
     scene.add(rt.Transmitter("tx", position=[0, 0, 10]))
     scene.add(rt.Receiver("rx", position=[5, 0, 2]))
     found = rt.PathSolver()(scene, max_depth=0, samples_per_src=100)
-    with pytest.raises(InputError, match="2 antennas, whose paths add up"):
+    with pytest.raises(InputError, match="2 antennas, whose paths are summed"):
         read(found)
 
 

@@ -121,7 +121,10 @@ WRONG = {
     "a receiver missing": (lambda t: t[t.type != "receiver"], "the last its receiver"),
     "an unknown type": (lambda t: t.replace({"type": {"reflection": "R"}}), "'R'"),
     "an unknown material": (lambda t: t.assign(material="wood"), "no material 'wood'"),
-    "two powers of a path": (lambda t: t.assign(power_db=t.power_db - t.point), "one and the same power_db"),
+    "two powers of a path": (
+        lambda t: t.assign(power_db=t.power_db - t.point),
+        "must state the same power_db",
+    ),
     "path loss in place of gain": (lambda t: t.assign(power_db=-t.power_db), "path gain is negative"),
     "received power in dBm": (lambda t: t.assign(power_db=t.power_db + 30), "30.0 dB above free space"),
     "delays in nanoseconds": (lambda t: t.assign(delay=t.delay * 1e9), "give the total delay in seconds"),

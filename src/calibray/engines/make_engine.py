@@ -1,4 +1,4 @@
-"""Make the engine of a study, and the fingerprint of everything that its answers depend on besides the candidate."""
+"""Make the engine of a study, and the fingerprint of everything but the candidate that determines its answers."""
 
 from __future__ import annotations
 
@@ -39,15 +39,14 @@ def make(
 
     Args:
         study: The study, opened or not.
-        name: "replay", "retrace" or "command"; the study's own if None.
+        name: "replay", "retrace" or "command"; if None, the study's engine.
         progress: Called after every launch of a trace ("tracing"), or every RT call of a batch ("running").
-        ledger: SQLite file that keeps RT calls. Replay does not use it: computing an answer is faster than reading
-            one.
+        ledger: SQLite file that stores RT calls. Replay does not use it, because computing an answer is faster than
+            reading one.
         workers: Run the calls of a batch on "command", or keep chunks of links on "replay" (`open_workers`).
-        paths: Paths of the study's links for "replay"; traced, or taken from the cache, if None.
+        paths: Paths of the study's links for "replay"; if None, they are traced or read from the cache.
 
-    Returns:
-        The engine, over all links of the study, held-out links included.
+    Returns: The engine, over all links of the study, including held-out links.
 
     Raises:
         InputError: The engine is unknown, does not suit the study, or takes no workers; the ledger cannot be used; or
@@ -73,9 +72,9 @@ def make(
 def fingerprint(study: OpenedStudy) -> str:
     """Fingerprint (SHA-256, in hexadecimal) of the problem that an engine solves for each candidate.
 
-    Method, seed, measured values, bounds and start values do not count: studies that differ only in these share their
-    calls. Re-tracing counts the tracer's versions. An external program's version is unknown, so its command line
-    counts.
+    Method, seed, measured values, bounds and start values do not enter: studies that differ only in these share their
+    calls. For re-tracing, the fingerprint includes the tracer's versions. An external program's version is unknown, so
+    its command line is included instead.
     """
     links, parameters, radio = study.links, study.parameters, study.radio
     free = {f"{parameter.material}.{parameter.constant}" for parameter in parameters}
@@ -127,7 +126,7 @@ def _fixed_constants(materials: Mapping[str, Material], free: set[str]) -> dict[
 
 
 def _geometry(scene: Scene) -> bytes:
-    """The scene's XML without material constants: some of them are calibrated, and must not count."""
+    """The scene's XML without material constants, some of which are calibrated and must not enter the fingerprint."""
     root = ElementTree.fromstring(scene.xml)
     for constants in root.findall("bsdf"):
         root.remove(constants)

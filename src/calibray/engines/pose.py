@@ -51,7 +51,7 @@ XP: Final = SimpleNamespace(
 )
 @dataclass(frozen=True, eq=False)
 class PoseError:
-    """Transmit antennas that point, and radiate, otherwise than stated; P paths, M poses, e parameters.
+    """Transmit antennas whose direction or gain differs from the stated one; P paths, M poses, e parameters.
 
     Attributes:
         basis: Directions of departure with their basis vectors [3, 3, P], see `wave_basis`.
@@ -60,7 +60,7 @@ class PoseError:
         mounted: Number of the pose of every path [P].
         of_antenna: Paths of each of the antennas.
         transmitter: Transmitter of every pose [M].
-        weights: What is added to yaw [rad], downtilt [rad] and gain [dB] of a transmitter, per unit of each effect
+        weights: The changes of yaw [rad], downtilt [rad] and gain [dB] of a transmitter, per unit of each effect
             parameter [3, T, e].
         antennas: The different antennas.
     """
@@ -117,7 +117,7 @@ def pose_error(
     effect_parameters: Sequence[Parameter],
     from_north: bool,
 ) -> PoseError | None:
-    """The errors that parameters such as "tx:CELL.azimuth" state; None if no parameter does.
+    """The errors described by parameters such as "tx:CELL.azimuth"; None if there are none.
 
     Args:
         paths: The paths, with the fields of the stated antennas.

@@ -12,10 +12,10 @@ from typing import Final
 import psutil
 
 CLOCK_TOLERANCE: Final = 2.0
-"""Largest difference of two readings of one process's start time [s]: where it is counted from 1970, the system's clock
+"""Largest difference of two readings of one process's start time [s]: if it is counted from 1970, the system's clock
 may be corrected between them.
 
-A process number is not used again within so short a time, because the system counts through all others first.
+The system does not reuse a process number within such a short time, because it first uses all others.
 """
 
 
@@ -28,8 +28,9 @@ class ProcessOwner:
         namespace: The process namespace, in which a container counts its own processes; empty if unknown.
         pid: The process number.
         started: Start time of the process [s since the machine's start, or since 1970 if that is unknown]; process
-            numbers are used again.
-        boot: Identifier of the machine's start, after which the same numbers mean other processes; empty if unknown.
+            numbers are reused.
+        boot: Identifier of the machine's start, after which the same numbers refer to other processes; empty if
+            unknown.
     """
 
     host: str
@@ -87,10 +88,10 @@ class ProcessOwner:
 
 
 def _start_time(pid: int) -> float:
-    """Start time of a process [s]. On Linux it counts from the machine's start, so that setting the clock is harmless.
+    """Start time of a process [s]. On Linux it counts from the machine's start, so setting the clock does no harm.
 
     Raises:
-        FileNotFoundError: There is no such process; likewise `ProcessLookupError`, `psutil.NoSuchProcess`.
+        FileNotFoundError: The process does not exist; likewise `ProcessLookupError`, `psutil.NoSuchProcess`.
     """
     if not _boot():
         return psutil.Process(pid).create_time()
@@ -103,7 +104,7 @@ def _start_time(pid: int) -> float:
 
 @cache
 def _boot() -> str:
-    """Identifier of the machine's start; empty where the system has none."""
+    """Identifier of the machine's start; empty if the system has none."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError):

@@ -1,4 +1,4 @@
-"""The interfaces of engines, their answers, the check of candidates, and observables: what is measured and modelled."""
+"""The interfaces of engines, their answers, the check of candidates, and observables."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from calibray.support.progress import Progress
 
 @runtime_checkable
 class Engine(Protocol):
-    """What turns candidates into path loss."""
+    """An engine computes the path loss of candidates."""
 
     @property
     def calls(self) -> int:
@@ -29,7 +29,7 @@ class Engine(Protocol):
 
     @property
     def parameters(self) -> Parameters:
-        """The parameters that a candidate gives values to."""
+        """The parameters whose values a candidate contains."""
         ...
 
     @property
@@ -38,7 +38,7 @@ class Engine(Protocol):
         ...
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss [n, L], [dB], for candidates [n, d] in the fields' units; +inf where a link has no path.
+        """Path loss [n, L], [dB], for candidates [n, d] in the fields' units; +inf for a link without a path.
 
         Raises:
             InputError: The candidates have another width, or a value is not finite or unphysical.
@@ -63,7 +63,7 @@ class Differentiable(Engine, Protocol):
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss [n, L], [dB], and its derivatives by the parameters [n, L, d], [dB] per unit.
+        """Path loss [n, L], [dB], and its derivatives with respect to the parameters [n, L, d], [dB] per unit.
 
         Raises:
             InputError: The candidates have another width, or a value is not finite or unphysical.
@@ -76,9 +76,9 @@ class Responses:
     """Path loss and further observables of all links for n candidates.
 
     Attributes:
-        path_loss: Path loss [n, L], [dB]; +inf where a link has no path.
-        observed: K further observables [n, K, L], in SI units; NaN where a link has none.
-        loss_slope: Derivatives of path loss by the parameters [n, L, d]; None if they were not asked for.
+        path_loss: Path loss [n, L], [dB]; +inf for a link without a path.
+        observed: K further observables [n, K, L], in SI units; NaN for a link without a value.
+        loss_slope: Derivatives of path loss with respect to the parameters [n, L, d]; None if not requested.
         observed_slope: Derivatives of the further observables [n, K, L, d]; likewise.
     """
 
@@ -88,7 +88,7 @@ class Responses:
     observed_slope: NDArray[np.float64] | None = None
 
     def arrays(self) -> list[NDArray[np.float64]]:
-        """Path loss, observables and, where there are any, their derivatives."""
+        """Path loss, observables and, if available, their derivatives."""
         every = self.path_loss, self.observed, self.loss_slope, self.observed_slope
         return [array for array in every if array is not None]
 
@@ -100,7 +100,7 @@ def joined(parts: Sequence[Responses]) -> Responses:
 
 
 def of_links(parts: Sequence[Responses], links: Sequence[NDArray[np.intp]]) -> Responses:
-    """The responses of parts of the links [l] as those of all, whose indices in all each part gives."""
+    """Combines the responses of parts of the links [l]; each part gives the indices of its links among all links."""
     count, arrays = sum(map(len, links)), []
     for column, axis in zip(zip(*(part.arrays() for part in parts), strict=True), (1, 2, 1, 2), strict=False):
         shape = list(column[0].shape)
@@ -114,7 +114,7 @@ def of_links(parts: Sequence[Responses], links: Sequence[NDArray[np.intp]]) -> R
 
 @runtime_checkable
 class Observing(Engine, Protocol):
-    """An engine that gives further observables of the links."""
+    """An engine that computes further observables of the links."""
 
     def respond(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
@@ -131,7 +131,7 @@ Reduction = Callable[[NDArray[np.float64], NDArray[np.float64] | None], Any]
 """Reduces the path loss of a chunk's links [n, l], [dB], and its derivatives [n, l, d] or None, to a few sums."""
 
 Reduced = Callable[[NDArray[np.float64], bool], list[Any]]
-"""From candidates [n, d] and whether derivatives are wanted to the result of the reduction for every chunk."""
+"""From candidates [n, d] and whether derivatives are requested to the result of the reduction for every chunk."""
 
 
 @runtime_checkable
@@ -140,18 +140,18 @@ class Chunked(Differentiable, Protocol):
 
     @property
     def chunks(self) -> Sequence[NDArray[np.int64]]:
-        """Indices of every chunk's links; together they hold every link once."""
+        """Indices of every chunk's links; together they contain every link once."""
         ...
 
     def reducing(self, reductions: Sequence[Reduction]) -> Reduced:
-        """A function of candidates that reduces every chunk's path loss on its worker, so that little data comes back.
+        """A function of candidates that reduces every chunk's path loss on its worker, which then returns little data.
 
-        There is one reduction for every chunk, sent to its worker once.
+        Every chunk has one reduction, which is sent to its worker once.
         """
         ...
 
     def traced_with(self, materials: Mapping[str, Material], progress: Progress | None = None) -> Chunked:
-        """The same engine on paths traced with other materials; progress is called after every chunk."""
+        """The same engine on paths traced with other materials; `progress` is called after every chunk."""
         ...
 
 
@@ -161,10 +161,10 @@ class Answer:
 
     Attributes:
         index: Index of the candidate in the batch.
-        path_loss_db: Path loss [L], [dB]; +inf where a link has no path, and for all links of a failed call.
+        path_loss_db: Path loss [L], [dB]; +inf for a link without a path, and for all links of a failed call.
         seconds: Time of the call [s].
         failure: Error message with engine and candidate; empty if the call succeeded.
-        rays: The response with the rays, as the program wrote it; or further observables [K, L] in SI units as
+        rays: The response with the rays, as the program wrote it, or further observables [K, L] in SI units as
             little-endian doubles; empty from an engine with neither.
     """
 
@@ -177,10 +177,10 @@ class Answer:
 
 @runtime_checkable
 class Answering(Engine, Protocol):
-    """An engine with expensive calls, which gives each answer of a batch as soon as it arrives.
+    """An engine with expensive calls, which returns each answer of a batch as soon as it arrives.
 
-    Its `path_loss` gives +inf for all links of a candidate that failed. It raises EngineError if every candidate of the
-    first batch fails, too many successive calls fail, or the ledger or a call's files cannot be written.
+    Its `path_loss` is +inf for all links of a failed candidate. It raises EngineError if every candidate of the first
+    batch fails, too many successive calls fail, or the ledger or a call's files cannot be written.
     """
 
     @property
@@ -191,21 +191,21 @@ class Answering(Engine, Protocol):
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
         """Answer candidates [n, d], in the fields' units, each as soon as its call ends.
 
-        After `stop` is set from outside no further call begins, and running calls are stopped where possible; answers
-        that have already arrived are still given.
+        After another thread sets `stop`, no further call starts, and running calls are stopped if possible; answers
+        that have already arrived are still returned.
 
         Raises:
             InputError: A value is unphysical.
             EngineError: Too many successive calls failed, or a call's files cannot be written; all earlier answers were
-                given.
+                returned.
         """
         ...
 
 
 def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> NDArray[np.float64]:
-    """Collect the path loss [n, L], [dB], of a batch of answers; +inf for all links of a candidate that failed.
+    """Collect the path loss [n, L], [dB], of a batch of answers; +inf for all links of a failed candidate.
 
-    If all of the first batch fails, the engine itself must be at fault.
+    If the whole first batch fails, the engine itself must be at fault.
 
     Raises:
         EngineError: Every candidate of the first batch failed.
@@ -224,7 +224,7 @@ def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> ND
 def gather_responses(
     answers: Iterable[Answer], shape: tuple[int, int], num_observables: int, first: bool
 ) -> Responses:
-    """Collect path loss and further observables of a batch of answers; NaN for all links of a candidate that failed.
+    """Collect path loss and further observables of a batch of answers; NaN for all links of a failed candidate.
 
     Raises:
         EngineError: Every candidate of the first batch failed.
@@ -238,7 +238,7 @@ def gather_responses(
 
 
 def check_candidates(candidates: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Candidates [n, d] as an array; those that cannot be evaluated are refused.
+    """Convert candidates [n, d] to an array, and refuse candidates that cannot be evaluated.
 
     Raises:
         InputError: The shape differs, or a value is not finite.
@@ -259,8 +259,9 @@ class Observable:
         name: Its name in messages.
         unit: Its unit.
         measured: Its measured values [L] of given links.
-        modelled: An engine's values for candidates [n, d]: [n, L], +inf where a link has no path.
-        derivatives: The same with derivatives by the parameters, [n, L] and [n, L, d]; None if there are none.
+        modelled: An engine's values for candidates [n, d]: [n, L], +inf for a link without a path.
+        derivatives: The same with derivatives with respect to the parameters, [n, L] and [n, L, d]; None if there are
+            none.
     """
 
     name: str
@@ -280,4 +281,4 @@ PATH_LOSS: Final = Observable(
     modelled=lambda engine, candidates: engine.path_loss(candidates),
     derivatives=lambda engine, candidates: engine.path_loss_and_jacobian(candidates),
 )
-"""Path loss [dB], which the paper calibrates on."""
+"""Path loss [dB], on which the paper calibrates."""

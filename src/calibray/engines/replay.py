@@ -1,4 +1,4 @@
-"""Replay: stored paths, evaluated for any candidate, with derivatives; one program per carrier if there are several."""
+"""Replay evaluates stored paths for any candidate, with derivatives; it has one program per carrier."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths
 
 MOST_DERIVATIVES: Final = 2_000_000
-"""Largest number of derivatives by material constants in one call; more would fill the memory."""
+"""Largest number of derivatives with respect to material constants in one call; more would fill the memory."""
 
 LARGE: Final = 50_000
-"""Interactions above which a program is large."""
+"""Number of interactions above which a program is large."""
 
 MAY_TABULATE: Final = 30_000
-"""Interactions above which coefficients may come from tables."""
+"""Number of interactions above which coefficients may come from tables."""
 
 MOST_NODES: Final = 0.25
 """Largest number of table nodes per interaction; filling more nodes takes longer than the tables save."""
@@ -34,13 +34,13 @@ TABLE_TOLERANCE: Final = 1e-4
 """Largest error of a tabulated coefficient."""
 
 TABLE_CANDIDATES: Final = 32
-"""Candidates spread over the bounds that decide, with the start values, how fine tables must be."""
+"""Candidates spread over the bounds; together with the start values they determine how fine tables must be."""
 
 BATCH: Final = 32
 """Largest number of candidates in one call."""
 
 OBSERVED_SIZE: Final = 64
-"""Most candidates in one call of a function of further observables, which is compiled for this number."""
+"""Largest number of candidates in one call of a function of further observables, which is compiled for this number."""
 
 
 @final
@@ -49,17 +49,17 @@ class Replay:
 
     Args:
         paths: The path program.
-        parameters: The parameters that a candidate gives values to.
+        parameters: The parameters whose values a candidate contains.
         combining: How a link's paths combine: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
         dtype: Precision, `numpy.float64` or `numpy.float32`; if None, single precision for large programs whose paths
             combine by power.
-        tabulate: Whether coefficients come from tables; if None, wherever that is faster.
+        tabulate: Whether coefficients come from tables; if None, whenever that is faster.
         batch: Largest number of candidates in one call; the program is compiled for this number.
         effects: Effects on the paths, in the order of `paths`.
 
     Raises:
-        InputError: A parameter's material is not in the paths, or the combining cannot be used.
+        InputError: A parameter's material is not in the paths, or this kind of combining cannot be used.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class Replay:
         return self.interactions > LARGE
 
     def without_effects(self) -> Replay:
-        """The same without the effects, for path loss that a scene alone gives."""
+        """The same without the effects, for the path loss of the scene alone."""
         return Replay(self.paths, self.parameters, *self._options)
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -145,7 +145,7 @@ class Replay:
 
     @cached_property
     def _channel(self) -> fields.Channel:
-        """The paths as further observables see them."""
+        """The paths in the form that further observables need."""
         plan = fields.layout(self.paths)
         return fields.Channel(
             plan.program,
@@ -215,7 +215,7 @@ class Replay:
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         """Material constants [size, M, 8] and values of effects [size, e] of a batch.
 
-        The program is compiled for `size` candidates: the rest of the tables keep the base values.
+        The program is compiled for `size` candidates; unused rows of the tables have the base values.
         """
         tables = np.repeat(base[None], size, axis=0)
         tables[: len(batch), self._rows, self._columns] = batch[:, self.parameters.of_materials]
@@ -233,7 +233,7 @@ class Replay:
         return intervals if force or intervals.sum() <= MOST_NODES * self.interactions else None
 
     def _refine_tables(self) -> None:
-        """Make the tables finer for these and all following candidates, or give them up at the finest."""
+        """Make the tables finer for these and all following candidates, or stop using them at the finest."""
         if self._intervals is not None:
             finer = 2 * self._intervals
             self._intervals = finer if finer.max() <= fields.FINEST else None
@@ -258,7 +258,7 @@ class CarrierPaths:
     """The paths at one carrier.
 
     Attributes:
-        paths: The path program of the links measured there, with the constants at that carrier.
+        paths: The path program of the links measured at the carrier, with the constants there.
         links: Indices of these links among all links [l].
         effects: Effects on the paths.
     """
@@ -273,14 +273,14 @@ class ReplayCarriers:
     """Stored paths, evaluated at several carriers; parameters may be coefficients of laws over frequency.
 
     Args:
-        carriers: The carriers; together they hold every link once.
-        parameters: The parameters that a candidate gives values to.
+        carriers: The carriers; together they contain every link once.
+        parameters: The parameters whose values a candidate contains.
         materials: The scene's materials before calibration, at the carrier of the trace.
         combining: How a link's paths combine: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
 
     Raises:
-        InputError: A parameter's material is not in the paths, or the combining cannot be used.
+        InputError: A parameter's material is not in the paths, or this kind of combining cannot be used.
     """
 
     def __init__(

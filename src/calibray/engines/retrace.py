@@ -40,9 +40,9 @@ class Retrace:
     """The ray tracer, run again for every candidate.
 
     Args:
-        tracers: The ray tracer at each carrier; together they hold every link once.
+        tracers: The ray tracer at each carrier; together they contain every link once.
         materials: The scene's materials before calibration, at the study's carrier.
-        parameters: The parameters that a candidate gives values to.
+        parameters: The parameters whose values a candidate contains.
         combining: How a link's paths combine: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
         progress: Called with "running" after every candidate of a batch.

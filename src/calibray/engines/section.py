@@ -1,4 +1,4 @@
-"""What a kind of engine states in the study file, and what it gets to work on: an opened study."""
+"""The engine section of a study file, and the opened study that an engine works on."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class OpenedStudy(Protocol):
 
     @property
     def links(self) -> Measurements:
-        """All links, held-out links included."""
+        """All links, including held-out links."""
         ...
 
     @property
@@ -62,7 +62,7 @@ class OpenedStudy(Protocol):
 
     @property
     def parameters(self) -> Parameters:
-        """The parameters that a candidate gives values to."""
+        """The parameters whose values a candidate contains."""
         ...
 
     @property
@@ -112,11 +112,11 @@ class OpenedStudy(Protocol):
     def trace(
         self, materials: Mapping[str, Material] | None = None, progress: Progress | None = None
     ) -> Paths:
-        """The paths of the links, with `materials` in place of the scene's."""
+        """The paths of the links, with `materials` in place of the scene's materials."""
         ...
 
     def effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
-        """Effects on the paths of links, of all links if None, that no material has."""
+        """Effects, other than materials, on the paths of links; of all links if None."""
         ...
 
     def at(self, links: Measurements) -> Self:
@@ -137,15 +137,15 @@ class Openable(Protocol):
 
 
 class EngineSection(Section, ABC):
-    """``[engine]``: what turns candidates into path loss, chosen by its name.
+    """``[engine]``: computes the path loss of candidates, chosen by its name.
 
-    To add a kind of engine, write one final subclass in a module of its own in `engines.kinds`: it is found there. Its
-    fields are its keys in the study file, and its name is a literal. Heavy imports belong into `open`, because every
-    study file that is read imports all kinds.
+    To add a kind of engine, write one final subclass in a separate module in `engines.kinds`, where it is found. Its
+    fields are its keys in the study file, and its name is a literal. Put heavy imports into `open`, because every study
+    file that is read imports all kinds.
 
     Attributes:
         name: The kind's name in study files.
-        expensive: Whether a call costs more than a look-up, so that a ledger keeps the calls.
+        expensive: Whether a call takes longer than a look-up, so that a ledger stores the calls.
         external: Whether an external program answers, so that no ray tracer is needed.
         chunked: Whether chunks of links can be traced and replayed on workers.
     """
@@ -157,12 +157,12 @@ class EngineSection(Section, ABC):
 
     @property
     def exports_rays(self) -> bool:
-        """Whether an external program answers with rays, so that a replay can stand for it."""
+        """Whether an external program answers with rays, so that a replay can replace it."""
         return self.external and getattr(self, "rays", False) is True
 
     @abstractmethod
     def answers_by(self, study: OpenedStudy) -> list[str] | None:
-        """Versions or a command line, which the answers depend on; None if answers are not kept in a ledger."""
+        """Versions or a command line that determine the answers; None if answers are not stored in a ledger."""
 
     @abstractmethod
     def open(
@@ -177,5 +177,5 @@ class EngineSection(Section, ABC):
         Workers run the calls of a batch if the kind is `external`, and keep chunks of links if it is `chunked`.
 
         Raises:
-            InputError: The study does not suit this kind of engine.
+            InputError: This kind of engine cannot be used for the study.
         """

@@ -1,11 +1,11 @@
 """Complex numbers as pairs of real arrays, the functions of them that fields need, and sums over segments.
 
-Compilers vectorize pairs of real arrays, which makes them several times faster than complex types. All functions work
-element by element and are differentiable.
+Compilers vectorize pairs of real arrays, which are therefore several times faster than complex types. All functions
+work element by element and can be differentiated.
 
 Segments are the paths of a link, or the interactions of a link and a material. XLA adds scattered numbers one after the
-other, some 5 ns each. Most of them can be added in blocks instead: numbers are ordered so that each block belongs to
-one segment, and only the remainder of every segment is scattered.
+other, in about 5 ns each. Most of them can be added in blocks instead: numbers are ordered so that each block belongs
+to one segment, and only the remainder of every segment is scattered.
 """
 
 from __future__ import annotations
@@ -77,10 +77,10 @@ def safe_sqrt(value: jax.Array) -> jax.Array:
 
 
 def materialize(values: Values, positive: jax.Array) -> Values:
-    """The same values, computed once and stored; `positive` is any positive number known at run time only.
+    """The same values, computed once and stored; `positive` is any positive number that is unknown at compile time.
 
-    XLA on CPU fuses a computation into each of its uses, so it repeats sines and exponentials many times over; it also
-    drops `optimization_barrier`. It cannot fuse across a branch on a value that is unknown when it compiles.
+    XLA on CPU fuses a computation into each of its uses, so it repeats sines and exponentials many times; it also drops
+    `optimization_barrier`. It cannot fuse across a branch on a value that is unknown when it compiles.
     """
     return jax.lax.cond(
         positive > 0, lambda kept: kept, lambda kept: jax.tree.map(jnp.negative, kept), values
@@ -91,9 +91,9 @@ def materialize(values: Values, positive: jax.Array) -> Values:
 def cosine_and_sine(angle: ArrayLike) -> tuple[jax.Array, jax.Array]:
     """Cosine and sine of many angles [...], [rad], at once.
 
-    In double precision, XLA on CPU calls the system's functions for one number after the other, some 30 ns for both.
-    The same polynomials without a branch are vectorized and take 2 ns. Each result is within 2.3e-16 of the true value;
-    beyond a million turns within the effect of the angle's own rounding.
+    In double precision, XLA on CPU calls the system's functions for one number after the other, in about 30 ns for
+    both. The same polynomials without a branch are vectorized and take 2 ns. Each result is within 2.3e-16 of the true
+    value; beyond a million turns, the error is that of rounding the angle itself.
     """
     angle_as_given = jnp.asarray(angle)
     angle = angle_as_given.astype(jnp.float64)
@@ -117,7 +117,7 @@ def _cosine_and_sine_jvp(primals: tuple, tangents: tuple) -> tuple:
 
 
 def _polynomial(factors: tuple[float, ...], x: jax.Array) -> jax.Array:
-    """Value of a polynomial by Horner's scheme, factors from the highest power down."""
+    """Value of a polynomial by Horner's scheme, with factors from the highest power down."""
     value = jnp.full_like(x, factors[0])
     for factor in factors[1:]:
         value = value * x + factor

@@ -1,8 +1,8 @@
 """Delays, angles and power delay profiles of links, for any materials.
 
-All are means over a link's paths weighted by the paths' powers, so they depend on the materials as smoothly as path
-loss does. `statistics` and `delay_profile` are pure JAX; with `calibray.fields.path_powers` they can be differentiated
-by the materials, within `calibray.fields.jax_settings`.
+All of them are means over a link's paths weighted by the paths' powers, so they depend on the materials as smoothly as
+path loss does. `statistics` and `delay_profile` are pure JAX; with `calibray.fields.path_powers` they can be
+differentiated with respect to the materials, within `calibray.fields.jax_settings`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from calibray.paths import Paths
 )
 @dataclass(frozen=True)
 class ChannelStatistics:
-    """Second-order statistics of every link; NaN where a link has no path.
+    """Second-order statistics of every link; NaN for a link without a path.
 
     Attributes:
         mean_delay: Mean delay [L], [s].
@@ -55,7 +55,7 @@ def channel_statistics(paths: Paths, materials: Mapping[str, Material] | None = 
 
     Args:
         paths: The path program.
-        materials: Constants by name; materials not named keep those of the trace.
+        materials: Constants by name; materials that are not named keep the constants of the trace.
 
     Returns:
         The statistics, as NumPy arrays.
@@ -91,7 +91,7 @@ def statistics(
 
 
 def link_mean(weight: jax.Array, value: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
-    """Weighted mean of the values of every link [L]; NaN where no value has a weight."""
+    """Weighted mean of the values of every link [L]; NaN if no value has a weight."""
     total = partial(jax.ops.segment_sum, segment_ids=link, num_segments=num_links)
     sums = total(weight)
     return jnp.where(sums > 0, total(weight * value) / jnp.where(sums > 0, sums, 1.0), jnp.nan)
@@ -132,7 +132,7 @@ def power_delay_profile(
     Args:
         paths: The path program.
         delays: Edges of the delay bins, increasing [n + 1], [s].
-        materials: Constants by name; materials not named keep those of the trace.
+        materials: Constants by name; materials that are not named keep the constants of the trace.
 
     Returns:
         Power gains [L, n]; paths outside the edges are left out.

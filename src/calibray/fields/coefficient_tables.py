@@ -1,14 +1,14 @@
 """Tables of the slab coefficients over the angle of incidence, for programs with many interactions.
 
-A coefficient depends on the geometry through the cosine of incidence alone. If a program has many more interactions
-than its tables have nodes, each candidate's coefficients are computed at the nodes and interpolated by cubics through
-four of them: some 10 ns an interaction instead of 100. The position of an interaction in its table does not depend on
-the materials, so it is computed once. Each pair of material and mode has its own row of nodes.
+A coefficient depends on the geometry only through the cosine of incidence. If a program has many more interactions than
+its tables have nodes, each candidate's coefficients are computed at the nodes. Cubics through four nodes then
+interpolate them, in about 10 ns per interaction instead of 100. The position of an interaction in its table does not
+depend on the materials, so it is computed once. Each pair of material and mode has its own row of nodes.
 
-Nodes are evenly spaced in a root of the cosine: the square root, or the sixth root for metals, whose Brewster angle
-lies within a thousandth of grazing incidence. A sheet of plasterboard at 2 GHz needs some hundred intervals, a thick
-slab at 60 GHz thousands. `table_intervals` chooses their number from candidates that represent all others.
-`table_error` then bounds the error for every candidate, at Brewster angles, grazing incidence and slab resonances too.
+Nodes are evenly spaced in a root of the cosine: the square root, or the sixth root for metals, whose Brewster angle is
+within a thousandth of grazing incidence. A sheet of plasterboard at 2 GHz needs about a hundred intervals, and a thick
+slab at 60 GHz needs thousands. `table_intervals` chooses their number from candidates that represent all others.
+`table_error` then bounds the error for every candidate, also at Brewster angles, grazing incidence and slab resonances.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ COARSEST: Final = 16
 """Smallest number of intervals of a row."""
 
 _STAGES: Final = (1024, 8192, FINEST)
-"""Upper limits of the search for a number of intervals; a finer one is computed only if the coarser one fails."""
+"""Successive limits of the search for a number of intervals; the next one is only tried if the one before fails."""
 
 _TOLERANCE_SHARE: Final = 0.1
 """Share of the tolerance that the representative candidates may use."""
@@ -48,10 +48,10 @@ _METAL_LOSS: Final = 1e3
 """Loss term above which a material is treated as a metal."""
 
 _GRAZING: Final = 1e-9
-"""Cosine at the first node. At exactly 0 even air would reflect everything."""
+"""Cosine at the first node. At exactly 0, even air would reflect everything."""
 
 _EXTRA_NODES: Final = 3
-"""Nodes of a row beyond its intervals: one before the first, one at the end of the last, one behind it."""
+"""Nodes of a row beyond its intervals: one before the first, one at the end of the last, one after it."""
 
 _STENCIL: Final = 3
 """Nodes on either side that `table_error` needs."""
@@ -64,11 +64,11 @@ _STENCIL: Final = 3
 )
 @dataclass(frozen=True)
 class TableLayout:
-    """The position of each coefficient in the tables. Rows of all pairs of material and mode follow each other.
+    """The position of each coefficient in the tables. The rows of all pairs of material and mode follow one another.
 
     Attributes:
         cell: Node below the coefficient, counted over all rows; one array for each step of each group, [n] or [k, n].
-        fraction: Distance from that node in units of the interval, likewise.
+        fraction: Distance from that node in units of the interval, in the same arrays.
         cosine: Cosine of incidence at every node [N].
         material: Material of every node [N].
         mode: Mode of every node [N].
@@ -86,7 +86,7 @@ class TableLayout:
 @partial(jax.tree_util.register_dataclass, data_fields=["values"], meta_fields=[])
 @dataclass(frozen=True)
 class CoefficientTables:
-    """Tables of coefficients. The numbers of a cell are adjacent, so that a look-up costs one or two cache lines.
+    """Tables of coefficients. The numbers of a cell are adjacent, so that a look-up reads one or two cache lines.
 
     Attributes:
         values: Cubic polynomials from every node to the next: real and imaginary part of the transverse electric and
@@ -129,8 +129,8 @@ def table_layout(
 ) -> TableLayout:
     """Find the position of every coefficient [J] in the tables, with `spacing_roots` `root` [M].
 
-    `steps` are the coefficients at each step of each group, of any shape; J where there is none, whose coefficient is
-    1.
+    `steps` are the coefficients at each step of each group, of any shape; J marks an empty position, whose coefficient
+    is 1.
     """
     rows, row = np.unique(material.astype(np.int64) * len(Mode) + mode, return_inverse=True)
     row = row.reshape(-1)
@@ -174,7 +174,7 @@ def fill_tables(layout: TableLayout, table: jax.Array, wavelength: jax.Array) ->
 def _cubics(value: jax.Array) -> jax.Array:
     """Factors [N, 16] of the cubics from every node to the next, by Lagrange through both and their neighbours.
 
-    Cubics at nodes without these neighbours are meaningless, and not used.
+    Cubics at nodes without these neighbours are meaningless and are not used.
     """
     before, after, beyond = (jnp.roll(value, -step, axis=0) for step in (-1, 1, 2))
     linear = after - before / 3 - value / 2 - beyond / 6
@@ -184,10 +184,10 @@ def _cubics(value: jax.Array) -> jax.Array:
 
 
 def interpolate(tables: CoefficientTables, cell: jax.Array, fraction: jax.Array) -> tuple[Pair, Pair]:
-    """Transverse electric and magnetic coefficients (real, imaginary) [...], looked up.
+    """Transverse electric and magnetic coefficients (real, imaginary) [...], interpolated from the table.
 
-    `cell` is the node below, counted over all rows [...], `fraction` the distance from it in units of the interval
-    [...].
+    `cell` is the node below, counted over all rows [...], and `fraction` is the distance from it in units of the
+    interval [...].
     """
 
     def value(part: int) -> jax.Array:
@@ -201,8 +201,8 @@ def table_error(tables: CoefficientTables, layout: TableLayout) -> jax.Array:
     """Upper bound of the interpolation error of any coefficient's real or imaginary part [1].
 
     Every node is compared with the cubic through the nodes one and three steps away, which has twice the step. The
-    error of cubics falls with the fourth power of the step, so the tables' error is a sixteenth of the largest gap. The
-    bound is twice that.
+    error of cubics decreases with the fourth power of the step, so the tables' error is a sixteenth of the largest
+    difference. The bound is twice that.
     """
     value = tables.values[:, :4]
 
@@ -217,7 +217,7 @@ def table_error(tables: CoefficientTables, layout: TableLayout) -> jax.Array:
 def table_intervals(paths: Paths, tables: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
     """Number of intervals by material and mode [M, 3] for coefficients with an error within `tolerance` [1].
 
-    They are powers of two up to `FINEST`; 0 where there is no such row. The constants `tables` [n, M, 8] are those of
+    They are powers of two up to `FINEST`; 0 if there is no such row. The constants `tables` [n, M, 8] belong to
     candidates that represent all others.
     """
     material, mode, _ = coefficient_arguments(paths)
@@ -236,7 +236,7 @@ def table_intervals(paths: Paths, tables: NDArray[np.float64], tolerance: float)
 def _row_intervals(
     constants: NDArray[np.float64], mode: int, root: int, wavelength: float, tolerance: float
 ) -> int:
-    """Intervals that a row needs for one material's constants [8]."""
+    """Number of intervals that a row needs for one material's constants [8]."""
     for finest in _STAGES:
         errors = np.asarray(_errors_by_intervals(constants[None], mode, root, wavelength, finest))
         sufficient = np.flatnonzero(errors <= tolerance)

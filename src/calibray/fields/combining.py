@@ -27,7 +27,7 @@ class Combining:
     Attributes:
         kind: "power": sum |a|^2; "coherent": |sum a e^{-j 2 pi f tau}|^2; "band": the average of the coherent power
             over a band.
-        nodes: For "band": frequencies relative to the carrier [Hz] and weights [2, q]; else None.
+        nodes: For "band": frequencies relative to the carrier [Hz] and weights [2, q]; otherwise None.
     """
 
     kind: str = "power"
@@ -63,7 +63,7 @@ def _band_nodes(
     """Gauss-Legendre nodes and weights over a band [2, q], enough for the largest spread of delays within a link.
 
     The average of |H|^2 over the band contains oscillations e^{j 2 pi f (tau_i - tau_j)}. A rule with n nodes
-    integrates them to machine precision once n exceeds about a quarter of their phase [rad] plus ten.
+    integrates them to machine precision if n exceeds about a quarter of their phase [rad] plus ten.
 
     Raises:
         InputError: The bandwidth is not positive.
@@ -94,7 +94,7 @@ def link_power(
     frequency: jax.Array | float,
     combining: Combining = POWER,
 ) -> jax.Array:
-    """Power gain of every link [L] from its path gains [R, T, P]; 0 where a link has no path.
+    """Power gain of every link [L] from its path gains [R, T, P]; 0 for a link without a path.
 
     With several ports the power is summed over receive ports and averaged over transmit ports.
     """
@@ -125,6 +125,6 @@ def path_loss_of_gains(
     frequency: float,
     combining: Combining = POWER,
 ) -> NDArray[np.float64]:
-    """Path loss of every link [L], [dB], from complex path gains [P, R, T]; +inf where a link has no path."""
+    """Path loss of every link [L], [dB], from complex path gains [P, R, T]; +inf for a link without a path."""
     real, imaginary = (jnp.asarray(np.moveaxis(part, 0, -1)) for part in (gain.real, gain.imag))
     return np.asarray(decibel(link_power((real, imaginary), link, delay, num_links, frequency, combining)))

@@ -1,12 +1,12 @@
 """Path loss of every link of a program, and its derivatives, for batches of candidates.
 
 With the slab formula, a batch is one compiled loop over its candidates: the numbers of one candidate stay in a core's
-nearest cache, and fewer candidates cost less. Within it, the stages are materialized
+nearest cache, and fewer candidates take less time. Within the loop, the stages are materialized
 (`calibray.fields.arithmetic.materialize`), because XLA on CPU would otherwise fuse each stage into all its uses and
 repeat it there.
 
-Large programs with tables are evaluated in stages that are compiled separately. Looking coefficients up, carrying the
-fields along and taking the power form one stage, which reads every constant once and writes one number a path.
+Large programs with tables are evaluated in stages that are compiled separately. One stage interpolates coefficients,
+propagates the fields and computes the power; it reads every constant once and writes one number per path.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def path_gains(paths: Paths, materials: Mapping[str, Material] | None = None) ->
 
     Args:
         paths: The path program.
-        materials: Constants by name; materials not named keep those of the trace.
+        materials: Constants by name; materials that are not named keep the constants of the trace.
 
     Returns:
         Complex gains [P]; [P, R, T] if an antenna is dual-polarized.
@@ -85,16 +85,15 @@ def path_loss(
 
     Args:
         paths: The path program.
-        materials: Constants by name; materials not named keep those of the trace.
-        combining: "power" sums the paths' powers (a wide band, or many snapshots); "coherent" their fields at the
-            carrier; "band" averages the coherent power over `bandwidth`.
+        materials: Constants by name; materials that are not named keep the constants of the trace.
+        combining: "power" sums the paths' powers (a wide band, or many snapshots), "coherent" sums their fields at the
+            carrier, and "band" averages the coherent power over `bandwidth`.
         bandwidth: Bandwidth [Hz], for "band".
 
-    Returns:
-        Path loss [L], [dB]; +inf where a link has no path.
+    Returns: Path loss [L], [dB]; +inf for a link without a path.
 
     Raises:
-        InputError: The combining or a material is unknown, or the bandwidth missing.
+        InputError: The combining or a material is unknown, or the bandwidth is missing.
     """
     prepared = Combining.make(combining, paths.link, paths.delay, bandwidth)
     tables = paths.material_table(materials)[None]
@@ -105,7 +104,8 @@ def path_loss(
 def program_path_loss(program: GroupedProgram, table: jax.Array, combining: Combining = POWER) -> jax.Array:
     """Path loss of every link [L], [dB], for material constants [M, 8], as one pure function.
 
-    It is +inf where a link has no path. To differentiate or compile it, do so within `calibray.fields.jax_settings`.
+    Path loss is +inf for a link without a path. To differentiate or compile the function, do so within
+    `calibray.fields.jax_settings`.
     """
     response = materialize(material_response(program, table), program.wavelength)
     return decibel(_power(program, split_by_step(program, response), combining))
@@ -125,7 +125,7 @@ def program_gains(program: GroupedProgram, table: jax.Array) -> Pair:
 def path_powers(program: GroupedProgram, table: ArrayLike) -> jax.Array:
     """Power gain of every path [P], in the order of the program, for material constants [M, 8].
 
-    It is summed over receive ports and averaged over transmit ports, as one pure function.
+    The power is summed over receive ports and averaged over transmit ports, in one pure function.
     """
     return _path_powers(program, _split_by_step(program, _material_response(program, jnp.asarray(table))))
 
@@ -139,9 +139,9 @@ def path_losses(
 ) -> tuple[NDArray[np.floating], float]:
     """Path loss [count, L], [dB], of a batch of candidates with material constants [n, M, 8].
 
-    It is +inf where a link has no path. Returned too is the largest error of a tabulated coefficient. The first `count`
-    candidates are evaluated. A function is compiled for the number of tables, so that a partly filled batch saves a
-    compilation.
+    Path loss is +inf for a link without a path. The second result is the largest error of a tabulated coefficient. Only
+    the first `count` candidates are evaluated. The function is compiled for the number of tables, so that a partly
+    filled batch saves a compilation.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
@@ -169,10 +169,10 @@ def path_losses_and_slopes(
     combining: Combining = POWER,
     count: int | None = None,
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], float]:
-    """Path loss as by `path_losses`, and its derivatives [count, L, M, columns], [dB] per unit.
+    """Path loss as in `path_losses`, and its derivatives [count, L, M, columns], [dB] per unit.
 
-    The derivatives, by the materials' constants in `columns` of the tables, are 0 where a link has no path. Returned
-    third is the largest error of a tabulated coefficient.
+    The derivatives with respect to the materials' constants in `columns` of the tables are 0 for a link without a path.
+    The third result is the largest error of a tabulated coefficient.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
@@ -213,7 +213,7 @@ def path_losses_and_slopes_with_effects(
     combining: Combining = POWER,
     count: int | None = None,
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
-    """Path loss with effects, its derivatives by materials [count, L, M, columns] and by effects [count, L, e]."""
+    """Path loss with effects, and its derivatives by materials [count, L, M, columns] and by effects [count, L, e]."""
     count = len(tables) if count is None else count
     arrays = jnp.asarray(tables), jnp.asarray(values)
     answers = _slopes_with_effects(program, *arrays, effects, count, columns, combining)
@@ -237,7 +237,7 @@ def _power(
 def _slope(
     program: GroupedProgram, responses: tuple[GroupResponse, ...], combining: Combining
 ) -> tuple[jax.Array, tuple[GroupResponse, ...]]:
-    """Power gain of every link, and its derivative by the response at every step.
+    """Power gain of every link, and its derivative with respect to the response at every step.
 
     Every path belongs to one link, so one reverse pass over the summed power gives the derivatives of all links.
     """
@@ -252,15 +252,15 @@ def contract(
     derivatives: tuple[MaterialResponse, ...],
     num_materials: int,
 ) -> jax.Array:
-    """Derivatives of a quantity of every link by material constants [L, M, columns].
+    """Derivatives of a quantity of every link with respect to material constants [L, M, columns].
 
-    Every interaction belongs to one material, so one tangent per column serves all materials at once: the cost does not
+    Every interaction belongs to one material, so one tangent per column serves all materials at once: the time does not
     grow with their number.
 
     Args:
         program: The program.
-        slope: Derivatives of the quantity by the response at every step.
-        derivatives: Derivatives of the response by the constants of each column.
+        slope: Derivatives of the quantity with respect to the response at every step.
+        derivatives: Derivatives of the response with respect to the constants of each column.
         num_materials: Number of materials M.
     """
     by_column = []
@@ -286,13 +286,13 @@ def _contract(
     derivatives: tuple[MaterialResponse, ...],
     num_materials: int,
 ) -> jax.Array:
-    """Derivatives of path loss [L, M, columns] from those of the power by the response."""
+    """Derivatives of path loss [L, M, columns] from those of the power with respect to the response."""
     inverse = jnp.where(power > 0, 1 / jnp.where(power > 0, power, 1.0), 0.0)
     return -10 / np.log(10) * inverse[:, None, None] * contract(program, slope, derivatives, num_materials)
 
 
 def _by_path(by_field: list[AntennaFields], tangents: list[AntennaFields]) -> jax.Array:
-    """Derivatives of the power of every path by effect parameters [P, e], through the antenna fields."""
+    """Derivatives of the power of every path with respect to effect parameters [P, e], through the antenna fields."""
     groups = []
     for outer, inner in zip(by_field, tangents, strict=True):
         # Fields are [2 or 1, ports, 2, n], their tangents [..., n, e].

@@ -1,8 +1,8 @@
 """Groups of paths that are evaluated together, and the sequence of their interactions.
 
 Paths of a group have interactions of the same kinds in the same order, so that every step of a group is a dense array.
-With padding, paths that differ only in the length of a run of reflections and transmissions share a group, and the
-shorter runs are filled up with interactions that change nothing.
+With padding, paths that differ only in the length of a run of reflections and transmissions share a group, and shorter
+runs are padded with interactions that change nothing.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def exact_groups(paths: Paths) -> list[PathGroup]:
 
 
 def padded_groups(paths: Paths) -> list[PathGroup]:
-    """Group paths that agree once each run of reflections and transmissions is counted as one interaction.
+    """Group paths that are equal if each run of reflections and transmissions counts as one interaction.
 
     Within a group, the path with the most reflections and transmissions comes first; a run is as long as the longest
     one of its paths.

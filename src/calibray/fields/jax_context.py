@@ -1,10 +1,10 @@
-"""The JAX settings under which Calibray computes; outside of its calls JAX keeps the user's.
+"""The JAX settings under which Calibray computes; outside of its calls, the user's settings apply.
 
-Within `jax_settings` JAX computes in double precision, and takes compiled programs from a folder that outlives the
-process. A compiled program is machine code, so it is taken only from a folder that nobody but the user can write
-(`calibray.support.cache_folder.Store`). JAX's own cache on disk writes entries in place and does not check them. Its
-keys, which cover everything a program depends on, are used here, but reading and writing goes through the store.
-If the user named a folder for JAX's cache (`JAX_COMPILATION_CACHE_DIR`), that one is used.
+Within `jax_settings`, JAX computes in double precision, and reads compiled programs from a folder that outlives the
+process. A compiled program is machine code, so it is read only from a folder that only the user can write to
+(`calibray.support.cache_folder.Store`). JAX's own cache on disk writes entries in place and does not check them.
+Calibray uses JAX's keys, which cover everything a program depends on, but reads and writes through the store. If the
+user has set a folder for JAX's cache (`JAX_COMPILATION_CACHE_DIR`), that folder is used.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from calibray.support.messages import first_line, shortened
 
 _lock = threading.Lock()
 _calls = 0
-"""Calls in progress that use the store, over all threads."""
+"""Number of calls in progress that use the store, over all threads."""
 _users_cache: Any = None
 """JAX's cache on disk before the first of these calls."""
 
@@ -36,8 +36,8 @@ _users_cache: Any = None
 def jax_settings() -> Iterator[None]:
     """Compute in double precision and keep compiled programs; afterwards JAX has the user's settings again.
 
-    Every function of `calibray.fields` that computes does so within these settings. Enter them yourself to
-    differentiate or compile around one of the pure functions.
+    Every function of `calibray.fields` that computes uses these settings. Enter them yourself to differentiate or
+    compile code around one of the pure functions.
 
     Raises:
         InputError: JAX finds no device to compute on.
@@ -76,9 +76,9 @@ def _check_device() -> None:
 
 @contextmanager
 def _cache_of_jax(programs: Any) -> Iterator[None]:
-    """Make the store the cache on disk of JAX.
+    """Make the store JAX's cache on disk.
 
-    JAX has one cache for all threads, but the folder is a setting of each thread. The store therefore answers only
+    JAX has one cache for all threads, but the folder is a setting of each thread. The store therefore serves only
     threads in which its own folder is set, so that programs of the user are not kept.
     """
     global _calls, _users_cache
@@ -134,7 +134,7 @@ def _kept_programs() -> Any:
 
 
 def _entry_name(key: str) -> str:
-    """Name of an entry. It includes the processor, as its code may crash on another one that shares the folder."""
+    """Name of an entry, which includes the processor, because its code may crash on another one."""
     return hashlib.sha256(f"{key} {_processor()}".encode()).hexdigest()
 
 

@@ -1,7 +1,7 @@
 """Response of the materials: the coefficients of all interactions, and the amplitudes of diffuse reflection.
 
-`material_response` computes them for all groups together, in flat arrays or as tables. `split_by_step` hands each step
-of each group its own.
+`material_response` computes them for all groups together, in flat arrays or as tables. `split_by_step` gives each step
+of each group its own part.
 
 The scattering patterns f_s of diffuse reflection follow Degli-Esposti et al., IEEE Trans. Antennas Propag. 55(1), 2007.
 """
@@ -38,7 +38,7 @@ GroupResponse = tuple[tuple[Coefficients, ...], tuple[tuple[jax.Array, jax.Array
 )
 @dataclass(frozen=True)
 class MaterialResponse:
-    """All that the fields take from the materials.
+    """Everything that the fields need from the materials.
 
     Attributes:
         coefficients: Transverse electric and magnetic coefficients, each (real, imaginary) [K]; or their tables.
@@ -107,10 +107,11 @@ def response_and_derivatives(
 
 
 def _by_conductivity(program: GroupedProgram, by_permittivity: MaterialResponse) -> MaterialResponse:
-    """Derivatives by the conductivity from those by the permittivity, which saves a pass.
+    """Derivatives with respect to the conductivity from those with respect to the permittivity, which saves a pass.
 
-    Coefficients are analytic in eta = eps_r - j loss, and the loss is proportional to the conductivity. So the
-    derivative by the conductivity is -j times the loss per unit of conductivity times that by the permittivity.
+    Coefficients are analytic in eta = eps_r - j loss, and the loss is proportional to the conductivity. The derivative
+    with respect to the conductivity is therefore -j times the loss per unit of conductivity times the derivative with
+    respect to the permittivity.
     """
     loss_per_unit = loss_term(jnp.ones_like(program.wavelength), program.wavelength)
 
@@ -130,10 +131,10 @@ def _by_conductivity(program: GroupedProgram, by_permittivity: MaterialResponse)
 def split_by_step(
     program: GroupedProgram, response: MaterialResponse, blank: float = 1.0
 ) -> tuple[GroupResponse, ...]:
-    """The response, or its derivatives, cut into what each step of each group takes, group by group.
+    """The response, or its derivatives, split into the parts for each step of each group, group by group.
 
-    Reverse passes differentiate by these parts. By the flat arrays, every part would cost a pass over all of them.
-    `blank` is the value of a coefficient at empty positions: 1, or 0 for derivatives.
+    Reverse passes differentiate with respect to these parts. With respect to the flat arrays, every part would need a
+    pass over all of them. `blank` is the value of a coefficient at empty positions: 1, or 0 for derivatives.
     """
     groups, row = [], 0
     step_coefficients = _coefficients_by_step(program, response, blank)
@@ -174,7 +175,7 @@ def _unpacked(
 ) -> jax.Array:
     """The numbers of one step of a group, with `blank` at positions that are not stored.
 
-    A line is read beyond its end into the next one and the excess is replaced, which needs no pass of its own.
+    A line is read beyond its end into the next one and the excess is replaced, which needs no separate pass.
     """
     parts, size = [], shape[-1]
     for length in reversed(lines):  # the last line is stored first
@@ -186,7 +187,7 @@ def _unpacked(
 
 
 LARGEST_EXPONENT = 64
-"""Largest exponent alpha of a lobe whose normalization is tabulated; beyond, it is extrapolated linearly."""
+"""Largest exponent alpha of a lobe whose normalization is tabulated; above it, it is extrapolated linearly."""
 
 
 def pattern_value(
@@ -200,8 +201,8 @@ def pattern_value(
 ) -> jax.Array:
     """Density f_s [n], [1/sr], of the diffusely reflected power over directions.
 
-    The cosines [n] are those of the angle of incidence, and between the scattered direction and the normal, the
-    specular direction and the direction back to the source.
+    The cosines [n] are those of the angle of incidence, and of the angles between the scattered direction and the
+    normal, the specular direction and the direction back to the source.
     """
     lambertian = cos_scattered / jnp.pi
     if all(pattern == "lambertian" for pattern in patterns):

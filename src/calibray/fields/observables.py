@@ -1,10 +1,10 @@
-"""Further observables of links besides path loss, as a receiver measures them, with derivatives.
+"""Further observables of links in addition to path loss, as a receiver measures them, with derivatives.
 
-Each is a statistic of what a receiver sees of a link's paths, weighted by power. A receiver of limited bandwidth sees
-taps in place of paths: samples of its power delay profile, in which the pulse of each path is spread over a few taps.
-It sees neither taps far below the strongest nor those below its noise floor. A logistic function of the level in dB,
-`SOFT_DB` wide, takes the place of that hard limit, so that derivatives are exact. It changes the weight of taps within
-some 2 dB of the limit. `docs/measurements/observables.md` has the error of the smooth limit.
+Each is a power-weighted statistic of the paths of a link that a receiver resolves. A receiver of limited bandwidth
+resolves taps instead of paths: samples of its power delay profile, in which the pulse of each path is spread over a few
+taps. It detects neither taps far below the strongest tap nor taps below its noise floor. A logistic function of the
+level in dB, `SOFT_DB` wide, replaces that hard limit, so that derivatives are exact. It changes the weight of taps
+within some 2 dB of the limit. `docs/measurements/observables.md` shows the error of the smooth limit.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ SOFT_DB: Final = 0.5
 """Width of the limit of a receiver's range [dB]."""
 
 TAPS: Final = 4
-"""Taps over which a path is spread: the main lobe of a Hann pulse is four taps wide. All side lobes together hold
+"""Taps over which a path is spread: the main lobe of a Hann pulse is four taps wide. All side lobes together contain
 0.05 % of the power, and the highest is 31 dB down."""
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["delay", "link", "index", "share"], meta_fields=[])
 @dataclass(frozen=True)
 class Taps:
-    """The T taps of all links in which a receiver of limited bandwidth sees P paths.
+    """The T taps of all links in which a receiver of limited bandwidth resolves P paths.
 
     Attributes:
         delay: Delay of every tap [T], [s].
@@ -72,7 +72,7 @@ class Taps:
     def of(cls, delay: NDArray[np.float64], link: NDArray[np.integer], bandwidth: float) -> Taps:
         """The taps of paths with delays [P], [s], in links [P], at a bandwidth [Hz].
 
-        Taps are 1 / bandwidth apart. At this distance they preserve the power, the mean and the mean square of the
+        Taps are 1 / bandwidth apart. At this spacing they preserve the power, the mean and the mean square of the
         delays of the sampled profile, wherever a path lies between two taps.
         """
         number = np.floor(delay * bandwidth).astype(np.int64)[:, None] + np.arange(TAPS) - TAPS // 2 + 1
@@ -95,14 +95,14 @@ class Taps:
         return jax.ops.segment_sum(spread.ravel(), jnp.asarray(self.index).ravel(), len(self.delay))
 
     def of_paths(self, seen: jax.Array) -> jax.Array:
-        """Share of every path's power [P] that is seen, from that of every tap [T]."""
+        """Share of every path's power [P] that is detected, from that of every tap [T]."""
         return jnp.sum(seen[jnp.asarray(self.index)] * self.share, axis=1)
 
 
 def hann_pulse(time: NDArray[np.float64]) -> NDArray[np.float64]:
     """Power of the pulse of a receiver whose spectrum has a Hann window, at times in units of 1 / bandwidth.
 
-    Its root mean square width is 1 / (sqrt(3) bandwidth). It is 0 outside the main lobe.
+    Its root mean square width is 1 / (sqrt(3) bandwidth). The power is 0 outside the main lobe.
     """
     inside = np.abs(time) < TAPS / 2
     near = np.isclose(np.abs(time), 1.0)
@@ -157,7 +157,7 @@ def _bandwidths(wanted: tuple[Statistic, ...]) -> list[float]:
 def link_responses(
     channel: Channel, values: NDArray[np.float64], count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Path loss by the sum of powers [count, L], [dB], and statistics [count, K, L]; NaN where a link has no path.
+    """Path loss by the sum of powers [count, L], [dB], and statistics [count, K, L]; NaN for a link without a path.
 
     Args:
         channel: The paths.
@@ -262,7 +262,7 @@ def _statistic(channel: Channel, power: jax.Array, wanted: Statistic) -> jax.Arr
 
 
 def _seen(power: jax.Array, link: jax.Array, num_links: int, wanted: Statistic) -> jax.Array:
-    """How much of every tap the receiver sees, by its level [T]."""
+    """Share of every tap that the receiver detects, by its level [T]."""
     level_db, seen = -decibel(power), jnp.ones_like(power)
     if wanted.dynamic_range_db is not None:
         strongest = jax.ops.segment_max(power, link, num_links)
@@ -287,7 +287,7 @@ def _share(
 def _flight(
     weight: jax.Array, seen: jax.Array, delay: jax.Array, link: jax.Array, num_links: int, wanted: Statistic
 ) -> jax.Array:
-    """Time of flight of every link [L], [s]: of the mean path, or of one with those that it is not resolved from."""
+    """Time of flight of every link [L], [s]: of the mean path, or of one path and those not resolved from it."""
     if wanted.path == "mean":
         return link_mean(weight, delay, link, num_links)
     if wanted.path == "first":

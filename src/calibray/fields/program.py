@@ -4,8 +4,8 @@ Paths are grouped by the kinds of their interactions (`calibray.fields.grouping`
 The arguments of the coefficients of all groups are stored in one flat array, because the slab formula is evaluated for
 all of them at once.
 
-A large program is laid out without padding. A small one takes less time to evaluate than to compile. There, shorter
-runs of reflections and transmissions are filled up, so that fewer groups have to be compiled.
+A large program is stored without padding. A small program takes less time to evaluate than to compile. In a small
+program, shorter runs of reflections and transmissions are therefore padded, so that fewer groups have to be compiled.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class Group:
     """Paths with the same sequence of interactions: n paths, T transmit and R receive ports.
 
     Attributes:
-        tx: Transmit field, real and imaginary part [2, T, 2, n]; the real part alone if all are real [1, T, 2, n].
-        rx: Receive field times A lambda / 4 pi, likewise [2 or 1, R, 2, n].
+        tx: Transmit field, real and imaginary part [2, T, 2, n]; only the real part if all are real [1, T, 2, n].
+        rx: Receive field times A lambda / 4 pi, in the same form [2 or 1, R, 2, n].
         rotation: Per step (cos, sin) into the frame of the interaction [2, n]; for a run of k [k, 2, n].
         turn: Per step (cos, sin) from the frame of incidence into the basis (theta, phi) [2, n], or None.
         wedge: Per step the matrices C_0 .. C_4, real and imaginary part [2, 5, 2, 2, n], or None.
@@ -76,17 +76,18 @@ class Group:
 class FormulaArguments:
     """Arguments of the slab formula at K positions, in the order in which the groups' steps use the coefficients.
 
-    Gathering coefficients from another order would take nearly as long as the formula itself. Empty positions at the
-    end of a line are left out.
+    Reordering coefficients would take nearly as long as the formula itself. Empty positions at the end of a line are
+    omitted.
 
     Attributes:
         material: Material [K].
         cosine: Cosine of the angle of incidence [K].
         transmitted: Whether the coefficient is a transmission [K].
-        unreduced: Whether it is a reflection that keeps the scattered energy, as for a diffuse one [K].
-        blank: Whether the position is empty, and the coefficient 1 [K]; None if no position is.
+        unreduced: Whether it is a reflection that keeps the scattered energy, as in a diffuse interaction [K].
+        blank: Whether the position is empty and its coefficient is 1 [K]; None if no position is empty.
         shapes: Shape of the positions at each step of each group, (n,) or (k, n).
-        lines: Number of positions stored of each line (one, or k for a run) of each step; the last line comes first.
+        lines: Number of stored positions in each line (one line, or k for a run) of each step; the last line comes
+            first.
         any_transmitted: Whether any coefficient is a transmission.
     """
 
@@ -121,8 +122,9 @@ class DiffuseArguments:
         solid_angle: Solid angle of the ray tube over its sampling probability [D], [sr].
         cos_scattered: Cosine between scattered direction and normal [D].
         cos_incidence: Cosine of the angle of incidence [D]; empty if every material is Lambertian.
-        cos_specular: Cosine between scattered and specular direction [D]; empty likewise.
-        cos_backward: Cosine between scattered direction and the direction back to the source [D]; empty likewise.
+        cos_specular: Cosine between scattered and specular direction [D]; empty in the same case.
+        cos_backward: Cosine between scattered direction and the direction back to the source [D]; empty in the same
+            case.
         patterns: Scattering pattern of every material.
     """
 
@@ -156,8 +158,8 @@ class GroupedProgram:
     Attributes:
         groups: The paths, grouped by kind of interactions.
         by_link: Segments of the paths by link.
-        link: Link of every path, in the order of the groups [P]; None for sums of powers only.
-        delay: Delay of every path, in the order of the groups [P], [s]; None likewise.
+        link: Link of every path, in the order of the groups [P]; None if only powers are summed.
+        delay: Delay of every path, in the order of the groups [P], [s]; None in the same case.
         wavelength: [m].
         coefficients: Arguments of the slab formula, or positions in tables.
         diffuse: Arguments of the scattering patterns.
@@ -220,7 +222,7 @@ def layout(
 
     With `intervals`, one for all or by material and mode [M, 3], the coefficients are tabulated over the angle of
     incidence; None evaluates the slab formula at every interaction. With `phases`, links and delays of the paths are
-    kept. Only sums of powers can be computed without.
+    kept. Without them, only sums of powers can be computed.
     """
     padded = intervals is None or paths.num_interactions <= PADDED
     path_groups = padded_groups(paths) if padded else exact_groups(paths)
@@ -257,7 +259,7 @@ class _Numbering:
 
     Attributes:
         wedges: The diffractions [W].
-        count: Number of coefficients; as a number of a coefficient it denotes an empty position.
+        count: Number of coefficients; as an index it denotes an empty position.
         table_row: Row of each interaction in the table of its kind, -1 for reflections and transmissions [I].
         steps: Coefficients at each step of each group, [n] or [k, n]; a diffraction has two steps.
         scattered: Diffuse interactions in the order of use [D].
@@ -367,10 +369,10 @@ def _group(paths: Paths, group: PathGroup, table_row: NDArray[np.int64], dtype: 
 
 
 def _num_parts(field: NDArray[np.complex128]) -> int:
-    """1 if all fields are real, as with most linearly polarized antennas, else 2."""
+    """1 if all fields are real, as with most linearly polarized antennas, otherwise 2."""
     return 2 if field.imag.any() else 1
 
 
 def _parts(value: NDArray[np.complex128], dtype: type, count: int = 2) -> jax.Array:
-    """Real and imaginary part, or the real part alone."""
+    """Real and imaginary part, or only the real part."""
     return jnp.asarray(np.stack([value.real, value.imag][:count]).astype(dtype))

@@ -1,4 +1,4 @@
-"""Fields carried along paths: the chain of Jones matrices between the two antennas.
+"""Propagates fields along paths: the chain of Jones matrices between the two antennas.
 
 - Reflection and transmission: a real rotation into the frame of incidence, then the diagonal (c_te, c_tm).
 - Diffuse reflection: not linear in the field, because its amplitude follows the specularly reflected field.
@@ -72,7 +72,7 @@ def _group_gains(group: Group, response: GroupResponse, keep: Keep) -> Pair:
 
 
 def _component(field: jax.Array, component: int) -> Pair:
-    """One component of an antenna's field [ports, n]; the imaginary part is not stored if all are 0."""
+    """One component of an antenna's field [ports, n]; the imaginary part is not stored if it is 0 everywhere."""
     real = field[0, :, component]
     return real, field[1, :, component] if field.shape[0] == 2 else jnp.zeros_like(real)
 

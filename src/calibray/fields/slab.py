@@ -16,7 +16,7 @@ FIELD_COLUMN: Final = {name: column for column, name in enumerate(FIELDS)}
 """Column of each material constant in a table of materials."""
 
 _SELECTED_MATERIALS: Final = 12
-"""Up to this number of materials a constant is selected by comparing indices, beyond it is gathered. XLA gathers
+"""Up to this number of materials, a constant is selected by comparing indices; beyond it, it is gathered. XLA gathers
 numbers one after the other, but vectorizes comparisons."""
 
 
@@ -24,14 +24,14 @@ class Mode(IntEnum):
     """How a coefficient is used."""
 
     REFLECTION = 0
-    """Specular reflection or wedge face: reduced by the energy that is scattered."""
+    """Specular reflection or wedge face: reduced by the scattered energy."""
     TRANSMISSION = 1
     FULL_REFLECTION = 2
     """Reflection of a diffuse interaction: not reduced."""
 
 
 def loss_term(conductivity: jax.Array, wavelength: jax.Array) -> jax.Array:
-    """Negative imaginary part of the complex relative permittivity [1], of a conductivity [S/m]."""
+    """Negative imaginary part of the complex relative permittivity [1], from a conductivity [S/m]."""
     # ITU-R P.2040-3 eq. 9: eta'' = sigma / (2 pi f eps_0), f = c / lambda.
     return conductivity * wavelength / (2 * jnp.pi * speed_of_light * epsilon_0)
 
@@ -86,9 +86,9 @@ def coefficients_of_materials(
     transmitted: jax.Array | bool,
     unreduced: jax.Array,
 ) -> tuple[Pair, Pair]:
-    """Coefficients [...] from constants of materials [M, 8]; reflection is reduced by the energy that is scattered.
+    """Coefficients [...] from constants of materials [M, 8]; reflection is reduced by the scattered energy.
 
-    It is not reduced where `unreduced` [...].
+    Where `unreduced` [...] is true, it is not reduced.
     """
     column = {name: table[:, index] for name, index in FIELD_COLUMN.items()}
     te, tm = coefficients(

@@ -1,14 +1,14 @@
 """Box-constrained minima of quadratic forms with an arrowhead matrix: diagonal blocks bordered by a few columns.
 
 The normal equations of a nuisance have this form. Columns of different groups share no link, so they form separate
-blocks. Columns over all links overlap with every block and form the border. Block elimination solves the system at
-about the cost of reading the matrix, for any number of groups.
+blocks. Columns over all links overlap with every block and form the border. Block elimination solves the system in
+about the time needed to read the matrix, for any number of groups.
 
 Block principal pivoting keeps the bounds (L. F. Portugal, J. J. Judice and L. N. Vicente, A comparison of block
 pivoting and interior-point algorithms for linear least squares problems with nonnegative variables, Mathematics of
 Computation 63, 1994), in all problems of a batch at once. Each iteration fixes the components that leave their bounds,
-frees the fixed components whose gradient points inwards, and solves again. If the number of infeasible components
-stops falling, only the last one is exchanged (Murty's rule), which guarantees termination. The result meets the
+releases the fixed components whose gradient points inwards, and solves again. If the number of infeasible components
+stops decreasing, only the last one is exchanged (Murty's rule), which guarantees termination. The result meets the
 optimality conditions exactly, without a step length or a convergence tolerance.
 """
 
@@ -89,7 +89,7 @@ class Arrowhead:
         """Unbounded minimum over the free components; the others are zero.
 
         Args:
-            free: Mask of the free components, none of them held [m, q].
+            free: Mask of the free components; none of them is fixed [m, q].
             side: Right-hand sides [m, q, k].
 
         Returns:
@@ -105,7 +105,7 @@ class Arrowhead:
     def minimum(
         self, side: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Minimum within bounds; held components take the value within their bounds that is nearest to zero.
+        """Minimum within bounds; fixed components take the value within their bounds that is nearest to zero.
 
         Args:
             side: Right-hand sides [m, q].
@@ -213,7 +213,7 @@ def _to_exchange(
     patience: NDArray[np.int64],
     pending: NDArray[np.intp],
 ) -> NDArray[np.bool_]:
-    """Components to exchange: all infeasible ones while their number falls, else the last of each independent part.
+    """Components to exchange: all infeasible ones while their number decreases, else the last of each independent part.
 
     Args:
         infeasible: Infeasible components of the r unsolved problems [r, q].

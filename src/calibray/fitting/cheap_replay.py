@@ -1,8 +1,8 @@
 """The replay of a study's scene as the cheap model of an engine without derivatives.
 
-We trace the study's scene once; its paths then evaluate a candidate in microseconds. The material constants that the
-study does not calibrate (above all thickness, then conductivity and permittivity) are the constants of the cheap model,
-which space mapping adjusts.
+We trace the study's scene once; evaluating a candidate on its paths then takes microseconds. The constants of the cheap
+model are the material constants that the study does not calibrate: above all thickness, then conductivity and
+permittivity. Space mapping adjusts them.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Rows(Protocol):
         ...
 
     def known(self, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Mask of the residuals that depend on the reached links [m]; `reached` marks the links with a path [L]."""
+        """Mask of the residuals that depend on the links with a path [m]; `reached` marks these links [L]."""
         ...
 
 
@@ -186,7 +186,7 @@ class ProblemRows:
 
     @property
     def filling(self) -> NDArray[np.float64]:
-        """The ceiling, or without one the measured path loss [L], [dB]."""
+        """The ceiling, or without a ceiling the measured path loss [L], [dB]."""
         objective = self.problem.objective
         if objective.ceiling_db is not None:
             return np.full(len(objective.measured), objective.ceiling_db)
@@ -226,8 +226,8 @@ class CheapReplay:
     """The cheap model of a calibration, if any.
 
     Attributes:
-        model: The model; None if the study wants none or it cannot be made.
-        remark: The reason if it cannot be made.
+        model: The model; None if the study requests none or it cannot be made.
+        remark: The reason why it cannot be made.
     """
 
     model: ReplayedModel | None = None
@@ -262,7 +262,7 @@ def make_cheap_replay(
         reason = " ".join(str(error).split())
         return CheapReplay(None, _no_model(f"the scene cannot be traced here ({reason})"))
     if not model.known.any():
-        return CheapReplay(None, _no_model("the trace of the scene reaches none of the links"))
+        return CheapReplay(None, _no_model("no link has a path in the trace of the scene"))
     return CheapReplay(model)
 
 

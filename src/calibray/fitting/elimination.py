@@ -1,4 +1,4 @@
-"""Elimination of the nuisance: best coefficients and projected derivatives, for all candidates at once.
+"""Eliminates the nuisance: best coefficients and projected derivatives, for all candidates at once.
 
 Variable projection (G. H. Golub and V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973): the coefficients b
 minimise sum_i w_i (gap_i - z_i.b)^2 + sum_j (ridge_j b_j)^2 within their bounds. With one column per link, each
@@ -119,7 +119,7 @@ class Elimination:
     ) -> NDArray[np.float64]:
         """Least-squares coefficients of the derivatives on the design; 0 for a coefficient at its bound.
 
-        These are minus the derivatives of the best coefficients by the parameters.
+        These are minus the derivatives of the best coefficients with respect to the parameters.
 
         Args:
             slope: Derivatives of the modelled path loss at the links with weight [n, m, d].

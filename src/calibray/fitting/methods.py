@@ -20,10 +20,10 @@ from calibray.support.messages import did_you_mean
 AUTO: Final = "auto"
 
 STARTS: Final = (16, 512)
-"""Fewest and most local searches of a multi-start method."""
+"""Smallest and largest number of local searches of a multi-start method."""
 
 START_INTERACTIONS: Final = 4_000_000
-"""Target for local searches times interactions of the path program, which keeps the cost of a search constant."""
+"""Target for local searches times interactions of the path program, which keeps the time of a search constant."""
 
 
 def check_method(name: str) -> None:
@@ -38,17 +38,17 @@ def check_method(name: str) -> None:
 
 
 def choose(problem: Problem, model: CheapModel | None = None) -> Optimizer:
-    """Make the optimizer that a study names; "auto" takes the best one for its engine.
+    """Make the optimizer that a study names; "auto" chooses the best one for its engine.
 
     Args:
         problem: The problem.
-        model: A cheap model of it, if available.
+        model: A cheap model of the engine, if available.
 
     Returns:
         The optimizer.
 
     Raises:
-        InputError: The method needs derivatives that the engine does not give, or its options cannot be used.
+        InputError: The method needs derivatives that the engine does not provide, or its options cannot be used.
     """
     engine = problem.engine
     interactions = engine.interactions if isinstance(engine, Differentiable) else None
@@ -59,7 +59,7 @@ def check_fit(setup: Setup) -> None:
     """Check that a study's method and options work on its engine, before any expensive call or output.
 
     Raises:
-        InputError: The method does not exist, needs derivatives that the engine does not give, or its options cannot
+        InputError: The method does not exist, needs derivatives that the engine does not provide, or its options cannot
             be used.
     """
     check_method(setup.study.method.name)
@@ -79,7 +79,7 @@ def _make(
         name = "least-squares" if differentiable else "space-mapping"
     if METHODS[name].needs_derivatives() and not differentiable:
         raise InputError(
-            f"method {name!r} needs derivatives, which only the engine 'replay' gives; use method 'auto'"
+            f"method {name!r} needs derivatives, which only the engine 'replay' provides; use method 'auto'"
         )
     try:
         return optimizers.make(

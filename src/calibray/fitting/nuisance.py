@@ -2,10 +2,10 @@
 
 A term is one column of the links: a constant (an offset), the logarithm of the distance (a slope per decade), or any
 numeric column of the table. It has one coefficient for all links or one per group. Several terms form one design
-[links, q]. The design is sparse: a link has one entry per term, however many groups there are.
+[links, q]. The design is sparse: a link has one entry per term, for any number of groups.
 
-The model is linear in the coefficients. For every candidate the best ones follow in closed form (variable projection),
-within their bounds and with Gaussian priors; see `elimination.py`.
+The model is linear in the coefficients. For every candidate, the best coefficients follow in closed form (variable
+projection), within their bounds and with Gaussian priors; see `elimination.py`.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ CONSTANT: Final = "constant"
 LOG_DISTANCE: Final = "log_distance"
 
 OFFSET: Final = "offset"
-"""Name of the term that `[offset]` makes."""
+"""Name of the term that `[offset]` creates."""
 
 UNKNOWN_DB: Final = 10.0
-"""Assumed standard deviation between groups if only one is measured [dB per unit of the column]; wide, because one
-group says nothing about the spread."""
+"""Assumed standard deviation between groups if only one is measured [dB per unit of the column]; it is large, because
+one group contains no information about the spread."""
 
 START_SPREAD: Final = 6.0
 """Standard deviation between the groups of a random effect before it is estimated [dB per unit of the column]."""
@@ -46,14 +46,14 @@ class Term:
         name: Its name.
         by: The column: "constant", "log_distance", or a column of the links' table.
         value: The values of the column [L]: 1 for a constant; decades of distance relative to `centre` for
-            "log_distance"; else in the unit of the table.
+            "log_distance"; otherwise in the unit of the table.
         group: Index of each link's group in `labels` [L]; -1 for a link of another group.
         labels: Labels of the groups; one empty label if all links share one coefficient.
         bounds: Lower and upper bound of every coefficient, [dB] per unit of the column.
         prior: Standard deviation of the coefficients' Gaussian prior around zero, in the same unit; +inf for none.
-        centre: Value subtracted from the column: the mean of log10(distance / 1 m) over the links that the term was
-            made for, else 0.
-        around: Name of the term with the mean that these coefficients deviate from, for a random effect; else "".
+        centre: Value subtracted from the column: the mean of log10(distance / 1 m) over the links for which the term
+            was made, otherwise 0.
+        around: For a random effect, name of the term with the mean from which these coefficients deviate; otherwise "".
     """
 
     name: str
@@ -113,7 +113,8 @@ def make_term(
         name: Name of the term.
         by: "constant" for an offset [dB]; "log_distance" for a slope [dB per decade] about the links' geometric mean
             distance; or a numeric column of the links' table.
-        labels: Labels of the links' groups [L], for one coefficient per group; one coefficient for all links if None.
+        labels: Labels of the links' groups [L], for one coefficient per group; if None, all links share one
+            coefficient.
         bounds: Lower and upper bound of the coefficients; unbounded if None.
         prior: Standard deviation of the coefficients' Gaussian prior around zero; flat if None.
 
@@ -278,7 +279,7 @@ class Nuisance:
     def filled(
         self, coefficients: NDArray[np.float64], counted: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Fill in the coefficients of unmeasured groups: the mean over the measured groups of the term.
+        """Fill in the coefficients of unmeasured groups with the mean over the measured groups of the term.
 
         Deviations of a random effect have the mean 0 and its spread.
 
@@ -286,9 +287,8 @@ class Nuisance:
             coefficients: Coefficients fitted to some links [n, q].
             counted: Mask of these links [L].
 
-        Returns:
-            All coefficients [n, q], and their standard deviations [q]: the spread between groups for a filled-in
-            coefficient, else 0.
+        Returns: All coefficients [n, q], and their standard deviations [q]: the spread between groups for a filled-in
+            coefficient, otherwise 0.
         """
         measured = np.asarray(abs(self.design[counted]).sum(axis=0)).ravel() > 0
         filled, deviation, first = coefficients.copy(), np.zeros(len(measured)), 0
@@ -306,7 +306,7 @@ class Nuisance:
         return filled, deviation
 
     def new_group_spread(self, block: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Standard deviation of random effects at links whose group lies in one block, once that is left out [L], [dB].
+        """Standard deviation of random effects at links whose group is only in one block, if it is left out [L], [dB].
 
         Args:
             block: Block of every link [L]; -1 for a link that is not used.
@@ -327,7 +327,7 @@ class Nuisance:
 
         Args:
             coefficients: The coefficients [q].
-            determined: Mask of those that the links determine [q].
+            determined: Mask of the coefficients that the links determine [q].
         """
         coefficient: dict[str, dict[str, float]] = {}
         first = 0

@@ -1,12 +1,12 @@
 """The objective that a calibration minimises.
 
-It is the paper's RMSE (eq. 1) over the links with weight, weighted by these. Nuisances, an offset or other columns of a
-linear design, enter the model as path loss + design x coefficients. For every candidate the best coefficients follow in
-closed form (variable projection), so optimizers search only the parameters.
+It is the paper's RMSE (eq. 1) over the links with weight, weighted by their weights. Nuisances, an offset or other
+columns of a linear design, enter the model as path loss + design x coefficients. For every candidate, the best
+coefficients follow in closed form (variable projection), so optimizers search only the parameters.
 
 A Gaussian prior of a coefficient adds the row (noise / prior) x coefficient to the residuals. Up to constants, the sum
 of squares is then minus twice the log posterior, in units of the noise variance. `value` includes these rows, `rmse` is
-the paper's RMSE of the links only. Without priors both are the same number.
+the paper's RMSE of the links only. Without priors, both numbers are the same.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Objective:
         measured: Measured path loss [L], [dB].
         weight: Weights of the links; 0 leaves a link out [L].
         nuisance: The nuisance; may have no terms.
-        ceiling_db: Path loss assigned to a link without a path [dB]; None leaves such links out.
+        ceiling_db: Path loss assigned to a link without a path [dB]; if None, these links are left out.
         noise_db: Standard deviation of a link's error at the mean weight, which scales the priors [dB].
     """
 
@@ -75,7 +75,7 @@ class Objective:
     def coefficient_slopes(
         self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Derivatives of the best coefficients by the parameters.
+        """Derivatives of the best coefficients with respect to the parameters.
 
         Args:
             path_loss: Modelled path loss [n, L], [dB].
@@ -93,8 +93,8 @@ class Objective:
     def determined(self) -> NDArray[np.bool_]:
         """Mask of the columns that the links with weight determine [q].
 
-        Undetermined are, for example, the offset of a group without such links, or the slope of a group whose links all
-        have the same distance.
+        Examples of undetermined coefficients are the offset of a group without these links, or the slope of a group
+        whose links all have the same distance.
         """
         if not self.nuisance.terms:
             return np.zeros(0, dtype=bool)
@@ -176,7 +176,7 @@ class Objective:
         return np.sqrt(np.mean(links**2, axis=1))
 
     def shares(self, chunks: Sequence[NDArray[np.int64]]) -> list[Share]:
-        """Split the objective by chunks of links, each of which can be summed by itself.
+        """Split the objective by chunks of links, each of which can be summed separately.
 
         Returns:
             The share of every chunk.
@@ -254,7 +254,7 @@ class Objective:
 
     @cached_property
     def _counted(self) -> NDArray[np.int64] | slice:
-        """The links with weight; a slice if all have weight, which avoids copies."""
+        """The links with weight; a slice if all links have weight, which avoids copies."""
         counted = self.weight > 0
         return slice(None) if counted.all() else np.flatnonzero(counted)
 
@@ -292,7 +292,7 @@ def make_objective(
         reached: Mask of the links with a path [L].
         calibrated: Mask of the calibration links [L].
         nuisance: The nuisance over all links; none if None.
-        ceiling_db: Path loss assigned to a link without a path [dB]; None leaves such links out.
+        ceiling_db: Path loss assigned to a link without a path [dB]; if None, these links are left out.
         noise_db: Standard deviation of a link's error [dB]; required if a coefficient has a prior.
 
     Returns:

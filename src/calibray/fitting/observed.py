@@ -1,8 +1,8 @@
-"""Observables besides path loss in the objective: rows of residuals that follow those of the links.
+"""Observables in addition to path loss in the objective: rows of residuals that follow those of the links.
 
-Their rows are weighted by the ratio of the errors' standard deviations, like those of priors, so that a sum of squares
-is minus twice the log likelihood in units of the noise variance of path loss. An unknown bias is eliminated: it is the
-mean residual of its group.
+Their rows are weighted by the ratio of the standard deviations of the errors, like those of priors. A sum of squares is
+therefore minus twice the log likelihood in units of the noise variance of path loss. An unknown bias is eliminated: it
+is the mean residual of its group.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class Observed:
 
     Attributes:
         name: Its name in the study.
-        statistic: What the model gives for it.
-        measured: Measured values [L], in the unit; NaN where a link lacks it.
+        statistic: The modelled quantity.
+        measured: Measured values [L], in the unit; NaN for a link without a value.
         scale: The unit in SI units.
         group: Group of each link's bias, from 0 [L]; -1 without a bias.
         labels: Labels of the groups; empty without a bias.
@@ -56,14 +56,14 @@ class Observed:
         return np.flatnonzero(np.isfinite(self.measured) & (weight > 0))
 
     def freedom(self, weight: NDArray[np.float64]) -> int:
-        """Number of values minus that of the biases."""
+        """Number of values minus number of biases."""
         used = self.used(weight)
         return len(used) - (len(np.unique(self.group[used])) if self.labels else 0)
 
     def residuals(
         self, modelled: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Modelled minus measured values [n, m] in the unit, the bias eliminated, and the biases [n, groups].
+        """Modelled minus measured values [n, m] in the unit, with the bias eliminated, and the biases [n, groups].
 
         Args:
             modelled: Modelled values [n, L] in SI units.
@@ -98,15 +98,15 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
     """The observables that a study states.
 
     Raises:
-        InputError: A column cannot be used, too few links have a value, or the engine gives path loss only.
+        InputError: A column cannot be used, too few links have a value, or the engine computes only path loss.
     """
     sections, links = setup.study.observables, setup.links
     if not sections:
         return ()
     if not isinstance(engine, Observing):
         raise InputError(
-            f"{setup.study.path}: [observables]: the engine {setup.study.engine.name!r} gives path loss only; use "
-            "'replay' or 'command'"
+            f"{setup.study.path}: [observables]: the engine {setup.study.engine.name!r} computes only path loss; use "
+            f"'replay' or 'command'"
         )
     every, read = [], cache(_read)
     for name, section in sections.items():
@@ -167,7 +167,7 @@ def _groups(links: Measurements, bias: str | None) -> tuple[NDArray[np.int64], t
 def with_errors(
     every: tuple[Observed, ...], modelled: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> tuple[Observed, ...]:
-    """The observables with errors estimated from their residuals, where the study states none.
+    """The observables with errors estimated from their residuals, if the study states none.
 
     Args:
         every: The observables.

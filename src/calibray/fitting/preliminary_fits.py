@@ -1,14 +1,14 @@
 """Fits before the calibration: which links to leave out near the noise floor, and the noise level for priors.
 
 Among links with equal expected power, those near the noise floor are reported only if their error makes them strong.
-A selection by measured values keeps these and biases the fit. A selection by predicted values does not, because the
-prediction is independent of the link's error (selection on the explanatory variables: J. M. Wooldridge, Econometric
+A selection by measured values keeps these links and biases the fit. A selection by predicted values does not, because
+the prediction is independent of the link's error (selection on the explanatory variables: J. M. Wooldridge, Econometric
 Analysis of Cross Section and Panel Data, 2nd ed., MIT Press 2010, chapter 19). We fit the model to all links above the
 floor, then to the links predicted well above it, until the selection is stable.
 
 Residuals follow y = X b + Z u + e with u ~ N(0, lambda sigma^2) per group and e ~ N(0, sigma^2). X has what is fitted
-besides. The restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971) does not take the scatter that
-the fit of b removes for less spread, as a maximum likelihood would.
+besides. The restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971) accounts for the scatter that
+the fit of b removes, unlike maximum likelihood, which takes it for a smaller spread.
 
 Expectation maximization with a Gaussian approximation at the optimum (D. Bates and S. DebRoy, J. Multivariate Analysis
 91, 2004, section 5): the square of the spread is the mean of the transmitters' squared values plus their variances.
@@ -41,10 +41,10 @@ SELECTIONS: Final = 4
 """Largest number of selections."""
 
 NOISE_ESTIMATES: Final = 5
-"""Largest number of noise estimates, each with the priors weighted by the one before."""
+"""Largest number of noise estimates; each uses priors weighted by the previous estimate."""
 
 TOLERANCE: Final = 0.02
-"""Relative change of the noise estimate that ends the iteration."""
+"""Relative change of the noise estimate at which the iteration ends."""
 
 LEAST_NOISE_DB: Final = 1e-3
 """Lower limit of the noise estimate, so that data without noise keep a finite weight of the priors [dB]."""
@@ -53,19 +53,19 @@ LEAST_SPREAD_DB: Final = 0.05
 """Lower limit of the spread between groups, so that the prior stays finite [dB per unit of the column]."""
 
 SEARCHES: Final = 32
-"""Local searches of the first fit; later fits continue from its minima."""
+"""Number of local searches of the first fit; later fits continue from its minima."""
 
 
 def leave_out_near_floor(problem: Problem, progress: Progress | None = None) -> Problem:
-    """Leave out the links with a predicted path loss near the noise floor.
+    """Leave out the links whose predicted path loss is near the noise floor.
 
     Args:
         problem: The problem.
         progress: Called with the stage "choosing links" after every fit.
 
     Returns:
-        The problem with these links at weight 0 and marked in `faint`. It is unchanged without a noise floor, and on an
-        engine without derivatives, because its calls are expensive.
+        The problem with these links at weight 0 and marked in `faint`. The problem is unchanged without a noise floor,
+        and on an engine without derivatives, because its calls are expensive.
     """
     limit, objective = problem.setup.links.limit_db, problem.objective
     if limit is None or not problem.differentiable:
@@ -163,7 +163,7 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
 
 
 def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tuple[Problem, float]:
-    """The problem with the spreads of its random effects estimated at a point of the search space [d].
+    """The problem with the spreads of its random effects, estimated at a point of the search space [d].
 
     Returns:
         The problem, and the standard deviation of a link's error within the groups of the last effect [dB].
@@ -193,7 +193,7 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
 
 
 def with_estimated_errors(problem: Problem, point: NDArray[np.float64]) -> Problem:
-    """The problem with errors of its further observables estimated at a point of the search space [d].
+    """The problem with errors of its further observables, estimated at a point of the search space [d].
 
     Returns:
         The problem; unchanged without further observables.
@@ -238,12 +238,11 @@ def group_spread(
 
     Args:
         residuals: Residuals of the links [n].
-        design: Columns X of what is fitted besides, with the derivatives of the model [n, k].
+        design: Columns X of the other fitted terms, with the derivatives of the model [n, k].
         column: The column [n].
         group: Group of every link [n], from 0.
 
-    Returns:
-        The standard deviations; none between groups if there are too few links.
+    Returns: The standard deviations; the one between groups is 0 if there are too few links.
 
     Example:
         >>> shift = np.repeat([3.0, -2.0, 0.0, -1.0], 5)
@@ -275,21 +274,20 @@ def group_spread(
 
 
 ROUNDS: Final = 20
-"""Largest number of estimates; where links determine most transmitters well, three suffice."""
+"""Largest number of estimates; if links determine most transmitters well, three suffice."""
 
 LEAST: Final = 1e-3
 """Lower limit of a spread, as a share of the width of the bounds, so that priors stay finite."""
 
 
 def estimate_spreads(problem: Problem, progress: Progress | None = None) -> Problem:
-    """Estimate the spread of every population of transmitters whose study leaves it open.
+    """Estimate the spread of every population of transmitters for which the study states none.
 
     Args:
         problem: The problem.
         progress: Called with the stage "estimating spreads" after every estimate.
 
-    Returns:
-        The problem with these spreads in its study and priors; itself without such a population.
+    Returns: The problem with these spreads in its study and priors; unchanged without such a population.
     """
     fields, parameters = estimated_fields(problem.setup.study), problem.parameters
     if not fields or not problem.differentiable:

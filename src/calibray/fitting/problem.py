@@ -37,7 +37,7 @@ class Evaluation(NamedTuple):
     Attributes:
         value: The objective, including priors [n].
         residuals: Weighted residuals, then one row per prior [n, m].
-        jacobian: Their derivatives by the search coordinates [n, m, d]; None if not requested.
+        jacobian: Their derivatives with respect to the search coordinates [n, m, d]; None if not requested.
         modelled: The engine's values [n, L]; [n, 0] if it returned only sums.
         rmse_db: The RMSE of the links only (paper eq. 1) [n].
         represents: Number of full residuals that the m compressed ones represent, with the same mean squares and
@@ -87,8 +87,8 @@ class Problem:
         before: The engine's values for the initial parameters [L].
         observable: The quantity that is measured and modelled.
         priors: Priors of the parameters.
-        faint: Mask of the links left out because they are censored or predicted near the noise floor [L]; None if no
-            link is.
+        faint: Mask of the links that are left out because they are censored or predicted near the noise floor [L]; None
+            if no link is left out.
         observed: Further observables of the links, whose residuals follow those of path loss.
     """
 
@@ -111,7 +111,7 @@ class Problem:
             observable: The quantity that is measured and modelled.
 
         Raises:
-            InputError: No calibration link is left, or a group has held-out links only.
+            InputError: No calibration link is left, or a group has only held-out links.
         """
         setup = setup.with_position_noise()
         study, links, held_out = setup.study, setup.links, setup.held_out
@@ -138,7 +138,7 @@ class Problem:
 
     @property
     def has_priors(self) -> bool:
-        """Whether the optimum depends on the noise level, as with a prior or a further observable."""
+        """Whether the optimum depends on the noise level, for example because of a prior or a further observable."""
         of_coefficients = np.isfinite(self.objective.nuisance.prior).any()
         return bool(len(self.priors)) or bool(of_coefficients) or bool(self.observed)
 
@@ -169,7 +169,7 @@ class Problem:
 
     @property
     def differentiable(self) -> bool:
-        """Whether the engine gives derivatives of the observable."""
+        """Whether the engine provides derivatives of the observable."""
         return isinstance(self.engine, Differentiable) and self.observable.derivatives is not None
 
     def evaluate(self, points: NDArray[np.float64], derivatives: bool = False) -> Evaluation:
@@ -199,11 +199,11 @@ class Problem:
         return Evaluation(value, residuals, jacobian, modelled, rmse_db, observed=observed)
 
     def respond(self, candidates: NDArray[np.float64], derivatives: bool = False) -> Responses:
-        """What the engine answers: the links' values and the further observables.
+        """The engine's answer: the links' values and the further observables.
 
         Args:
             candidates: Candidates in the fields' units [n, d].
-            derivatives: Whether to compute derivatives by the parameters; the engine must give them.
+            derivatives: Whether to compute derivatives with respect to the parameters; the engine must provide them.
         """
         if self.observed:
             return self._observing.respond(candidates, self.statistics, derivatives)
@@ -217,7 +217,7 @@ class Problem:
     def squares(self, points: NDArray[np.float64], derivatives: bool = False) -> Evaluation:
         """Like `evaluate`, for methods that use only squares and products of the residuals.
 
-        If the engine holds the links in chunks, each chunk returns sums, and d + 1 compressed residuals represent those
+        If the engine has the links in chunks, each chunk returns sums, and d + 1 compressed residuals represent those
         of all links. Otherwise the residuals are the full ones.
 
         Args:
@@ -294,7 +294,7 @@ class Problem:
         Args:
             candidates: Parameter values [n, d], in the fields' units.
             modelled: The engine's values for them [n, L].
-            observed: Its further observables [n, K, L], in SI units; None without any.
+            observed: Its further observables [n, K, L], in SI units; None if there are none.
 
         Returns:
             The residuals [n, m].
@@ -318,11 +318,10 @@ class Problem:
         Args:
             candidates: Parameter values [n, d], in the fields' units.
             modelled: The engine's values for them [n, L].
-            slope: Their derivatives by k variables [n, L, k]: the d search coordinates, then any others.
-            observed_slope: The same of the further observables [n, K, L, k]; None without any.
+            slope: Their derivatives with respect to k variables [n, L, k]: the d search coordinates, then any others.
+            observed_slope: The same for the further observables [n, K, L, k]; None if there are none.
 
-        Returns:
-            Derivatives of the residuals by the same variables [n, m, k].
+        Returns: Derivatives of the residuals with respect to the same variables [n, m, k].
         """
         parts = [self.objective.jacobian(modelled, slope)]
         if len(self.priors):
@@ -352,15 +351,15 @@ class Problem:
 
     @property
     def _observing(self) -> Observing:
-        """The engine, which gives further observables.
+        """The engine, which computes further observables.
 
         Raises:
             InputError: It gives path loss only.
         """
         if not isinstance(self.engine, Observing):
             raise InputError(
-                f"{self.setup.study.path}: [observables]: the engine {self.setup.study.engine.name!r} gives path loss "
-                "only; use 'replay' or 'command'"
+                f"{self.setup.study.path}: [observables]: the engine {self.setup.study.engine.name!r} computes only "
+                f"path loss; use 'replay' or 'command'"
             )
         return self.engine
 

@@ -1,7 +1,7 @@
-"""What an engine assumes, from ratios of its rays' powers: a global search over constants and polarizations.
+"""Identifies an engine's assumptions from ratios of its rays' powers: a global search over constants and polarizations.
 
-Materials are added one after the other. Each is scanned (`ray_scan.py`) on paths that meet no material that is still to
-come; the best points, with several polarizations, are refined together with what is known so far, by least squares with
+Materials are added one after the other. Each is scanned (`ray_scan.py`) on paths that meet no material that is added
+later. The best points, with several polarizations, are refined together with the values so far, by least squares with
 exact derivatives on all these paths. The best few go on. If a misfit remains at the end, each material is scanned again
 on all its paths.
 """
@@ -25,16 +25,17 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths, take
 
 KEPT: Final = 3
-"""Explanations that go on from one material to the next."""
+"""Number of explanations that are passed from one material to the next."""
 
 EXACT_DB: Final = 0.005
 """Misfit at which a search ends [dB]."""
 
 KNOWN_DB: Final = 0.02
-"""Misfit up to which what explained earlier calls is kept for the next one [dB]; wrong minima have 0.1 dB and more."""
+"""Misfit below which the explanation of earlier calls is kept for the next one [dB]; wrong minima had 0.1 dB and
+more."""
 
 EVALUATIONS: Final = (12, 30)
-"""Evaluations of a refinement between scans and of the last one, with each loss."""
+"""Number of evaluations of a refinement between scans and of the last one, with each loss."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +55,14 @@ class Understanding:
     misfit_db: float
 
     def replay(self, parameters: Parameters, last: Call) -> Replay:
-        """The replay of a call's paths, corrected so that it agrees with it."""
+        """The replay of a call's paths, corrected so that it agrees with the call."""
         paths = self.model.replay_paths(last.candidate, self.values, self.linear)
         correction = 10 ** (last.export.level_db / 10) / np.maximum(powers(paths), 1e-300)
         return Replay(replace(paths, correction=correction), parameters)
 
 
 class Ratio(NamedTuple):
-    """Paths that the last call shares with an earlier one.
+    """Paths that the last call has in common with an earlier one.
 
     Attributes:
         call: The earlier call.
@@ -84,13 +85,13 @@ class Ratio(NamedTuple):
 def understand(
     parameters: Parameters, calls: list[Call], known: bool, before: Understanding | None = None
 ) -> Understanding:
-    """Find what explains the ratios of all calls.
+    """Find the assumptions that explain the ratios of all calls.
 
     Args:
         parameters: The study's parameters.
-        calls: The calls, the last one is modelled.
+        calls: The calls, of which the last one is modelled.
         known: Whether the program's antennas are those of the engine.
-        before: What explained the calls before the last one, if any.
+        before: The explanation of the calls before the last one, if any.
     """
     last, ratios = calls[-1], ratios_of(calls)
     model = RayModel.of(parameters, last.export.paths, known)
@@ -133,7 +134,7 @@ def _best(fits: list[Understanding]) -> list[Understanding]:
 
 
 def _meetings(model: RayModel) -> tuple[NDArray[np.bool_], list[int]]:
-    """Which materials every path meets [P, M], and those with a parameter, that most paths meet alone first."""
+    """The materials that every path meets [P, M], and those with a parameter, most often met alone first."""
     paths, names = model.paths, list(model.paths.materials)
     meets = np.zeros((paths.num_paths, len(names)), dtype=bool)
     meets[np.repeat(np.arange(paths.num_paths), np.diff(paths.first)), paths.material] = True
@@ -147,8 +148,8 @@ def _scanned(
 ) -> list[Understanding]:
     """Explanations with other constants of one material, from scans on some of the paths [P].
 
-    A scan with upright antennas of all polarizations starts from the first explanation; others, with the antennas that
-    each explanation has, take tilts into account.
+    A scan with upright antennas of all polarizations starts from the first explanation. Other scans use the antennas of
+    each explanation and so account for tilts.
     """
     model, first = fits[0].model, np.isinf(fits[0].misfit_db)
     name = list(model.paths.materials)[material]
@@ -198,7 +199,7 @@ def _polarized(fit: Understanding, slants: tuple[float | None, float | None]) ->
 
 
 def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: int) -> Understanding:
-    """Least squares of all ratios, from an explanation; values that change no ratio stay as they are."""
+    """Least squares on all ratios, starting from an explanation; values that change no ratio keep their value."""
     lower, upper = fit.model.bounds
     start = np.clip(fit.values, lower, upper)
     size = np.linalg.norm(_errors(replace(fit, values=start), ratios, last)[1], axis=0)

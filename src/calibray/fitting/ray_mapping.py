@@ -1,12 +1,12 @@
-"""Ray mapping: an expensive engine that exports its rays is understood from a few calls.
+"""Ray mapping identifies the assumptions of an expensive engine that exports its rays from a few calls.
 
-Every call gives the power of each path. Ratios of a path's powers at two sets of constants are free of antenna gains
-and units, so they tell what the engine assumes: thickness, conductivity, slabs or half-spaces, the polarization of its
-antennas. We fit these to all ratios of the calls so far (`ray_fit.py`). The last call then corrects the power of every
-path, and the corrected program is replayed: its minimum is the next call, which checks it.
+Every call gives the power of each path. Ratios of a path's powers at two sets of constants do not depend on antenna
+gains and units. They therefore show what the engine assumes: thickness, conductivity, slabs or half-spaces, and the
+polarization of its antennas. We fit these to all ratios of the calls so far (`ray_fit.py`). The last call then corrects
+the power of every path. The next call is at the minimum of the replay of this corrected program, and checks it.
 
-The first call is at the start values. The second one is where the ratios say most about the assumed constants: of some
-points of the box, that with the largest mean log determinant of their information.
+The first call is at the start values. The second call is where the ratios are most informative about the assumed
+constants: of some points of the box, the one with the largest mean log determinant of their information.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ SEARCHES: Final = 64
 """Local searches for the minimum of the corrected program."""
 
 PROBES: Final = 32
-"""Points of the box of which the second call is one."""
+"""Number of points of the box from which the second call is chosen."""
 
 DRAWS: Final = 3
 """Sets of assumed constants over which the information is averaged."""
 
 DRAWN: Final = 3.0
-"""Largest factor between one of them and the study's constant."""
+"""Largest ratio between one of them and the study's constant."""
 
 SIGMA_DB: Final = 0.1
 """Error of a ratio in the information [dB]."""
 
 UNDERSTOOD_DB: Final = 0.05
-"""Misfit of the ratios up to which the engine counts as understood [dB]; wrong minima had 0.8 dB and more."""
+"""Misfit of the ratios below which the engine counts as identified [dB]; wrong minima had 0.8 dB and more."""
 
 MOST_CALLS: Final = 10
-"""Calls after which ray mapping ends, whatever the gap."""
+"""Number of calls after which ray mapping ends in any case."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class RayMap:
 
     Attributes:
         engine: Replay that agrees with the engine at the best call.
-        calls: The calls; from the third on, each is at the minimum of the program that the others corrected.
+        calls: The calls; from the third on, each is at the minimum of the program corrected by the earlier ones.
         best: The call of least objective.
         understanding: What explains the engine.
         gap_db: Root mean square over the links of the answered minus the predicted path loss at the last call [dB].
@@ -75,24 +75,23 @@ class RayMap:
 
     @property
     def understood(self) -> bool:
-        """Whether the assumed constants explain all calls, and predicted the last one."""
+        """Whether the assumed constants explain all calls and predicted the last one."""
         return max(self.understanding.misfit_db, self.gap_db) <= UNDERSTOOD_DB
 
 
 def map_rays(
     problem: Problem, ask: Ask, *, tolerance_db: float = 0.01, most_calls: int = MOST_CALLS, seed: int = 0
 ) -> RayMap:
-    """Call an engine until its path loss at the minimum is predicted.
+    """Call an engine until the path loss at the minimum is predicted.
 
     Args:
         problem: The problem; its engine is not called.
         ask: Calls the engine.
-        tolerance_db: Gap at which it ends [dB].
+        tolerance_db: Gap at which the mapping ends [dB].
         most_calls: Calls after which it ends.
         seed: Seed of the random numbers.
 
-    Returns:
-        The replay that stands for the engine, and how well it does.
+    Returns: The replay that replaces the engine, and its accuracy.
     """
     parameters, known = problem.parameters, problem.setup.known_antennas is not None
     understanding: Understanding | None = None
@@ -119,7 +118,7 @@ def map_rays(
 
 
 def with_engine(problem: Problem, replay: Replay) -> Problem:
-    """The problem on a replay; links without a path there are left out unless they are censored."""
+    """The problem on a replay; links without a path in it are left out unless they are censored."""
     objective = problem.objective
     if objective.ceiling_db is None:
         reached = np.isfinite(replay.path_loss(problem.parameters.start[None])[0])
@@ -139,7 +138,7 @@ def _gap(replay: Replay, call: Call) -> float:
 
 
 def _most_informative(problem: Problem, call: Call, random: np.random.Generator) -> NDArray[np.float64]:
-    """The candidate whose ratios to the first call say most about the assumed constants [d]."""
+    """The candidate at which the ratios to the first call are most informative about the assumed constants [d]."""
     known = problem.setup.known_antennas is not None
     model = RayModel.of(problem.parameters, call.export.paths, known)
     probes = problem.parameters.from_unit(design("sobol", PROBES, len(problem.parameters), random))

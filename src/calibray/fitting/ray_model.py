@@ -1,9 +1,9 @@
-"""The powers of an engine's rays as a function of the parameters and of what the engine assumes.
+"""The powers of an engine's rays as a function of the parameters and of the engine's assumptions.
 
 An engine assumes thickness, conductivity and permittivity of the materials that the study does not calibrate, and the
-antennas. The gain of an antenna cancels in ratios of powers, its polarization does not. An antenna without polarization
-receives both components of a wave. Any other one is polarized linearly: along a slant angle in the frame of its axis
-(3GPP TR 38.901, eq. 7.3-4/5), which may be tilted.
+antennas. The gain of an antenna cancels in ratios of powers, but its polarization does not. An antenna without
+polarization receives both components of a wave. Any other one is polarized linearly: along a slant angle in the frame
+of its axis (3GPP TR 38.901, eq. 7.3-4/5), which may be tilted.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from calibray.paths import Paths
 from calibray.paths.chains import spherical_basis
 
 HALF_SPACE: Final = 1e4
-"""Thickness that no wave crosses [m]: it decays there unless the conductivity is below 1e-6 S/m."""
+"""Thickness that no wave crosses [m]: it decays within it unless the conductivity is below 1e-6 S/m."""
 
 RANGES: Final = {"thickness": (5e-4, HALF_SPACE), "conductivity": (1e-7, 1e3)}
 """Ranges of the assumed constants, in the fields' units."""
 
 PERMITTIVITY_FACTOR: Final = 2.0
-"""Largest factor between a permittivity that is not calibrated and the engine's."""
+"""Largest ratio between a permittivity that is not calibrated and the engine's."""
 
 TILT: Final = 0.3
-"""Largest tangent of the tilt of an antenna's axis along x or y, 17 degrees: more than base stations have."""
+"""Largest tangent of the tilt of an antenna's axis along x or y, 17 degrees: more than the tilt of base stations."""
 
 ANGLES: Final = 3
 """Slant and two tilts of an end."""
 
 Pair = tuple[jax.Array, jax.Array]
 Ends = tuple[bool, bool]
-"""Whether the antenna is polarized linearly, at the transmitter and at the receiver."""
+"""Whether the antenna is linearly polarized, at the transmitter and at the receiver."""
 
 
 class Call(NamedTuple):
@@ -64,7 +64,7 @@ class RayModel:
     Attributes:
         paths: The program, without correction.
         parameters: The study's parameters.
-        known: Whether its antennas are those of the engine; else they have the ports V and H.
+        known: Whether its antennas are those of the engine; otherwise they have the ports V and H.
     """
 
     paths: Paths
@@ -135,7 +135,7 @@ class RayModel:
     def replay_paths(
         self, candidate: NDArray[np.float64], values: NDArray[np.float64], linear: Ends
     ) -> Paths:
-        """The program with values [k]: its materials, and its antennas as they are assumed to be."""
+        """The program with values [k]: its materials, and its assumed antennas."""
         fields = [self.paths.tx_field, self.paths.rx_field]
         angles = values[len(self.assumed) :].reshape(-1, ANGLES)
         with jax_settings():
@@ -175,7 +175,7 @@ class _Frame(NamedTuple):
         columns: Their columns [q].
         tx: Axes of the fields at the transmitter [P, 2, 3]; empty if the antennas are known.
         rx: Those at the receiver.
-        crossed: Weight of the port across the polarization at both ends [2]: 0 for a linear one, else 1.
+        crossed: Weight of the port orthogonal to the polarization at both ends [2]: 0 for a linear one, otherwise 1.
     """
 
     table: NDArray[np.float64]
@@ -197,7 +197,7 @@ def _basis(zenith_azimuth: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _ports(basis: jax.Array, angles: jax.Array) -> jax.Array:
-    """Weights of the ports V and H in a port with a slant and a tilted axis, and in the one across it [P, 2, 2]."""
+    """Weights of the ports V and H in a port with a slant and a tilted axis, and in its orthogonal port [P, 2, 2]."""
     axis = jnp.stack([angles[1], angles[2], jnp.ones(())])
     # The antenna's own axis theta points away from the pole: -axis, without its part along the direction.
     theta = -basis @ axis
@@ -225,7 +225,7 @@ def _level_and_slope(
 
 
 def _polarized(frame: _Frame, gain: jax.Array, angles: jax.Array) -> jax.Array:
-    """One part of the gains [R, T, P] between ports along and across the polarizations."""
+    """One part of the gains [R, T, P] between ports along and orthogonal to the polarizations."""
     tx = _ports(jnp.asarray(frame.tx), angles[:ANGLES])
     rx = _ports(jnp.asarray(frame.rx), angles[ANGLES:])
     weight = [jnp.stack([jnp.ones(()), frame.crossed[end]]) for end in range(2)]

@@ -1,8 +1,8 @@
 """Scan of one material's thickness and conductivity, on ratios of the powers of some paths.
 
-A slab resonates: the power of a ray has a minimum for every half wavelength that the thickness grows by, so a local
-search ends in a wrong one. A scan tries a fine grid of thicknesses up to the depth where the wave has decayed, for some
-conductivities, with several polarizations of both ends. It evaluates reflections and transmissions alone.
+A slab resonates: the power of a ray has a minimum whenever the thickness grows by half a wavelength, so a local search
+ends in a wrong one. A scan evaluates a fine grid of thicknesses up to the depth where the wave has decayed, for some
+conductivities, with several polarizations at both ends. It evaluates only reflections and transmissions.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ THICKEST: Final = 0.6
 """Largest thickness of a scan [m], unless the study's is more than half of it."""
 
 DECAYED: Final = 4.0
-"""Attenuation within a slab [Np] beyond which it acts as a half-space: what returns has e^-8 of its amplitude."""
+"""Attenuation within a slab [Np] beyond which it acts as a half-space: the returning wave has e^-8 of its amplitude."""
 
 RESOLUTION: Final = 20.0
-"""Points of a scan for a wavelength in the slab, which has two resonances."""
+"""Number of points of a scan per wavelength in the slab, which has two resonances."""
 
 ROBUST_DB: Final = 1.5
-"""Error of a ratio beyond which it counts less [dB]: near a resonance, where a ray has next to no power, the step of a
-scan changes it by tens of dB."""
+"""Error of a ratio beyond which it gets less weight [dB]: near a resonance, where a ray has almost no power, one step
+of a scan changes it by tens of dB."""
 
 SCANNED: Final = 48
 """Paths of a scan."""
@@ -48,7 +48,7 @@ KEPT: Final = 3
 """Local minima of each scan."""
 
 BATCH: Final = 512
-"""Points that are evaluated at once."""
+"""Number of points that are evaluated at once."""
 
 SLANTS: Final = (0.0, np.pi / 2, np.pi / 4, -np.pi / 4)
 """Slants of a linear polarization [rad]: vertical, horizontal, and both diagonals."""
@@ -77,7 +77,7 @@ class Scan:
 
     Attributes:
         values: Logarithms of the scanned constants [H, K, c].
-        misfit: Mean loss of the ratios [H, K]; inf where there are fewer minima.
+        misfit: Mean loss of the ratios [H, K]; inf if there are fewer minima.
     """
 
     values: NDArray[np.float64]
@@ -99,7 +99,7 @@ def scan(
         fields: The constants that are scanned, of thickness and conductivity.
         last: The materials of the last call.
         calls: The ratios to earlier calls.
-        known: Whether the antennas are known; there is one pair of polarizations then.
+        known: Whether the antennas are known; there is then only one pair of polarizations.
     """
     everything = [materials[name] for materials in (last, *(call.materials for call in calls))]
     grid = _grid(fields, everything, paths.materials[name].thickness, paths.frequency)
@@ -116,7 +116,7 @@ def scan(
 
 
 def chosen(paths: Paths, subset: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Of some paths, those that a scan evaluates: of reflections and transmissions, the simplest and shortest."""
+    """The paths that a scan evaluates: of those with only reflections and transmissions, the simplest and shortest."""
     other = ~np.isin(paths.kind, (Kind.SPECULAR, Kind.REFRACTION))
     path = np.repeat(np.arange(paths.num_paths), np.diff(paths.first))
     subset = np.setdiff1d(subset, path[other])

@@ -1,4 +1,4 @@
-"""The search on an engine that answers with rays: ray mapping, and the replay that stands for the engine afterwards."""
+"""The search on an engine that answers with rays: ray mapping, and the replay that replaces the engine afterwards."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def search_rays(
         engine: That engine.
         progress: Called with the stage "calibrating" after every RT call.
 
-    Returns:
-        The problem on the replay that stands for the engine, the search, and how well the engine is understood.
+    Returns: The problem on the replay that replaces the engine, the search, and how well the engine's assumptions are
+    identified.
 
     Raises:
         EngineError: A call failed.

@@ -23,13 +23,13 @@ Evaluate = Callable[[NDArray[np.float64], bool], Evaluation]
 """Evaluates points of the search space [n, d]; the flag requests derivatives."""
 
 SEARCHES: Final = 64
-"""Local searches for further minima if the method kept only its best."""
+"""Number of local searches for further minima if the method kept only its best."""
 
 BASINS: Final = 24
-"""Minimum number of minima that posterior sampling starts from."""
+"""Smallest number of minima from which posterior sampling starts."""
 
 RELEVANT: Final = 20.0
-"""Largest excess sum of squares of a relevant minimum, in noise variances; a likelihood ratio of exp(-10)."""
+"""Largest excess of the sum of squares for a relevant minimum, in noise variances; a likelihood ratio of exp(-10)."""
 
 
 def rounds(optimizer: Optimizer, evaluate: Evaluate) -> Iterator[tuple[NDArray[np.float64], Evaluation]]:
@@ -84,8 +84,8 @@ class Trail:
         minima: Minima of the optimizer's searches, the best first, as points of the search space [k, d].
         rt_calls: RT calls of the search, including calls of an earlier run that the ledger answered.
         ledger_hits: Number of calls that the ledger answered.
-        modelled: The engine's values for each candidate [L], for an engine without derivatives only.
-        observed: Further observables for each candidate [K, L], likewise.
+        modelled: The engine's values for each candidate [L], only for an engine without derivatives.
+        observed: Further observables for each candidate [K, L], only for such an engine.
     """
 
     candidates: list[NDArray[np.float64]] = field(default_factory=list)

@@ -1,8 +1,8 @@
-"""Sums of squares and products over chunks of links: all that least squares needs, at a cost independent of the links.
+"""Sums of squares and products over chunks of links, which are all that least squares needs.
 
-For gaps g (measured minus modelled path loss), derivatives J, weights w and a nuisance's design Z, a chunk gives
-[J g]' w [J g] and Z' w [J g]. Their sums over all chunks give the normal equations with the nuisance eliminated. With
-A = [J g] and the best coefficients X of every column,
+For gaps g (measured minus modelled path loss), derivatives J, weights w and a nuisance's design Z, a chunk returns [J
+g]' w [J g] and Z' w [J g]. Their sums over all chunks give the normal equations with the nuisance eliminated. With A =
+[J g] and the best coefficients X of every column,
 
     (A - Z X)' w (A - Z X) = A'wA - X'Z'wA - A'wZ X + X'Z'wZ X.
 
@@ -86,7 +86,7 @@ def total(parts: Sequence[Sums], shares: Sequence[Share], columns: int) -> Sums:
 
     Args:
         parts: The sums of every chunk.
-        shares: The shares that they were made by.
+        shares: The shares from which they were made.
         columns: Number of columns of the nuisance q.
 
     Returns:

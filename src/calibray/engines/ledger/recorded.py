@@ -34,14 +34,15 @@ LONGEST_WAIT: Final = 1.0
 
 @final
 class Recorded:
-    """An engine behind a ledger: a candidate that any run has paid for is not run again.
+    """An engine behind a ledger, which does not run a candidate again that any run has paid for.
 
     Args:
         engine: The engine.
         ledger: The ledger.
-        problem: Fingerprint of everything that the engine's answers depend on besides the candidate.
+        problem: Fingerprint of everything that determines the engine's answers apart from the candidate.
         name: Name of the engine.
-        progress: Called with "waiting", the answers that came from another run and the answers waited for.
+        progress: Called with "waiting", the number of answers received from another run and the number of answers
+            awaited.
 
     Attributes:
         hits: Number of candidates answered by the ledger so far; they are not RT calls.
@@ -66,7 +67,7 @@ class Recorded:
 
     @property
     def parameters(self) -> Parameters:
-        """The parameters that a candidate gives values to."""
+        """The parameters whose values a candidate contains."""
         return self._engine.parameters
 
     @property
@@ -75,14 +76,14 @@ class Recorded:
         return self._engine.materials
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates, from the ledger or else the engine; see `Answering`."""
+        """Path loss of every link for candidates, from the ledger or otherwise from the engine; see `Answering`."""
         answers, first = self._all_answers(candidates)
         return gather(answers, (len(candidates), self._engine.num_links), first)
 
     def respond(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
     ) -> Responses:
-        """Path loss and the further observables that the engine is asked for; see `Observing.respond`.
+        """Path loss and the requested further observables; see `Observing.respond`.
 
         Raises:
             InputError: Derivatives are wanted.
@@ -93,7 +94,7 @@ class Recorded:
         return gather_responses(answers, (len(candidates), self._engine.num_links), len(wanted), first)
 
     def _all_answers(self, candidates: NDArray[np.float64]) -> tuple[list[Answer], bool]:
-        """The answers to candidates, and whether they are the first."""
+        """The answers to candidates, and whether these candidates are the first ones."""
         first = self.calls + self.hits == 0
         answers = list(self.answers(check_candidates(candidates, len(self.parameters))))
         if first and all(answer.failure for answer in answers) and not self._ledger.read_only:
@@ -101,7 +102,7 @@ class Recorded:
         return answers, first
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
-        """Answer candidates from the ledger or else the engine, until `stop` is set; see `Answering.answers`."""
+        """Answer candidates from the ledger or otherwise the engine, until `stop` is set; see `Answering.answers`."""
         values, stop = candidates, stop or Event()
         # The same candidate may occur several times in one batch, and is run once.
         missing: dict[bytes, list[int]] = {}

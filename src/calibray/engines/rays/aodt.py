@@ -1,8 +1,8 @@
 """Paths of NVIDIA's Aerial Omniverse Digital Twin, from a folder with `raypaths.parquet` and `cirs.parquet`.
 
 Both tables name the time, the radio unit and the user equipment. `raypaths` has a row for each path, with its points in
-units of the scene (centimetres unless stated) and types of interaction, `cirs` a row for each pair of antenna elements,
-with lists of complex gains and delays [s] in the order of the paths.
+units of the scene (centimetres unless stated) and its types of interaction. `cirs` has a row for each pair of antenna
+elements, with lists of complex gains and delays [s] in the order of the paths.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def read_aodt(folder: Path, metres_per_unit: float = 0.01) -> SourceTable:
     Powers are summed over the antenna elements of the user equipment and averaged over those of the radio unit.
 
     Raises:
-        InputError: A table or column is missing or malformed, or gains and paths of a pair differ in number.
+        InputError: A table or column is missing or malformed, or the numbers of gains and paths of a pair differ.
     """
     rays, gains = (read_table(folder / name) for name in FILES)
     for table, names in ((rays, ["points", "interaction_types"]), (gains, ["cir_re", "cir_im", "cir_delay"])):

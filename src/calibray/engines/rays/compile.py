@@ -1,7 +1,7 @@
-"""From a ray table to a path program and back, with checks and the correction of every path's power.
+"""Converts a ray table to a path program and back, with checks and the correction of every path's power.
 
-The correction is the power that the engine states over the power of the replay. It contains what the engine knows and
-the study does not, such as antennas: replay at other constants multiplies it by the ratio of the replayed powers.
+The correction is the power that the engine states divided by the power of the replay. It contains properties that only
+the engine knows, such as its antennas: replay at other constants multiplies it by the ratio of the replayed powers.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ from calibray.tracing.settings import Antenna
 _LOG: Final = logging.getLogger(__name__)
 
 UNKNOWN: Final = Antenna("iso", "VH")
-"""Antenna at an end whose antenna is unknown: no polarization is lost, and the correction contains the rest."""
+"""The antenna at an end whose real antenna is unknown: it loses no polarization, and the correction contains the
+rest."""
 
 FREE_SPACE_DB: Final = 1.0
-"""Largest difference of a direct path from its free-space power where antennas are known [dB]: engines' tables of a
-pattern differ by tenths, while transmitted power or watts in place of decibels makes tens."""
+"""Largest difference of a direct path from its free-space power if antennas are known [dB]: engines' tables of a
+pattern differ by tenths, while transmitted power or watts instead of decibels cause tens."""
 
 DIRECT_GAIN_DB: Final = 60.0
 """Gain of both antennas together that no direct path exceeds [dB]: two dishes of 30 dBi."""
@@ -42,7 +43,7 @@ DIRECT_GAIN_DB: Final = 60.0
 
 @dataclass(frozen=True, eq=False)
 class RaySetting:
-    """What the paths of a table are read for.
+    """The context in which the paths of a table are read.
 
     Attributes:
         scene: The scene, with the constants that the engine used.
@@ -58,7 +59,7 @@ class RaySetting:
 
     @classmethod
     def of(cls, study: OpenedStudy) -> RaySetting:
-        """The links of a study at its start values; antennas that it does not state are unknown."""
+        """The links of a study at its start values; antennas that the study does not state are unknown."""
         return cls(study.scene, study.radio.frequency, study.known_antennas, study.links)
 
 
@@ -110,8 +111,8 @@ def rays_of(paths: Paths) -> RayTable:
     power = powers(paths)
     if not (power > 0).all():
         raise InputError(
-            f"path {int(np.argmin(power))} has no power, which a ray table cannot state; leave it out with "
-            "calibray.paths.take"
+            f"path {int(np.argmin(power))} has no power, which a ray table cannot state; remove it with "
+            f"calibray.paths.take"
         )
     return RayTable(
         "paths", np.arange(count), paths.link, paths.tx_position[paths.link],
@@ -126,7 +127,7 @@ def powers(paths: Paths) -> NDArray[np.float64]:
 
 
 def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
-    """The paths with the normals and materials of their surfaces; and the largest distance from one [m]."""
+    """The paths with the normals and materials of their surfaces, and the largest distance from a surface [m]."""
     present = table.kind != 0
     stops = np.concatenate([table.tx[:, None], table.vertex, table.rx[:, None]], axis=1)
     stops[np.arange(len(stops)), present.sum(axis=1) + 1] = table.rx
@@ -228,7 +229,7 @@ def _assign_links(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.int64] | None]:
     """Ends of distinct links, the link of every path among them, and the links of the program among them or None.
 
-    Paths between other positions than those of `links` have the link -1.
+    Paths between positions that are not in `links` have the link -1.
 
     Raises:
         InputError: No path belongs to a link, or the paths of a link have different ends.
@@ -275,7 +276,7 @@ def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], kno
         raise InputError(
             f"{table.source}: a direct path of link {paths.link[worst]} is {off[worst]:.1f} dB above free space "
             f"{what}; power_db must be the path gain, received minus transmitted power, with antenna gains"
-            + ("; leave the antennas out if they are not those of the engine" if known else "")
+            + ("; omit the antennas if they are not those of the engine" if known else "")
         )
 
 
@@ -285,6 +286,6 @@ def _correction(table: RayTable, paths: Paths, power: NDArray[np.float64]) -> ND
         material = list(paths.materials)[paths.material[paths.first[int(np.argmin(replayed))]]]
         raise InputError(
             f"{table.source}: a path of the table has no power in replay; check the constants of {material!r} (a "
-            "diffuse reflection needs a scattering_coefficient), or leave the antennas out"
+            f"diffuse reflection needs a scattering_coefficient), or omit the antennas"
         )
     return power / replayed

@@ -23,14 +23,14 @@ from calibray.support.messages import first_line
 
 TYPES: Final = {"1": "reflection", "2": "diffraction", "3": "diffuse", "4": "transmission"}
 OTHER_NAMES: Final = {"delay": "toa", "inter_pos": "inter_loc", "tx_pos": "tx_loc", "rx_pos": "rx_loc"}
-"""Matrices by their names in earlier versions."""
+"""Matrices and their names in earlier versions."""
 
 LARGEST: Final = 2**30
 """Largest size of a matrix in memory [bytes]."""
 
 
 def is_deepmimo(folder: Path) -> bool:
-    """Whether a folder has matrices of a scenario."""
+    """Whether a folder contains matrices of a scenario."""
     return any(_files(folder))
 
 
@@ -38,7 +38,7 @@ def read_deepmimo(folder: Path) -> SourceTable:
     """Read the paths of all transmitters.
 
     Raises:
-        InputError: A matrix is missing, malformed, too large, or has another shape than its others.
+        InputError: A matrix is missing, malformed or too large, or its shape does not match the others.
     """
     paths = [path for file in _files(folder) for path in _paths(file)]
     return rows_of(paths, str(folder))

@@ -1,4 +1,4 @@
-"""The rays of one call, and an engine that answers with rays and keeps them."""
+"""The rays of one call, and an engine that answers with rays and stores them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Export:
         """Read and check the response of a program.
 
         Raises:
-            InputError: It is no ray table, states no power, or does not agree with the scene or the links.
+            InputError: The response is not a ray table, states no power, or does not agree with the scene or the links.
         """
         return cls.of_table(RayTable.of(parse_rays(response, RESPONSE)), RaySetting.of(study))
 
@@ -62,28 +62,28 @@ class Export:
 
     @property
     def path_loss_db(self) -> NDArray[np.float64]:
-        """The engine's path loss [L]; +inf without a path."""
+        """The engine's path loss [L]; +inf for a link without a path."""
         power = np.bincount(self.paths.link, 10 ** (self.level_db / 10), self.paths.num_links)
         with np.errstate(divide="ignore"):
             return -10 * np.log10(power)
 
     @property
     def weight(self) -> NDArray[np.float64]:
-        """Weight of every path [P]: its share of the link's power, and a little more."""
+        """Weight of every path [P]: its share of the link's power, and a small constant."""
         power = 10 ** (self.level_db / 10)
         return power / np.bincount(self.paths.link, power)[self.paths.link] + FAINT
 
 
 @final
 class Exporting:
-    """An engine that answers with rays, whose rays are kept: it is called once for each candidate.
+    """An engine that answers with rays and stores them, so that it is called once for each candidate.
 
     Args:
         engine: The engine.
         study: The opened study.
 
     Attributes:
-        parameters: The parameters that a candidate gives values to.
+        parameters: The parameters whose values a candidate contains.
         materials: The scene's materials before calibration.
     """
 

@@ -1,4 +1,4 @@
-"""Files of ray tables: CSV, Parquet, JSON and HDF5, by their ending."""
+"""Files of ray tables: CSV, Parquet, JSON and HDF5, distinguished by their extension."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from calibray.support.output_files import check_file, exists, replacing, write_t
 from calibray.support.output_tables import write_table
 
 LARGEST_JSON: Final = 2**26
-"""Largest JSON file [bytes]; in memory, its numbers take some twenty times as much."""
+"""Largest JSON file [bytes]; in memory, its numbers take about twenty times as much."""
 
 HDF5: Final = b"\x89HDF"
 """First bytes of an HDF5 file."""
@@ -31,7 +31,7 @@ def read_ray_file(file: str | Path) -> SourceTable:
     """Read the rows of a .csv, .parquet, .json or .h5 file.
 
     Raises:
-        InputError: The file does not exist, has another ending, or is malformed.
+        InputError: The file does not exist, has another extension, or is malformed.
     """
     path = Path(file)
     suffix = path.suffix.lower()
@@ -70,15 +70,15 @@ def _parsed(content: Path | BytesIO | str, source: str) -> SourceTable:
         fault = shortened(str(error))
         raise InputError(f"{source}: not a ray table ({fault}); see docs/reference/ray-table.md") from None
     if frame.empty:
-        raise InputError(f"{source}: holds no rows; a ray table needs at least one path")
+        raise InputError(f"{source}: contains no rows; a ray table needs at least one path")
     return SourceTable(frame, source=source)
 
 
 def write_ray_file(file: str | Path, frame: pd.DataFrame, overwrite: bool = False) -> None:
-    """Write the rows as .csv, .parquet, .json or .h5; a file there is replaced only once the new one is complete.
+    """Write the rows as .csv, .parquet, .json or .h5; an existing file is replaced only once the new one is complete.
 
     Raises:
-        InputError: The ending is unknown, or the file cannot be written or must not be replaced.
+        InputError: The file extension is unknown, or the file cannot be written or must not be replaced.
     """
     target = check_file(file, overwrite=overwrite)
     match target.suffix.lower():

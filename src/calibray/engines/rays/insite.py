@@ -1,7 +1,7 @@
 """Paths of Remcom Wireless InSite, from its text files `*.paths.*.p2m`.
 
-Lines that begin with # are comments. The first line is the number of receivers. For each one follow its number and its
-number of paths and, if there are any, a line of sums. A path has a line of nine numbers (number, number of
+Lines that begin with # are comments. The first line is the number of receivers. For each receiver, its number and its
+number of paths follow and, if there are any paths, a line of sums. A path has a line of nine numbers (number, number of
 interactions, received power [dBm], phase [deg], time of arrival [s], four angles [deg]), a line such as Tx-R-D-Rx, and
 a line for each point.
 """
@@ -20,7 +20,7 @@ from calibray.measurements import SourceTable
 from calibray.support.messages import shortened
 
 TYPES: Final = {"R": "reflection", "D": "diffraction", "DS": "diffuse", "T": "transmission"}
-"""Interactions by their letters; foliage (F, X) has no material of a surface."""
+"""Interactions by their letters; foliage (F, X) is not a surface with a material."""
 
 
 def read_insite(file: Path, tx_power_dbm: float | None) -> SourceTable:
@@ -76,7 +76,7 @@ def _numbers(file: Path, line: tuple[int, str], count: int) -> list[float]:
         values = []
     if len(values) != count or not np.isfinite(values).all():
         raise InputError(
-            f"{file}, line {number}: {shortened(text)!r}, must be {count} numbers; this is no paths file of Wireless "
-            "InSite (project.paths.t001_01.r002.p2m)"
+            f"{file}, line {number}: {shortened(text)!r}, must be {count} numbers; this is not a paths file of "
+            f"Wireless InSite (project.paths.t001_01.r002.p2m)"
         )
     return values

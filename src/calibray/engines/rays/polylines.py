@@ -1,4 +1,4 @@
-"""The rows of a ray table from paths as other programs keep them: points, types of interaction and power."""
+"""The rows of a ray table, from paths in the form of other programs: points, types of interaction and power."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Polyline(NamedTuple):
         points: Points from the transmitter to the receiver [n, 3], [m].
         types: Types of the n - 2 interactions, as in the column `type`.
         power_db: Path gain [dB].
-        delay: Propagation delay [s], NaN if not stated.
+        delay: Propagation delay [s]; NaN if not stated.
     """
 
     points: NDArray[np.floating]
@@ -34,11 +34,11 @@ def rows_of(paths: Iterable[Polyline], source: str) -> SourceTable:
     """The ray table of paths, in their order.
 
     Raises:
-        InputError: There is no path, or one has another number of points than of interactions and ends.
+        InputError: The list is empty, or the numbers of points, interactions and ends of a path do not match.
     """
     paths = list(paths)
     if not paths:
-        raise InputError(f"{source}: holds no path; export the rays of at least one link")
+        raise InputError(f"{source}: contains no path; export the rays of at least one link")
     for number, path in enumerate(paths):
         if len(path.points) != len(path.types) + 2:
             raise InputError(

@@ -1,4 +1,4 @@
-"""Paths of Sionna RT in memory: what its `PathSolver` returns.
+"""Paths of Sionna RT in memory, as returned by its `PathSolver`.
 
 Vertices and interactions are [D, R, T, P] with synthetic arrays, else [D, R, Ra, T, Ta, P] for the antennas of the
 arrays. Gains `a` are real and imaginary part [R, Ra, T, Ta, P].
@@ -26,17 +26,18 @@ def is_sionna_paths(value: object) -> bool:
 
 
 def read_sionna_paths(paths: Any) -> SourceTable:
-    """Read paths between antennas of one place each.
+    """Read paths between antennas with one position each.
 
     Powers are summed over the ports of a receiver and averaged over those of a transmitter.
 
     Raises:
-        InputError: An array has antennas at several places, or there is no path.
+        InputError: An array has antennas at several positions, or there is no path.
     """
     for array in (paths.tx_array, paths.rx_array):
         if array.array_size != 1:
             raise InputError(
-                f"{SOURCE}: an array has {array.array_size} antennas, whose paths add up; trace with one antenna each"
+                f"{SOURCE}: an array has {array.array_size} antennas, whose paths are summed; trace with one antenna "
+                f"each"
             )
     return rows_of(_paths(paths), SOURCE)
 
@@ -64,6 +65,6 @@ def _paths(paths: Any) -> Iterator[Polyline]:
 
 
 def _positions(ends: Any, count: int) -> NDArray[np.float64]:
-    """Positions of the ends [count, 3]; ports at one place are listed one after the other."""
+    """Positions of the ends [count, 3]; ports at one position are listed one after the other."""
     positions = np.array(ends, dtype=float).T
     return positions[:: len(positions) // count]

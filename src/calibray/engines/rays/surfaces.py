@@ -1,4 +1,4 @@
-"""The surface that every interaction of a ray table lies on: its normal, its material, and the edge that diffracts."""
+"""The surface of every interaction of a ray table: its normal, its material, and the diffracting edge."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ TOLERANCE: Final = 0.02
 """Largest distance of an interaction from its surface [m]; coordinates rounded to centimetres lie within 0.009 m."""
 
 SAME: Final = 1e-3
-"""Faces whose distances from a point differ by less coincide there [m]."""
+"""Faces coincide at a point if their distances from it differ by less [m]."""
 
 PAIRS: Final = 20_000_000
-"""Points times faces whose bounding boxes are compared at once, which takes 0.5 GB."""
+"""Number of points times faces whose bounding boxes are compared at once, which takes 0.5 GB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class Surfaces:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Interactions with their directions and, where the table states it, their material.
+    """Interactions with their directions and, if the table states it, their material.
 
     Attributes:
         point: [n, 3], [m].
@@ -100,7 +100,7 @@ class Hits:
         leaving: Unit vectors of travel after [n, 3].
         length: The shorter one of the two segments [n], [m].
         reflects: Whether the mirror law must hold [n].
-        material: Index of the stated material, -1 if none is [n].
+        material: Index of the stated material; -1 if none is stated [n].
         label: What messages call them [n].
     """
 
@@ -113,7 +113,7 @@ class Hits:
     label: NDArray[np.str_]
 
     def mirror_error(self, index: NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance between where a reflection leads and where the path goes, of hits with normals [k, 3], [m]."""
+        """Distance between the end of the reflected ray and the path, for hits with normals [k, 3], [m]."""
         incident = self.incident[index]
         mirrored = incident - 2 * np.sum(incident * normal, axis=1)[:, None] * normal
         return np.linalg.norm(mirrored - self.leaving[index], axis=1) * self.length[index]
@@ -122,10 +122,11 @@ class Hits:
 def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.int64], float]:
     """Face of every interaction [n], and the largest distance from it [m]; `names` are those of the materials.
 
-    Of the faces at hand, reflections take the nearest one whose mirror law holds, others the nearest.
+    Among the nearby faces, a reflection gets the nearest one that obeys the mirror law, and other interactions get the
+    nearest.
 
     Raises:
-        InputError: A point lies on no surface (of its material), faces of different materials coincide there, or no
+        InputError: A point is on no surface (of its material), faces of different materials coincide there, or no
             surface reflects the wave into the direction of the path.
     """
     index, face, distance = surfaces.near(hits.point, TOLERANCE)
@@ -144,8 +145,8 @@ def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.
     if bent[first].any():
         worst = int(np.argmax(np.where(bent[first], error[order][first], 0)))
         raise InputError(
-            f"{hits.label[worst]}: is no reflection on the surface of {names[surfaces.material[face[first[worst]]]]!r} "
-            f"there: it misses the mirror law by {error[order][first[worst]]:.3g} m; export the vertices with more "
+            f"{hits.label[worst]}: is not a reflection on the surface of "
+            f"{names[surfaces.material[face[first[worst]]]]!r} there: it violates the mirror law by {error[order][first[worst]]:.3g} m; export the vertices with more "
             "digits, or correct its type"
         )
     _refuse_ambiguous(surfaces, hits, (index, face, distance, bent), first, names)
@@ -153,7 +154,7 @@ def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.
 
 
 def _off_surface(surfaces: Surfaces, hits: Hits, lost: NDArray[np.int64], names: list[str]) -> InputError:
-    """The error of points that lie on no surface."""
+    """The error for points that are on no surface."""
     number = lost[0]
     stated = hits.material[number]
     faces = np.ones(len(surfaces.material), bool) if stated < 0 else surfaces.material == stated
@@ -189,8 +190,9 @@ class Edge:
         face: The 0-face, which the wave illuminates.
         normal_0: Its outward normal [3].
         normal_n: Outward normal of the other face [3].
-        direction: Unit vector along the edge [3]; with the normal of the 0-face it makes the vector into that face.
-        error: How far the path misses Keller's law [m].
+        direction: Unit vector along the edge [3]; its cross product with the normal of the 0-face points into that
+            face.
+        error: Distance by which the path violates Keller's law [m].
     """
 
     face: int
@@ -213,13 +215,13 @@ def find_edge(surfaces: Surfaces, hits: Hits, number: int) -> Edge:
     if not usable:
         raise InputError(
             f"{hits.label[number]}: no edge of the scene diffracts the wave into the direction of the path there; "
-            "check the vertex, or leave the path out"
+            "check the vertex, or remove the path"
         )
     return min(usable, key=lambda edge: (round(edge.error, 6), np.dot(incident, edge.normal_0), leaving[0]))
 
 
 def _edge(surfaces: Surfaces, hits: Hits, number: int, faces: tuple[int, int]) -> Edge | None:
-    """The wedge of a 0-face and an n-face; None if they form none that the path goes around."""
+    """The wedge of a 0-face and an n-face; None if they form no wedge around which the path bends."""
     point, incident, leaving = hits.point[number], hits.incident[number], hits.leaving[number]
     normal_0, normal_n = surfaces.normal[list(faces)]
     direction = np.cross(normal_0, normal_n)

@@ -1,7 +1,7 @@
 """A ray table: one row for each point of a path, from the transmitter over its interactions to the receiver.
 
-`docs/reference/ray-table.md` documents the columns. Rows may come in any order, because every row names its path and
-its place on it.
+`docs/reference/ray-table.md` documents the columns. Rows may be in any order, because every row names its path and its
+position on it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ENDS: Final = ("transmitter", "receiver")
 """Values of `type` of the first and the last point of a path."""
 
 MOST_POINTS: Final = 102
-"""Most points of a path: `trace.max_depth` allows 100 interactions."""
+"""Largest number of points of a path: `trace.max_depth` allows 100 interactions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +184,7 @@ def _positions(table: SourceTable, axes: str) -> NDArray[np.float64]:
 
 
 def _optional_labels(table: SourceTable, name: str) -> NDArray:
-    """Labels of a column, empty where missing or where there is no such column [rows]."""
+    """Labels of a column; empty if a label or the column is missing [rows]."""
     if name not in table.frame:
         return np.full(len(table), "", dtype=object)
     return table.frame[name].astype(object).where(table.frame[name].notna(), "").astype(str).to_numpy(object)
@@ -198,7 +198,7 @@ def _link(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray | None:
 
 
 def _names(table: SourceTable, name: str) -> NDArray:
-    """Numbers, which sort as numbers, or else labels [rows]."""
+    """Numbers, which sort as numbers, or otherwise labels [rows]."""
     if pd.api.types.is_integer_dtype(table.column(name)):
         return table.numbers(name).astype(np.int64)
     return table.labels(name)
@@ -211,12 +211,12 @@ def _per_path(table: SourceTable, name: str, row_path: NDArray[np.int64]) -> NDA
 
 
 def _stated(table: SourceTable, name: str, row_path: NDArray[np.int64]) -> pd.Series:
-    """A value of the whole path, which all its rows that state it must share [P]."""
+    """A value of the whole path, which must be the same in all rows that state it [P]."""
     groups = table.column(name).groupby(row_path)
     if (differing := groups.nunique() != 1).any():
         row = int(np.argmax(row_path == int(np.argmax(differing.to_numpy()))))
         raise InputError(
-            f"{table.cell(row, name)}: the rows of a path must state one and the same {name}; correct them"
+            f"{table.cell(row, name)}: all rows of a path must state the same {name}; correct them"
         )
     return groups.first()
 
@@ -238,5 +238,5 @@ def _power(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray[np.float6
         return None
     real, imaginary = (_per_path(table, name, row_path) for name in ("gain_real", "gain_imag"))
     if not ((power := real**2 + imaginary**2) > 0).all():
-        raise InputError(f"{table.source}: a path has the gain 0; leave it out")
+        raise InputError(f"{table.source}: a path has the gain 0; remove it")
     return power
