@@ -146,8 +146,8 @@ def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.
         worst = int(np.argmax(np.where(bent[first], error[order][first], 0)))
         raise InputError(
             f"{hits.label[worst]}: is not a reflection on the surface of "
-            f"{names[surfaces.material[face[first[worst]]]]!r} there: it violates the mirror law by {error[order][first[worst]]:.3g} m; export the vertices with more "
-            "digits, or correct its type"
+            f"{names[surfaces.material[face[first[worst]]]]!r} there: it violates the mirror law by "
+            f"{error[order][first[worst]]:.3g} m; export the vertices with more digits, or correct its type"
         )
     _refuse_ambiguous(surfaces, hits, (index, face, distance, bent), first, names)
     return face[first], float(distance[first].max(initial=0.0))
