@@ -1,4 +1,4 @@
-"""Radio materials: the constants of a surface, and the laws of ITU-R P.2040 that give them by name.
+"""Radio materials: the constants of a surface, and the laws of ITU-R P.2040 that give them by material name.
 
 Revision P.2040-1 differs from the later ones below 100 GHz (concrete 5.31 became 5.24, glass 6.27 became 6.31). -2 and
 -3 print the same Table 3. -4 keeps those rows and adds rows above 100 GHz and new materials. Sionna RT 2.2 follows -4,
@@ -72,7 +72,7 @@ BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
         "lambda_": Bound(0.0, 1.0, "1"),
     }
 )
-"""Physical bounds of each field: those that Sionna RT enforces, and a thickness greater than 0."""
+"""Physical bounds of each field: the bounds of Sionna RT, and a thickness greater than 0."""
 
 SCATTERING_PATTERNS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
@@ -198,7 +198,7 @@ def _table(rows: Mapping[str, tuple[tuple[float, ...], ...]]) -> _Table:
 
 
 def _extended(base: _Table, rows: Mapping[str, tuple[tuple[float, ...], ...]]) -> _Table:
-    """A table with rows added after those of `base`, whose rows win where ranges overlap."""
+    """A table with additional rows after those of `base`, whose rows apply if ranges overlap."""
     return _table({name: (*base.get(name, ()), *rows.get(name, ())) for name in {**base, **rows}})
 
 
@@ -266,7 +266,7 @@ _P2040_4: Final = _extended(
 ITU_MATERIALS: Final[Mapping[str, _Table]] = MappingProxyType(
     {"P.2040-1": _P2040_1, "P.2040-2": _P2040_2, "P.2040-3": _P2040_2, "P.2040-4": _P2040_4}
 )
-"""ITU-R P.2040 Table 3 by revision and material; where ranges overlap the first row wins, as in Sionna RT."""
+"""ITU-R P.2040 Table 3 by revision and material; if ranges overlap, the first row applies, as in Sionna RT."""
 
 DEFAULT_REVISION: Final = "P.2040-3"
 
@@ -283,7 +283,7 @@ def itu_material(
     Args:
         name: Name as in Sionna RT, for instance "concrete" or "very_dry_ground".
         frequency: Frequency [Hz], within the range of the material's law, ends included.
-        thickness: Thickness of the slab [m]; P.2040 gives none, 0.1 m is Sionna RT's default.
+        thickness: Thickness of the slab [m]; P.2040 states none, and 0.1 m is Sionna RT's default.
         revision: Revision of the recommendation, a key of `ITU_MATERIALS`.
         **scattering: Further fields of the `Material`, for instance ``scattering_coefficient=0.3``.
 

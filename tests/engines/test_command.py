@@ -113,11 +113,11 @@ def test_answers_that_can_be_read(tmp_path, content, num_links, loss):
         ("[70, 80]", "no key 'path_loss_db'"),
         ('{"path_loss": [70, 80]}', "no key 'path_loss_db'"),
         ('{"path_loss_db": [70]}', r"shape \(1,\), must be \(2,\)"),
-        ('{"path_loss_db": [[70, 80]]}', r"holds \[70, 80\] in path_loss_db, which is not a number"),
+        ('{"path_loss_db": [[70, 80]]}', r"contains \[70, 80\] in path_loss_db, which is not a number"),
         ('{"path_loss_db": [70, NaN]}', r"path_loss_db\[1\] = nan; must be a number"),
         ('{"path_loss_db": [-Infinity, 70]}', r"path_loss_db\[0\] = -inf"),
-        ('{"path_loss_db": [70, true]}', "holds true in"),
-        ('{"path_loss_db": [70, "80"]}', 'holds "80" in'),
+        ('{"path_loss_db": [70, true]}', "contains true in"),
+        ('{"path_loss_db": [70, "80"]}', 'contains "80" in'),
         (f'{{"path_loss_db": [70, 1{"0" * 400}]}}', "too large"),
     ],
 )
@@ -311,7 +311,7 @@ def test_a_worker_that_dies_costs_its_candidate_alone(tmp_path):
     ("workers", "scheduler", "message"),
     [
         (0, None, "must be at least 1"),
-        (2, "tcp://here:1", "give one of them"),
+        (2, "tcp://here:1", "give only one of them"),
         *(
             (None, address, "--scheduler .*: not an address; give host and port, as tcp://")
             for address in (

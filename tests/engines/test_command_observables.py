@@ -80,7 +80,7 @@ def test_one_call_answers_for_path_loss_and_observables(tmp_path):
         ("", "no key 'observables'"),
         (', "observables": [[1, 2], [3, 4]]', r"shape \(2, 2\), must be \(1, 2\)"),
         (', "observables": [[1, 2], [3]]', "lists of different lengths"),
-        (', "observables": [[1, "many"]]', 'holds "many" in observables'),
+        (', "observables": [[1, "many"]]', 'contains "many" in observables'),
     ],
 )
 def test_answers_without_usable_observables_are_refused(tmp_path, observables, message):
@@ -96,7 +96,7 @@ def test_observables_in_hdf5(tmp_path):
         response["path_loss_db"], response["observables"] = [70.0, 80.0], [[1.0, np.nan], [3.0, 4.0]]
     _, observed = read_answer(file, "hdf5", 2, 2)
     np.testing.assert_array_equal(observed, [[1.0, np.nan], [3.0, 4.0]])
-    with pytest.raises(Unusable, match="must hold 6 numbers"):
+    with pytest.raises(Unusable, match="must contain 6 numbers"):
         read_answer(file, "hdf5", 2, 3)
 
 

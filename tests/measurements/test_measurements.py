@@ -161,7 +161,7 @@ def test_metadata_that_end_the_library_are_looked_at_in_another_process(tmp_path
     pd.DataFrame({"x": [1.0, 2.0]}).to_parquet(path)
     monkeypatch.setattr(table_files, "run_limited", lambda code, *_: "group.column" not in code)
     monkeypatch.setattr(pq, "ParquetFile", lambda *_, **__: pytest.fail("opened in this process"))
-    with pytest.raises(InputError, match="its library fails while it reads it; export it again"):
+    with pytest.raises(InputError, match="its library fails while reading it; export it again"):
         read_table(path)
 
 
@@ -262,8 +262,8 @@ LATER = TABLE.splitlines()[1:]
     ("text", "changes", "message"),
     [
         # The file
-        ("", {}, "holds no rows"),
-        ("x,y,z,loss\n", {}, "holds no rows"),
+        ("", {}, "contains no rows"),
+        ("x,y,z,loss\n", {}, "contains no rows"),
         (TABLE + "1,2,3\n", {}, "row 6: 3 cells, the header has 6"),
         (TABLE + "1,2,3,99,LOS,1,\n", {}, "row 6: 7 cells, the header has 6"),
         (
@@ -454,5 +454,5 @@ def test_links_to_predict_at_have_no_values(tmp_path):
     np.testing.assert_array_equal(links_from_table(read_table(tmp_path / "links.csv")).rx, links.rx)
     with pytest.raises(InputError, match="no column 'rx_z'"):
         links_from_frame(frame.drop(columns="rx_z"))
-    with pytest.raises(InputError, match="holds no rows"):
+    with pytest.raises(InputError, match="contains no rows"):
         links_from_frame(frame.iloc[:0])

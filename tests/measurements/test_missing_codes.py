@@ -57,7 +57,7 @@ def test_further_codes_are_stated():
     frame = pd.DataFrame({"x": [10.0, 20.0, 30.0], "rssi": [-70.0, -110.0, -101.0]})
     links = measured_links(SourceTable(frame), COLUMNS, Preparation(missing=(-110.0,)))
     assert links.path_loss_db.tolist() == [70.0, 101.0]
-    with pytest.raises(InputError, match=r"holds no measured value; check links\.missing"):
+    with pytest.raises(InputError, match=r"contains no measured value; check links\.missing"):
         measured_links(SourceTable(frame[1:2].reset_index()), COLUMNS, Preparation(missing=(-110.0,)))
     text = frame.assign(rssi=["-70", "n.m.", "-110"])
     with pytest.raises(InputError, match=r"'n\.m\.' is not a number"):

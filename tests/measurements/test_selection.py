@@ -29,7 +29,7 @@ def test_a_wide_table_becomes_one_row_per_link():
         ({"ap1": "x", "ap2": "x"}, "rss", "two columns have the same transmitter"),
         ({"ap1": "x"}, "room", "column 'room' exists already"),
         ({"room": "x"}, "rss", "row 1, column 'room': 'a' is not a number"),
-        ({"empty": "x"}, "rss", "the columns empty hold no value"),
+        ({"empty": "x"}, "rss", "the columns empty contain no value"),
     ],
 )
 def test_wide_columns_that_do_not_fit_are_refused(columns, value, message):

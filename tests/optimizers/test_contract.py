@@ -227,7 +227,7 @@ def test_there_is_no_best_before_the_first_evaluation():
 @pytest.mark.parametrize(
     ("lower", "upper", "message"),
     [
-        ([0.0], [0.0], r"lower\[0\] = 0 and upper\[0\] = 0; .* leave a fixed parameter out"),
+        ([0.0], [0.0], r"lower\[0\] = 0 and upper\[0\] = 0; .* remove a fixed parameter"),
         ([0.0, 5.0], [1.0, 4.0], r"lower\[1\] = 5 and upper\[1\] = 4; .* swap them"),
         ([0.0], [INF], r"upper\[0\] = inf; the bounds must be finite"),
         ([NAN], [1.0], r"lower\[0\] = nan"),

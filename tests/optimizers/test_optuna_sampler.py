@@ -164,7 +164,7 @@ def test_without_a_space_it_is_inferred_and_categories_are_drawn():
 
 
 def test_what_it_cannot_search_is_refused():
-    with pytest.raises(InputError, match="neither float nor integer; leave it out"):
+    with pytest.raises(InputError, match="neither float nor integer; remove it"):
         SGWOIMSampler({"kind": optuna.distributions.CategoricalDistribution(["x", "y"])})
     with pytest.raises(InputError, match="population = 2"):
         SGWOIMSampler(SPACE, population=2)

@@ -256,7 +256,7 @@ def test_a_table_of_walls_is_read_as_surveyors_write_it(tmp_path, text, unit):
     [
         ("", "no column 'x0'"),
         ("x0,y0,x1,y1\n0,0,1,1\n", "no column 'type'"),
-        ("x0,y0,x1,y1,type\n", "holds no segment"),
+        ("x0,y0,x1,y1,type\n", "contains no segment"),
         ("x0,y0,x1,y1,type\n0,0,a,1,brick\n", "row 2: x1 = 'a' is not a number"),
         ("x0,y0,x1,y1,type\n0,0,,1,brick\n", "row 2: lacks its type or a coordinate"),
         ("wkt,type\nLINE,brick\n", "row 2: wkt = 'LINE' is not a geometry"),

@@ -167,7 +167,7 @@ def test_footprints_of_geojson_are_projected(tmp_path):
     ("change", "message"),
     [
         ({"height": "height"}, "no column 'height'"),
-        ({"height": "word"}, "holds 'high', must hold metres"),
+        ({"height": "word"}, "contains 'high', must contain metres"),
         ({"height": "negative"}, "feature 2: negative = -1, must be finite, not negative and at most 1000"),
         ({"layer": "roads"}, "cannot be read"),
     ],
@@ -445,7 +445,7 @@ def test_an_undeclared_gap_is_no_height(tmp_path, gap):
     heights[heights == -9999.0] = gap
     with rasterio.open(file, "w", **{**profile, "nodata": None}) as model:
         model.write(heights, 1)
-    with pytest.raises(InputError, match=r"12 of \d+ cells hold no height on land, such as .*a_nodata"):
+    with pytest.raises(InputError, match=r"12 of \d+ cells have no height on land, such as .*a_nodata"):
         read_terrain(file, Frame.utm(11.5755, 48.1374), (-100, -100, 100, 100))
 
 

@@ -234,8 +234,11 @@ def test_what_cannot_be_told_is_asked_for(scene, tmp_path, columns, message):
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ({"Lat": "50.01N", "Lon": 9.99, "RSRP": -80.0}, "'Lat' holds text such as '50.01N': write numbers"),
-        ({"x": 0.0, "y": 30.0, "RSRP": ["<-110"] + ["-80"] * 9}, "'RSRP' holds text such as '<-110'"),
+        (
+            {"Lat": "50.01N", "Lon": 9.99, "RSRP": -80.0},
+            "'Lat' contains text such as '50.01N': write numbers",
+        ),
+        ({"x": 0.0, "y": 30.0, "RSRP": ["<-110"] + ["-80"] * 9}, "'RSRP' contains text such as '<-110'"),
         (
             {"x": 0.0, "y": 30.0, "Signal": 84.0},
             "'Signal' has values about 84, and received powers .* negative",

@@ -5,7 +5,7 @@ fading; it predicts the mean power over some tens of wavelengths (W. C. Y. Lee, 
 mobile radio signal", IEEE Trans. Veh. Technol. 34(1), 1985: 40 wavelengths, 36 to 50 samples). The mean is taken of
 powers, not of decibels: for Rayleigh fading, the mean of the decibels is 2.5 dB too low.
 
-The logarithm of a mean of few samples is biased low as well, by (10 / ln 10) var / (2 n mean^2) to second order (delta
+The logarithm of a mean of few samples is also biased low, by (10 / ln 10) var / (2 n mean^2) to second order (delta
 method): 0.2 dB for ten samples of Rayleigh fading, and zero for a single path.
 """
 
@@ -24,19 +24,19 @@ from calibray.measurements.preparation import Averaging, LinkColumns, Preparatio
 from calibray.measurements.source_table import SourceTable
 
 MAX_UNCERTAINTY_DB: Final = 1.0
-"""Largest uncertainty [dB] of an average from its samples below the noise floor; more uncertain ones are left out."""
+"""Largest uncertainty of an average from its samples below the noise floor [dB]; averages with more are left out."""
 
 _AREA: Final = "calibray area"
 
 
 def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
-    """Average the samples of one area, transmitter and group; the table itself without averaging.
+    """Average the samples of one area, transmitter and group; without averaging, return the table itself.
 
     A sample below the noise floor has a power between zero and the floor, and counts as half of the floor. Averages
-    that this leaves uncertain by more than `MAX_UNCERTAINTY_DB` are left out, because the samples above the floor alone
-    would be the strong ones. Of the steps, `averaging`, `keep`, `transmitter` and `noise_floor_dbm` are used. Returns
-    for each average the row of its first sample, with the mean receiver position, the mean value, and the columns
-    `std_db` (standard deviation of the samples [dB], NaN for one sample) and `count`.
+    whose uncertainty then exceeds `MAX_UNCERTAINTY_DB` are left out, because the samples above the floor are only the
+    strong ones. The steps `averaging`, `keep`, `transmitter` and `noise_floor_dbm` are used. Returns for each average
+    the row of its first sample, with the mean receiver position, the mean value, and the columns `std_db` (standard
+    deviation of the samples [dB], NaN for one sample) and `count`.
 
     Raises:
         InputError: A column is missing or not numeric, a time cannot be read, or no average remains.
@@ -118,7 +118,7 @@ def _areas(table: SourceTable, averaging: Averaging, rx: Sequence[str]) -> NDArr
 
 
 def _elapsed(table: SourceTable, time: str) -> NDArray[np.float64]:
-    """Times of the rows [rows], [s] after any start."""
+    """Times of the rows [rows], [s] from an arbitrary start."""
     column = table.column(time)
     if pd.api.types.is_numeric_dtype(column):
         return table.numbers(time)
@@ -129,31 +129,31 @@ def _elapsed(table: SourceTable, time: str) -> NDArray[np.float64]:
             f"{table.source}, column {time!r}: a time cannot be read ({error}); give ISO 8601"
         ) from None
     if times.isna().any():
-        raise InputError(f"{table.source}, column {time!r}: a time is missing; leave the row out")
+        raise InputError(f"{table.source}, column {time!r}: a time is missing; remove the row")
     return np.asarray((times - times.min()) / pd.Timedelta(seconds=1), dtype=np.float64)
 
 
 SAME_POSITION: Final = 1e-4
-"""Distance [m] per axis up to which positions are equal, as in meshes: coordinates are written to a millimetre at best,
-and conversions of coordinates differ by micrometres."""
+"""Distance [m] per axis up to which positions are equal, as in meshes: coordinates are written with a resolution of a
+millimetre at best, and conversions of coordinates differ by micrometres."""
 
 
 def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
     """Merge the rows of one link.
 
-    Rows are of one link if their positions agree within `SAME_POSITION`, and transmitter, groups, carrier, transmitted
-    power and times are equal. Rows at different times stay separate links. A link below the noise floor is not merged
-    with one above it.
+    Rows belong to one link if their positions agree within `SAME_POSITION`, and transmitter, groups, carrier,
+    transmitted power and times are equal. Rows at different times stay separate links. A link below the noise floor is
+    not merged with one above it.
 
     Args:
-        table: The rows, before receivers inside buildings are moved: two positions may be moved to one corner.
-        steps: The steps that the rows went through; `keep`, `transmitter`, `noise_floor_dbm` and `averaging` are used
-            here. Averages merge repeats already.
+        table: The rows, before receivers inside buildings are moved: two positions may be moved to the same corner.
+        steps: The steps applied to the rows; `keep`, `transmitter`, `noise_floor_dbm` and `averaging` are used here.
+            Averages merge repeats already.
         columns: The columns that describe the links; positions in metres.
 
     Returns:
         For each link its first row, with the value of the mean linear power and the mean weight or standard
-        deviation. The table itself if no row repeats a link.
+        deviation. If no row repeats a link, the table itself.
 
     Raises:
         InputError: A column is missing or not numeric.
@@ -204,11 +204,11 @@ def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkCol
 def join_positions(
     positions: NDArray[np.float64], group: NDArray[np.int64] | None = None
 ) -> NDArray[np.int64]:
-    """Number the places of positions: those within `SAME_POSITION` of each other, also step by step, are one place.
+    """Number the places of positions: those within `SAME_POSITION` of each other, directly or through others, are one.
 
     Args:
         positions: The positions [N, axes], [m].
-        group: Positions of different groups are different places [N]; one group if None.
+        group: Group of every position; positions of different groups are different places [N]; one group if None.
 
     Returns:
         Number of each position's place [N], in the order of the first positions.

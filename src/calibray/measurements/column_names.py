@@ -1,4 +1,4 @@
-"""Guess what the columns of a table hold, from the words of their names and from their values."""
+"""Guess the contents of a table's columns from the words of their names and from their values."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ PATTERNS: Final = {
     "time": r"time|timestamp|date|datetime|utc|epoch|zeit(stempel)?|uhrzeit|datum|fecha|hora|heure",
     "distance": r"dist.*|separation|abstand|entfernung",
 }
-"""Spellings of column names, without accents. To recognize one more, add it to its row; case and punctuation do not
-matter."""
+"""Spellings of column names, without accents. To recognize another spelling, add it to its row; case and punctuation do
+not matter."""
 
 LENGTH_UNITS: Final = {
     "cm": 0.01,
@@ -138,7 +138,7 @@ def words(name: object) -> frozenset[str]:
 
 
 def matches(name: object, *rows: str) -> bool:
-    """Whether a word of a column's name is a spelling in one of some rows of `PATTERNS`.
+    """Whether a word of a column's name is a spelling in one of the given rows of `PATTERNS`.
 
     Example:
         >>> matches("RSRP [dBm]", "received power"), matches("RSRP [dBm]", "x", "y")
@@ -148,9 +148,9 @@ def matches(name: object, *rows: str) -> bool:
 
 
 def find_flight_time(frame: pd.DataFrame) -> tuple[str, str, str] | None:
-    """Find the column of round-trip times or times of flight, its kind and its unit; None without one.
+    """Find the column of round-trip times or times of flight, its kind and its unit; None if there is none.
 
-    Wi-Fi devices also give a round trip as the distance, in metres.
+    Wi-Fi devices may also state the round trip as a distance in metres.
 
     Example:
         >>> find_flight_time(pd.DataFrame({"rtt_std_ns": [2.0], "rtt_ns": [80.0]}))
@@ -169,7 +169,7 @@ def find_flight_time(frame: pd.DataFrame) -> tuple[str, str, str] | None:
 
 
 def numeric_columns(frame: pd.DataFrame) -> list[str]:
-    """Names of the columns that hold numbers."""
+    """Names of the columns that contain numbers."""
     return [
         str(name)
         for name in frame
@@ -178,11 +178,11 @@ def numeric_columns(frame: pd.DataFrame) -> list[str]:
 
 
 def text_instead(frame: pd.DataFrame, *rows: str) -> str:
-    """What a column holds that is named as in some rows of `PATTERNS`, but has text; empty without such a column.
+    """Text of a column that is named as in some rows of `PATTERNS` but is not numeric; empty without such a column.
 
     Example:
         >>> text_instead(pd.DataFrame({"Lat": ["51.2N", "51.3N"], "cell": "A"}), "latitude")
-        "; column 'Lat' holds text such as '51.2N': write numbers"
+        "; column 'Lat' contains text such as '51.2N': write numbers"
     """
     for name in frame:
         if str(name) not in numeric_columns(frame) and matches(name, *rows):
@@ -190,14 +190,14 @@ def text_instead(frame: pd.DataFrame, *rows: str) -> str:
             bad = cells[pd.to_numeric(cells, errors="coerce").isna()]
             if len(bad):
                 cell = shortened(str(bad.iloc[0]))
-                return f"; column {shortened(str(name))!r} holds text such as {cell!r}: write numbers"
+                return f"; column {shortened(str(name))!r} contains text such as {cell!r}: write numbers"
     return ""
 
 
 def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) -> PositionColumns | None:
     """Find the columns of one end's position; metres are preferred to degrees.
 
-    With `unnamed`, columns that name neither end may be this end's.
+    With `unnamed`, columns that name neither end may belong to this end.
 
     Example:
         >>> find_position(pd.DataFrame({"time": [0], "lat": [50.0], "lon": [10.0]}), "rx", unnamed=True)
@@ -222,7 +222,7 @@ def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) 
 
 
 def _height(names: Iterable[str]) -> str | None:
-    """The first column of heights of an antenna, or else of heights, but not of the ground or a building."""
+    """The first column of heights of an antenna, or otherwise of heights, but not of the ground or a building."""
     heights = [name for name in names if matches(name, "height") and not matches(name, "another height")]
     return min(heights, key=lambda name: not matches(name, "antenna"), default=None)
 
@@ -235,8 +235,8 @@ def find_transmitter_height(frame: pd.DataFrame) -> str | None:
 def find_value(table: SourceTable) -> ValueColumn:
     """Find the column of measured values, and its quantity.
 
-    Names with a decibel unit come first, then path losses before path gains before received powers. The sign of the
-    values decides between loss and gain.
+    Names with a decibel unit come first, then path loss before path gain before received power. The sign of the values
+    distinguishes loss and gain.
 
     Raises:
         InputError: No column looks like one.
@@ -307,7 +307,7 @@ def find_length_unit(names: Iterable[str]) -> float:
 def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
     """Find the column of carriers, and the carrier of every row [Hz], if there is one.
 
-    The unit is that of the column's name, or else follows from the size of its values.
+    The unit is that of the column's name, or otherwise follows from the size of its values.
     """
     for name in numeric_columns(frame):
         if not matches(name, "frequency"):
@@ -333,12 +333,12 @@ def find_distance(frame: pd.DataFrame) -> str | None:
 
 
 def _are_degrees(longitude: pd.Series, latitude: pd.Series) -> bool:
-    """Whether coordinates can be degrees; some tables have metres of a map projection in columns named so."""
+    """Whether coordinates can be degrees; some tables have metres of a map projection in columns with such names."""
     return bool(longitude.abs().median() <= 180 and latitude.abs().median() <= 90)
 
 
 def is_named_value(name: str) -> bool:
-    """Whether a name has the words of a measured value."""
+    """Whether a name contains the words of a measured value."""
     return matches(name, "path loss", "path gain", "received power")
 
 
@@ -347,6 +347,6 @@ def _first(names: Iterable[str], row: str) -> str | None:
 
 
 def _is_plausible(values: pd.Series, quantity: Quantity) -> bool:
-    """Whether values can be of a quantity; the sign of a loss or gain is open."""
+    """Whether values can belong to a quantity; the sign of a loss or gain is not decided."""
     median = float(np.nanmedian(values)) if values.notna().any() else 0.0
     return -200 < median < -10 if quantity == "rsrp" else 20 < abs(median) < 250

@@ -1,4 +1,4 @@
-"""Tables as text, as loggers and spreadsheets write them: encoding, separator, header, units, placeholders."""
+"""Tables as text, in the form that loggers and spreadsheets write: encoding, separator, header, units, placeholders."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ SUFFIXES: Final = (".csv", ".txt", ".tsv", ".dat")
 """Endings of tables as text."""
 
 PLACEHOLDERS: Final = frozenset({"-", "--", "---", "\u2013", "\u2014", "?", "*"})
-"""Texts that stand for a missing number in a column of numbers."""
+"""Texts that mark a missing number in a column of numbers."""
 
 UNITS: Final = frozenset({
     "m", "cm", "mm", "km", "ft", "feet", "foot", "in", "inch", "inches", "db", "dbm", "dbi", "hz", "khz",
     "mhz", "ghz", "deg", "degree", "degrees", "\u00b0", "rad", "s", "ms", "us", "ns", "min", "h", "%", "v",
     "w", "mw", "m/s", "km/h", "mph", "bit", "kbps", "mbps", "bool", "string", "text", "int", "float",
 })  # fmt: skip
-"""Units, in lower case, of which a row below the header consists."""
+"""Units, in lower case, that a row of units below the header may contain."""
 
 _HEAD: Final = 64  # records that show the layout of a file
 _MOST_ABOVE: Final = 30  # lines above a header at most
@@ -41,10 +41,10 @@ class _Layout:
     """Where a table stands in a text.
 
     Attributes:
-        separator: The mark between columns; a space for any white space.
+        separator: The mark between columns; a space represents any white space.
         skipped: Lines above the header.
         units: The unit of every column, from a row below the header; empty if there is none.
-        unit_lines: First line of the row of units, and the line after its end, from the header's first line.
+        unit_lines: First line of the row of units, and the line after its end, counted from the header's first line.
     """
 
     separator: str
@@ -54,10 +54,10 @@ class _Layout:
 
 
 def read_text(path: Path) -> str:
-    """Text of a file in UTF-8, in UTF-16 with a byte order mark, or else in Windows-1252.
+    """Text of a file in UTF-8, in UTF-16 with a byte order mark, or otherwise in Windows-1252.
 
     Raises:
-        InputError: The file cannot be read, or has bytes that are no text.
+        InputError: The file cannot be read, or contains bytes that are not text.
     """
     try:
         raw = path.read_bytes()
@@ -80,16 +80,16 @@ def read_text(path: Path) -> str:
 def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTable:
     r"""Rows of a table in a text, without blank lines.
 
-    Lines above the header with another number of cells are skipped; units in a row below it become part of the names.
-    Columns of numbers may have placeholders (`PLACEHOLDERS`) and one unit of decibels in every cell.
+    Lines above the header with another number of cells are skipped; units in a row below it are appended to the names.
+    Columns of numbers may contain placeholders (`PLACEHOLDERS`) and one unit of decibels in every cell.
 
     Args:
         path: Name of the table for messages.
         text: The text.
-        separator: The mark between columns; found in the text if None.
+        separator: The mark between columns; detected if None.
 
     Raises:
-        InputError: The text is malformed, or its header or decimal mark is not unique.
+        InputError: The text is malformed, or its header or decimal mark is ambiguous.
         KeyboardInterrupt: Ctrl-C arrived while pandas was reading.
 
     Example:
@@ -138,7 +138,7 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
 
 
 def _layout(text: str, separator: str | None) -> _Layout:
-    """The first line from which on all lines have equally many cells, and the mark that gives the most cells."""
+    """The first line from which all lines have the same number of cells, and the mark that gives the most cells."""
     for above in range(_MOST_ABOVE + 1):
         layouts: list[tuple[int, _Layout]] = []
         head = list(islice(io.StringIO(text, newline=""), above, above + 4 * _HEAD))
@@ -198,7 +198,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _with_unit(name: object, unit: str) -> str:
-    """Name of a column with its unit, unless the name has it."""
+    """Name of a column with its unit, unless the name contains it."""
     plain = str(name).strip()
     return (
         plain
@@ -208,9 +208,9 @@ def _with_unit(name: object, unit: str) -> str:
 
 
 def _plain_numbers(column: pd.Series, decimal: str) -> pd.Series:
-    """A column of texts as numbers if each is a number, a placeholder, or a number with the unit of all others.
+    """Convert a column of texts to numbers if each is a number, a placeholder, or a number with the same unit.
 
-    Other texts lose white space at their ends.
+    Other texts are stripped of white space at their ends.
     """
     if not pd.api.types.is_string_dtype(column):
         return column
@@ -230,7 +230,7 @@ def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
     """The decimal mark of the numbers of a CSV text.
 
     Raises:
-        InputError: It is not the same in all.
+        InputError: The decimal mark is not the same in all numbers.
     """
     lines: dict[str, int] = {}
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=layout.separator, skipinitialspace=True)
@@ -249,9 +249,9 @@ def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
 
 
 def _checked_layout(path: Path, text: str, layout: _Layout) -> tuple[list[str], list[int], bool]:
-    """Header and first line of each row of a CSV text, refused where pandas would repair a fault without notice.
+    """Header and first line of each row of a CSV text; a fault that pandas would repair silently is refused.
 
-    The last result says whether every row ends with an empty cell beyond the header.
+    The last result states whether every row ends with an empty cell beyond the header.
 
     Raises:
         InputError: A column appears twice, or a row has more or fewer cells than the header.
@@ -270,7 +270,7 @@ def _checked_layout(path: Path, text: str, layout: _Layout) -> tuple[list[str], 
                 header = cells
                 if all(map(_is_number, filter(str.strip, header))):
                     raise InputError(
-                        f"{path}, row {line}: holds numbers; put a line with the names of the columns above it"
+                        f"{path}, row {line}: contains numbers; put a line with the names of the columns above it"
                     )
                 names = Counter(name.strip() for name in header if name.strip())
                 if repeated := [name for name, count in names.items() if count > 1]:

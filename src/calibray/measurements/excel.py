@@ -1,6 +1,6 @@
-"""Excel workbooks: the first sheet as CSV text, so that one parser reads both formats.
+"""Excel workbooks: the first sheet is converted to CSV text, so that one parser reads both formats.
 
-Sheets are read row by row: a sheet whose only value is in its last row and column needs no more memory than others.
+Sheets are read row by row, so a sheet whose only value is in its last row and column needs no more memory than others.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ _ROW: Final = re.compile(rb"""<(?:\w+:)?row\s(?:[^>]*?\s)?r=["']([^"']*)["']""")
 
 
 def sheet_text(path: Path) -> tuple[list[int], str]:
-    """Read the first sheet of a workbook as CSV, and the sheet's number of each of its rows that is not blank.
+    """Read the first sheet of a workbook as CSV, with the sheet's row number of each row that is not blank.
 
-    A formula counts as its last computed value. A formula without one stays text, which no column of numbers accepts.
-    Of merged cells, the first holds the value and the others are empty. The columns are those of the header, whose row
-    comes first.
+    A formula counts as its last computed value. A formula without a value stays text, which no column of numbers
+    accepts. Of merged cells, the first contains the value and the others are empty. The columns are those of the
+    header, which is the first row.
 
     Raises:
         InputError: The file is not a workbook, has no sheet of cells, is too large, or has a value in a column
@@ -61,7 +61,7 @@ def sheet_text(path: Path) -> tuple[list[int], str]:
 
 
 def _check_archive(path: Path) -> bool:
-    """Refuse a workbook that is too large or has rows out of order; tell whether it has formulas."""
+    """Refuse a workbook that is too large or has rows out of order; return whether it has formulas."""
     with zipfile.ZipFile(path) as archive:
         size = sum(entry.file_size for entry in archive.infolist())
         if size > MAX_UNPACKED:
@@ -76,7 +76,7 @@ def _check_archive(path: Path) -> bool:
 
 
 def _check_row_order(path: Path, sheet: bytes) -> None:
-    """Refuse rows that do not ascend: openpyxl drops repeated ones and fills gaps with empty rows for hours."""
+    """Refuse rows that are not in ascending order: openpyxl drops repeated ones and spends hours on filling gaps."""
     previous = 0
     for text in _ROW.findall(sheet):
         number = int(text) if text.isdigit() and len(text) < 10 else 0
@@ -112,7 +112,7 @@ def _rows(path: Path, computed: bool) -> Iterator[tuple[int, _Cells]]:
 
 
 def _with_formulas(values: _Cells, formulas: _Cells) -> _Cells:
-    """A row of computed values, with the formula as text where nothing was computed."""
+    """A row of computed values, with the formula as text where no value was computed."""
     padded = (*values, *[None] * (len(formulas) - len(values)))
     return tuple(
         formula if value is None and str(formula).startswith("=") else value
@@ -132,7 +132,8 @@ def _below_header(path: Path, rows: list[tuple[int, _Cells]]) -> list[tuple[int,
         if stray:
             raise InputError(
                 f"{path}, row {number}: {str(cells[stray[0]])[:60]!r} is in column {stray[0] + 1}, which has no name "
-                f"in row {header_row}; the first sheet must hold the table only, with the column names in its first row"
+                f"in row {header_row}; the first sheet must contain only the table, with the column names in its "
+                "first row"
             )
         table.append((number, tuple(cells[index] if index < len(cells) else None for index in named)))
     return table

@@ -17,7 +17,7 @@ MAX_PATTERN_LENGTH: Final = 200
 """Largest number of characters of a regular expression."""
 
 MAX_SEARCH_STEPS: Final = 1e9
-"""Largest sum of squared text lengths in a column that is searched for a repetition; that takes 2 to 5 s."""
+"""Largest sum of squared text lengths in a column that is searched for a repetition; the search then takes 2 to 5 s."""
 
 COMPARISONS: Final[Mapping[type[ast.cmpop], Callable[[Any, Any], Any]]] = {
     ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt,

@@ -1,7 +1,7 @@
 """Row filters: a small closed language over the columns of a table.
 
-Python's parser reads a filter, and this module interprets the tree over whole columns; nothing is passed to `eval`. The
-operators, functions and methods of `filter_language` are all that exist: no attributes, no subscripts, no other calls.
+Python's parser reads a filter, and this module interprets the tree over whole columns; nothing is passed to `eval`.
+Only the operators, functions and methods of `filter_language` exist: no attributes, no subscripts, no other calls.
 Precedence follows pandas' queries, in which ``&`` and ``|`` mean ``and`` and ``or`` and bind as loosely.
 """
 
@@ -44,8 +44,8 @@ def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
     """Mask [rows] of the rows that pass a filter; a missing value in a comparison does not pass.
 
     Raises:
-        InputError: The filter is malformed or too large, names an unknown column or something that is not allowed,
-            or gives no truth value per row. The message names the part of the filter, not the filter's source.
+        InputError: The filter is malformed or too large, names an unknown column or something that is not allowed, or
+            does not give one truth value per row. The message names the part of the filter, not the filter's source.
 
     Example:
         >>> frame = pd.DataFrame({"x": [1, 2, 3], "my set": ["A", "B", "A"]})
@@ -193,7 +193,7 @@ class _Interpreter:
                 return value
         elif isinstance(value, int | float) and not isinstance(value, bool):
             return value
-        raise self._refusal(node, "must be a number, or a column of numbers, to be calculated with")
+        raise self._refusal(node, "must be a number, or a column of numbers, for arithmetic")
 
     def _column(self, node: ast.expr) -> pd.Series:
         value = self.value(node)
@@ -279,7 +279,7 @@ class _Interpreter:
                 method = _allowed(name, METHODS)
                 column = self._number(owner) if name == "abs" else self._column(owner)
                 return self._call_method(node, name, method, column)
-        raise self._refusal(node, "not allowed in a filter; only columns' methods may be called")
+        raise self._refusal(node, "not allowed in a filter; only methods of columns may be called")
 
     def _call_method(
         self, node: ast.Call, name: str, method: Callable[..., Any], column: pd.Series | int | float
@@ -297,7 +297,7 @@ class _Interpreter:
             raise self._refusal(node, str(error)) from None
 
     def _argument(self, node: ast.expr) -> Any:
-        """The value of a part that may also be a list or tuple of literals."""
+        """The value of a part, which may also be a list or tuple of literals."""
         if isinstance(node, ast.Tuple):
             return tuple(self._literals(node))
         return self._literals(node) if isinstance(node, ast.List) else self.value(node)
@@ -321,7 +321,7 @@ def _as_floats(number: pd.Series | int | float) -> pd.Series | np.float64:
 
 
 def _overflows(operation: Callable[[Any, Any], Any], left: Any, right: Any, result: Any) -> bool:
-    """Whether a result is infinite, or beyond the integers of its column, which would wrap around."""
+    """Whether a result is infinite or exceeds the integer range of its column, where it would wrap around."""
     if not isinstance(result, pd.Series):
         return not isfinite(result) or (isinstance(result, int) and abs(result) > _MAX_INTEGER)
     if result.dtype.kind not in "iu" or not len(result):

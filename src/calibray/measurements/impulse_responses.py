@@ -1,7 +1,7 @@
-"""Impulse responses of links as multipath components: the samples above a stated threshold.
+"""Converts impulse responses of links to multipath components: the samples above a stated threshold.
 
 They are read from NumPy (.npz, .npy), MATLAB (.mat, also version 7.3) and HDF5 files: one array with one row per link
-(and one or more snapshots), or a folder with one file per link, named like the link.
+(and one or more snapshots), or a folder with one file per link, named after the link.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ DELAYS: Final = ("delay", "delays", "tau", "time", "t")
 """Names of an array of the delays of the samples [s]."""
 
 MARGIN_DB: Final = 10.0
-"""Distance of a sample from the noise, above which it counts as signal. Of the samples of noise, whose power is
-exponentially distributed, one in 22,000 exceeds its mean by as much."""
+"""Distance from the noise above which a sample counts as signal. The power of noise samples is exponentially
+distributed, so one in 22,000 exceeds its mean by this distance."""
 
 
 def read_impulse_responses(
@@ -49,13 +49,13 @@ def read_impulse_responses(
             [links, snapshots, samples]; or a folder with a file per link, [samples] or [snapshots, samples].
         labels: Labels of the links.
         sample_rate: Samples per second [Hz]; None if the files state delays [s].
-        margin_db: How far above the noise a sample counts [dB].
+        margin_db: Distance above the noise from which a sample counts [dB].
 
     Returns:
         The samples above the threshold as components; powers are those of the samples.
 
     Raises:
-        InputError: A file cannot be read, or its array fits no link.
+        InputError: A file cannot be read, or its array matches no link.
     """
     source = Path(source)
     parts = []
@@ -96,11 +96,11 @@ def _read(file: Path, sample_rate: float | None) -> tuple[NDArray[Any], NDArray[
     delays = next((arrays.pop(name) for name in list(arrays) if name.lower() in DELAYS), None)
     numeric = {name: array for name, array in arrays.items() if array.dtype.kind in "fciu" and array.ndim}
     if not numeric:
-        raise InputError(f"{file}: holds no array of numbers")
+        raise InputError(f"{file}: contains no array of numbers")
     name, response = max(numeric.items(), key=lambda item: item[1].size)
     response = np.squeeze(response) if response.ndim > 3 else response
     if not np.isfinite(response).all():
-        raise InputError(f"{file}: {shortened(name)!r} holds values that are not finite")
+        raise InputError(f"{file}: {shortened(name)!r} contains values that are not finite")
     count = response.shape[-1]
     if delays is not None:
         delay = np.asarray(delays, dtype=float).reshape(-1)
@@ -163,7 +163,7 @@ def _check_size(file: Path, size: int) -> None:
 
 @contextmanager
 def _explained(file: Path) -> Iterator[None]:
-    """Turn errors of libraries into errors with the file's name."""
+    """Convert errors of libraries to errors with the file's name."""
     try:
         yield
     except InputError:

@@ -15,10 +15,10 @@ from calibray.support.messages import shortened
 from calibray.tables import Column, Table, display
 
 MIN_DISTANCE: Final = 1e-3
-"""Distance [m] between transmitter and receiver below which they coincide, and no path loss is defined."""
+"""Distance [m] between transmitter and receiver below which they coincide, so that no path loss is defined."""
 
 FREQUENCIES: Final = (1e6, 1e12)
-"""Range of carriers [Hz]; a value outside was probably given in MHz or GHz."""
+"""Range of carriers [Hz]; a value outside was probably stated in MHz or GHz."""
 
 MAX_CARRIERS: Final = 32
 """Largest number of carriers; a column with more values probably holds another quantity."""
@@ -31,14 +31,14 @@ class Measurements:
     Attributes:
         tx: Transmitter positions [links, 3], [m].
         rx: Receiver positions [links, 3], [m].
-        path_loss_db: Measured path losses [links], [dB]; all NaN for links without measured values.
+        path_loss_db: Measured path loss [links], [dB]; NaN everywhere for links without measured values.
         weight: Relative weights [links], [1], greater than 0; 1 unless given.
         group: Label [links] of each link's group, or None.
-        frequency: Carrier of each link [links], [Hz], or None if all have the study's.
-        limit_db: Largest path loss [links], [dB] that could have been measured, or None if unknown.
+        frequency: Carrier of each link [links], [Hz]; None if all have the study's carrier.
+        limit_db: Largest path loss [links], [dB] that could have been measured; None if unknown.
         censored: Mask [links] of the links below the noise floor, whose path loss is at least `path_loss_db`; None if
             no link is censored.
-        table: The rows of the source table, for filters and messages; one empty row per link unless given.
+        table: The rows of the source table, for filters and messages; if not given, one empty row per link.
 
     Raises:
         InputError: Shapes disagree, a position is not finite, a transmitter and its receiver coincide, a weight is not
@@ -120,7 +120,7 @@ class Measurements:
 
     @property
     def prepared(self) -> dict[str, int]:
-        """What was left out, averaged or moved before rows were links, each with the number of rows."""
+        """What was left out, averaged or moved before rows became links, each with the number of rows."""
         return dict(self.table.changes)
 
     @property
@@ -209,9 +209,9 @@ def _check_links(links: Measurements) -> None:
         (~np.isfinite(links.tx).all(axis=1), "the transmitter's position is not finite; correct it"),
         (~np.isfinite(links.rx).all(axis=1), "the receiver's position is not finite; correct it"),
         (links.distance < MIN_DISTANCE, "transmitter and receiver are at the same point; move or remove one"),
-        (~(links.weight > 0), "the weight must be greater than 0; leave the row out"),
+        (~(links.weight > 0), "the weight must be greater than 0; remove the row"),
         (np.isinf(links.weight), "the weight must be finite; correct it"),
-        (np.isinf(links.path_loss_db), "the path loss is infinite; leave the row out"),
+        (np.isinf(links.path_loss_db), "the path loss is infinite; remove the row"),
         (
             np.isfinite(links.path_loss_db) != links.measured,
             "only some links have a path loss; give all or none",

@@ -1,7 +1,7 @@
 """Observables of links from measured multipath components: delays, powers and angles of every path, link by link.
 
-Each is the statistic that the model computes, with a hard limit of the receiver's range. Where a link was measured
-several times, as with rotations of the receiving array, it is the mean over these.
+Each is the statistic that the model computes, with a hard limit of the receiver's range. If a link was measured several
+times, for example with rotations of the receiving array, it is the mean over the measurements.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ class Multipath:
 
     Attributes:
         link: Label of each component's link [n].
-        snapshot: Label of the measurement of this link that it belongs to [n].
+        snapshot: Label of the component's measurement of its link [n].
         delay: Delay [n], [s].
         level_db: Power gain [n], [dB].
         azimuth: Azimuth, counterclockwise from the x axis [n], [rad]; None if it was not measured.
-        elevation: Elevation or zenith angle [n], [rad]; None likewise.
+        elevation: Elevation or zenith angle [n], [rad]; None if it was not measured.
     """
 
     link: NDArray[np.str_]
@@ -64,8 +64,8 @@ class Multipath:
 def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multipath:
     """Read a table with one row per component.
 
-    Columns are found by their names: a delay (`delay_ns`), a path loss, path gain or power [dB] (`path_loss_db`), and
-    if there are any an azimuth, an elevation, and the number of the rotation or snapshot.
+    The columns are recognised by their names: a delay (`delay_ns`), a path loss, path gain or power [dB]
+    (`path_loss_db`), and if present an azimuth, an elevation, and the number of the rotation or snapshot.
 
     Args:
         path: The table.
@@ -114,8 +114,8 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
 def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:
     """A statistic of every link in SI units, by the link's label; the mean over its snapshots.
 
-    Links of which the receiver sees no component are left out. The bandwidth of the receiver is part of the
-    components already.
+    Links of which the receiver detects no component are left out. The components already include the bandwidth of the
+    receiver.
 
     Raises:
         InputError: The statistic needs an angle that was not measured.
@@ -141,7 +141,7 @@ def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:
 
 
 def _seen(multipath: Multipath, index: NDArray[np.int64], statistic: Statistic) -> NDArray[np.int64]:
-    """The components of a snapshot that the receiver sees."""
+    """The components of a snapshot that the receiver detects."""
     delay, level_db = multipath.delay[index], multipath.level_db[index]
     seen = np.isfinite(level_db)
     if statistic.floor_db is not None:

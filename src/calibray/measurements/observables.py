@@ -1,4 +1,4 @@
-"""Further observables of links besides path loss: what is measured of a link's paths, and in which unit."""
+"""Further observables of links in addition to path loss: the measured quantity of a link's paths, and its unit."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ KINDS: Final = {
 """Kinds of observables, with the unit of their values."""
 
 FLIGHTS: Final = (TIME_OF_FLIGHT, ROUND_TRIP)
-"""Kinds that are times, of which a device may have a bias."""
+"""Kinds that are times, for which a device may have a bias."""
 
 SECTORS: Final = (DEPARTURE_SECTOR, ARRIVAL_SECTOR)
 PROFILES: Final = (DELAY_BIN, *SECTORS)
-"""Kinds that are shares of a link's power in bins: one value per bin, each an observable of its own."""
+"""Kinds that are shares of a link's power in bins: one value per bin, each a separate observable."""
 
 SHARE_RANGE_DB: Final = 30.0
 """Dynamic range of the share of power in a bin, unless a study states one [dB]."""
@@ -47,13 +47,14 @@ SHARE_RANGE_DB: Final = 30.0
 
 @dataclass(frozen=True)
 class Statistic:
-    """What is measured of a link's paths.
+    """A measured statistic of a link's paths.
 
     Attributes:
         kind: One of `KINDS`.
         path: Path of a time of flight: "mean", "first" or "strongest".
-        dynamic_range_db: How far below the strongest path the receiver sees paths [dB]; None for all.
-        floor_db: Path gain below which it sees none [dB]; None for no limit.
+        dynamic_range_db: Largest level below the strongest path at which the receiver detects paths [dB]; None for all
+            paths.
+        floor_db: Path gain below which it detects no paths [dB]; None for no limit.
         window: Longest delay after the first path [s]; None for no limit.
         bandwidth: Bandwidth of the receiver [Hz]; None if it resolves all paths.
         edges: Ends of the bin of one of `PROFILES`: delays after the first path [s], or azimuths [rad].
@@ -81,7 +82,7 @@ class Statistic:
 
 @dataclass(frozen=True)
 class Wanted:
-    """A statistic that an external program answers with.
+    """A statistic that an external program computes.
 
     Attributes:
         name: Its name in the study.
@@ -96,6 +97,6 @@ class Wanted:
     scale: float
 
     def record(self) -> dict[str, object]:
-        """What a program is told: name, kind, unit, and the limits that the study states."""
+        """The description sent to a program: name, kind, unit, and the limits that the study states."""
         limits = {key: value for key, value in asdict(self.statistic).items() if value is not None}
         return {"name": self.name, "unit": self.unit, **limits}

@@ -1,4 +1,4 @@
-"""Place both ends of every row in the scene's frame: by columns or a track, and receivers outside buildings."""
+"""Place both ends of every row in the scene's frame, from columns or a track, and move receivers out of buildings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TRACK_COLUMNS: Final = ("track_longitude", "track_latitude")
 """The columns of a row's position on a track [deg]."""
 
 MAX_FILE_SIZE: Final = 200_000_000
-"""Largest GPX file that is read [bytes]; a track of one point per second reaches it after three weeks."""
+"""Largest GPX file that is read [bytes]; a track with one point per second reaches it after three weeks."""
 
 
 def join_track(table: SourceTable, track: Track) -> SourceTable:
@@ -28,7 +28,7 @@ def join_track(table: SourceTable, track: Track) -> SourceTable:
     of satellite receivers have errors of metres. The new columns are `TRACK_COLUMNS`.
 
     Raises:
-        InputError: The track or a time cannot be read, or no row lies within the track's times.
+        InputError: The track or a time cannot be read, or no row lies within the times of the track.
     """
     points = _read_gpx(Path(track.file))
     seconds = _row_times(table, track) - track.clock
@@ -131,7 +131,7 @@ def place_rows(
     """Write the positions of both ends as the columns `TX_COLUMNS` and `RX_COLUMNS` in metres.
 
     A position is x, y, z (numbers [m], columns in `steps.unit_m`), or with a frame longitude, latitude [deg] and height
-    [m]. Returns the rows and the names of the columns; the arguments unchanged if the only step is a filter.
+    [m]. Returns the rows and the names of the columns; returns the arguments unchanged if the only step is a filter.
 
     Raises:
         InputError: A column is missing or not numeric, or a position is not on the globe.
@@ -171,9 +171,9 @@ def _positions(
 
 
 def clear_buildings(table: SourceTable, steps: Preparation, rx: Coordinates) -> SourceTable:
-    """Leave out or move receivers that stand inside buildings, seen from above.
+    """Leave out or move receivers that are inside buildings, as seen from above.
 
-    Of the steps, `inside` and `outside` are used; the table itself is returned without them.
+    The steps `inside` and `outside` are used; without them, the table itself is returned.
 
     Raises:
         InputError: No row remains.

@@ -1,4 +1,4 @@
-"""Guess which columns of a table describe transmit antennas, as network planning tools and operators write them."""
+"""Guess which columns of a table describe transmit antennas, as planning tools and operators name them."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ import pandas as pd
 from calibray.measurements.column_names import matches, numeric_columns, words
 
 LARGEST_ANGLE: Final = {"azimuth_deg": 360.0, "downtilt_deg": 90.0, "electrical_downtilt_deg": 90.0}
-"""Largest angle that a column can hold [deg], by the key of ``[links.tx_antenna]`` that it becomes."""
+"""Largest angle that a column can contain [deg], by its key in ``[links.tx_antenna]``."""
 
 POWERS: Final = (-30.0, 100.0)
-"""Smallest and largest transmitted power that a column can hold [dBm]."""
+"""Smallest and largest transmitted power that a column can contain [dBm]."""
 
 
 def find_angles(frame: pd.DataFrame, of_transmitters: bool) -> dict[str, str]:
     """Find the columns of azimuth, mechanical and electrical downtilt by the key of ``[links.tx_antenna]``.
 
-    A downtilt that names no kind is mechanical, unless its name says that it is the sum of both.
+    A downtilt without a kind in its name is mechanical, unless its name says that it is the sum of both.
 
     Args:
         frame: The table.
-        of_transmitters: Whether each row is a transmitter; otherwise names must say that the antenna is one's.
+        of_transmitters: Whether each row is a transmitter; otherwise the names must state that the antenna is a
+            transmitter's.
 
     Example:
         >>> frame = pd.DataFrame(columns=["Azimuth (°)", "Mechanical Downtilt (°)", "E-Tilt", "Total Tilt"])
@@ -49,11 +50,11 @@ def find_angles(frame: pd.DataFrame, of_transmitters: bool) -> dict[str, str]:
 
 
 def unusable(frame: pd.DataFrame, key: str, column: str) -> str:
-    """Why a column cannot be the angle of every transmitter; empty if it can."""
+    """The reason why a column cannot be the angle of every transmitter; empty if it can."""
     values = pd.to_numeric(frame[column], errors="coerce")
     missing = int(values.isna().sum())
     if missing or column not in numeric_columns(frame):
-        return f"{missing or len(frame)} of {len(frame)} rows hold no number; fill them and state the key"
+        return f"{missing or len(frame)} of {len(frame)} rows contain no number; fill them and state the key"
     if values.abs().max() > LARGEST_ANGLE[key]:
         return f"the value {values.abs().max():g} is not an angle in degrees"
     return ""
@@ -72,7 +73,7 @@ def find_antenna_names(frame: pd.DataFrame, known: Iterable[str] = ()) -> str | 
 
 
 def plain_name(label: object) -> str:
-    """An antenna's name without case, punctuation and the suffix of a file.
+    """An antenna's name without case, punctuation and file extension.
 
     Example:
         >>> plain_name("80010677_0824 X-CO.MSI") == plain_name("80010677 0824_x_co")
@@ -85,7 +86,7 @@ def plain_name(label: object) -> str:
 
 
 def find_powers(frame: pd.DataFrame) -> dict[str, str]:
-    """Column of EIRP or else of transmitted power in a table of transmitters, by the key of ``[links]`` [dBm]."""
+    """Column of EIRP, or otherwise transmitted power, of a table of transmitters, by the key of ``[links]`` [dBm]."""
     likely = [
         name
         for name in numeric_columns(frame)

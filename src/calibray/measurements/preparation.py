@@ -1,4 +1,4 @@
-"""What a table's columns mean, and the steps that turn its rows into links."""
+"""The meaning of a table's columns, and the steps that convert its rows to links."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ class LinkColumns:
         tx: Transmitter position: x, y, z [m], or longitude, latitude [deg] and height [m].
         rx: Receiver position, likewise.
         value: Column of the measured values.
-        quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm]: a received power whose
-            transmitted power is unknown. The path loss is then minus the received power, and an offset absorbs the
+        quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm]: a received power with
+            unknown transmitted power. The path loss is then minus the received power, and an offset absorbs the
             transmitted power.
         group: Column of group labels, or several columns whose labels are joined.
         weight: Column of relative weights [1], greater than 0.
         std: Standard deviation [dB] of the values, a number or a column; the weights become 1 / std^2.
-        tx_power_dbm: Transmitted power [dBm], a number or a column; for "received_power" only.
+        tx_power_dbm: Transmitted power [dBm], a number or a column; only for "received_power".
         frequency: Column of carrier frequencies [Hz].
 
     Raises:
-        InputError: The quantity is unknown, does not fit `tx_power_dbm`, or both `weight` and `std` are given.
+        InputError: The quantity is unknown or does not match `tx_power_dbm`, or both `weight` and `std` are given.
     """
 
     tx: Coordinates
@@ -67,7 +67,7 @@ class LinkColumns:
                 "add an [offset]"
             )
         if self.quantity != "received_power" and self.tx_power_dbm is not None:
-            raise InputError(f"quantity = {self.quantity!r} takes no tx_power_dbm; leave it out")
+            raise InputError(f"quantity = {self.quantity!r} takes no tx_power_dbm; remove it")
         if self.weight is not None and self.std is not None:
             raise InputError(f"weight = {self.weight!r} and std = {self.std!r}: give one of them")
 
@@ -82,7 +82,7 @@ class Averaging:
         size: Width or length [m], or duration [s]; not used for "place".
         time: Column of times, for "time".
         unbiased: Whether to correct the bias of the logarithm of a mean of few samples.
-        minimum_count: Averages of fewer samples are left out.
+        minimum_count: Smallest number of samples of an average; averages of fewer samples are left out.
     """
 
     by: Literal["place", "cell", "distance", "time"]
@@ -99,8 +99,8 @@ class Track:
     Attributes:
         file: GPX file.
         time: Column of the rows' times.
-        longest_gap: Rows between two track points further apart in time than this are left out [s].
-        clock: How far the rows' clock is ahead of the track's [s].
+        longest_gap: Largest time between two track points [s]; rows between points farther apart are left out.
+        clock: Time by which the rows' clock is ahead of the track's [s].
     """
 
     file: str
@@ -111,7 +111,7 @@ class Track:
 
 @dataclass(frozen=True)
 class Preparation:
-    """The steps that turn rows into links; none by default.
+    """The steps that convert rows to links; none by default.
 
     Attributes:
         wide: Name of the transmitter by column, for a table with one column per transmitter.
@@ -124,12 +124,12 @@ class Preparation:
         censored: Whether links at or below the noise floor are kept, as censored links at the floor.
         frame: The scene's frame on the globe, if positions are longitude, latitude and height; None for lengths.
         crs: Reference system of positions that have a frame.
-        unit_m: Length of one unit of columns of positions in the scene's frame [m].
-        ground: Height of the ground, if heights are above it.
+        unit_m: Length of one unit of position columns in the scene's frame [m].
+        ground: Height of the ground, if heights are measured from it.
         averaging: How samples are averaged.
-        keep: Columns that averages do not cross, in addition to the transmitter's.
-        computed: Further columns by name, computed from the rows with the columns of their transmitters; a function
-            gives None if a column that it needs is missing and need not be there.
+        keep: Columns whose groups averages keep apart, in addition to the transmitter's.
+        computed: Further columns by name, computed from the rows with the columns of their transmitters. A function
+            returns None if a column that it needs is missing and optional.
         inside: What to do with receivers inside buildings; nothing if None.
         outside: Moves positions out of buildings; needed with `inside`.
     """

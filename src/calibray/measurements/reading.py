@@ -43,14 +43,14 @@ def read_measurements(
         tx: Transmitter position (x, y, z) [m] in the scene's frame, each a number or the name of a column.
         rx: Receiver position, likewise.
         value: Column of the measured values.
-        quantity: What they are: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm], a
-            received power whose transmitted power is unknown (see `LinkColumns`).
+        quantity: The measured quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm], a
+            received power with unknown transmitted power (see `LinkColumns`).
         where: Filter over the columns (see `filters`); rows that do not pass are left out before any check.
         group: Column of group labels.
         weight: Column of relative weights [1], greater than 0.
         std: Standard deviation [dB] of the values, a number or a column; the weights become 1 / std^2.
-        tx_power_dbm: Transmitted power [dBm], a number or a column, for "received_power" only: the path loss is
-            this power minus the received one, antenna gains and cable losses included.
+        tx_power_dbm: Transmitted power [dBm], a number or a column, only for "received_power": the path loss is this
+            power minus the received power, including antenna gains and cable losses.
         frequency: Column of carrier frequencies [Hz], for links measured at several carriers.
 
     Returns:
@@ -67,7 +67,7 @@ def read_measurements(
 def measured_links(
     table: SourceTable, columns: LinkColumns, steps: Preparation | None = None
 ) -> Measurements:
-    """Turn the rows of a table into measured links; `prepared` counts what was left out, averaged or changed.
+    """Convert the rows of a table to measured links; `prepared` counts what was left out, averaged or changed.
 
     Raises:
         InputError: A column is missing or malformed, a value is missing or implausible, a transmitter is unknown, or
@@ -86,15 +86,14 @@ def measured_links(
 def links_from_frame(
     frame: pd.DataFrame, group: str | Sequence[str] | None = None, frequency: str | None = None
 ) -> Measurements:
-    """Links without measured values, to predict at.
+    """Links without measured values, for predictions.
 
     Args:
         frame: Table with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] in the scene's frame.
-        group: Column of group labels, or several whose labels are joined.
+        group: Column of group labels, or several columns whose labels are joined.
         frequency: Column of carrier frequencies [Hz]; if the table lacks it, all links have the study's carrier.
 
-    Returns:
-        The links, with path losses NaN.
+    Returns: The links, with NaN as path loss.
 
     Raises:
         InputError: A column is missing, or a position is not finite.
@@ -111,7 +110,7 @@ def links_from_table(
     tx: Coordinates = TX_COLUMNS,
     rx: Coordinates = RX_COLUMNS,
 ) -> Measurements:
-    """Links without measured values, path losses NaN, from the rows of a file.
+    """Links without measured values, with NaN as path loss, from the rows of a file.
 
     Labels of several columns in `group` are joined. If the table lacks the column `frequency` [Hz], all links have the
     study's carrier. No step may leave out rows.
@@ -120,7 +119,7 @@ def links_from_table(
         InputError: There are no rows, a column is missing or malformed, or a position is not finite.
     """
     if len(table) == 0:
-        raise InputError(f"{table.source}: holds no rows; give at least one link")
+        raise InputError(f"{table.source}: contains no rows; give at least one link")
     steps = steps or Preparation()
     table, tx, rx = place_rows(select_rows(table, steps), steps, tx, rx)
     return Measurements(
@@ -141,7 +140,7 @@ PLAUSIBLE_POWER_DBM: Final = (-200.0, 30.0)
 
 
 def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> Measurements:
-    """Make one link of each row; positions are in metres. Used here are `noise_floor_dbm` and `censored`.
+    """Make one link of each row; positions are in metres. The steps `noise_floor_dbm` and `censored` are used here.
 
     Raises:
         InputError: A column is missing, or a value is missing, not a number or implausible.
@@ -165,7 +164,7 @@ def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> 
 
 
 def _path_loss_db(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
-    """Path losses [rows], [dB]; minus the received power [dBm] if the transmitted power is unknown."""
+    """Path loss [rows], [dB]; minus the received power [dBm] if the transmitted power is unknown."""
     measured = table.numbers(columns.value)
     match columns.quantity:
         case "rsrp":
@@ -211,6 +210,6 @@ def _weights(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
         first = int(np.flatnonzero(wrong)[0])
         name = table.cell(first, source) if isinstance(source, str) else "std"
         raise InputError(
-            f"{name}: {values[first]:g} must be greater than 0; leave the row out with a where filter"
+            f"{name}: {values[first]:g} must be greater than 0; remove the row with a where filter"
         )
     return values if columns.std is None else 1 / values**2

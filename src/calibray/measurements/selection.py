@@ -23,11 +23,11 @@ NAMED: Final = 20
 def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> SourceTable:
     """Select the rows that become links.
 
-    The steps run in the order of the code, so that a filter sees the columns of the track but not those of the
-    transmitters. Used here are `wide`, `track`, `where`, `missing`, `transmitters`, `computed`, `noise_floor_dbm` and
-    `censored`. `value` is the column of the measured values; with `wide`, the name of the new one. The rows that remain
-    have no numbers that mean a missing value (`missing_codes`). Values at or below the noise floor, and missing ones,
-    are set to the floor.
+    The steps run in the order of the code, so that a filter can use the columns of the track but not those of the
+    transmitters. The steps `wide`, `track`, `where`, `missing`, `transmitters`, `computed`, `noise_floor_dbm` and
+    `censored` are used here. `value` is the column of the measured values; with `wide`, it is the name of the new
+    column. The remaining rows contain no numbers that mean a missing value (`missing_codes`). Values at or below the
+    noise floor, and missing values, are set to the floor.
 
     Raises:
         InputError: A column is missing or malformed, a transmitter is unknown, or no row remains.
@@ -59,7 +59,7 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
         if steps.noise_floor_dbm is None and coded.any():
             if coded.all():
                 raise InputError(
-                    f"{table.source}: column {value!r} holds no measured value; check links.missing"
+                    f"{table.source}: column {value!r} contains no measured value; check links.missing"
                 )
             table = table.select(~coded)
     if steps.transmitters is not None:
@@ -75,7 +75,7 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
 def melt(
     table: SourceTable, columns: Mapping[str, str], value: str, transmitter: str, *, keep_empty: bool = False
 ) -> SourceTable:
-    """One row per link, those of one row together, from a table with one column per transmitter.
+    """One row per link, with those of one row together, from a table with one column per transmitter.
 
     `value` and `transmitter` name the new columns. With `keep_empty`, cells without a value become links, as for
     prediction.
@@ -95,7 +95,7 @@ def melt(
     # In row-major order: the links of one row stay together.
     row, column = np.nonzero(~np.isnan(values) | keep_empty)
     if not len(row):
-        raise InputError(f"{table.source}: the columns {', '.join(columns)} hold no value")
+        raise InputError(f"{table.source}: the columns {', '.join(columns)} contain no value")
     frame = table.frame[others].iloc[row].reset_index(drop=True)
     frame[transmitter] = np.array(list(columns.values()))[column]
     frame[value] = values[row, column]
@@ -105,9 +105,9 @@ def melt(
 
 
 def plain_labels(column: Iterable[object]) -> list[str]:
-    """Labels for comparison: without case, without white space at the ends, 5 for 5.0, and a colon for a hyphen.
+    """Labels for comparison: without case or white space at the ends, with 5 for 5.0 and a colon for a hyphen.
 
-    Tools write one address as `AA-BB` and as `aa:bb`, and whole numbers as floats if a column has gaps.
+    Tools write the same address as `AA-BB` and as `aa:bb`, and whole numbers as floats if a column has gaps.
 
     Example:
         >>> plain_labels(["C4-64", "c4:64 ", 5.0])
@@ -120,7 +120,7 @@ def plain_labels(column: Iterable[object]) -> list[str]:
 
 
 def comparison(names: Iterable[object]) -> Callable[[Iterable[object]], list[str]]:
-    """How labels are compared with names: as `plain_labels`, unless that makes two names one."""
+    """How labels are compared with names: with `plain_labels`, unless that makes two names equal."""
     texts = list(map(str, names))
     if len(set(plain_labels(texts))) == len(set(texts)):
         return plain_labels
@@ -128,9 +128,9 @@ def comparison(names: Iterable[object]) -> Callable[[Iterable[object]], list[str
 
 
 def naming_column(transmitters: pd.DataFrame, labels: Iterable[object]) -> str | None:
-    """The column of a table of transmitters that names them: no value twice, and at least half of some labels.
+    """The column that names the transmitters in their table: no value twice, and at least half of some labels.
 
-    Returns None if no column or several do so.
+    Returns None if no column or several columns do so.
 
     Example:
         >>> naming_column(pd.DataFrame({"id": ["a", "b"], "height": [5.0, 5.0]}), ["b", "b"])
@@ -146,7 +146,7 @@ def naming_column(transmitters: pd.DataFrame, labels: Iterable[object]) -> str |
 
 
 def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) -> SourceTable:
-    """Links with the other columns of their transmitters, whose names may be in a column of another name."""
+    """Links with the other columns of their transmitters, which may be named in a column of another name."""
     label_of_link = table.labels(key).tolist()
     name = key if key in transmitters.frame else naming_column(transmitters.frame, label_of_link) or key
     labels = transmitters.labels(name).tolist()
@@ -162,7 +162,7 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
         more = f" and {len(unknown) - NAMED} more" if len(unknown) > NAMED else ""
         raise InputError(
             f"{table.source}: {transmitters.source} lacks {cells}{more}, the {key} of {lacking.sum()} of {len(table)} "
-            f"rows; {did_you_mean(str(unknown[0]), labels)}; add them, or leave their rows out with links.where, as in "
+            f"rows; {did_you_mean(str(unknown[0]), labels)}; add them, or remove their rows with links.where, as in "
             f'where = "`{key}` not in [{cells}]"'
         )
     joined = transmitters.frame.drop(columns=name).iloc[[index_of_label[label] for label in compared_of_link]]
@@ -173,7 +173,7 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
 
 
 def _apply_noise_floor(table: SourceTable, steps: Preparation, floor: float, value: str) -> SourceTable:
-    """Set powers at or below the noise floor to it; leave these rows out unless a later step uses them."""
+    """Set powers at or below the noise floor to the floor; leave these rows out unless a later step uses them."""
     power = table.numbers(value, gaps=True)
     below = ~(power > floor)  # A missing power counts as below the floor.
     table = table.assign(**{value: np.where(below, floor, power)})
@@ -188,17 +188,18 @@ CODES: Final = (
     *(0, 1, -1, 99, 100, 101, 127, 128, 255, 500, 999, 1000, 9999, 32767, 65535, 99999, 2147483647),
     *(-200, -255, -256, -500, -999, -1000, -9999, -32768, -99999, -2147483648),
 )  # fmt: skip
-"""Numbers in use for missing values: by UJIIndoorLoc (100), Wi-Fi RTT logs (-200), Android (2147483647), and others."""
+"""Numbers that loggers use for missing values: UJIIndoorLoc (100), Wi-Fi RTT logs (-200), Android (2147483647), and
+others."""
 
 MIN_GAP_DB: Final = 20.0
-"""A code is at least this far from every measured value [dB]."""
+"""Smallest distance of a code from every measured value [dB]."""
 
 LARGEST_LEVEL: Final = 190.0
-"""Magnitude above which a code with the sign of the other values can be no power [dBm] or gain [dB]."""
+"""Magnitude above which a code with the sign of the other values cannot be a power [dBm] or gain [dB]."""
 
 
 def find_codes(values: ArrayLike) -> tuple[float, ...]:
-    """Find the numbers that stand for a missing value among values [n], [dB] or [dBm]; ascending.
+    """Find the numbers that mark a missing value among values [n], [dB] or [dBm]; ascending.
 
     A number counts as a code if it is in `CODES`, is far from all other values, and has the other sign or an impossible
     magnitude: 100 is a code among powers, and a value among path losses.
@@ -231,9 +232,9 @@ def without_codes(column: pd.Series) -> pd.Series:
 def mask_codes(
     table: SourceTable, columns: Sequence[str], stated: Sequence[float] = ()
 ) -> tuple[SourceTable, NDArray[np.bool_]]:
-    """Set the codes in columns of measured values to missing, and note their number.
+    """Set the codes in columns of measured values to missing, and record their number.
 
-    Codes are judged over all columns, which hold one quantity; those stated are codes whatever the other values are.
+    Codes are judged over all columns, which contain one quantity; stated codes apply whatever the other values are.
     Returns the rows, and a mask [rows] of those in which a column had a code.
 
     Raises:

@@ -57,7 +57,7 @@ class SourceTable:
         return replace(self, frame=self.frame.loc[mask].reset_index(drop=True), row=self.row[mask])
 
     def keep(self, mask: NDArray[np.bool_], reason: str) -> SourceTable:
-        """The rows where a mask [rows] is true; the number of others is noted in `changes` under the reason.
+        """The rows where a mask [rows] is true; `changes` records the number of other rows under the reason.
 
         Raises:
             InputError: No row remains.
@@ -71,7 +71,7 @@ class SourceTable:
         """Mask [rows] of the rows that pass a filter (see `filters`); a missing value in a comparison does not pass.
 
         Raises:
-            InputError: The expression is malformed, names an unknown column, or gives no truth value per row.
+            InputError: The expression is malformed, names an unknown column, or does not give one truth value per row.
         """
         try:
             return evaluate(expression, self.frame)
@@ -105,9 +105,13 @@ class SourceTable:
         if gaps and missing.all():
             return np.full(len(self), np.nan)
         if not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_string_dtype(column)):
-            raise InputError(f"{self.source}: column {source!r} holds {column.dtype}, must hold numbers")
+            raise InputError(
+                f"{self.source}: column {source!r} contains {column.dtype}, must contain numbers"
+            )
         if pd.api.types.is_bool_dtype(column):
-            raise InputError(f"{self.source}: column {source!r} holds true and false, must hold numbers")
+            raise InputError(
+                f"{self.source}: column {source!r} contains true and false, must contain numbers"
+            )
         parsed = pd.to_numeric(column, errors="coerce")
         if (text := parsed.isna().to_numpy() & ~missing).any():
             first = int(np.flatnonzero(text)[0])
@@ -120,7 +124,7 @@ class SourceTable:
             rows = ", ".join(map(str, self.row[unusable][:5])) + (", ..." if unusable.sum() > 5 else "")
             raise InputError(
                 f"{self.source}: column {source!r} is missing or not finite in {unusable.sum()} of {len(self)} "
-                f"rows (row {rows}); correct them, or leave them out with a where filter"
+                f"rows (row {rows}); correct them, or remove them with a where filter"
             )
         return numbers
 

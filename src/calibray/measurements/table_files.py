@@ -21,16 +21,16 @@ from calibray.support.messages import first_line, shortened
 from calibray.support.output_files import exists
 
 LARGEST_TABLE: Final = 2 * 2**30
-"""Decompressed size of a Parquet file that is read at once [bytes]; pandas takes up to twice as much."""
+"""Largest decompressed size of a Parquet file that is read at once [bytes]; pandas needs up to twice as much."""
 
 LARGEST_ROW_GROUP: Final = 2**30
-"""Decompressed size of a row group, or of a piece, of a Parquet file that is read in pieces [bytes]."""
+"""Largest decompressed size of a row group, or of a piece, of a Parquet file that is read in pieces [bytes]."""
 
 DECODING_MEMORY: Final = 4 * 2**30
-"""Limit of the address space in which a Parquet file is decoded once [bytes]."""
+"""Limit of the address space in which a Parquet file is first decoded [bytes]."""
 
 PIECE_ROWS: Final = 100_000
-"""Most rows of a Parquet file that are read together."""
+"""Largest number of rows of a Parquet file that are read together."""
 
 _DECODE: Final = """
 from pyarrow import parquet
@@ -61,17 +61,17 @@ except Exception as error:
 """
 
 _decoded: Final[set[tuple[str | int, ...]]] = set()
-"""Files that were decoded before, in their present form."""
+"""Files that were decoded before and have not changed since."""
 
 
 def read_table(path: str | Path) -> SourceTable:
     """Read a .csv, .txt, .tsv, .dat, .parquet or .xlsx file without blank lines; of a workbook, the first sheet.
 
-    Commas, semicolons, tabs or spaces separate the columns of a text. Unless commas do, numbers may have decimal
-    commas. `parse_text` says what is skipped.
+    Commas, semicolons, tabs or spaces separate the columns of a text. If the separator is not a comma, numbers may have
+    decimal commas. `parse_text` describes what is skipped.
 
     Raises:
-        InputError: The file does not exist, has another ending, is empty or malformed, or the library that reads it
+        InputError: The file does not exist, has another extension, is empty or malformed, or the library that reads it
             (pyarrow, openpyxl) is not installed.
     """
     path = Path(path)
@@ -92,14 +92,14 @@ def read_table(path: str | Path) -> SourceTable:
                 f"{path}: cannot read a {suffix or 'nameless'} table; use .csv, .txt, .parquet or .xlsx"
             )
     if len(table) == 0:
-        raise InputError(f"{path}: holds no rows; a table needs a header and at least one row")
+        raise InputError(f"{path}: contains no rows; a table needs a header and at least one row")
     return table
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class PiecedTable:
-    """A table that is read in pieces, so that a large Parquet file never lies in memory as a whole.
+    """A table that is read in pieces, so that a large Parquet file is never in memory as a whole.
 
     Attributes:
         source: Name of the file.
@@ -129,11 +129,11 @@ class PiecedTable:
         size = sum(_check_size(path, [group], LARGEST_ROW_GROUP, "a row group") for group in groups)
         _decode_elsewhere(path, size, LARGEST_ROW_GROUP, whole=False)
         if not rows:
-            raise InputError(f"{path}: holds no rows; a table needs a header and at least one row")
+            raise InputError(f"{path}: contains no rows; a table needs a header and at least one row")
         return cls(str(path), rows, None)
 
     def pieces(self, size: int) -> Iterator[SourceTable]:
-        """The rows in the order of the file, in pieces of at most `size`; a column has the same type in all.
+        """The rows in the order of the file, in pieces of at most `size`; a column has the same type in all pieces.
 
         Raises:
             InputError: The file is damaged.
@@ -197,20 +197,21 @@ def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> int
 def _decode_elsewhere(path: Path, size: int, limit: int, whole: bool) -> None:
     """Decode a Parquet file in a process with limits: pages may be larger than declared, and rows may share one text.
 
-    Its declared size and the limit of its rows in memory are in bytes. The limit is for the whole table or a row group.
+    Its declared size and the limit of its rows in memory are in bytes. The limit applies to the whole table or a row
+    group.
 
     Raises:
-        InputError: The file takes more memory or time, or is damaged.
+        InputError: The file needs more memory or time, or is damaged.
     """
     code = _DECODE.format(path=str(path.resolve()), limit=limit, whole=whole, rows=PIECE_ROWS)
     _run_elsewhere(path, code, size)
 
 
 def _run_elsewhere(path: Path, code: str, size: int) -> None:
-    """Run code on a file in a process with limits, once for each code and form of the file.
+    """Run code on a file in a process with limits, once for each code and state of the file.
 
     Raises:
-        InputError: The file takes more memory or time, or is damaged.
+        InputError: The file needs more memory or time, or is damaged.
     """
     status = path.stat()
     key = (code, status.st_mtime_ns, status.st_size, status.st_ino)
@@ -223,7 +224,7 @@ def _run_elsewhere(path: Path, code: str, size: int) -> None:
     except TimeoutError as error:
         raise InputError(f"{path}: cannot be decompressed {error}; export it again") from None
     if not is_read:
-        raise InputError(f"{path}: its library fails while it reads it; export it again")
+        raise InputError(f"{path}: its library fails while reading it; export it again")
     _decoded.add(key)
 
 

@@ -1,4 +1,4 @@
-"""Columns that join a table of links with one of transmitters, or that hold the values of a transmitter each."""
+"""Columns that join a table of links with one of transmitters, or that contain the values of one transmitter each."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from calibray.measurements.column_names import is_named_value, matches, words
 from calibray.measurements.selection import comparison, naming_column
 
 MAX_DEVICES: Final = 12
-"""Largest number of receiving devices; a column with more values probably holds something else, such as a location."""
+"""Largest number of receiving devices; a column with more values probably contains something else, such as a
+location."""
 
 
 def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[str, str]:
     """Find the columns of a wide table, and the transmitter of each.
 
-    Their names differ only in the name of the transmitter, between separators. Of several quantities, received power or
-    path loss is chosen. Nothing is found if there are fewer than two.
+    The names of these columns differ only in the name of the transmitter, between separators. If there are several
+    quantities, received power or path loss is chosen. The result is empty if there are fewer than two.
 
     Example:
         >>> find_wide_columns(pd.DataFrame({"x": [1.0], "rss_a": [-50.0], "rss_b": [-60.0]}), ["a", "b"])
@@ -48,7 +49,7 @@ def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[
 
 
 def find_unknown_wide_columns(frame: pd.DataFrame, columns: Mapping[str, str]) -> list[str]:
-    """Find columns of a wide table that are named like those of transmitters, but of none in the table of them.
+    """Find columns of a wide table that are named like those of transmitters but belong to none in their table.
 
     Example:
         >>> table = pd.DataFrame(columns=["x", "rss_a", "rss_b", "rss_c"])
@@ -67,7 +68,7 @@ def find_unknown_wide_columns(frame: pd.DataFrame, columns: Mapping[str, str]) -
 
 
 def name_melted_values(columns: Iterable[str]) -> str:
-    """Name the column of values that at least one column of a wide table becomes, after a word they share.
+    """Name the column of values that the columns of a wide table are combined into, after a word they share.
 
     Example:
         >>> name_melted_values(["RSS AP1", "RSS AP2"])
@@ -81,8 +82,8 @@ def name_melted_values(columns: Iterable[str]) -> str:
 def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | None:
     """Find the column by which two tables name the transmitter, if any.
 
-    It is the first column of both tables in which every value of the links appears once among the transmitters; else
-    the first that is named like transmitters in which some values appear.
+    It is the first column of both tables in which every value of the links appears once among the transmitters;
+    otherwise the first that is named like transmitters and shares some values.
     """
     partial = None
     for name in transmitters:
@@ -99,7 +100,7 @@ def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | No
 
 
 def find_naming_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> tuple[str, str] | None:
-    """Find the column of the links that names the transmitter, and that of another name in the table of transmitters.
+    """Find the column of the links that names the transmitter, and its counterpart in the table of transmitters.
 
     Columns that are named like transmitters come first, then other columns of texts.
 
@@ -121,7 +122,7 @@ def find_naming_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> tuple[st
 def find_transmitter_of_positions(frame: pd.DataFrame, position: Sequence[str]) -> str | None:
     """Find the column that names the transmitters whose positions are in columns of the same table.
 
-    Each of its labels has one position, and there are as many labels as positions or more.
+    Each of its labels has one position, and there are at least as many labels as positions.
 
     Example:
         >>> links = pd.DataFrame({"cell": ["a", "b", "a"], "tx_x": [0, 50, 0], "tx_y": 0, "rsrp": [-80, -90, -85]})
@@ -141,7 +142,7 @@ def find_transmitter_of_positions(frame: pd.DataFrame, position: Sequence[str]) 
 
 
 def find_transmitter_names(transmitters: pd.DataFrame) -> str:
-    """Find the column of names of a table of transmitters, one per row.
+    """Find the column of names in a table of transmitters with one row each.
 
     Raises:
         InputError: No column with such a name distinguishes the transmitters.

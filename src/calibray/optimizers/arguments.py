@@ -14,7 +14,7 @@ from calibray.errors import InputError
 
 
 def whole(name: str, value: int, at_least: int, at_most: float = inf) -> int:
-    """The whole number `value` of the argument `name`, if it lies within its bounds.
+    """The whole number `value` of the argument `name`, if it is within its bounds.
 
     Raises:
         InputError: It is not a whole number, or outside its range.
@@ -30,7 +30,7 @@ def whole(name: str, value: int, at_least: int, at_most: float = inf) -> int:
 
 
 def real(name: str, value: float, at_least: float, at_most: float = inf) -> float:
-    """The finite number `value` of the argument `name`, if it lies within its bounds.
+    """The finite number `value` of the argument `name`, if it is within its bounds.
 
     Raises:
         InputError: It is not a finite number, or outside its range.
@@ -43,7 +43,7 @@ def real(name: str, value: float, at_least: float, at_most: float = inf) -> floa
 
 
 def choice(name: str, value: str, allowed: Iterable[str]) -> str:
-    """The string `value` of the argument `name`, if it is one of those allowed.
+    """The string `value` of the argument `name`, if it is one of the allowed strings.
 
     Raises:
         InputError: The value is not allowed.
@@ -87,7 +87,7 @@ class Box:
             if not (np.isfinite(a) and np.isfinite(b) and a < b):
                 raise InputError(
                     f"lower[{number}] = {a:g} and upper[{number}] = {b:g}; the bounds must be finite with "
-                    "lower below upper: swap them, or leave a fixed parameter out of the search"
+                    "lower below upper: swap them, or remove a fixed parameter from the search"
                 )
         low.setflags(write=False)
         high.setflags(write=False)
@@ -117,5 +117,5 @@ class Box:
         return (np.asarray(x, dtype=float) - self.lower) / self.width
 
     def from_unit(self, unit: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Map the unit cube onto the box, never past its faces by rounding [..., d]."""
+        """Map the unit cube onto the box; rounding never moves a point outside [..., d]."""
         return self.clip(self.lower + unit * self.width)

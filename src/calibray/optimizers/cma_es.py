@@ -1,8 +1,8 @@
-"""CMA-ES, the covariance matrix adaptation evolution strategy, by its author's library.
+"""CMA-ES, the covariance matrix adaptation evolution strategy, in its author's library.
 
 N. Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772, in the package `cma`. It searches the unit cube,
-starts in the middle (or at the best point told before) with a step of 0.3, and restarts from a random point when it
-converges before its budget is used.
+starts in the middle (or at the best point passed to `tell` before) with a step of 0.3, and restarts from a random point
+if it converges before its budget is used.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ STEP = 0.3
 
 @final
 class CMAES(Optimizer):
-    """Covariance matrix adaptation. Uses the value alone; budget as set. Needs `calibray[optimizers]`.
+    """Covariance matrix adaptation. Uses only the value, with the given budget. Needs `calibray[optimizers]`.
 
     Args:
         budget: Number of evaluations.
-        population: Candidates per generation, 4 + 3 ln d if None.
+        population: Candidates per generation; 4 + 3 ln d if None.
 
     Raises:
         InputError: An argument is out of range, or `cma` is not installed.

@@ -1,11 +1,11 @@
-"""Projected Levenberg-Marquardt from many starts at once, for least squares in the unit cube.
+"""Projected Levenberg-Marquardt from many starting points in parallel, for least squares in the unit cube.
 
 A step minimises the damped quadratic model g.p + p.(H + mu I) p / 2 with H = J^T J and g = J^T r within the cube.
-Components that would leave the cube are fixed on its face, group after group, and the rest is solved again. The damping
-mu follows the gain ratio after H. B. Nielsen (Damping Parameter in Marquardt's Method, IMM-REP-1999-05, Technical
-University of Denmark).
+Components that would leave the cube are fixed on its face, group after group, and the system is solved again for the
+others. The damping mu follows the gain ratio after H. B. Nielsen (Damping Parameter in Marquardt's Method,
+IMM-REP-1999-05, Technical University of Denmark).
 
-`descend` is a generator, so its caller decides how points are evaluated: `least_squares.py` asks the engine,
+`descend` is a generator, so its caller decides how points are evaluated: `least_squares.py` uses the engine, and
 `descend_all` calls a model.
 """
 
@@ -25,7 +25,8 @@ MERGE_DISTANCE = 1e-3
 """Distance in the unit cube below which two searches approach the same minimum."""
 
 Residuals = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Residuals [s, m] and their Jacobian by unit coordinates [s, m, d]; a row that is not finite is a failure."""
+"""Residuals [s, m] and their Jacobian with respect to unit coordinates [s, m, d]; a row that is not finite is a
+failure."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Starts:
         curvature: Its Gauss-Newton matrix H [s, d, d].
         damping: mu [s].
         growth: Factor on the damping at the next rejection [s].
-        searches: Number of searches merged into each one, itself included [s].
+        searches: Number of searches merged into each one, including itself [s].
     """
 
     unit: NDArray[np.float64]
@@ -128,7 +129,7 @@ def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> St
 def merge(starts: Starts, settled: Starts) -> tuple[Starts, Starts, NDArray[np.bool_]]:
     """Find searches that come close to a better one and would only reach the same minimum.
 
-    Returns the moving searches and the settled ones, with the merged ones counted in `searches` of the better ones, and
+    Returns the moving searches and the settled ones, with merged searches counted in `searches` of the better ones, and
     True for each moving search that can be dropped [s].
     """
     number, cost = len(settled.cost), np.concatenate([settled.cost, starts.cost])
@@ -151,13 +152,14 @@ def descend(
     earlier: Starts | None = None,
     followed: int | None = None,
 ) -> Generator[NDArray[np.float64], Residuals, Starts]:
-    """Advance all starts [s, d] until each has converged, merged with a better one, or been given up.
+    """Advance all starting points [s, d] until each has converged, merged with a better one, or been abandoned.
 
-    A search has converged when its model predicts less than `tolerance` as relative decrease of the cost, or a shorter
-    step. It is given up when it lies more than `catch_up` of its predicted decreases behind the best one. New searches
-    that come close to `earlier` ends are merged with them. Of the starts, the `followed` ones of the lowest cost are
-    followed, or all. Yields points to evaluate [s, d]. Returns the earlier searches, those that converged or were still
-    moving at the end, then those that were given up, which are so near another minimum that they could not catch up.
+    A search has converged if its model predicts a relative decrease of the cost below `tolerance`, or a shorter step.
+    A search is abandoned if its cost exceeds the best one by more than `catch_up` of its predicted decreases. New
+    searches that come close to `earlier` ends are merged with them. Only the `followed` searches of the lowest cost are
+    followed, or all. Yields points to evaluate [s, d]. Returns the earlier searches, then those that converged or were
+    still moving at the end, then those that were abandoned because they were close to another minimum but too far
+    behind.
     """
     starts = begin(unit, (yield unit))
     starts = starts.rows(np.isfinite(starts.cost))
@@ -189,7 +191,7 @@ def descend_all(
     iterations: int,
     tolerance: float,
 ) -> Starts:
-    """Descend from `unit` [s, d] on a model, which gives residuals and their Jacobian; returns the ends."""
+    """Descend from `unit` [s, d] on a model, which gives residuals and their Jacobian; return the ends."""
     descent = descend(unit, iterations, tolerance)
     points = next(descent)
     while True:
@@ -200,7 +202,7 @@ def descend_all(
 
 
 def distinct(starts: Starts, separation: float) -> Starts:
-    """Keep the best of searches that ended closer than `separation` in the unit cube, the lowest cost first."""
+    """Keep the best of searches that ended closer than `separation` in the unit cube, with the lowest cost first."""
     order = np.argsort(starts.cost, kind="stable")
     near = cdist(starts.unit[order], starts.unit[order]) < separation
     kept = np.zeros(len(order), dtype=bool)

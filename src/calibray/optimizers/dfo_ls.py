@@ -1,10 +1,10 @@
-"""DFO-LS, derivative-free least squares by its authors' library.
+"""DFO-LS, derivative-free least squares in its authors' library.
 
 C. Cartis, J. Fiala, B. Marteau, L. Roberts, "Improving the Flexibility and Robustness of Model-Based
 Derivative-Free Optimization Solvers", ACM Trans. Math. Softw. 45 (2019) 32, in the package `DFO-LS`. It
-fits a linear model to every residual in a trust region, one evaluation at a time. It is a local method: it
-starts in the middle of the unit cube (or at the best point told before), and restarts from random points
-when it converges before its budget is used.
+fits a linear model to every residual in a trust region, one evaluation at a time. DFO-LS is a local method: it starts
+in the middle of the unit cube (or at the best point passed to `tell` before), and restarts from random points if it
+converges before its budget is used.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class DFOLS(Optimizer):
         seed: Seed of the random points of restarts.
         budget: Number of evaluations.
         radius: First trust region, as a share of the box.
-        tolerance: Trust region at which a start has converged, as a share of the box.
+        tolerance: Trust region at which a search has converged, as a share of the box.
 
     Raises:
         InputError: An argument is out of range, or `DFO-LS` is not installed.
@@ -75,7 +75,7 @@ def _minimise(
     rng: np.random.Generator,
     evaluate: Evaluate,
 ) -> None:
-    """Minimise from one start after the other without end."""
+    """Minimise from one starting point after the other, without end."""
     box = archive.box
     d = box.dimension
 

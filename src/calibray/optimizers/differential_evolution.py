@@ -1,7 +1,7 @@
-"""Differential evolution by SciPy, one generation a batch (R. Storn, K. Price, J. Global Optim. 11 (1997) 341).
+"""Differential evolution in SciPy, with one generation per batch (R. Storn, K. Price, J. Global Optim. 11 (1997) 341).
 
-Without SciPy's final polish, which would need derivatives. It restarts with another population when it converges before
-its budget is used.
+SciPy's final polish, which would need derivatives, is not used. It restarts with another population if it converges
+before its budget is used.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, 
 
 @final
 class DifferentialEvolution(Optimizer):
-    """Differential evolution. Uses the value alone; budget as set.
+    """Differential evolution. Uses only the value, with the given budget.
 
     Args:
         budget: Number of evaluations.
-        population: Candidates per generation as a multiple of d; SciPy uses at least 5 in all.
+        population: Candidates per generation as a multiple of d; SciPy uses at least 5 in total.
 
     Raises:
         InputError: An argument is out of range.
@@ -51,7 +51,7 @@ class DifferentialEvolution(Optimizer):
 
 
 def _minimise(population: int, archive: Archive, rng: np.random.Generator, evaluate: Evaluate) -> None:
-    """Minimise with one population after the other without end."""
+    """Minimise with one population after the other, without end."""
     box = archive.box
 
     def objective(x: NDArray[np.float64]) -> NDArray[np.float64]:  # [d, n], SciPy's vectorized form

@@ -12,13 +12,13 @@ from calibray.errors import InputError
 from calibray.optimizers.arguments import Box
 
 Objective = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""Residuals [n, m] to the value [n], which rises with their mean square."""
+"""Converts residuals [n, m] to the value [n], which rises with their mean square."""
 
 OBJECTIVE_TOLERANCE = 1e-4
 """Largest relative difference between a value and the one computed from its residuals, for float32 engines."""
 
 DECIMALS = 9
-"""Decimals of unit coordinates to which two points have to agree to count as one."""
+"""Number of decimals of unit coordinates in which two points must agree to count as one."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Best:
 
     Attributes:
         x: The point [d].
-        y: Its value; +inf when every evaluation failed.
+        y: Its value; +inf if every evaluation failed.
     """
 
     x: NDArray[np.float64]
@@ -42,7 +42,7 @@ class Evaluations:
         x: Points [n, d].
         y: Value [n], +inf for a failed evaluation.
         residuals: Residuals [n, m], whose mean square rises and falls with y, or None.
-        jacobian: Derivatives of the residuals by the parameters [n, m, d], or None.
+        jacobian: Derivatives of the residuals with respect to the parameters [n, m, d], or None.
     """
 
     x: NDArray[np.float64]
@@ -70,7 +70,7 @@ class Evaluations:
         return self.jacobian
 
     def rows(self, rows: NDArray[np.intp]) -> Evaluations:
-        """The evaluations with these indices [k], in that order."""
+        """The evaluations with these indices [k], in this order."""
         residuals = None if self.residuals is None else self.residuals[rows]
         jacobian = None if self.jacobian is None else self.jacobian[rows]
         return Evaluations(self.x[rows], self.y[rows], residuals, jacobian)
@@ -92,7 +92,7 @@ class Evaluations:
 
 
 class Archive:
-    """Every evaluation of a run in the order of `tell`, asked for or not."""
+    """Every evaluation of a run in the order of `tell`, whether it was requested or not."""
 
     def __init__(self, box: Box) -> None:
         self.box = box
@@ -120,7 +120,7 @@ class Archive:
 
     @property
     def leading(self) -> Evaluations:
-        """The first evaluation with the lowest value, alone.
+        """The first evaluation with the lowest value.
 
         Raises:
             InputError: Nothing has been told yet.
@@ -143,7 +143,7 @@ class Archive:
     def leaders(self, count: int) -> NDArray[np.float64]:
         """The best distinct points over the whole run [count, d], best first, ties in the order of `tell`.
 
-        The last one is repeated if there are fewer.
+        If there are fewer points, the last one is repeated.
         """
         evaluations = self.all()
         chosen: list[NDArray[np.float64]] = []
@@ -155,7 +155,7 @@ class Archive:
         return np.array(chosen + [chosen[-1]] * (count - len(chosen)))
 
     def imputed(self, evaluations: Evaluations) -> Evaluations:
-        """Give failed evaluations the values of the worst successful one, so that models steer away from them.
+        """Give failed evaluations the values of the worst successful one, so that models avoid them.
 
         The value is zero while every evaluation of the run has failed.
         """
@@ -182,11 +182,11 @@ def checked_evaluations(
     """Validate and copy evaluations: points x [n, d], values y [n], residuals [n, m], derivatives [n, m, d].
 
     A value of +inf is a failed evaluation, whose residuals and derivatives are ignored. Parts that the optimizer does
-    not use are checked and left out. Values are compared with the `objective` of the residuals unless it is None.
+    not use are checked and omitted. Values are compared with the `objective` of the residuals unless it is None.
 
     Raises:
-        InputError: A shape is wrong, a number is not finite, a point lies outside the box, a part that the
-            optimizer uses is missing, or a value does not belong to its residuals.
+        InputError: A shape is wrong, a number is not finite, a point is outside the box, a part that the optimizer uses
+            is missing, or a value does not match its residuals.
     """
     points, values = _array("x", x, (None, box.dimension)), _array("y", y, (None,))
     if len(points) != len(values) or len(values) == 0:
@@ -197,7 +197,7 @@ def checked_evaluations(
     for row, column in np.argwhere((points < box.lower) | (points > box.upper)):
         raise InputError(
             f"x[{row}, {column}] = {points[row, column]:g} lies outside its bounds "
-            f"[{box.lower[column]:g}, {box.upper[column]:g}]; leave the point out or widen the bounds"
+            f"[{box.lower[column]:g}, {box.upper[column]:g}]; remove the point or widen the bounds"
         )
     for (row,) in np.argwhere(~((values > -np.inf) & (values <= np.inf))):
         raise InputError(f"y[{row}] = {values[row]}; it must be a number, +inf for a failed evaluation")
@@ -224,10 +224,10 @@ def checked_evaluations(
 
 
 def check_order(evaluations: Evaluations, archive: Archive) -> None:
-    """Check that a lower value comes with a lower mean square, among evaluations and against the best before.
+    """Check that a lower value comes with a lower mean square, among evaluations and compared with the best so far.
 
     Raises:
-        InputError: An evaluation has a lower value than another and yet a higher mean square.
+        InputError: An evaluation has a lower value than another, but a higher mean square.
     """
     if len(archive):
         without_jacobian = Evaluations(evaluations.x, evaluations.y, evaluations.residuals)

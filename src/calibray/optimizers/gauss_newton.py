@@ -1,8 +1,8 @@
-"""Gauss-Newton with finite differences: what a user does who has a least squares solver and no derivatives.
+"""Gauss-Newton with finite differences: the approach of a user with a least squares solver and no derivatives.
 
-Every accepted point costs one evaluation for each parameter, all in one batch. Steps are those of `descent.py`. It is a
-local method: it starts in the middle of the box (or at the best point told before), and restarts at random points when
-it has converged before its budget is used.
+Every accepted point takes one evaluation for each parameter, all in one batch. Steps are those of `descent.py`. It is a
+local method: it starts in the middle of the box (or at the best point passed to `tell` before), and restarts at random
+points if it has converged before its budget is used.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class GaussNewton(Optimizer):
         seed: Seed of the random points of restarts.
         budget: Number of evaluations.
         step: Step of the differences, as a share of the box.
-        tolerance: Relative decrease, or step as a share of the box, at which a start has converged.
+        tolerance: Relative decrease, or step as a share of the box, at which a search has converged.
 
     Raises:
         InputError: An argument is out of range.
@@ -62,7 +62,7 @@ class GaussNewton(Optimizer):
 
 
 def _search(archive: Archive, settings: tuple[float, float], rng: np.random.Generator) -> Search:
-    """Search from one start after the other without end."""
+    """Search from one starting point after the other, without end."""
     d = archive.box.dimension
     start = archive.box.to_unit(archive.best.x) if len(archive) else np.full(d, 0.5)
     while True:

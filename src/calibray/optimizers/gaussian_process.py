@@ -1,8 +1,8 @@
-"""Bayesian optimization of the objective: a Gaussian process of the value alone, and its expected improvement.
+"""Bayesian optimization of the objective with a Gaussian process of the value and its expected improvement.
 
-It models one number where `VectorSurrogate` models every residual, with the same `kriging.py`. A run begins with a
-maximin Latin hypercube. Every further candidate maximises the logarithm of the expected improvement (D. R. Jones,
-M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15; the logarithm after S. Ament et al., NeurIPS 2023,
+It models one number, while `VectorSurrogate` models every residual, with the same `kriging.py`. A run begins with a
+maximin Latin hypercube. Every further candidate maximises the logarithm of the expected improvement (D. R. Jones, M.
+Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15; the logarithm after S. Ament et al., NeurIPS 2023,
 arXiv:2310.20708). A failed evaluation enters the model with the worst successful value.
 """
 
@@ -22,25 +22,25 @@ from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, 
 from calibray.optimizers.sampling import distance_to_nearest, draw_around, maximin_design
 
 CANDIDATES = 300
-"""Candidates drawn over the box, and as many around the best points."""
+"""Number of candidates drawn over the box, and of candidates around the best points."""
 
 REFINEMENTS = (0.1, 0.01, 0.001)
 """Standard deviations, in the unit cube, of further candidates around the most promising one."""
 
 SEPARATION = 1e-4
-"""Distance in the unit cube below which a point counts as evaluated already."""
+"""Distance in the unit cube below which a point counts as already evaluated."""
 
 OFTEN = 40
-"""Evaluations up to which the scales are learned every time; beyond, every tenth."""
+"""Number of evaluations up to which the scales are estimated every time; beyond it, every tenth time."""
 
 
 @final
 class GaussianProcess(Optimizer):
-    """Bayesian optimization. Uses the value alone; 20 d evaluations by default.
+    """Bayesian optimization. Uses only the value; 20 d evaluations by default.
 
     Args:
         budget: Number of evaluations, 20 d if None.
-        initial: Points of the initial design, 2 (d + 1) if None; points told before the first `ask` count.
+        initial: Points of the initial design, 2 (d + 1) if None; points passed to `tell` before the first `ask` count.
 
     Raises:
         InputError: An argument is out of range.
@@ -113,7 +113,7 @@ def log_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDAr
 
 
 def log_shape(z: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The logarithm of phi(z) + z Phi(z), accurate where that is tiny; z in standard deviations [k].
+    """The logarithm of phi(z) + z Phi(z), accurate also for tiny values; z in standard deviations [k].
 
     Example:
         >>> import numpy as np

@@ -2,7 +2,7 @@
 
 S. Mirjalili, S. M. Mirjalili, A. Lewis, "Grey Wolf Optimizer", Advances in Engineering Software 69, 2014.
 
-Choices where descriptions and common implementations differ:
+The following choices apply where descriptions and common implementations differ:
 
 - Iteration t = 1..T evaluates the whole population, then moves it with a(t) = 2 (1 - t/T). The move after the last
   evaluation is omitted, so a run takes exactly N T evaluations.
@@ -12,8 +12,8 @@ Choices where descriptions and common implementations differ:
 - Positions outside the bounds are clipped to them before evaluation.
 - A failed evaluation (+inf) ranks last and has no other effect.
 - C multiplies a position, so steps are short near the origin of the coordinates and long far from it: the pack is
-  biased towards the origin. That is the published algorithm and the default; `centred=True` measures positions from the
-  middle of the box instead, and does not depend on the origin.
+  biased towards the origin. This is the published algorithm and the default; with `centred=True`, positions are
+  measured from the middle of the box instead, and the origin has no effect.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ WOLVES = 30
 """N of the paper (table II)."""
 
 LEAST_BUDGET = 24
-"""Smallest budget that leaves SGWO-IM three leaders."""
+"""Smallest budget with which SGWO-IM has three leaders."""
 
 
 def linear_decay(iteration: int, iterations: int) -> float:
@@ -64,7 +64,7 @@ def encircle(
 
 
 def whole_iterations(budget: int) -> dict[str, int]:
-    """The settings of GWO that keep to a budget: 30 wolves, and as many whole iterations as fit.
+    """The settings of GWO for a budget: 30 wolves, and as many whole iterations as fit.
 
     There are fewer wolves if two iterations of 30 do not fit.
 
@@ -78,7 +78,7 @@ def whole_iterations(budget: int) -> dict[str, int]:
 
 @final
 class GWO(Optimizer):
-    """Grey Wolf Optimizer. Uses the value alone; 600 evaluations at the paper's settings.
+    """Grey Wolf Optimizer. Uses only the value; 600 evaluations at the paper's settings.
 
     Args:
         population: N, number of wolves.

@@ -1,9 +1,9 @@
 """Universal kriging: an interpolating model of all residuals, on length scales learned from them.
 
 Every residual is a linear trend plus weights on Matern-5/2 functions centred at the evaluated points. All residuals
-share the input scales (one per parameter, so a parameter without influence drops out). These maximise the restricted
-likelihood summed over all residuals: with tens of links a dozen points determine them well. Each residual has its own
-variance, which is profiled out. See `regression.py` for the mathematics.
+share the input scales (one per parameter, so a parameter without influence drops out). The scales maximise the
+restricted likelihood summed over all residuals: with tens of links, a dozen points determine them well. Each residual
+has its own variance, which is profiled out. See `regression.py` for the mathematics.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from calibray.optimizers.regression import (
 )
 
 NUGGET = 1e-8
-"""Of the prior variance: keeps the matrix regular, below the precision of any engine."""
+"""Share of the prior variance that keeps the matrix regular; it is below the precision of any engine."""
 
 LENGTH = 0.3
-"""Of the unit cube: median of the prior of a length scale; its logarithm has standard deviation 1."""
+"""Median of the prior of a length scale, as a share of the unit cube; its logarithm has standard deviation 1."""
 
 LOG_RATE_BOUNDS = (-3.0, 5.0)
 """Length scales from 20 down to 0.007."""
 
 NOISE_PRIOR = (np.log(1e-4), 3.0)
-"""Mean and standard deviation of the logarithm of the nugget where it is learned."""
+"""Mean and standard deviation of the logarithm of the nugget if it is estimated."""
 
 CONSTANT = 1e-9
-"""Standard deviation of a residual, relative to the largest, below which it says nothing about the scales."""
+"""Standard deviation of a residual, relative to the largest, below which it does not affect the scales."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class Kriging:
         return np.sum(self.root**2, axis=0)
 
     def predict(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Predicted mean [k, m], and variance as a share of the prior's, alike for all residuals [k]."""
+        """Predicted mean [k, m], and variance as a share of the prior's, which is the same for all residuals [k]."""
         return self.process.predict(Inputs.plain(unit))
 
     def mean_and_slope(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -71,11 +71,11 @@ class Kriging:
         return self.process.mean(inputs), self.process.slope(inputs)
 
     def left_out(self) -> NDArray[np.float64]:
-        """Residuals of every evaluated point predicted from all the others, scales kept [n, m]."""
+        """Residuals of every evaluated point predicted from all other points, with unchanged scales [n, m]."""
         return self.residuals - self.process.left_out_errors()
 
     def with_point(self, point: NDArray[np.float64]) -> Kriging:
-        """Add a point [d] as if evaluated exactly as predicted: same mean and prior, but certain there too."""
+        """Add a point [d] as if its evaluation equalled the prediction: same mean and prior, but no variance there."""
         unit = np.vstack([self.process.inputs.unit, point])
         residuals = np.vstack([self.residuals, self.predict(point[None])[0]])
         return Kriging(solve(unit, residuals, self.process.kernel).process, self.root)
@@ -90,8 +90,9 @@ def fit(
 ) -> Kriging:
     """Fit a model and its input scales to residuals [n, m] at distinct points of the unit cube [n, d].
 
-    There must be at least d + 2 points that span the cube. `noisy` learns the nugget too, for an engine whose answers
-    scatter; else the model interpolates. `guess` is a kernel to start from as well as the prior's.
+    There must be at least d + 2 points that span the cube. `noisy` also estimates the nugget, for an engine whose
+    answers scatter; otherwise the model interpolates. `guess` is an additional starting point for the kernel, besides
+    the prior's.
     """
     spread = residuals.std(axis=0)
     varying = residuals[:, spread > CONSTANT * max(spread.max(), 1e-300)]

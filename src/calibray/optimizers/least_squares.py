@@ -1,18 +1,19 @@
 """Multi-start least squares with exact derivatives: projected Levenberg-Marquardt on all starts at once.
 
-Local searches are cheap if derivatives come with the residuals, and a batch of candidates costs little more than one.
-So many starts run in parallel, and each `ask` holds the next trial point of every start that still moves. RMSE over
-permittivities is multimodal (slab resonances), so one start is not enough. A search is given up when it comes close to
-a better one, or is so far behind the best that it can hardly catch up. Its last point is kept as a further minimum
-(`minima`): minima that fit nearly as well show how ambiguous the best one is. The steps are those of `descent.py`.
+Local searches are cheap if derivatives come with the residuals, and a batch of candidates takes little longer than one.
+Many searches therefore run in parallel, and each `ask` returns the next trial point of every search that still moves.
+RMSE over permittivities is multimodal (slab resonances), so one starting point is not enough. A search is abandoned if
+it comes close to a better one, or is so far behind the best that it can hardly catch up. Its last point is kept as a
+further minimum (`minima`): minima that fit nearly as well show how ambiguous the best one is. The steps are those of
+`descent.py`.
 
-Starts come in rounds, and end once `RETURNS` searches have ended in the best minimum. Another minimum that fits better
-and has as wide a basin would then have been missed by all searches with a probability of e^-k after k returns. Problems
-with narrower basins use all their starts. (The Bayesian rule of Boender and Rinnooy Kan, Mathematical Programming 37,
-1987, counts the different minima, for which every search would have to be followed to its end.)
+Starting points come in rounds, until `RETURNS` searches have ended in the best minimum. If another minimum fitted
+better and had an equally wide basin, all searches would have missed it with a probability of e^-k after k returns.
+Problems with narrower basins use all their starting points. (The Bayesian rule of Boender and Rinnooy Kan, Mathematical
+Programming 37, 1987, counts the different minima, which requires every search to be followed to its end.)
 
-If the starts are used up before the best minimum has returned that often, minima are combined into new starting points
-(`recombine`), and searches start from those that fit best, until they find no better minimum.
+If too few searches have ended in the best minimum, minima are combined into new starting points (`recombine`). Searches
+start from those that fit best, until they find no better minimum.
 """
 
 from __future__ import annotations
@@ -33,16 +34,16 @@ from calibray.optimizers.sampling import design
 from calibray.support.messages import shortened
 
 CATCH_UP = 100.0
-"""Default number of predicted decreases that a search may be behind the best one before it is given up."""
+"""Default number of predicted decreases that a search may be behind the best one before it is abandoned."""
 
 NEARER = 10.0
-"""The same for searches that start near their end, or with others that do."""
+"""The same for searches that start near their end, or together with such searches."""
 
 COMBINATIONS = 32
-"""Combinations of minima that are tried at a time, no more than there were starts."""
+"""Number of combinations of minima that are tried at a time, at most the number of starting points."""
 
 FOLLOWED = 0.2
-"""Share of them from which searches start, those that fit best."""
+"""Share of the combinations, those that fit best, from which searches start."""
 
 PARENTS = 12
 """Lowest minima that are combined."""
@@ -54,7 +55,7 @@ ROUND = 64
 """Starts of a round."""
 
 RETURNS = 10
-"""Searches that end in the best minimum before no more are started."""
+"""Number of searches that end in the best minimum before no more are started."""
 
 LEVEL = 1e-4
 """Relative difference of the mean square below which two minima fit equally well, as along a valley."""
@@ -72,15 +73,16 @@ class LeastSquares(Optimizer):
 
     Args:
         seed: Seed of the scrambled Sobol points that the searches start from.
-        starts: Largest number of those points; powers of two are spread best. Each costs about ten evaluations. If all
-            are used, combinations of the minima cost some hundred more. The best point told before the first `ask`, if
-            any, is a further start.
+        starts: Largest number of these points; powers of two are spread best. Each costs about ten evaluations. If all
+            are used, combinations of the minima need some hundred more. The best point passed to `tell` before the
+            first `ask`, if any, is a further starting point.
         x0: Further starting points, [d] or [k, d].
         iterations: Largest number of steps of each search.
-        tolerance: A search has converged when its model predicts less than this relative decrease of the mean
-            square, or a step shorter than this in the unit cube.
-        catch_up: Predicted decreases that a search may be behind the best one before it is given up. Use fewer if
-            starts are minima already and the others only have to show whether they lead to a better one.
+        tolerance: A search has converged if its model predicts less than this relative decrease of the mean square, or
+            a step shorter than this in the unit cube.
+        catch_up: Number of predicted decreases that a search may be behind the best one before it is abandoned. Use a
+            smaller number if some starting points already are minima and the others only have to show whether they lead
+            to a better one.
 
     Raises:
         InputError: An argument is out of range.
@@ -172,7 +174,7 @@ class LeastSquares(Optimizer):
 
 
 def returns(ended: Starts) -> int:
-    """Number of searches that ended in the best minimum, or in one that fits as well, merged ones included."""
+    """Number of searches that ended in the best minimum or in one that fits equally well, including merged ones."""
     if not len(ended.cost):
         return 0
     return int(ended.searches[ended.cost <= ended.cost.min() + _slack(ended)].sum())
@@ -182,11 +184,11 @@ def recombine(minima: NDArray[np.float64], number: int) -> NDArray[np.float64]:
     """Combine minima [k, d], the best first, into `number` points from which other minima may be reached.
 
     The best minimum is shifted by the difference of two others, or takes one coordinate of another. Shifts help because
-    one cause, such as a resonating slab, repeats minima at equal distances wherever the other parameters are. They are
-    the mutation of differential evolution (Storn and Price, Journal of Global Optimization 11, 1997). Exchanges help
-    where parameters act nearly independently, such as materials that few paths meet both of. They are its crossover. No
-    minimum is within `SPACE` of another. Points of the lowest minima come first, shifted and exchanged ones in turn;
-    there are fewer than wanted if the minima give no more.
+    one cause, such as a resonating slab, repeats minima at equal distances for any values of the other parameters. They
+    are the mutation of differential evolution (Storn and Price, Journal of Global Optimization 11, 1997). Exchanges
+    help if parameters act nearly independently, such as materials that rarely occur on the same path. They are its
+    crossover. Points within `SPACE` of a minimum are excluded. Points of the lowest minima come first, with shifted and
+    exchanged ones in turn; there may be fewer points than requested.
     """
     best, low, dimension = minima[0], minima[:PARENTS], minima.shape[1]
     target, source = np.nonzero(~np.eye(len(low), dtype=bool))

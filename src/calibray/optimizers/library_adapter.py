@@ -1,8 +1,8 @@
-"""Minimisers of libraries that call an objective, turned into ask-and-tell searches.
+"""Converts minimisers of libraries, which call an objective, to ask-and-tell searches.
 
 The minimiser runs in a separate thread and waits inside its objective for the evaluation. Only one side runs at a time,
-so a run is as reproducible as the library. When a search is dropped before its end, the objective raises inside the
-library, which ends the thread.
+so a run is as reproducible as the library. If a search is dropped before its end, the objective raises an exception
+inside the library, which ends the thread.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from calibray.optimizers.evaluations import Evaluations
 from calibray.optimizers.protocol import Search
 
 Evaluate = Callable[[NDArray[np.float64]], Evaluations]
-"""The function that a minimiser calls: candidates [n, d] to their evaluations."""
+"""The function that a minimiser calls: it maps candidates [n, d] to their evaluations."""
 
 
 class _AbandonedError(BaseException):
-    """Ends a minimiser whose search was dropped; not an `Exception`, so that no library swallows it."""
+    """Ends a minimiser whose search was dropped; not an `Exception`, so that no library catches it."""
 
 
 def inverted(minimise: Callable[[Evaluate], None]) -> Search:
-    """Run a minimiser in a thread and yield the candidates [n, d] that it wants evaluated.
+    """Run a minimiser in a thread and yield the candidates [n, d] that it needs evaluated.
 
     Raises:
         Exception: Whatever `minimise` raises.
@@ -65,7 +65,7 @@ def inverted(minimise: Callable[[Evaluate], None]) -> Search:
 
 
 def limited(search: Search, budget: int) -> Search:
-    """End a search when it has used its budget, and shorten the last batch; it must not end before."""
+    """End a search when it has used its budget, and shorten the last batch; the search must not end earlier."""
     with closing(search):
         x = next(search)
         while True:

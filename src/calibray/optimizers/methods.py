@@ -54,7 +54,7 @@ LABELS: Final = {
 }
 
 _NO_OPTIONS: Final = {"lower", "upper", "seed", "objective", "cheap_model"}
-"""Constructor arguments that the study sets, so that users cannot."""
+"""Constructor arguments that the study sets, so that users cannot set them."""
 
 
 def method(name: str) -> type[Optimizer]:
@@ -97,25 +97,26 @@ def make(
     cheap_model: CheapModel | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> Optimizer:
-    """Make an optimizer by its method's name; each method receives the arguments that it takes.
+    """Make an optimizer by its method's name; each method receives the arguments that it accepts.
 
     Args:
         name: A method of `METHODS`.
         lower: Lower bounds [d].
         upper: Upper bounds [d].
         seed: Seed.
-        budget: Number of evaluations to keep to; the method's default if None. Ignored if the method stops by itself.
-        start: Points to start from, [d] or [k, d], for methods that take them.
+        budget: Number of evaluations in the budget; the method's default if None. The budget is ignored if the method
+            stops by itself.
+        start: Starting points, [d] or [k, d], for methods that use them.
         starts: Number of further starting points, for the same methods; their default if None.
-        objective: Residuals to the value, for methods that use residuals; their root mean square if None.
-        cheap_model: A cheap model of the engine, for methods that take one.
+        objective: Converts residuals to the value, for methods that use residuals; their root mean square if None.
+        cheap_model: A cheap model of the engine, for methods that use one.
         options: Settings of the method, which override all of these.
 
     Returns:
         The optimizer.
 
     Raises:
-        InputError: There is no such method, it has no such setting or refuses a value, the budget is too small, or
+        InputError: The method does not exist, it has no such setting or refuses a value, the budget is too small, or
             its library is not installed.
 
     Example:

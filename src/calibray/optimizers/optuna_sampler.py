@@ -1,12 +1,12 @@
 """SGWO-IM as a sampler for Optuna, for use with its storages, dashboard and workers.
 
-Every candidate that is handed out is written into its trial. A new sampler with the same seed on a stored study
-therefore repeats the same candidates, takes their stored answers, and continues where the study stopped. Trials that it
-did not propose (enqueued, or from another sampler) join the archive and can lead the pack. A failed trial counts as a
-failed evaluation.
+Every candidate that is returned is written into its trial. A new sampler with the same seed on a stored study therefore
+repeats the same candidates, uses their stored answers, and continues where the study stopped. Trials that it did not
+propose (enqueued, or from another sampler) join the archive and can lead the pack. A failed trial counts as a failed
+evaluation.
 
-The pack cannot move before the iteration is complete. If every open candidate is with a worker, one that another
-process took is handed out again, because that process may have ended; otherwise the next trial is a random point.
+The pack cannot move before the iteration is complete. If workers are evaluating every open candidate, one from another
+process is returned again, because that process may have ended; otherwise the next trial is a random point.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ else:
     TrialState = optuna.trial.TrialState
 
 CANDIDATE = "sgwo-im:candidate"
-"""System attribute of a trial that holds its candidate in search coordinates."""
+"""System attribute of a trial that contains its candidate in search coordinates."""
 
 
 @final
@@ -46,7 +46,7 @@ class SGWOIMSampler(BaseSampler):
     """The paper's optimizer for an Optuna study of one objective.
 
     Args:
-        search_space: The parameters and their distributions, float or integer. If None it is inferred from the
+        search_space: The parameters and their distributions, float or integer. If None, they are inferred from the
             trials, which makes the first trial a random point; categorical parameters are sampled at random.
         seed: Seed.
         **settings: Further settings of `SGWOIM`.
@@ -71,7 +71,7 @@ class SGWOIMSampler(BaseSampler):
         for name, distribution in self._space.items():
             if not isinstance(distribution, FloatDistribution | IntDistribution):
                 raise InputError(
-                    f"{name}: {distribution} is neither float nor integer; leave it out of the search space"
+                    f"{name}: {distribution} is neither float nor integer; remove it from the search space"
                 )
         self._settings = {"seed": seed, **settings}
         self._inferred = optuna.search_space.IntersectionSearchSpace()
@@ -83,7 +83,7 @@ class SGWOIMSampler(BaseSampler):
         SGWOIM([0.0] * max(len(self._space), 1), [1.0] * max(len(self._space), 1), **self._settings)
 
     def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
-        """The distributions, by name, of the parameters that the pack moves in."""
+        """The distributions of the parameters that the pack searches, by name."""
         if self._space:
             return self._space
         inferred = self._inferred.calculate(study)
@@ -93,7 +93,7 @@ class SGWOIMSampler(BaseSampler):
     def sample_relative(
         self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
     ) -> dict[str, Any]:
-        """Hand out a candidate of the pack that no other trial works on; empty if Optuna should draw at random.
+        """Return a candidate of the pack that no other trial works on; empty if Optuna should draw at random.
 
         Raises:
             InputError: The study has several objectives.
@@ -123,13 +123,13 @@ class SGWOIMSampler(BaseSampler):
     def sample_independent(
         self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
     ) -> Any:
-        """Draw a parameter at random that the pack does not move in."""
+        """Draw a parameter that the pack does not search at random."""
         return self._random.sample_independent(study, trial, param_name, param_distribution)
 
     def after_trial(
         self, study: Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None
     ) -> None:
-        """Take a trial's answer, and stop the study after the last iteration."""
+        """Record a trial's answer, and stop the study after the last iteration."""
         with self._lock:
             if self._optimizer is None:
                 return
@@ -156,7 +156,7 @@ class SGWOIMSampler(BaseSampler):
         state: TrialState,
         values: Sequence[float] | None,
     ) -> None:
-        """Tell a finished trial to the optimizer, once."""
+        """Pass a finished trial to the optimizer, once."""
         if trial.number in self._told or optimizer.done:
             return
         self._told.add(trial.number)

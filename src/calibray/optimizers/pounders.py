@@ -2,13 +2,13 @@
 
 S. M. Wild, "Solving Derivative-Free Nonlinear Least Squares Problems with POUNDERS", in Advances and Trends in
 Optimization with Engineering Applications, SIAM (2017), ch. 40. The authors' package IBCDFO needs a solver (MINQ) that
-no package index has.
+no package index provides.
 
 Every residual has the quadratic model of least curvature through evaluated points near the best one. The sum of their
 squares, to second order, is minimised in a trust region, a box. Points for which the models are at least fully linear
-come first: they span all directions within the region. Where a direction is missing and the step failed, that direction
-is evaluated before the region shrinks. It is a local method: it starts in the middle of the box (or at the best point
-told before), and restarts at random points when it has converged before its budget is used.
+come first: they span all directions within the region. If a direction is missing and the step failed, that direction is
+evaluated before the region shrinks. It is a local method: it starts in the middle of the box (or at the best point
+passed to `tell` before), and restarts at random points if it has converged before its budget is used.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ SPANNING: Final = (1.75, 10.0)
 """Distances, in trust regions, within which points may span the directions: for a fully linear model, and at all."""
 
 NEW_DIRECTION: Final = 1e-3
-"""Least part of a point, in trust regions, along directions that earlier points lack (theta_1)."""
+"""Smallest part of a point, in trust regions, along directions that earlier points lack (theta_1)."""
 
 INDEPENDENT: Final = 1e-3
-"""Least pivot that a further point adds to the curvature (theta_2)."""
+"""Smallest pivot that a further point adds to the curvature (theta_2)."""
 
 ACCEPTED: Final = 0.05
-"""Share of the predicted decrease from which a step lets the trust region grow."""
+"""Share of the predicted decrease above which a step enlarges the trust region."""
 
 LARGEST: Final = 0.5
 """Largest trust region, as a share of the box."""
@@ -49,7 +49,7 @@ class POUNDERS(Optimizer):
         seed: Seed of the random points of restarts.
         budget: Number of evaluations.
         radius: First trust region, as a share of the box.
-        tolerance: Trust region at which a start has converged, as a share of the box.
+        tolerance: Trust region at which a search has converged, as a share of the box.
 
     Raises:
         InputError: An argument is out of range.
@@ -84,7 +84,7 @@ class POUNDERS(Optimizer):
 
 
 def _search(archive: Archive, radii: tuple[float, float], rng: np.random.Generator) -> Search:
-    """Search from one start after the other without end."""
+    """Search from one starting point after the other, without end."""
     d = archive.box.dimension
     start = archive.box.to_unit(archive.best.x) if len(archive) else np.full(d, 0.5)
     while True:
@@ -140,7 +140,7 @@ def _descend(archive: Archive, start: NDArray[np.float64], radii: tuple[float, f
 def _spanning(points: _Points, best: int, radius: float) -> tuple[list[int], NDArray[np.float64] | None]:
     """Points that span the directions around the best one, the latest first, and the directions that are missing.
 
-    Directions [k, d] are missing from a fully linear model where only far points, or none, span them.
+    Directions [k, d] are missing from a fully linear model if only far points, or none, span them.
     """
     offset = (points.unit - points.unit[best]) / radius
     distance = np.linalg.norm(offset, axis=1)
@@ -179,7 +179,7 @@ def _enriched(points: _Points, best: int, chosen: list[int], radius: float) -> N
 
 
 def _pivot(offset: NDArray[np.float64]) -> float:
-    """Least singular value of the quadratic terms of points, without what a plane can take up."""
+    """Smallest singular value of the quadratic terms of points, without the part that a plane can represent."""
     plane = np.hstack([np.ones((len(offset), 1)), offset])
     q = np.linalg.qr(plane, mode="complete")[0][:, plane.shape[1] :]
     return float(np.linalg.svd(q.T @ _quadratic(offset) @ q, compute_uv=False)[-1])

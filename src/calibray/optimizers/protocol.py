@@ -38,7 +38,7 @@ class Session:
         box: The box searched.
         uses: Parts of an evaluation that the algorithm uses: "value", "residuals", "jacobian".
         search: Starts the algorithm on the archive; nothing of it runs before the first `ask`.
-        objective: Residuals to the value, if residuals are used.
+        objective: Converts residuals to the value, if residuals are used.
 
     Attributes:
         minima: Distinct minima of the algorithm other than the best [k, d]; empty until it sets them.
@@ -62,7 +62,7 @@ class Session:
 
     @property
     def done(self) -> bool:
-        """Whether the algorithm has ended; to know that, it works out the next candidates."""
+        """Whether the algorithm has ended; to determine this, it computes the next candidates."""
         # Nothing starts before the first ask, so that earlier evaluations can still be told.
         if self._asked is not None:
             self._advance()
@@ -109,7 +109,7 @@ class Session:
         return np.array([row for row, answer in enumerate(self._answers) if answer is None], dtype=np.intp)
 
     def _advance(self) -> None:
-        """Go on to the next batch once this one is complete."""
+        """Continue with the next batch once this one is complete."""
         answers = [answer for answer in self._answers if answer is not None]
         if self._finished or len(answers) < len(self._answers):
             return
@@ -125,8 +125,8 @@ class Schedule:
     """How a method keeps to a budget.
 
     Attributes:
-        settings: From a number of evaluations to the constructor arguments that keep to it.
-        least: Smallest budget that the method can run on.
+        settings: Maps a number of evaluations to the constructor arguments that respect it.
+        least: Smallest budget with which the method can run.
     """
 
     settings: Callable[[int], dict[str, int]]
@@ -138,28 +138,28 @@ def _as_given(budget: int) -> dict[str, int]:
 
 
 AS_GIVEN: Final = Schedule(_as_given)
-"""The schedule of a method that takes any budget as its setting `budget`."""
+"""The schedule of a method that accepts any budget as its setting `budget`."""
 
 
 class Optimizer(ABC):
     """Minimises a value over a box; the caller owns the loop.
 
     `while not opt.done: x = opt.ask(); opt.tell(x, *evaluate(x))` is a complete run. A final class takes its settings
-    in the constructor, hands its algorithm to a `Session`, sets the attributes below, and overrides nothing.
+    in the constructor, passes its algorithm to a `Session`, sets the attributes below, and overrides nothing.
 
     The value may be any number, such as an error or a negative log likelihood. A method that uses residuals minimises
-    their mean square, so the value must rise and fall with it. For a likelihood tell deviance residuals
-    sign(r) sqrt(2 (l(r) - l(0))) of residuals r with negative log likelihood l.
+    their mean square, so the value must rise and fall with it. For a likelihood, pass deviance residuals sign(r) sqrt(2
+    (l(r) - l(0))) of residuals r with negative log likelihood l to `tell`.
 
-    Every constructor takes `lower` and `upper`, the bounds [d], and `seed`, that of the random generator. Where
-    residuals are used it takes `objective`: residuals [n, m] to the value [n], their root mean square by default. The
-    value must rise with their mean square, which is minimised; both are checked.
+    Every constructor takes `lower` and `upper`, the bounds [d], and `seed`, the seed of the random generator. If
+    residuals are used, it also takes `objective`, which converts residuals [n, m] to the value [n]; by default their
+    root mean square. The value must rise with their mean square, which is minimised; both are checked.
 
     Attributes:
         uses: Parts of an evaluation that the method uses, of "value", "residuals" and "jacobian".
-        schedule: How it keeps to a budget; None if it stops by itself.
-        takes_starts: Whether its constructor takes `x0`, points to start from, and `starts`, the number of its own
-            starting points. In every other method the best point told before the first `ask` leads the search.
+        schedule: How it respects a budget; None if it stops by itself.
+        takes_starts: Whether its constructor takes `x0`, starting points, and `starts`, the number of its own starting
+            points. In every other method, the best point passed to `tell` before the first `ask` leads the search.
     """
 
     uses: ClassVar[frozenset[str]]
@@ -175,7 +175,7 @@ class Optimizer(ABC):
 
     @classmethod
     def within(cls, budget: int) -> dict[str, int]:
-        """The constructor arguments that keep to a budget; none if the method stops by itself.
+        """The constructor arguments that respect a budget; none if the method stops by itself.
 
         Raises:
             InputError: The budget is too small for the method.
@@ -190,7 +190,7 @@ class Optimizer(ABC):
 
     @property
     def budget(self) -> int | None:
-        """Largest number of evaluations it will ask for, or None if it stops by itself."""
+        """Largest number of evaluations that it will request, or None if it stops by itself."""
         return self._budget
 
     @property
@@ -218,11 +218,11 @@ class Optimizer(ABC):
 
     @property
     def evaluations(self) -> int:
-        """Number of evaluations told, asked for or not."""
+        """Number of evaluations so far, requested or not."""
         return len(self._session.archive)
 
     def ask(self) -> NDArray[np.float64]:
-        """The candidates [n, d] to evaluate next, inside the bounds; the same again until told.
+        """The candidates [n, d] to evaluate next, inside the bounds; the same again until they are evaluated.
 
         Raises:
             InputError: The optimizer is done.
@@ -238,19 +238,19 @@ class Optimizer(ABC):
     ) -> None:
         """Tell evaluations; everything is copied.
 
-        Candidates that were asked for may come in any order and in portions; the search goes on when the batch is
-        complete. Points that were not asked for, for instance those of an earlier run, join the archive. They can
-        become the best point, a leader or data of a surrogate, but answer no candidate and end no iteration.
+        Requested candidates may come in any order and in portions; the search continues when the batch is complete.
+        Points that were not requested, for instance those of an earlier run, join the archive. They can become the best
+        point, a leader or data of a surrogate, but they answer no candidate and end no iteration.
 
         Args:
             x: Points [n, d] inside the bounds.
             y: Value [n]; +inf for a failed evaluation.
             residuals: Residuals [n, m], weighted so that y = sqrt(mean(residuals**2)), or the value that the
-                constructor's `objective` gives. Ignored if only the value is used.
-            jacobian: Derivatives of the residuals by the parameters [n, m, d].
+                constructor's `objective` gives. Residuals are ignored if only the value is used.
+            jacobian: Derivatives of the residuals with respect to the parameters [n, m, d].
 
         Raises:
-            InputError: A shape is wrong, a number is not finite, a point lies outside the bounds, something in `uses`
-                is missing, or a value does not belong to its residuals. Nothing of that call is kept.
+            InputError: A shape is wrong, a number is not finite, a point is outside the bounds, something in `uses` is
+                missing, or a value does not match its residuals. No part of this call is kept.
         """
         self._session.tell(x, y, residuals, jacobian)

@@ -3,12 +3,12 @@
     K(x, x') = v_0 + v_1 h(x).h(x') + v_2 M(x, x') + nugget [x = x']
 
 M is the Matern-5/2 kernel with one rate (inverse length scale) per coordinate of the unit cube. h(x) is the response of
-a cheap model at x, if there is one. So v_0 allows an offset, v_1 a change of the response and v_2 a smooth rest. All
-residuals share K, so one factorization serves any number of them. With a linear trend the coefficients of 1 and x are
-unknown without a prior (universal kriging).
+a cheap model at x, if there is one. v_0 therefore allows an offset, v_1 a change of the response and v_2 a smooth rest.
+All residuals share K, so one factorization serves any number of residuals. With a linear trend, the coefficients of 1
+and x are unknown without a prior (universal kriging).
 
 One derivation covers both cases. C [n, f] holds orthonormal combinations of the points on which the trend vanishes;
-without a trend C is the identity. C^T y has covariance A = C^T K C, and P = C A^-1 C^T plays the role of K^-1.
+without a trend C is the identity. C^T y has covariance A = C^T K C, and P = C A^-1 C^T takes the place of K^-1.
 
 C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, MIT Press 2006, eqs. 2.25, 2.26, 2.41,
 2.42, 4.17, 5.9 and sec. 9.9; leave-one-out in closed form after S. Rippa, Adv. Comput. Math. 11 (1999) 193.
@@ -26,12 +26,12 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
 SINGULAR = 1e10
-"""Value of the likelihood where the kernel matrix cannot be factored."""
+"""Value of the likelihood if the kernel matrix cannot be factored."""
 
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Points as the kernel sees them.
+    """Points in the form for the kernel.
 
     Attributes:
         unit: Coordinates in the unit cube [n, d].
@@ -194,7 +194,7 @@ class Process:
         return slope.transpose(0, 2, 1)
 
     def left_out_errors(self) -> NDArray[np.float64]:
-        """Value minus prediction of every point when it is left out, hyperparameters kept [n, m] (Rippa 1999)."""
+        """Value minus prediction of every point when it is left out, hyperparameters unchanged [n, m] (Rippa 1999)."""
         return self.weights / self.inverse_diagonal[:, None]
 
     def _whiten(self, columns: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -205,7 +205,7 @@ class Process:
 def condition(
     inputs: Inputs, values: NDArray[np.float64], kernel: Kernel, *, linear: bool = False, freedom: float = 0.0
 ) -> Process:
-    """Condition a process on values; for the arguments see `Process`."""
+    """Condition a process on values; see `Process` for the arguments."""
     trend, matrix = Trend.of(inputs.unit, linear), kernel.matrix(inputs)
     lower = np.asarray(np.linalg.cholesky(trend.contrasts.T @ matrix @ trend.contrasts), dtype=np.float64)
     whitened = solve_triangular(lower, trend.contrasts.T @ values, lower=True)
@@ -217,7 +217,7 @@ def condition(
 class Likelihood:
     """Negative log likelihood of kernels, restricted to the contrasts, up to a constant.
 
-    Without a prior of the variances each one takes its most likely value; with one the residuals follow a
+    Without a prior of the variances, each one takes its most likely value; with a prior, the residuals follow a
     multivariate t distribution. For the arguments see `Process`.
     """
 
@@ -231,9 +231,9 @@ class Likelihood:
         self.contrasts = Trend.of(unit, linear).contrasts
 
     def __call__(self, kernel: Kernel) -> tuple[float, NDArray[np.float64]]:
-        """The value, and its gradient by the logarithms of v_0, v_1, v_2, rates and nugget [3 + d + 1].
+        """The value, and its gradient with respect to the logarithms of v_0, v_1, v_2, rates and nugget [3 + d + 1].
 
-        They are `SINGULAR` and zeros where the kernel matrix cannot be factored.
+        The results are `SINGULAR` and zeros if the kernel matrix cannot be factored.
         """
         count, residuals = self.values.shape
         rates_squared = kernel.rates**2
@@ -268,7 +268,7 @@ class Prior(NamedTuple):
         spread: Standard deviations.
         lower: Lower bounds.
         upper: Upper bounds.
-        fixed: How many of the first ones stay at their mean.
+        fixed: Number of the first ones that stay at their mean.
     """
 
     mean: NDArray[np.float64]
@@ -287,10 +287,11 @@ def most_probable(
     guess: Kernel | None = None,
     steps: int = 30,
 ) -> Kernel:
-    """The kernel of the largest posterior density.
+    """The kernel with the largest posterior density.
 
-    `scale` squared multiplies variances and nugget. The loss is divided by `divisor`, which sets the size of the first
-    step. The search takes at most `steps` from the prior's mean and from `guess`, such as the kernel of an earlier fit.
+    `scale` squared multiplies variances and nugget. The loss is divided by `divisor`, which determines the size of the
+    first step. The search takes at most `steps` from the prior's mean and from `guess`, such as the kernel of an
+    earlier fit.
     """
     held, learned = prior.mean[: prior.fixed], slice(prior.fixed, None)
 

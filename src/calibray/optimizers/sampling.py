@@ -1,6 +1,6 @@
-"""Designs of points in a box, and searches that evaluate one and stop: the negative controls.
+"""Designs of points in a box, and searches that evaluate one design and stop: the negative controls.
 
-An optimizer that does not beat these at an equal budget has learned nothing from its evaluations.
+An optimizer that is not better than these at an equal budget has learned nothing from its evaluations.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> N
 def maximin_design(
     count: int, dimension: int, rng: np.random.Generator, tries: int = 50
 ) -> NDArray[np.float64]:
-    """The Latin hypercube [count, dimension], of as many as `tries`, whose closest points are the farthest apart."""
+    """The Latin hypercube [count, dimension] with the largest smallest distance between points, out of `tries`."""
     drawn = [design("latin-hypercube", count, dimension, rng) for _ in range(tries)]
     spacing = [pdist(points).min(initial=np.inf) for points in drawn]
     return drawn[int(np.argmax(spacing))]
@@ -47,7 +47,7 @@ def maximin_design(
 def draw_around(
     points: NDArray[np.float64], count: int, log_reach: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Draw points [count, d] near given ones of the unit cube [n, d], over several orders of magnitude.
+    """Draw points [count, d] near given points of the unit cube [n, d], over several orders of magnitude.
 
     The standard deviation is log-uniform from 10^`log_reach` to 10^-0.5.
     """
@@ -62,11 +62,11 @@ def distance_to_nearest(x: NDArray[np.float64], points: NDArray[np.float64]) -> 
 
 
 class Sampling(Optimizer):
-    """A search that evaluates a design and learns nothing; abstract in the kind of design.
+    """A search that evaluates a design and does not learn; abstract in the kind of design.
 
     Args:
         seed: Seed of the design.
-        budget: Number of points, all asked for at once.
+        budget: Number of points, all in one batch.
 
     Raises:
         InputError: An argument is out of range.
@@ -92,7 +92,7 @@ class Sampling(Optimizer):
 
 @final
 class RandomSearch(Sampling):
-    """Independent uniform points. Uses the value alone; budget as set.
+    """Independent uniform points. Uses only the value, with the given budget.
 
     Example:
         >>> RandomSearch([0.0, 0.0], [1.0, 2.0], budget=10).ask().shape
@@ -104,7 +104,7 @@ class RandomSearch(Sampling):
 
 @final
 class LatinHypercube(Sampling):
-    """One point in each slice of every dimension. Uses the value alone; budget as set.
+    """One point in each slice of every dimension. Uses only the value, with the given budget.
 
     Example:
         >>> sorted((LatinHypercube([0.0], [1.0], budget=4).ask()[:, 0] * 4).astype(int).tolist())
@@ -116,7 +116,7 @@ class LatinHypercube(Sampling):
 
 @final
 class Sobol(Sampling):
-    """A scrambled Sobol sequence. Uses the value alone; budget as set.
+    """A scrambled Sobol sequence. Uses only the value, with the given budget.
 
     Example:
         >>> Sobol([0.0, 0.0], [1.0, 2.0], budget=10).ask().shape

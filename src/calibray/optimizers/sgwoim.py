@@ -5,24 +5,24 @@ Calibration for 6G Digital Twin Channels", Algorithm 1 and eqs. 2 to 4. Defaults
 T = 20, cosine convergence, memory weight 0.1 to 0.3, 5 full iterations, then K = 5 real evaluations per
 iteration: 5 * 30 + 15 * 5 = 225 evaluations.
 
-Choices where the paper is silent, in addition to those of `gwo.py`:
+The following choices apply where the paper is silent, in addition to those of `gwo.py`:
 
-- "RBF model is available" means t > `full_iterations`. The model is refitted in every iteration on all real
-  evaluations of the run, including those that were not asked for.
-- Wolves that are screened out still move; only their real evaluations change their memory.
+- "RBF model is available" means t > `full_iterations`. The model is refitted in every iteration on all real evaluations
+  of the run, including those that were not requested.
+- Wolves that the surrogate does not select still move; only their real evaluations change their memory.
 - Memory starts at the initial position with a score of infinity, and changes on strictly lower scores.
 - The K elites are evaluated in the order of their predictions; equal predictions keep the order of the pack.
-- Memory fusion (eq. 3) takes the unclipped X_GWO; the fused position is clipped.
+- Memory fusion (eq. 3) uses the unclipped X_GWO; the fused position is clipped.
 - Predictions choose which wolves are evaluated and have no other effect: leaders, memories and the best
   point come from the archive of real evaluations.
 
-With `w_min = w_max = 0`, linear convergence and no surrogate this is GWO, bit for bit.
+With `w_min = w_max = 0`, linear convergence and no surrogate, this is GWO, bit for bit.
 
 The surrogate is SciPy's `RBFInterpolator` on inputs scaled to the unit cube, with smoothing 1e-6. The default kernel is
 cubic with a linear tail. The Gaussian one is the classical RBF network with a constant tail; its width follows the rule
 of the largest spacing, sigma = d_max / sqrt(2 M) for M centres (S. Haykin, Neural Networks, 2nd ed., sec. 5.13).
 Repeated points are merged with the mean of their objectives. A failed evaluation counts as the worst successful one, so
-the model steers away from it and is not distorted by infinity.
+that the model avoids it and is not distorted by infinity.
 """
 
 from __future__ import annotations
@@ -65,9 +65,9 @@ CONVERGENCE = {"cosine": cosine_decay, "linear": linear_decay}
 
 
 def screened_iterations(budget: int) -> dict[str, int]:
-    """The settings of SGWO-IM that keep to a budget: the paper's schedule at 225, and in proportion at any other.
+    """The settings of SGWO-IM for a budget: the paper's schedule at 225, and in proportion at any other.
 
-    Two thirds are spent in 5 full iterations, on 30 wolves at most, and the rest on 5 elites per iteration.
+    Two thirds are spent in 5 full iterations with at most 30 wolves, and the rest on 5 elites per iteration.
 
     Example:
         >>> screened_iterations(225)
@@ -81,17 +81,17 @@ def screened_iterations(budget: int) -> dict[str, int]:
 
 @final
 class SGWOIM(Optimizer):
-    """The paper's optimizer. Uses the value alone; 225 evaluations at the paper's settings.
+    """The paper's optimizer. Uses only the value; 225 evaluations at the paper's settings.
 
     Args:
         population: N, number of wolves.
         iterations: T.
-        full_iterations: Iterations that evaluate the whole population before the surrogate screens.
-        elites: K, wolves evaluated in each screened iteration.
+        full_iterations: Number of iterations that evaluate the whole population before the surrogate selects wolves.
+        elites: K, number of wolves evaluated in each later iteration.
         w_min: Memory weight at the start.
         w_max: Memory weight at the end.
         convergence: "cosine" (the paper's eq. 2) or "linear" (standard GWO).
-        surrogate: Whether to screen; without it every iteration evaluates the whole population.
+        surrogate: Whether the surrogate selects wolves; without it, every iteration evaluates the whole population.
         kernel: Radial basis function of the surrogate: "cubic" or "gaussian".
         centred: Measure positions from the middle of the box instead of the origin.
 
@@ -156,7 +156,9 @@ class SGWOIM(Optimizer):
             InputError: Nothing has been asked yet.
         """
         if self._memory is None:
-            raise InputError("the pack has no memory before its first evaluation: ask() and tell() first")
+            raise InputError(
+                "the pack has no memory before its first evaluation: call ask() and tell() first"
+            )
         return self._memory
 
     def _search(self, archive: Archive) -> Search:
@@ -174,7 +176,7 @@ class SGWOIM(Optimizer):
             positions = self.box.clip((1.0 - w) * guided + w * memory.x)  # eq. 3
 
     def _screen(self, archive: Archive, positions: NDArray[np.float64], iteration: int) -> NDArray[np.intp]:
-        """The wolves to evaluate: all of them at first, then the K that the surrogate ranks best."""
+        """The wolves to evaluate: first all of them, then the K that the surrogate ranks best."""
         if not self.surrogate or iteration <= self.full_iterations:
             return np.arange(self.population)
         predicted = predict(archive, positions, self.kernel)
@@ -182,7 +184,7 @@ class SGWOIM(Optimizer):
 
 
 def remember(memory: Evaluations, wolves: NDArray[np.intp], answers: Evaluations) -> Evaluations:
-    """Update the pack's memory with the answers of evaluated wolves, where a score is strictly lower."""
+    """Update the pack's memory with the answers of evaluated wolves that have a strictly lower score."""
     x, y = memory.x.copy(), memory.y.copy()
     better = answers.y < y[wolves]
     x[wolves[better]], y[wolves[better]] = answers.x[better], answers.y[better]
@@ -192,7 +194,7 @@ def remember(memory: Evaluations, wolves: NDArray[np.intp], answers: Evaluations
 def predict(archive: Archive, candidates: NDArray[np.float64], kernel: str = "cubic") -> NDArray[np.float64]:
     """Predict the objective of candidates [n, d] from all real evaluations; zero while all have failed.
 
-    The archive must hold more than d distinct points that span the box.
+    The archive must contain more than d distinct points that span the box.
     """
     if not np.isfinite(archive.best.y):
         return np.zeros(len(candidates))

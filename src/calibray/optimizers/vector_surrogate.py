@@ -1,7 +1,8 @@
 """The vector surrogate: a model of every residual instead of their root mean square, searched globally.
 
-The objective is a sum over links, so an evaluation that returns the residual of every link tells far more than their
-sum. Residuals are smoother than the objective, and tens of them share one dependence on the parameters (`kriging.py`).
+The objective is a sum over links, so an evaluation that returns the residual of every link contains far more
+information than their sum. Residuals are smoother than the objective, and tens of them share one dependence on the
+parameters (`kriging.py`).
 
 A run begins with a maximin Latin hypercube. It has few points for many parameters, because residuals can be modelled as
 soon as a plane can be laid through them. Then three kinds of step take turns on a model that is refitted after every

@@ -108,7 +108,7 @@ class StudyContent(Section, ABC):
             self.links.mountings or self.links.position_error_m is not None
         ):
             raise InputError(
-                "engine.rays holds paths of one position and one antenna: leave links.tx_antenna, rx_antenna and "
+                "engine.rays contains paths of one position and one antenna: leave links.tx_antenna, rx_antenna and "
                 "position_error_m out"
             )
         if self.links.mountings and self.engine.name != "replay":

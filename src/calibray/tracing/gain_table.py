@@ -168,7 +168,7 @@ def _axis(
     axis = np.unique(values)
     if len(axis) < 2:
         raise InputError(
-            f"{table.source}: column {name!r} holds {axis[0]:g} only; give a grid over all directions "
+            f"{table.source}: column {name!r} contains {axis[0]:g} only; give a grid over all directions "
             "(principal cuts alone are not enough)"
         )
     steps = np.diff(axis)

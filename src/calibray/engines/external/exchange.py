@@ -258,7 +258,7 @@ def _read_hdf5(response: bytes, name: str, size: int) -> NDArray[np.float64]:
             # Checked before it is read, because a small compressed file may unpack to any size.
             if dataset.size != size:
                 raise Unusable(
-                    f"its response contains {name} of shape {dataset.shape}, must hold {size} numbers"
+                    f"its response contains {name} of shape {dataset.shape}, must contain {size} numbers"
                 )
             return np.asarray(dataset[()], dtype=float)
     except Unusable:

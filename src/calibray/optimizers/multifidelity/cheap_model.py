@@ -1,4 +1,4 @@
-"""What a cheap model of an expensive engine offers, and a cheap model made of a function without derivatives."""
+"""The interface of a cheap model of an expensive engine, and a cheap model made from a function without derivatives."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class CheapAnswer(NamedTuple):
 
     Attributes:
         residuals: Residuals in the order of the engine's residuals [n, m].
-        by_point: Their derivatives by the search coordinates [n, m, d].
-        by_constant: Their derivatives by the model's constants [n, m, q].
+        by_point: Their derivatives with respect to the search coordinates [n, m, d].
+        by_constant: Their derivatives with respect to the model's constants [n, m, q].
     """
 
     residuals: NDArray[np.float64]
@@ -29,7 +29,7 @@ class CheapAnswer(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Constants:
-    """Constants of a cheap model that the search does not move and that may be wrong.
+    """Constants of a cheap model that the search does not change and that may be wrong.
 
     Attributes:
         centre: Their believed values [q]; q may be 0.
@@ -59,7 +59,7 @@ class Constants:
 
 
 class CheapModel(Protocol):
-    """A model whose cost is negligible compared with the engine that is minimised."""
+    """A model whose computing time is negligible compared with the engine that is minimised."""
 
     @property
     def constants(self) -> Constants:
@@ -68,7 +68,7 @@ class CheapModel(Protocol):
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Residuals that the model predicts [m]; for the others it answers any constant number."""
+        """Residuals that the model predicts [m]; for the others it returns any constant number."""
         ...
 
     def residuals(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:

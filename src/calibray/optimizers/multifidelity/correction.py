@@ -1,19 +1,19 @@
-"""A cheap model corrected until it agrees with the engine: first its constants, then the remaining discrepancy.
+"""Corrects a cheap model until it agrees with the engine: first its constants, then the remaining discrepancy.
 
-*Input mapping*: the constants of the cheap model are set to those that explain the engine's answers best. Errors are
-weighted by the covariance of the discrepancy, most of which is a common offset. So an offset of a link does not bend a
-constant. The constants have a prior around their believed values. Slabs resonate, so there are many minima: the search
-starts from the likeliest of many draws from that prior. This is implicit space mapping (J. W. Bandler, Q. S. Cheng,
-N. K. Nikolova, M. A. Ismail, IEEE Trans. Microw. Theory Tech. 52 (2004) 378). *Output mapping*: offset, slope and rest
-by `discrepancy.py`. Both are fitted in turns.
+*Input mapping*: the constants of the cheap model are set to the values that explain the engine's answers best. Errors
+are weighted by the covariance of the discrepancy, most of which is a common offset. An offset of a link therefore does
+not distort a constant. The constants have a prior around their assumed values. Slabs resonate, so there are many
+minima: the search starts from the likeliest of many draws from that prior. This is implicit space mapping (J. W.
+Bandler, Q. S. Cheng, N. K. Nikolova, M. A. Ismail, IEEE Trans. Microw. Theory Tech. 52 (2004) 378). *Output mapping*:
+offset, slope and rest by `discrepancy.py`. Both are fitted in turns.
 
 A few answers do not determine the constants of a cheap model. Several sets of them explain the answers equally well and
-predict minima at different points, and the lowest of these predictions is the most optimistic one. So a corrected model
-is averaged over members drawn from the posterior of the constants, each corrected until it passes through all answers.
-Where they agree, little is uncertain. Members are drawn by randomised maximum likelihood: each is fitted from a
-different start, to answers and a prior that are both disturbed by their uncertainties (D. S. Oliver, N. He, A. C.
-Reynolds, ECMOR V, 1996). The predicted variance is compared with the errors of the steps so far, to which nothing was
-fitted, and stretched accordingly.
+predict minima at different points, and the lowest of these predictions is the most optimistic one. A corrected model is
+therefore averaged over members drawn from the posterior of the constants, each corrected until it passes through all
+answers. Where the members agree, the uncertainty is small. Members are drawn by randomised maximum likelihood: each is
+fitted from a different starting point, to answers and a prior that are both disturbed by their uncertainties (D. S.
+Oliver, N. He, A. C. Reynolds, ECMOR V, 1996). The predicted variance is compared with the errors of the steps so far,
+which were not used in any fit, and scaled accordingly.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from calibray.optimizers.multifidelity.cheap_model import CheapModel
 from calibray.optimizers.regression import Inputs, Kernel, Process
 
 TURNS: Final = 2
-"""Rounds of output and input mapping."""
+"""Number of rounds of output and input mapping."""
 
 STEPS: Final = 12
-"""Steps of an input mapping from one start."""
+"""Number of steps of an input mapping from one starting point."""
 
 FOLLOWED: Final = 8
-"""Draws from the prior, those that explain the answers best, from which an input mapping starts."""
+"""Number of draws from the prior, those that explain the answers best, from which an input mapping starts."""
 
 CONVERGED: Final = 1e-4
 """Relative decrease of the cost, or step in the unit cube, at which an input mapping has converged."""
@@ -60,17 +60,17 @@ class Response:
 
     @staticmethod
     def of(residuals: NDArray[np.float64], known: NDArray[np.bool_]) -> Response:
-        """Measure it on residuals at points spread over the box [k, m]; `known` says which the model predicts [m]."""
+        """Measure it on residuals at points spread over the box [k, m]; `known` marks the predicted ones [m]."""
         centre = residuals.mean(axis=0)
         scale = float(np.sqrt(np.mean((residuals - centre)[:, known] ** 2))) if known.any() else 0.0
         return Response(known, centre, max(scale, 1e-6 * max(float(np.abs(residuals).max()), 1e-6)))
 
     def inputs(self, unit: NDArray[np.float64], residuals: NDArray[np.float64]) -> Inputs:
-        """Points of the unit cube [k, d] as the discrepancy sees them, from the cheap model's residuals [k, m]."""
+        """Points of the unit cube [k, d] and their responses, from the cheap model's residuals [k, m]."""
         return Inputs(unit, self.scaled(residuals - self.centre))
 
     def scaled(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The predicted ones of the residuals [k, m, ...], scaled to a mean square of 1 together [k, r, ...]."""
+        """The predicted residuals among [k, m, ...], scaled together to a mean square of 1 [k, r, ...]."""
         return rows[:, self.known] / (self.scale * np.sqrt(max(int(self.known.sum()), 1)))
 
 
@@ -116,23 +116,23 @@ class Corrected:
         return cheap + self.discrepancy.mean(inputs), slope + self.discrepancy.slope(inputs, response_slope)
 
     def base(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], Inputs]:
-        """Residuals [k, m] of the cheap model with adjusted constants, and the points as the discrepancy sees them."""
+        """Residuals [k, m] of the cheap model with adjusted constants, and the points with their responses."""
         cheap = cheap_residuals(self.model, self.box, unit, self.constants)
         return cheap, self.response.inputs(unit, cheap)
 
     def base_and_slope(
         self, unit: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], Inputs, NDArray[np.float64]]:
-        """What `base` gives, and both derivatives by the coordinates of the unit cube.
+        """The values of `base`, and both derivatives with respect to the coordinates of the unit cube.
 
-        Residuals [k, m], their derivatives [k, m, d], the points as the discrepancy sees them, and the derivatives of
-        their responses [k, r, d].
+        Residuals [k, m], their derivatives [k, m, d], the points in the form for the discrepancy, and the derivatives
+        of their responses [k, r, d].
         """
         cheap, slope = cheap_and_slope(self.model, self.box, unit, self.constants)
         return cheap, slope, self.response.inputs(unit, cheap), self.response.scaled(slope)
 
     def with_point(self, point: NDArray[np.float64], residuals: NDArray[np.float64]) -> Corrected:
-        """Add a point of the unit cube [d] as if evaluated with these residuals [1, m]."""
+        """Add a point of the unit cube [d] as if its evaluation had these residuals [1, m]."""
         unit, answers = np.vstack([self.unit, point]), np.vstack([self.residuals, residuals])
         cheap, inputs = self.base(unit)
         process = discrepancy.solve(inputs, answers - cheap, self.discrepancy.kernel)
@@ -159,9 +159,9 @@ def correct(
 ) -> Corrected:
     """Fit a corrected model to an engine's answers [n, m] at points of the unit cube [n, d].
 
-    At the points of `cloud` [k, d] the cheap model's response is measured. The input mapping starts from the likeliest
-    of the `trials` [s, q] and from the constants of `before`, the model of fewer points. `noisy` says whether the
-    answers scatter.
+    The response of the cheap model is measured at the points of `cloud` [k, d]. The input mapping starts from the
+    likeliest of the `trials` [s, q] and from the constants of `before`, the model of fewer points. `noisy` states
+    whether the answers scatter.
     """
 
     def with_discrepancy(constants: NDArray[np.float64], guess: tuple[Kernel, float] | None) -> Corrected:
@@ -208,11 +208,11 @@ def constants_fit(
     centre: NDArray[np.float64] | None = None,
     noise: NDArray[np.float64] | None = None,
 ) -> Callable[[NDArray[np.float64]], Residuals]:
-    """The least squares problem of the constants, with the covariance of the discrepancy held.
+    """The least squares problem of the constants, with a fixed covariance of the discrepancy.
 
-    The prior has its centre at `centre` [q], or at that of the cheap model. `noise` disturbs the answers, in their
-    standard deviations [n m]. Returns a function of constants, in the unit cube between their bounds [s, q], that gives
-    rows and their Jacobian; half the sum of squares of the rows is the negative log density.
+    The prior has its centre at `centre` [q], or at that of the cheap model. `noise` disturbs the answers, in units of
+    their standard deviations [n m]. Returns a function of constants, in the unit cube between their bounds [s, q], that
+    returns rows and their Jacobian. Half the sum of squares of the rows is the negative log density.
     """
     model, process, prior = corrected.model, corrected.discrepancy, corrected.model.constants
     points, width = corrected.box.from_unit(corrected.unit), prior.width
@@ -238,10 +238,10 @@ def constants_fit(
 
 
 def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Negative log density [s] of constants [s, q] up to a constant, with the kernel of the discrepancy held.
+    """Negative log density [s] of constants [s, q] up to a constant, with a fixed kernel of the discrepancy.
 
-    The variances of the links are integrated out. So a link that the present constants do not explain counts fully for
-    others that may.
+    The variances of the links are integrated out. A link that the present constants do not explain therefore has full
+    weight for other constants.
     """
     model, prior = corrected.model, corrected.model.constants
     points, (count, links) = corrected.box.from_unit(corrected.unit), corrected.residuals.shape
@@ -253,7 +253,7 @@ def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> NDArray[np.f
 
 
 def _adjusted(corrected: Corrected, trials: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The constants [q] that explain the answers best, with the kernel of the discrepancy held."""
+    """The constants [q] that explain the answers best, with a fixed kernel of the discrepancy."""
     prior, present = corrected.model.constants, corrected.constants[None]
     if len(trials):
         trials = trials[np.argsort(misfit(corrected, trials), kind="stable")[:FOLLOWED]]
@@ -264,7 +264,7 @@ def _adjusted(corrected: Corrected, trials: NDArray[np.float64]) -> NDArray[np.f
 
 
 UNLIKELY: Final = 30.0
-"""Excess of the negative log density, per constant and three more, beyond which a member is left out.
+"""Excess of the negative log density, per constant and three more, above which a member is left out.
 
 Links share errors, so the posterior is wider than this density, which assumes independent links.
 """
@@ -308,14 +308,14 @@ class Averaged:
         return Prediction(mean, variance / len(predictions), predictions)
 
     def with_point(self, point: NDArray[np.float64]) -> Averaged:
-        """Add a point of the unit cube [d] as if evaluated exactly as predicted; the members then agree there."""
+        """Add a point of the unit cube [d] as if its evaluation equalled the prediction; the members agree there."""
         residuals = self.predict(point[None]).mean
         return Averaged(tuple(member.with_point(point, residuals) for member in self.members))
 
 
 @dataclass
 class ErrorRecord:
-    """How the errors of the steps so far compare with their predicted variances.
+    """Ratios of the errors of the steps so far to their predicted variances.
 
     Attributes:
         ratios: Mean square error over predicted variance of every step.
@@ -329,7 +329,7 @@ class ErrorRecord:
         return (1.0 + sum(self.ratios)) / (1.0 + len(self.ratios))
 
     def add(self, mean: NDArray[np.float64], variance: float, residuals: NDArray[np.float64]) -> None:
-        """Add a step: predicted residuals [m], their averaged variance without the stretch, observed ones [m]."""
+        """Add a step: predicted residuals [m], their averaged variance before scaling, observed residuals [m]."""
         ratio = float(np.mean((residuals - mean) ** 2)) / max(variance, 1e-12)
         self.ratios.append(min(ratio, CAPPED))
 

@@ -1,19 +1,19 @@
 """The discrepancy between an expensive model and a cheap one: a Gaussian process over the box for every residual.
 
 The discrepancy consists of an offset, a change of response and a rest: v_0, v_1 and v_2 of `regression.py`. h(x) is the
-deviation of the cheap model's residuals from their mean over the box. Links respond alike to the parameters, so paths
-that the cheap model lacks respond as other links do. The v_1 term is therefore the slope of a link's output mapping,
-and helps for links of which the cheap model knows nothing. Each residual has a variance, whose inverse gamma prior is
-integrated out. So a few links that the cheap model predicts badly do not spoil the others.
+deviation of the cheap model's residuals from their mean over the box. Links respond similarly to the parameters, so
+paths that the cheap model lacks respond as other links do. The v_1 term is therefore the slope of a link's output
+mapping, and helps for links that the cheap model does not predict. Each residual has a variance, whose inverse gamma
+prior is integrated out. A few links that the cheap model predicts badly therefore do not affect the others.
 
 M. C. Kennedy, A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, sec. 4.
 
-A process states its uncertainty point by point, but errors at two near points are the same error. To learn where the
-minimum of an uncertain function may lie one needs whole functions. A function is drawn from the prior, as a sum of the
-kernel's features with normal weights. The process then adds what that function misses at the evaluated points (J. T.
-Wilson et al., Efficiently sampling functions from Gaussian process posteriors, ICML 2020, eq. 10). Features of the
-Matern kernel are cosines whose frequencies follow Student's t with 5 degrees of freedom (A. Rahimi, B. Recht, Random
-features for large-scale kernel machines, NIPS 2007).
+A process states its uncertainty at each point, but errors at two nearby points are nearly equal. To learn where the
+minimum of an uncertain function may be, we need whole functions. A function is drawn from the prior, as a sum of the
+kernel's features with normal weights. The process then adds the difference between that function and the answers at the
+evaluated points (J. T. Wilson et al., Efficiently sampling functions from Gaussian process posteriors, ICML 2020, eq.
+10). Features of the Matern kernel are cosines whose frequencies follow Student's t with 5 degrees of freedom (A.
+Rahimi, B. Recht, Random features for large-scale kernel machines, NIPS 2007).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ VARIANCE_SPREAD: Final = 2.0
 LOG_VARIANCE_BOUNDS: Final = (-14.0, 6.0)
 
 LENGTH: Final = 0.5
-"""Of the unit cube: median of the prior of a length scale."""
+"""Median of the prior of a length scale, as a share of the unit cube."""
 
 LENGTH_SPREAD: Final = 0.7
 """Standard deviation of its logarithm."""
@@ -57,7 +57,7 @@ NUGGET: Final = 1e-6
 """Smallest nugget, relative to the mean square of the response; it keeps the matrix regular."""
 
 NOISE: Final = (float(np.log(1e-4)), 3.0)
-"""Mean and standard deviation of the logarithm of the nugget where it is learned."""
+"""Mean and standard deviation of the logarithm of the nugget if it is estimated."""
 
 
 def fit(
@@ -71,7 +71,7 @@ def fit(
     """Fit the process to discrepancies [n, m], by the largest posterior density of its hyperparameters.
 
     The prior is relative to `scale`, the root mean square of the cheap model's response. `noisy` learns the nugget too.
-    `guess` is a kernel to start from as well as the prior's.
+    `guess` is an additional starting point for the kernel, besides the prior's.
     """
     d, low = inputs.unit.shape[1], float(np.log(NUGGET))
     three, rates = np.ones(3), np.ones(d)
@@ -144,7 +144,7 @@ class SampledFunction:
 
     Attributes:
         prior: A draw from the prior.
-        rest: Process through what the draw misses at the evaluated points.
+        rest: Process through the differences between the draw and the answers at the evaluated points.
     """
 
     prior: PriorDraw
@@ -155,7 +155,7 @@ class SampledFunction:
         return self.prior.values(at) + self.rest.mean(at)
 
     def slopes(self, at: Inputs, response_slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives [k, m, d] by the unit cube's coordinates, given those of the responses [k, r, d]."""
+        """Derivatives [k, m, d] with respect to the unit cube's coordinates, given those of the responses [k, r, d]."""
         return self.prior.slopes(at, response_slope) + self.rest.slope(at, response_slope)
 
 
@@ -166,7 +166,7 @@ def sample_function(process: Process, random: np.random.Generator, stretch: floa
     size = stretch * np.sqrt(kernel.variances)
 
     def correlated(rows: int) -> NDArray[np.float64]:
-        """Normal draws with the covariance of the residuals [rows, m], as by `Process.root`."""
+        """Normal draws with the covariance of the residuals [rows, m], as in `Process.root`."""
         independent = np.sqrt(FREEDOM) * random.standard_normal((rows, residuals))
         draws = random.standard_normal((rows, count)) @ process.whitened
         return (draws + independent) / np.sqrt(count + FREEDOM)
@@ -186,6 +186,6 @@ def sample_function(process: Process, random: np.random.Generator, stretch: floa
 
 
 def standardized_error(process: Process, points: NDArray[np.intp]) -> float:
-    """Root mean square, over expected standard deviations, of errors at points left out; 1 if those are right."""
+    """Root mean square of the errors at points left out, over the expected standard deviations; 1 if both agree."""
     expected = 1.0 / np.outer(process.inverse_diagonal, process.precision)
     return float(np.sqrt(np.mean((process.left_out_errors() ** 2 / expected)[points])))

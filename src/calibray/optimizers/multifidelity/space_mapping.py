@@ -1,27 +1,27 @@
-"""Space mapping: an expensive model searched with the help of a cheap one that is corrected after every call.
+"""Space mapping searches an expensive model with the help of a cheap one, which is corrected after every call.
 
 If you know the physics, you already have a cheap approximation of the expensive model, possibly with wrong constants.
-Its minimum is the first call. After every call the cheap model is corrected until it agrees with all answers
-(`correction.py`), and searched for minima by many local searches, in all basins at once. Steps are of two kinds:
+Its minimum is the first call. After every call, the cheap model is corrected until it agrees with all answers
+(`correction.py`). Many local searches then find its minima in all basins. Steps are of two kinds:
 
 - *exploitation*: among the minima of the corrected model within a trust region, the one with the lowest expected mean
   square, uncertainty included. The trust region is a box around the best point. It is halved after a step that does not
   improve and doubled after one that does;
 - *exploration*: the point of the largest expected improvement over the whole box, by draws of the discrepancy, as in
-  `vector_surrogate.py`. Minima of the corrected model in other basins are among the candidates. It follows an
-  exploitation that gained next to nothing, and replaces one that would repeat a point.
+  `vector_surrogate.py`. Minima of the corrected model in other basins are among the candidates. An exploration follows
+  an exploitation that gained almost nothing, and replaces one that would repeat a point.
 
-Both account for the constants that few answers leave open, and for the errors of the predictions so far
-(`correction.py`). Without that, steps on planted districts jump half across the box to predicted minima that do not
+Both account for the constants that few answers do not determine, and for the errors of the predictions so far
+(`correction.py`). Without this, steps on planted districts jump across half the box to predicted minima that do not
 exist.
 
-The cheap model is trusted only while it helps. Each point is predicted from all the others, once by the corrected model
+The cheap model is used only while it helps. Each point is predicted from all other points, once by the corrected model
 and once by the same process without a cheap model; `error_ratio` compares the squared errors of the median link. After
-three and after four calls the cheap model has to reach a ratio of `HELPFUL`. Later it is dropped if the ratio exceeds
-`MISLED` twice in a row. The vector surrogate then goes on with all evaluations so far. It also runs from the first call
-if there is no cheap model. The median link decides, because a few links dominate the sum over all. On planted problems
-(eight with their cheap model, four with random tones instead) the ratio was at most 0.66 after four calls with the
-right model (1.9 once after three), and at least 1.01 with tones.
+three and after four calls, the cheap model must reach a ratio of `HELPFUL`. Later it is dropped if the ratio exceeds
+`MISLED` twice in a row. The vector surrogate then continues with all evaluations so far. It also runs from the first
+call if there is no cheap model. The median link decides, because a few links dominate the sum over all. On planted
+problems (eight with their cheap model, four with random tones instead), the ratio was at most 0.66 after four calls
+with the right model (once 1.9 after three), and at least 1.01 with tones.
 
 J. W. Bandler et al., "Space mapping: the state of the art", IEEE Trans. Microw. Theory Tech. 52 (2004) 337.
 """
@@ -58,58 +58,60 @@ FIRST_SEARCHES: Final = 64
 """Local searches on the cheap model."""
 
 SEARCHES: Final = 16
-"""New local searches on each corrected model, besides those from earlier minima and the best points."""
+"""Number of new local searches on each corrected model, in addition to those from earlier minima and the best
+points."""
 
 KEPT: Final = 8
-"""Earlier minima, and best points, from which local searches start."""
+"""Number of earlier minima, and of best points, from which local searches start."""
 
 SEARCH_STEPS: Final = 30
 """Steps of a local search on a model."""
 
 CONVERGED: Final = 1e-6
-"""Relative decrease of the cost, or step in the unit cube, at which it has converged."""
+"""Relative decrease of the cost, or step in the unit cube, at which a local search has converged."""
 
 TRIALS: Final = 200
-"""Constants drawn from their prior for each of the first input mappings, which start from the likeliest ones."""
+"""Number of constants drawn from their prior for each of the first input mappings, which start from the likeliest
+ones."""
 
 TRIED: Final = 10
-"""Calls after which an input mapping starts from the one before alone."""
+"""Number of calls after which an input mapping starts only from the previous one."""
 
 CANDIDATES: Final = 300
-"""Candidates drawn over the box, and as many around the best points."""
+"""Number of candidates drawn over the box, and of candidates around the best points."""
 
 DRAWS: Final = 512
-"""Draws of the discrepancy for the expected improvement, of all members together."""
+"""Number of draws of the discrepancy for the expected improvement, of all members together."""
 
 APART: Final = 0.003
 """Distance in the unit cube below which two minima are one."""
 
 MEMBERS: Final = 8
-"""Models with other constants that the first steps are averaged over."""
+"""Number of models with other constants over which the first steps are averaged."""
 
 AVERAGED: Final = 10
-"""Calls up to which they are."""
+"""Number of calls up to which steps are averaged over these models."""
 
 SEPARATION: Final = 1e-3
-"""Distance in the unit cube below which a point counts as evaluated already."""
+"""Distance in the unit cube below which a point counts as already evaluated."""
 
 REACHES: Final = (0.02, 1.0)
 """Smallest and largest half width of the trust region."""
 
 GAINED: Final = 1e-3
-"""Share of the objective that an exploitation has to gain for another one to follow."""
+"""Share of the objective that an exploitation must gain for another one to follow."""
 
 JUDGED: Final = 3
-"""Calls from which on the cheap model is judged."""
+"""Number of calls from which the cheap model is judged."""
 
 HELPFUL: Final = 0.8
-"""Error ratio of the median link beyond which the first verdicts doubt the cheap model."""
+"""Error ratio of the median link above which the first checks doubt the cheap model."""
 
 MISLED: Final = 2.0
-"""Ratio beyond which later verdicts do; points are then so close together that any process predicts them."""
+"""Ratio above which later checks doubt it; points are then so close together that any process predicts them."""
 
 DOUBTS: Final = 2
-"""Doubts in a row after which the cheap model is dropped, and number of the first verdicts."""
+"""Number of successive doubts after which the cheap model is dropped, and number of the first checks."""
 
 
 @final
@@ -118,8 +120,8 @@ class SpaceMapping(Optimizer):
 
     Args:
         budget: Number of evaluations, 20 d if None.
-        cheap_model: The cheap model; without one the vector surrogate searches.
-        batch: Candidates asked for at once, for engines that run in parallel.
+        cheap_model: The cheap model; without one, the vector surrogate searches.
+        batch: Number of candidates per batch, for engines that run in parallel.
         noisy: Whether the engine's answers scatter.
 
     Raises:
@@ -173,7 +175,7 @@ class SpaceMapping(Optimizer):
 
     @property
     def corrected(self) -> Corrected | None:
-        """The cheap model as corrected by all evaluations before the last step; None where it is not trusted."""
+        """The cheap model as corrected by all evaluations before the last step; None if it is not used."""
         return self._corrected
 
     def _search(self, archive: Archive) -> Search:
@@ -209,7 +211,7 @@ class SpaceMapping(Optimizer):
             left, turn = left - count, turn + count
 
     def _without(self, archive: Archive, left: int) -> Search:
-        """The vector surrogate, which is given all evaluations so far."""
+        """The vector surrogate, with all evaluations so far."""
         surrogate = VectorSurrogate(
             self.box.lower, self.box.upper, seed=self._seed, budget=left, batch=self.batch, noisy=self.noisy,
             objective=self._objective,
@@ -228,7 +230,7 @@ class SpaceMapping(Optimizer):
         return np.vstack([prior.centre, prior.draw(draws)])
 
     def _first(self, model: CheapModel, count: int, turn: int) -> NDArray[np.float64]:
-        """The lowest minima of the cheap model with its believed constants, after the first `turn` ones [count, d]."""
+        """The lowest minima of the cheap model with its assumed constants, after the first `turn` ones [count, d]."""
         d = self.box.dimension
 
         def evaluate(unit: NDArray[np.float64]) -> Residuals:
@@ -239,7 +241,7 @@ class SpaceMapping(Optimizer):
         return np.vstack([self._minima[turn:], self._rng.random((count, d))])[:count]
 
     def _averaged(self, corrected: Corrected) -> Averaged:
-        """The corrected model and others that explain the answers; half of them start from those before."""
+        """The corrected model and others that explain the answers; half of them start from the previous ones."""
         prior = corrected.model.constants
         if len(corrected.residuals) > AVERAGED or not len(prior.centre):
             return Averaged((corrected,))
@@ -306,7 +308,7 @@ class SpaceMapping(Optimizer):
         return candidates[np.argmax(gain)]
 
     def _resize(self, best: float, before: float) -> None:
-        """Resize the trust region after an exploitation, and explore once where it gained too little."""
+        """Resize the trust region after an exploitation, and explore once if it gained too little."""
         if self._stalled or not np.isfinite(before):
             self._stalled = False
             return
@@ -315,7 +317,7 @@ class SpaceMapping(Optimizer):
 
 
 def error_ratio(corrected: Corrected) -> float:
-    """Squared errors of points predicted from all the others, with the cheap model over without it.
+    """Squared errors of points predicted from all other points, with the cheap model over without it.
 
     The ratio of the median link, from three points or more; the cheap model helps below 1.
     """

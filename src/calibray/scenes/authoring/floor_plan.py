@@ -132,7 +132,7 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[
         stated = None if np.isnan(thickness) else thickness
         segments += [Segment(a, b, kind.strip().lower(), bottom, bottom + extent, stated) for a, b in sides]
     if not segments:
-        raise InputError(f"floor plan {path}: holds no segment; give at least one wall")
+        raise InputError(f"floor plan {path}: contains no segment; give at least one wall")
     return segments
 
 

@@ -95,7 +95,7 @@ def make_plan_scene(
     folder = check_outputs(folder, SCENE_FILES, overwrite=overwrite)
     types = {**TYPES, **(types or {})}
     if not segments:
-        raise InputError("the floor plan holds no segment; give at least one wall")
+        raise InputError("the floor plan contains no segment; give at least one wall")
     merged = merge_faces(segments) if merge else MergedPlan(segments)
     sheets = merged.sheets
     materials = _materials(sheets, types)

@@ -73,7 +73,7 @@ def read_openstreetmap(
     except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:
         raise InputError(f"extract {path}: cannot be read ({error}); give an .osm or .osm.pbf file") from None
     if not outlines:
-        raise InputError(f"extract {path}: holds no complete building; choose an extract that covers some")
+        raise InputError(f"extract {path}: contains no complete building; choose an extract that covers some")
     degrees = np.array(outlines, dtype=object)
     frame = frame or _local_frame(degrees, WGS84)
     bottoms, tops, sources = zip(*(rule.heights(building) for building in tags), strict=True)
@@ -198,7 +198,9 @@ def _numbers(
         lengths = [parse_length(None if value is None else str(value)) for value in values]
         unread = [value for value, length in zip(values, lengths, strict=True) if value and length is None]
         if unread:
-            raise InputError(f"footprints {path}: column {source!r} holds {unread[0]!r}, must hold metres")
+            raise InputError(
+                f"footprints {path}: column {source!r} contains {unread[0]!r}, must contain metres"
+            )
         values = np.array([np.nan if length is None else length for length in lengths])
     numbers = np.asarray(values, dtype=float)
     bad = np.flatnonzero(

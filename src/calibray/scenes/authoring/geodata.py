@@ -247,7 +247,7 @@ class HeightModel:
         if np.ma.filled(wrong, False).any():
             value = stored[np.ma.filled(wrong, False)][0]
             raise InputError(
-                f"height model {self.path}: {int(wrong.sum())} of {rows * columns} cells hold no height on land, such "
+                f"height model {self.path}: {int(wrong.sum())} of {rows * columns} cells have no height on land, such "
                 f"as {value:g}; declare the number of missing heights (gdal_edit.py -a_nodata {value:g}), or the unit"
             )
         return heights
@@ -333,7 +333,7 @@ def _systems(path: Path, dataset: Any) -> tuple[str, float]:
         )
     axes = [axis for part in parts for axis in part.axis_info if axis.direction in ("up", "down")]
     if any(axis.direction == "down" for axis in axes):
-        raise InputError(f"height model {path}: holds depths, not heights; turn the sign")
+        raise InputError(f"height model {path}: contains depths, not heights; turn the sign")
     declared = {axis.unit_conversion_factor for axis in axes}
     unit = (dataset.units[0] or "").strip()
     if unit:

@@ -86,7 +86,7 @@ def verify_export(
             size for size, item in zip(scene.sizes, scene.objects, strict=True) if item.material == name
         ]
         if not surfaces_agree(by_material.get(names[name], []), stored, np.zeros(3)):
-            fault = f"Sionna RT holds another surface of material {shortened(repr(names[name]))}"
+            fault = f"Sionna RT contains another surface of material {shortened(repr(names[name]))}"
             raise InputError(_failed(target, fault))
     if scene.local_origin.any():
         _LOG.warning(

@@ -94,7 +94,7 @@ def _check_surfaces(mitsuba_scene: Any, scene: Scene) -> None:
         traced = held.get(number, [])
         if not surfaces_agree(traced, stored, scene.local_origin):
             raise InputError(
-                f"{scene.path}: Mitsuba holds another surface of material {material!r} than the mesh files "
+                f"{scene.path}: Mitsuba contains another surface of material {material!r} than the mesh files "
                 f"({sum(size.area for size in traced):.6g} m^2 instead of "
                 f"{sum(size.area for size in stored):.6g} m^2); export the meshes again, as binary PLY with "
                 "coordinates of type float"
