@@ -35,6 +35,7 @@ Repetition = Callable[[Path, pd.DataFrame, list[int]], list[dict[str, Any]]]
 
 FREQUENCY: Final = 3.5e9
 NOISE_DB: Final = 3.0
+RAYS: Final = 100_000
 AZIMUTH_DEG, DOWNTILT_DEG = 20.0, 5.0
 """Largest errors of the stated directions."""
 HALF: Final = 120.0
@@ -99,7 +100,7 @@ def _box(low: np.ndarray, high: np.ndarray, height: float) -> Mesh:
     return Mesh(np.vstack([roof, roof * [1, 1, 0]]), np.array([*faces, *([a, c, b] for a, b, c in walls)]))
 
 
-def study(folder: Path, table: pd.DataFrame, posed: bool) -> Study:
+def study(folder: Path, table: pd.DataFrame, posed: bool, rays: int = RAYS) -> Study:
     """The study of links; with the directions of its sectors as parameters if `posed`."""
     table.to_csv(folder / "links.csv", index=False)
     parameters: dict[str, Any] = {name: {"bounds": bounds} for name, bounds in MATERIALS.items()}
@@ -115,7 +116,7 @@ def study(folder: Path, table: pd.DataFrame, posed: bool) -> Study:
             "tx_antenna": {"azimuth_deg": "azimuth", "downtilt_deg": "downtilt", "electrical_downtilt_deg": 6.0},
         },
         "antennas": {"tx": PANEL, "rx": {"pattern": "dipole"}},
-        "trace": {"max_depth": 3, "samples": 100_000},
+        "trace": {"max_depth": 3, "samples": rays},
         "holdout": {"where": "held_out == True"},
         "parameters": parameters,
     }  # fmt: skip
@@ -123,10 +124,10 @@ def study(folder: Path, table: pd.DataFrame, posed: bool) -> Study:
 
 
 def planted(
-    folder: Path, links: pd.DataFrame, random: np.random.Generator
+    folder: Path, links: pd.DataFrame, random: np.random.Generator, rays: int = RAYS
 ) -> tuple[dict[str, float], np.ndarray, pd.DataFrame]:
     """A draw of the materials, a mask of the links that paths reach, and the links with their noisy path loss."""
-    setup = Setup.open(study(folder, links, posed=False))
+    setup = Setup.open(study(folder, links, posed=False, rays=rays))
     truth = {name: random.uniform(bounds[0] + 0.5, bounds[1] - 2.0) for name, bounds in MATERIALS.items()}
     values = np.array([truth[name] for name in setup.parameters.names])
     loss = path_loss(setup.trace(), setup.parameters.materials(values, setup.scene.materials))

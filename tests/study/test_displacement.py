@@ -15,6 +15,7 @@ from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.measurements import Measurements
 from calibray.study import Setup, Study
+from calibray.study.displacement import reached
 from two_ray import COLUMNS, TwoRay
 
 GROUND = "ground.relative_permittivity"
@@ -68,7 +69,9 @@ def test_path_loss_is_exact_at_the_traced_neighbours_and_its_derivatives_everywh
     setup = Setup.open(study(folder, "stated.csv"), tracer=TwoRay)
     engine = engines.make(setup)
     start = setup.parameters.start
-    for name, end, axis, step in (("tx:A.height", "tx", 2, 8.0), ("rx:phone.dy", "rx", 1, -10.0)):
+    for name, end, axis, step in (
+        ("tx:A.height", "tx", 2, 8.0), ("tx:A.height", "tx", 2, -4.0), ("rx:phone.dy", "rx", 1, -7.5)
+    ):  # fmt: skip
         candidate = np.where(np.array(setup.parameters.names) == name, step, start)
         moved = setup.links.tx.copy(), setup.links.rx.copy()
         label = setup.links.table.labels("transmitter" if end == "tx" else "device")
@@ -76,7 +79,7 @@ def test_path_loss_is_exact_at_the_traced_neighbours_and_its_derivatives_everywh
         there = Measurements(*moved, path_loss_db=np.zeros(160))
         expected = path_loss(Setup.open(study(folder, "true.csv", {}), TwoRay, there).trace())
         np.testing.assert_allclose(engine.path_loss(candidate[None])[0], expected, atol=1e-9)
-    candidate = start + np.array([0.5, 2.0, -3.0, 4.0, 1.0])
+    candidate = start + np.array([0.5, 2.3, -3.0, 4.0, 1.0])
     _, jacobian = engine.path_loss_and_jacobian(candidate[None])
     for index in range(len(start)):
         step = 1e-4 * np.eye(len(start))[index]
@@ -85,22 +88,43 @@ def test_path_loss_is_exact_at_the_traced_neighbours_and_its_derivatives_everywh
         assert np.abs(jacobian[0, :, index]).max() > 1e-3
 
 
-def test_a_displacement_beyond_the_neighbours_counts_up_to_twice_their_distance(folder: Path) -> None:
-    setup = Setup.open(study(folder, "stated.csv", {"tx:A.height": [-8, 8]}), tracer=TwoRay)
-    near = setup.placed_at({GROUND: 3.0, "tx:A.height": 1.0}, 0.25)
+def test_neighbours_stay_within_the_bounds_and_beyond_them_path_loss_is_constant(folder: Path) -> None:
+    opened = Setup.open(study(folder, "stated.csv", {"tx:A.height": [-8, 8]}), tracer=TwoRay)
+    near = opened.placed_at({GROUND: 3.0, "tx:A.height": 6.0}, (0.125, 0.25, 0.5))
+    assert near.placed_at({GROUND: 3.0, "tx:A.height": 6.0}).effects(near.trace()) == ()
+    # Neighbours at 1, 2 and 4 m below; above there is room for 2 m, and a third of it comes first.
+    heights = np.array([2.0, 4.0, 5.0, 6.0, 6.0 + 2 / 3, 6.0 + 4 / 3, 8.0])
     engine = engines.make(near)
-    heights = np.array([-1.0, 1.0, 3.0, 8.0, -8.0])
-    candidates = np.column_stack([np.full(5, 3.0), heights])
-    loss = engine.path_loss(candidates)
-    # Through the traces at -1, 1 and 3 m goes one parabola. 8 m lies 5 m beyond: 2 + 5 * 2 / (2 + 5) m from the middle.
-    for row, effective in ((3, 1 + 2 + 10 / 7), (4, 1 - 2 - 14 / 9)):
-        parabola = np.polyfit(heights[:3], loss[:3], 2)
-        np.testing.assert_allclose(loss[row], [np.polyval(each, effective) for each in parabola.T], atol=1e-8)
-    _, jacobian = engine.path_loss_and_jacobian(candidates[3:])
-    step = np.array([0.0, 1e-4])
-    difference = engine.path_loss(candidates[3:] + step) - engine.path_loss(candidates[3:] - step)
+
+    def path_loss_at(heights: np.ndarray) -> np.ndarray:
+        return engine.path_loss(np.column_stack([np.full(len(heights), 3.0), heights]))
+
+    mast = near.links.table.labels("transmitter") == "A"
+    for height, loss in zip(heights, path_loss_at(heights), strict=True):
+        there = Measurements(
+            near.links.tx + np.array([0, 0, height]), near.links.rx, path_loss_db=np.zeros(160)
+        )
+        expected = path_loss(Setup.open(study(folder, "true.csv", {}), TwoRay, there).trace())
+        np.testing.assert_allclose(loss[mast], expected[mast], atol=1e-9)
+    between = path_loss_at(np.linspace(4.0, 5.0, 7))
+    ends = np.sort(between[[0, -1]], axis=0) + np.array([[-1e-9], [1e-9]])
+    assert ((ends[0] <= between) & (between <= ends[1])).all()  # a monotone cubic does not overshoot
+    np.testing.assert_allclose(*path_loss_at(np.array([2.0, -8.0])), atol=1e-9)
+    middle, step = np.array([[3.0, 5.4]]), np.array([0.0, 1e-4])
+    _, jacobian = engine.path_loss_and_jacobian(middle)
+    difference = engine.path_loss(middle + step) - engine.path_loss(middle - step)
     np.testing.assert_allclose(jacobian[..., 1], difference / 2e-4, rtol=1e-5, atol=1e-6)
     assert np.abs(jacobian[..., 1]).max() > 1e-3
+
+
+def test_a_displacement_without_a_path_has_the_path_loss_of_the_next_one_inwards() -> None:
+    change_db = np.array(
+        [[np.inf, -np.inf, np.inf], [2.0, np.inf, np.nan], [0.0, 0.0, np.nan], [1.0, 4.0, np.nan]]
+    )
+    change_db = np.concatenate([change_db, [[np.inf, 5.0, np.nan]]])[None]
+    change_db[:, 2, 2] = 0.0
+    expected = [[2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 4.0, 0.0], [1.0, 5.0, 0.0]]
+    np.testing.assert_array_equal(reached(change_db)[0], expected)
 
 
 @pytest.fixture(scope="module")

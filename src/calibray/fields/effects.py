@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial, reduce
-from typing import Final, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.fields.program import GroupedProgram
-
-TINY: Final = 1e-12
-"""Keeps 0 / 0 from links that are not displaced [m]."""
 
 
 class Effect(Protocol):
@@ -123,31 +120,29 @@ class RoughSurfaces:
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["link", "group", "weights", "origin", "slope", "curvature", "distance"],
+    data_fields=["link", "group", "weights", "origin", "knots", "coefficients"],
     meta_fields=[],
 )
 @dataclass(frozen=True, eq=False)
 class DisplacementLoss:
-    """Change of path loss by displacements of G groups of links along K axes, a polynomial of second order each.
+    """Change of path loss by displacements of G groups of links along K axes, a cubic between each two of N knots.
 
     Attributes:
         link: Link of every path [P].
         group: Group of every link [K, L].
         weights: Displacement of every group per unit of each effect parameter, K of [G, e].
         origin: Values of the effect parameters at which the paths were traced [e].
-        slope: First-order coefficient of every link [K, L], [dB/m].
-        curvature: Second-order coefficient of every link [K, L], [dB/m^2].
-        distance: Distance of the traced neighbours of every link [K, L], [m]. Beyond it, displacements count less and
-            less, up to twice the distance: a polynomial is no extrapolation.
+        knots: Traced displacements of every link, ascending [K, N, L], [m]; beyond them the change is constant.
+        coefficients: Coefficients of the cubics in the distance from the lower knot, that of the highest power first
+            [K, 4, N - 1, L].
     """
 
     link: jax.Array | NDArray[np.integer]
     group: tuple[NDArray[np.int64], ...]
     weights: tuple[NDArray[np.float64], ...]
     origin: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    curvature: NDArray[np.float64]
-    distance: NDArray[np.float64]
+    knots: NDArray[np.float64]
+    coefficients: NDArray[np.float64]
 
     def ordered(self, order: NDArray[np.int64]) -> DisplacementLoss:
         """See `Effect.ordered`."""
@@ -155,13 +150,15 @@ class DisplacementLoss:
 
     def apply(self, program: GroupedProgram, values: jax.Array) -> GroupedProgram:
         """See `Effect.apply`."""
-        loss_db = jnp.zeros(self.slope[0].shape)
+        loss_db = jnp.zeros(self.knots.shape[2])
         for axis, (group, weights) in enumerate(zip(self.group, self.weights, strict=True)):
-            stated, most = (jnp.asarray(weights) @ (values - self.origin))[group], self.distance[axis]
-            inside = jnp.clip(stated, -most, most)
-            beyond = stated - inside
-            displacement = inside + beyond * most / (most + jnp.abs(beyond) + TINY)
-            loss_db += (self.slope[axis] + self.curvature[axis] * displacement) * displacement
+            knots = jnp.asarray(self.knots[axis])
+            stated = (jnp.asarray(weights) @ (values - self.origin))[group]
+            displacement = jnp.clip(stated, knots[0], knots[-1])
+            below = (displacement >= knots[1:-1]).sum(axis=0)[None]
+            distance = displacement - jnp.take_along_axis(knots, below, axis=0)[0]
+            cubic = jnp.take_along_axis(jnp.asarray(self.coefficients[axis]), below[None], axis=1)[:, 0]
+            loss_db += jnp.polyval(cubic, distance)
         return scaled(program, jnp.exp(-np.log(10) / 20 * loss_db)[self.link])
 
 

@@ -20,10 +20,10 @@ from calibray.support.progress import Progress, with_stage
 
 ROUNDS: Final = 3
 """Default number of traces if paths are sampled by the materials."""
-DISPLACED_ROUNDS: Final = 6
-"""Default number of traces if positions are parameters: planted ones are approached to 0.3 m in 4 to 6."""
-NEAREST: Final = 0.125
-"""Smallest distance of neighbours, as a share of the largest displacement: 1 m for bounds of 8 m."""
+DISPLACED_ROUNDS: Final = 4
+"""Default number of traces if positions are parameters."""
+AROUND: Final = (0.0625, 0.125, 0.25, 0.5, 1.0)
+"""Traced displacements on each side of calibrated positions, as shares of the largest one: 0.5 to 8 m of 8 m."""
 
 
 def retrace(
@@ -54,21 +54,30 @@ def retrace(
         rounds = DISPLACED_ROUNDS if displaced else ROUNDS
     if not isinstance(section, ReplaySection) or section.rays or rounds == 0 or not (sampled or displaced):
         return problem, trail, None
-    gap, stated = None, problem.objective
+    gap, stated, before = None, problem.objective, np.full(len(parameters), np.inf)
+    near = [
+        AROUND[0] * max(-item.lower, item.upper) if displaces(item.name) else np.inf for item in parameters
+    ]
     for turn in range(rounds):
-        setup = problem.setup.placed_at(parameters.named(trail.best), max(0.5 ** (turn + 1), NEAREST))
-        materials = parameters.materials(trail.best, problem.engine.materials)
-        stage = with_stage(progress, "checking")
+        best = trail.best
+        setup = problem.setup.placed_at(parameters.named(best))
+        materials = parameters.materials(best, problem.engine.materials)
+        stage, paths = with_stage(progress, "checking"), None
         if isinstance(problem.engine, Chunked):
             engine = problem.engine.traced_with(materials, stage)
         else:
-            engine = replay(setup, setup.trace(materials, stage), section.compress_db)
-        gap = path_loss_change(engine.path_loss(trail.best[None])[0], trail.best_modelled)
+            paths = setup.trace(materials, stage)
+            engine = replay(setup, paths, section.compress_db)
+        gap = path_loss_change(engine.path_loss(best[None])[0], trail.best_modelled)
         objective = problem.objective
         settled = np.abs(gap[objective.weight > 0]).max() <= study.fidelity.tolerance_db
+        # Nearer to the traced position than its neighbours, path loss is known as well as it gets.
+        settled |= displaced and bool((np.abs(best - before) <= near).all())
         if settled or study.method.name != AUTO or turn == rounds - 1:
             break
-        if displaced:
+        if displaced and paths is not None:
+            setup = setup.placed_at(parameters.named(best), AROUND)
+            engine, before = replay(setup, paths), best
             weight = np.where(objective.weight > 0, stated.weight, 0.0)
             objective = with_interpolation_error(replace(stated, weight=weight), trail.best_modelled, gap)
         # Links without a path in the new trace are left out of the next calibration.

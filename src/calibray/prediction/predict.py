@@ -31,9 +31,8 @@ from calibray.study.link_obstruction import COLUMNS as OBSTRUCTION
 from calibray.support.progress import Progress
 from calibray.validation.baselines import without_scene
 
-NEIGHBOURS: Final = 0.5
-"""Distance of the displaced antennas that are traced, as a share of the largest displacement, as in the first check of
-a calibration."""
+NEIGHBOURS: Final = (0.125, 0.5)
+"""Distances of the displaced antennas that are traced, as shares of the largest displacement: 1 and 4 m of 8 m."""
 
 NEAR_SHARE: Final = 0.1
 """Share of the residual field's variance that measured links explain, above which a link is near measured links."""

@@ -1,7 +1,7 @@
 """Positions that are parameters, heights of transmitters and shifts of devices, and errors of receivers' positions.
 
-Path loss is traced at the stated positions and at displaced ones. Between them its change is a polynomial of second
-order in the displacement [dB], for every link and direction.
+Path loss is traced at the stated positions and at displaced ones. Between them its change [dB] is a monotone cubic of
+the displacement, for every link and axis.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 
 from calibray.errors import InputError
 from calibray.measurements import Measurements
@@ -30,6 +31,12 @@ RECEIVER: Final = "rx:"
 
 AXES: Final = {"dx": 0, "dy": 1, "height": 2}
 """Axis of the scene along which each field displaces an antenna."""
+
+LEAST: Final = 0.01
+"""Least distance of the last neighbour [m], which keeps knots apart at the bounds."""
+
+ACROSS: Final = (0.25, 0.5, 0.75, 1.0)
+"""Displacements that are traced on each side before the calibration, as shares of the largest one."""
 
 
 def displaces(name: str) -> bool:
@@ -64,6 +71,24 @@ class Displacement:
         position = np.array(getattr(links, end))
         position[:, AXES[self.field]] += displacement
         return replace(links, **{end: position})
+
+    def knots(self, values: NDArray[np.float64], neighbours: Sequence[float]) -> NDArray[np.float64]:
+        """Displacements of the links from those by values of the parameters [d], ascending [2n + 1, L], [m].
+
+        Args:
+            values: Values of the parameters, where the displacement is 0.
+            neighbours: Displacements on each side, as shares of the largest one. Where this leads out of the bounds,
+                they are equidistant up to the bounds.
+        """
+        shares = np.array(neighbours)
+        equidistant = np.arange(1, len(shares) + 1) / max(len(shares), 1)
+        present, knots = self.weights @ values, [np.zeros((1, len(self.reach)))]
+        for side in (1, -1):
+            room = np.maximum(self.reach - side * present, LEAST)
+            outwards = np.minimum(shares[:, None] * self.reach, equidistant[:, None] * room)
+            outwards = np.maximum(outwards, equidistant[:, None] * LEAST)
+            knots = [*knots, side * outwards] if side > 0 else [side * outwards[::-1], *knots]
+        return np.concatenate(knots)[:, self.group]
 
 
 def displacements(
@@ -127,21 +152,21 @@ def displacement_loss(
     displacements: Sequence[Displacement],
     parameters: Parameters,
     values: NDArray[np.float64],
-    share: float,
+    neighbours: Sequence[float],
     links: Measurements,
     here: tuple[Paths, Effects],
     traced: Callable[[Measurements], tuple[Paths, Effects]],
 ) -> DisplacementLoss:
-    """The change of path loss by displacements, from traces at neighbouring positions.
+    """The change of path loss by displacements, from one trace of the links at all neighbouring positions.
 
     Args:
-        displacements: The displacements.
+        displacements: The K displacements.
         parameters: The study's parameters.
         values: Their values at which the paths are traced [d].
-        share: Distance of the neighbours, as a share of the largest displacement.
-        links: The links at these values.
+        neighbours: Distances of the n neighbours on each side, as shares of the largest displacement, ascending.
+        links: The L links at these values.
         here: Their paths, and other effects on them.
-        traced: Gives the same at other positions.
+        traced: Gives the same of displaced links, which may be fewer or more than these.
     """
     # JAX is slow to import, and every study file that is read imports this module.
     from calibray.engines.replay import Replay
@@ -153,43 +178,59 @@ def displacement_loss(
         replay = Replay(replace(paths, materials=materials), parameters, batch=1, effects=effects)
         return replay.path_loss(values[None])[0]
 
-    stated_db, slopes, curvatures, distances = path_loss_db(*here), [], [], []
-    for displacement in displacements:
-        distance = (share * displacement.reach)[displacement.group]
-        sides = [path_loss_db(*traced(displacement.moved(links, side * distance))) for side in (1.0, -1.0)]
+    knots = np.array([each.knots(values, neighbours) for each in displacements])  # [K, 2n + 1, L]
+    change_db = np.zeros(knots.shape)
+    moved = (knots != 0) & np.array([each.reach[each.group] > 0 for each in displacements])[:, None]
+    if moved.any():
+        axis, _, link = np.nonzero(moved)
+        there, offset = at_index(links, link), knots[moved]
+        for number, each in enumerate(displacements):
+            there = each.moved(there, np.where(axis == number, offset, 0.0))
         with np.errstate(invalid="ignore"):  # inf - inf where no path reaches
-            slope, curvature = polynomial(np.array(sides) - stated_db, distance)
-        slopes.append(slope)
-        curvatures.append(curvature)
-        distances.append(distance)
+            change_db[moved] = path_loss_db(*traced(there)) - path_loss_db(*here)[link]
     return DisplacementLoss(
         here[0].link,
-        tuple(displacement.group for displacement in displacements),
-        tuple(displacement.weights[:, parameters.of_effects] for displacement in displacements),
+        tuple(each.group for each in displacements),
+        tuple(each.weights[:, parameters.of_effects] for each in displacements),
         values[parameters.of_effects],
-        np.array(slopes),
-        np.array(curvatures),
-        np.array(distances),
+        knots,
+        np.array([cubics(*pair) for pair in zip(knots, reached(change_db), strict=True)]),
     )
 
 
-def polynomial(
-    change_db: NDArray[np.float64], distance: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Coefficients [L], [dB/m] and [dB/m^2], of a polynomial through 0 and the changes of path loss on both sides.
+def at_index(links: Measurements, index: NDArray[np.int64]) -> Measurements:
+    """Links by their numbers, each as often as it is named."""
+    table = links.table
+    return Measurements(
+        tx=links.tx[index],
+        rx=links.rx[index],
+        path_loss_db=links.path_loss_db[index],
+        table=replace(table, frame=table.frame.iloc[index].reset_index(drop=True), row=table.row[index]),
+    )
 
-    Args:
-        change_db: Path loss of links displaced by +distance and by -distance, minus that of the links [2, L].
-        distance: The distance [L], [m]; links with 0 are not displaced.
 
-    Returns:
-        Slope and curvature: where no path reaches one side, those of a line; 0 where none reaches any.
+def reached(change_db: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Changes of path loss [K, 2n + 1, L], [dB]; where no path reaches, that of the next position inwards."""
+    change_db, middle = change_db.copy(), change_db.shape[1] // 2
+    for step in range(1, middle + 1):
+        for side in (1, -1):
+            here, inwards = change_db[:, middle + side * step], change_db[:, middle + side * (step - 1)]
+            here[:] = np.where(np.isfinite(here), here, inwards)
+    return change_db
+
+
+def cubics(knots: NDArray[np.float64], change_db: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coefficients [4, N - 1, L] of monotone cubics through changes of path loss [N, L] at knots [N, L], [m].
+
+    They do not overshoot where paths appear or vanish between two positions (Fritsch and Carlson 1980).
     """
-    reached = np.isfinite(change_db)
-    above, below = np.where(reached, change_db, 0.0)
-    above, below = np.where(reached[0], above, -below), np.where(reached[1], below, -above)
-    distance = np.where(distance > 0, distance, 1.0)
-    return (above - below) / (2 * distance), (above + below) / (2 * distance**2)
+    coefficients = np.empty((4, len(knots) - 1, knots.shape[1]))
+    # SciPy wants the same knots for all columns; links of a group have the same ones.
+    distinct, group = np.unique(knots, axis=1, return_inverse=True)
+    for number, column in enumerate(distinct.T):
+        links = group.reshape(-1) == number
+        coefficients[:, :, links] = PchipInterpolator(column, change_db[:, links]).c
+    return coefficients
 
 
 DIRECTIONS: Final = np.sqrt(2.0) * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])

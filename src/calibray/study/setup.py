@@ -24,6 +24,7 @@ from calibray.scenes import Scene, check_material_name, read_scene
 from calibray.scenes.regions import Region
 from calibray.scenes.scene_file import read_content as scene_content
 from calibray.study.displacement import (
+    ACROSS,
     RECEIVER,
     Displacement,
     averaged,
@@ -74,7 +75,7 @@ class Setup:
         held_out: Mask of the held-out links [L].
         factory: Opens the scene in a ray tracer.
         placed: Values of the parameters at which paths are traced, if some displace antennas; start values if absent.
-        share: Distance of the neighbouring positions that are traced, as a share of the largest displacement.
+        neighbours: Distances of the neighbouring positions that are traced, as shares of the largest displacement.
     """
 
     study: StudyModel
@@ -84,7 +85,7 @@ class Setup:
     held_out: NDArray[np.bool_]
     factory: TracerFactory
     placed: Mapping[str, float] = field(default_factory=dict)
-    share: float = 1.0
+    neighbours: tuple[float, ...] = ACROSS
 
     @classmethod
     def open(
@@ -185,15 +186,15 @@ class Setup:
         """Values of the parameters at which paths are traced."""
         return np.array([self.placed.get(item.name, item.start) for item in self.parameters])
 
-    def placed_at(self, values: Mapping[str, float], share: float) -> Setup:
+    def placed_at(self, values: Mapping[str, float], neighbours: tuple[float, ...] = ()) -> Setup:
         """The same, traced with antennas at the positions that values of the parameters state.
 
-        Itself if no parameter displaces antennas. The neighbours that path loss is interpolated between are at a
-        `share` of the largest displacement.
+        Itself if no parameter displaces antennas. Path loss is interpolated between `neighbours` on each side of these
+        positions, shares of the largest displacement; without any, it does not depend on displacements.
         """
         if not any(displaces(item.name) for item in self.parameters):
             return self
-        return self._with_tracer(replace(self, placed=dict(values), share=share))
+        return self._with_tracer(replace(self, placed=dict(values), neighbours=neighbours))
 
     @property
     def _links_in_place(self) -> Measurements:
@@ -204,19 +205,19 @@ class Setup:
 
     def _displacement_effects(self, paths: Paths, others: Effects) -> Effects:
         """The change of path loss by displacements, from traces at neighbouring positions."""
-        if not self._displacements:
+        if not self._displacements or not self.neighbours:
             return ()
 
         def traced(links: Measurements) -> tuple[Paths, Effects]:
             moved = self._with_tracer(replace(self, links=links))
-            paths = moved._mounted(self._trace_links(links, self.scene, None), self.scene)
+            paths = moved._mounted(moved._trace_links(links, self.scene, None), self.scene)
             return paths, moved._pose_and_region_effects(paths)
 
         loss = displacement_loss(
             self._displacements,
             self.parameters,
             self._placed,
-            self.share,
+            self.neighbours,
             self._links_in_place,
             (paths, others),
             traced,
