@@ -12,10 +12,10 @@ import calibray as cb
 import two_ray
 from calibray import engines
 from calibray.errors import InputError
-from calibray.fields import path_loss
+from calibray.fields import DisplacementLoss, path_loss
 from calibray.measurements import Measurements
 from calibray.study import Setup, Study
-from calibray.study.displacement import reached
+from calibray.study.displacement import cubics, reached
 from two_ray import COLUMNS, TwoRay
 
 GROUND = "ground.relative_permittivity"
@@ -125,6 +125,20 @@ def test_a_displacement_without_a_path_has_the_path_loss_of_the_next_one_inwards
     change_db[:, 2, 2] = 0.0
     expected = [[2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 4.0, 0.0], [1.0, 5.0, 0.0]]
     np.testing.assert_array_equal(reached(change_db)[0], expected)
+
+
+def test_the_error_between_the_traced_displacements_is_that_of_a_line_in_place_of_a_step() -> None:
+    knots = np.array([-4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0])[None, :, None] * np.ones(3)
+    # A line; a step of 6 dB between 0 and 1 m; a step farther away than the five middle knots.
+    change_db = np.stack(
+        [2 * knots[0, :, 0], 6.0 * (knots[0, :, 0] > 0.5), 6.0 * (knots[0, :, 0] > 3)], axis=1
+    )
+    none = np.zeros((0, 0))
+    loss = DisplacementLoss(np.zeros(0, int), (), (none,), none, knots, cubics(knots[0], change_db)[None])
+    np.testing.assert_allclose(loss.error_db, [0.0, 6 / np.sqrt(6), 0.0], atol=1e-12)
+    uniform = np.random.default_rng(1).uniform(size=(2, 200_000))  # where the step and the link are
+    line = 6.0 * uniform[0] - 6.0 * (uniform[0] > uniform[1])
+    assert np.sqrt(np.mean(line**2)) == pytest.approx(6 / np.sqrt(6), rel=0.01)
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 from calibray.engines.kinds.replay import ReplaySection, replay
 from calibray.engines.protocol import Chunked
+from calibray.fields import DisplacementLoss
 from calibray.fitting.methods import AUTO, choose
 from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
@@ -78,8 +79,13 @@ def retrace(
         if displaced and paths is not None:
             setup = setup.placed_at(parameters.named(best), AROUND)
             engine, before = replay(setup, paths), best
-            weight = np.where(objective.weight > 0, stated.weight, 0.0)
-            objective = with_interpolation_error(replace(stated, weight=weight), trail.best_modelled, gap)
+            weight, error_db = np.where(objective.weight > 0, stated.weight, 0.0), gap
+            for effect in getattr(engine, "effects", ()):
+                if isinstance(effect, DisplacementLoss):
+                    error_db = np.hypot(error_db, effect.error_db)
+            objective = with_interpolation_error(
+                replace(stated, weight=weight), trail.best_modelled, error_db
+            )
         # Links without a path in the new trace are left out of the next calibration.
         if objective.ceiling_db is None:
             objective = replace(objective, weight=np.where(np.isfinite(gap), objective.weight, 0.0))
@@ -89,25 +95,25 @@ def retrace(
 
 
 def with_interpolation_error(
-    objective: Objective, modelled: NDArray[np.float64], gap: NDArray[np.float64]
+    objective: Objective, modelled: NDArray[np.float64], error_db: NDArray[np.float64]
 ) -> Objective:
     """The objective with errors of interpolated path loss in the weights of the links.
 
-    Interpolation errs most where paths appear or vanish between the traced positions. The gap after tracing again is
-    taken as the standard deviation of this error, in addition to that of the link's other errors.
+    Interpolation errs most where paths appear or vanish between the traced positions. Its error at the last check and
+    that between the new positions count as standard deviations, in addition to that of the link's other errors.
 
     Args:
         objective: The objective without such errors.
         modelled: Interpolated path loss at the best values [L], [dB].
-        gap: Path loss traced there minus `modelled` [L], [dB].
+        error_db: Error of the interpolation [L], [dB]; infinite for links that are left out.
     """
-    counted = (objective.weight > 0) & np.isfinite(gap)
+    counted = (objective.weight > 0) & np.isfinite(error_db)
     residual = (objective.model(modelled[None])[0] - objective.measured)[counted]
     # Relative to the mean weight; the median is not moved by the links whose interpolation is bad.
     relative = objective.weight[counted] / objective.weight[counted].mean()
     variance = np.median(residual**2 * relative) / chi2.ppf(0.5, 1) / relative
     weight = objective.weight.copy()
-    weight[counted] *= variance / (variance + gap[counted] ** 2)
+    weight[counted] *= variance / (variance + error_db[counted] ** 2)
     # The standard deviation at the mean weight follows that weight.
     noise_db = objective.noise_db * np.sqrt(objective.weight[counted].mean() / weight[counted].mean())
     return replace(objective, weight=weight, noise_db=float(noise_db))

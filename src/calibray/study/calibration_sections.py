@@ -264,7 +264,7 @@ class FidelitySection(Section):
 
     Attributes:
         tolerance_db: Largest change of a link's path loss [dB] that is accepted.
-        rounds: Largest number of traces, 0 for none; 3 if absent, or 6 if positions are parameters.
+        rounds: Largest number of traces, 0 for none; 3 if absent, or 4 if positions are parameters.
     """
 
     tolerance_db: Annotated[float, Field(gt=0)] = 0.5
