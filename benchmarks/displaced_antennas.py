@@ -69,7 +69,7 @@ def repetition(folder: Path, links: pd.DataFrame, every: bool, blind: bool, seed
                     "covered": bool(low <= truth[name] <= high),
                     "error": abs(value - truth[name]),
                     "width": high - low,
-                    "held_out_db": float(np.sqrt(np.nanmean(error**2))),
+                    "held_out_db": float(np.sqrt(np.mean(error[np.isfinite(error)] ** 2))),
                     "gap_db": result.fit.retrace_gap_db,
                     "seconds": seconds,
                 }
