@@ -36,7 +36,9 @@ LEAST: Final = 0.01
 """Least distance of the last neighbour [m], which keeps knots apart at the bounds."""
 
 ACROSS: Final = (0.25, 0.5, 0.75, 1.0)
-"""Displacements that are traced on each side before the calibration, as shares of the largest one."""
+"""Traced displacements on each side before the calibration, as shares of the largest one. Of panels of eight rows, path
+loss between heights 2 m apart is then wrong by 0.1 dB in the median and 2 dB RMS; by a parabola through both bounds of
+8 m, 5 dB RMS."""
 
 
 def displaces(name: str) -> bool:
