@@ -88,10 +88,15 @@ def test_a_damaged_entry_is_removed(tmp_path: Path, damage) -> None:
 
 
 def test_the_entries_read_least_recently_are_removed_above_the_limit(tmp_path: Path) -> None:
-    store = Store(tmp_path, ".x", 300)
-    for age, name in enumerate("abc"):
-        store.put(name, bytes(60))
-        os.utime(tmp_path / f"{name}.x", (age, age))
-    assert store.get("a") is not None  # now the youngest
-    store.put("d", bytes(60))
-    assert {path.stem for path in store.entries()} == {"a", "c", "d"}
+    """Not at once: about one written entry in 16 is followed by a look at all."""
+    store, looked = Store(tmp_path, ".x", limit := 10 * (60 + 32)), 0
+    for number in range(200):
+        store.put(f"{number}", bytes(60))
+        os.utime(tmp_path / f"{number}.x", (number, number))
+        if number == 0:
+            assert store.get("0") is not None  # from now on the youngest
+        looked += sum(path.stat().st_size for path in store.entries()) <= limit
+    kept = [int(path.stem) for path in store.entries()]
+    assert kept == [0, *range(199, 200 - len(kept), -1)]
+    assert 9 <= len(kept) < 60
+    assert 10 <= looked < 60

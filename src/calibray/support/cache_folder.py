@@ -23,6 +23,9 @@ COMPILED_BYTES: Final = 512 * 2**20
 _NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 _DIGEST_BYTES: Final = 32
 """Bytes of the SHA-256 at the start of each entry."""
+_PRUNED_AT: Final = 16
+"""One entry in so many is followed by a look at the size of all: with 7,000 entries it takes 0.08 s, as long as the
+compilation of a small program."""
 
 
 def cache_folder() -> Path | None:
@@ -43,7 +46,8 @@ class Store:
     Attributes:
         path: The folder, which need not exist.
         suffix: The end of the entries' file names.
-        limit: Size limit; the entries read least recently are removed above it [bytes].
+        limit: Size limit [bytes]; the entries read least recently are removed above it, after one written entry in
+            `_PRUNED_AT`.
     """
 
     path: Path
@@ -84,7 +88,8 @@ class Store:
                 with suppress(OSError):
                     os.unlink(partial, dir_fd=folder)
                 raise
-            self._remove_oldest()
+            if hashlib.sha256(name.encode()).digest()[0] % _PRUNED_AT == 0:
+                self._remove_oldest()
 
     @contextmanager
     def _folder(self) -> Iterator[int | None]:
