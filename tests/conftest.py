@@ -1,14 +1,25 @@
 """What all tests share: reproducible property tests, one cache of compiled code, no lines of progress."""
 
-# ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)
+# ruff: noqa: E402  (what NumPy and XLA read has to be set before they are imported)
 
 import os
 from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
 
 # Matrices of the tests are small, and BLAS threads that wait for each other cost more than they gain. NumPy and SciPy
 # read these when they are imported; subprocesses inherit them.
 for _library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
+
+# The small programs of the tests are compiled for longer than they run: in a third of the time without XLA's emitters of
+# fused loops and LLVM's optimizations. XLA ends the process at a flag that it does not know, so other versions than the
+# locked one compile as they do for users, as do the benchmarks and the demo.
+LOCK = Path(__file__).parents[1] / "requirements.lock"
+if f"jaxlib=={version('jaxlib')}" in LOCK.read_text(encoding="utf-8").split():
+    os.environ.setdefault(
+        "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+    )
 
 import pytest
 from hypothesis import settings
