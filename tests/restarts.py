@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,9 +30,13 @@ from calibray.calibration.calibrate import calibrate
 from calibray.engines import Retrace, open_workers
 from calibray.errors import EngineError, InputError
 from calibray.study import Study
+from calibray.uncertainty import sequential_monte_carlo as sampler
 # Else every child would import them.
 import trimesh
 import calibray.engines.make_engine, calibray.engines.external.program
+
+for name, value in json.loads(sys.argv[1]).items():
+    setattr(sampler, name, value)
 
 def run(workers, folder):
     answer = Retrace._trace
@@ -231,9 +235,13 @@ def result(folder: Path) -> tuple:
 
 
 @contextmanager
-def open_runner() -> Iterator[subprocess.Popen]:
-    """A process that runs the study of every folder it is told."""
-    command = [sys.executable, "-c", RUNNER]
+def open_runner(draws: Mapping[str, object] | None = None) -> Iterator[subprocess.Popen]:
+    """A process that runs the study of every folder it is told.
+
+    Args:
+        draws: Constants of `calibray.uncertainty.sequential_monte_carlo` that replace its own.
+    """
+    command = [sys.executable, "-c", RUNNER, json.dumps(draws or {})]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0) as runner:
         yield runner
         runner.stdin.close()
