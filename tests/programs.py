@@ -36,6 +36,7 @@ STUDY_TOML = """
 version = 1
 scene = {{ file = "sionna:simple_street_canyon", frequency = 3.5e9 }}
 links = {{ file = "links.csv", tx = ["tx_x", "tx_y", "tx_z"], rx = ["rx_x", "rx_y", "rx_z"], value = "path_loss_db" }}
+trace = {{ max_depth = 1, samples = 10_000 }}
 engine = {{ name = "command", command = {command}, retries = 0 }}
 method = {{ name = "{method}", options = {options} }}
 noise = {{ kind = "gaussian", range_m = 0 }}

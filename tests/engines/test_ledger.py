@@ -223,7 +223,7 @@ def problem(study: Study) -> str:
         ("[parameters]", "[materials]\nwood = { thickness = 0.5 }\n[parameters]", False),
         ("[parameters]", '[objective]\ncombining = "coherent"\n[parameters]', False),
         ("[parameters]", '[antennas]\ntx = { pattern = "dipole" }\n[parameters]', False),
-        ("[parameters]", "[trace]\nmax_depth = 1\n[parameters]", False),
+        ("max_depth = 1", "max_depth = 2", False),
         ("frequency = 3.5e9", "frequency = 3.6e9", False),
         ("simple_street_canyon", "simple_street_canyon_with_cars", False),
         ("'model.py'", "'other.py'", False),
