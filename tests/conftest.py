@@ -12,14 +12,12 @@ from pathlib import Path
 for _library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
-# The small programs of the tests are compiled for longer than they run: in a third of the time without XLA's emitters
-# of fused loops and LLVM's optimizations. XLA ends the process at a flag that it does not know, so versions other than
-# the locked one compile as they do for users, and so do the benchmarks and the demo.
+# XLA compiles the small programs of the tests for longer than they run, and for half as long without its emitters of
+# fused loops. It ends the process at a flag that it does not know, so versions other than the locked one compile as
+# they do for users, and so do the benchmarks and the demo.
 LOCK = Path(__file__).parents[1] / "requirements.lock"
 if f"jaxlib=={version('jaxlib')}" in LOCK.read_text(encoding="utf-8").split():
-    os.environ.setdefault(
-        "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
-    )
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 import pytest
 from hypothesis import settings
