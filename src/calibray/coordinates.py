@@ -200,7 +200,8 @@ def find_projection(
         low: West and south end of the scene [2], [m].
         high: East and north end [2], [m].
 
-    Returns: The projection with the most positions on the scene; None if no projection places half of them there.
+    Returns:
+        The projection with the most positions on the scene; None if no projection places half of them there.
 
     Example:
         >>> frame = Frame.local(11.5755, 48.1374)

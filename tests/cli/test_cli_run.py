@@ -273,7 +273,9 @@ def test_antennas_inside_buildings_are_listed_unless_most_are_inside(folder, ran
         r"transmitter inside a building +0\nreceiver inside a building +2 +rows 2, 3: check", text
     )
     indoors = render(*result_tables.tables(changed(result, enclosed=EnclosedAntennas.of(row, most, most))))
-    assert re.search(r"receiver inside a building +11 +as most are: assumed to be an indoor scene\n", indoors)
+    assert re.search(
+        r"receiver inside a building +11 +as for most receivers: assumed to be an indoor scene\n", indoors
+    )
     assert changed(result, enclosed=EnclosedAntennas.of(row, none, few)).counts["rows_with_enclosed_rx"] == [
         2,
         3,

@@ -178,7 +178,7 @@ def test_a_column_whose_name_is_a_number_is_taken_with_a_warning(tmp_path, caplo
     status, out, _ = scene_command("footprints", town, "-o", tmp_path / "out", "--height", "2020")
     assert status == 0
     assert "0.0 m to 12.0 m high" in out
-    assert "2020 is taken for the column of that name" in caplog.text
+    assert "2020 is interpreted as the column of that name" in caplog.text
 
 
 def test_footprints_become_a_scene(tmp_path):

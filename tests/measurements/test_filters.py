@@ -140,7 +140,7 @@ def test_anything_else_is_refused_without_side_effects(expression, tmp_path, mon
         ("~x > 3", "x: must be true or false", "parentheses"),
         ("y == None", "None: not allowed", "use isna() or notna()"),
         ("set.str.contains('(a+)+')", "contains('(a+)+'): only characters", "regex=False"),
-        ("`my column` + ok > 1", "ok: must be a number", "calculated with"),
+        ("`my column` + ok > 1", "ok: must be a number", "for arithmetic"),
     ],
 )
 def test_a_refusal_names_the_piece_and_the_remedy(expression, piece, remedy):

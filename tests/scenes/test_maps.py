@@ -426,8 +426,8 @@ LOCAL = 'ENGCRS["site",EDATUM["site"],CS[Cartesian,2],AXIS["x",east],AXIS["y",no
     [
         ({"unit": "cubits"}, "the unit 'cubits' of its heights is not known"),
         ({"unit": "m", "crs": "EPSG:32632+8228"}, "in another unit"),
-        ({"crs": LOCAL}, "has no place on the globe"),
-        ({"crs": "EPSG:5773"}, "has no place on the globe|no reference system"),
+        ({"crs": LOCAL}, "has no position on the globe"),
+        ({"crs": "EPSG:5773"}, "has no position on the globe|no reference system"),
         ({"transform": Affine(0, 0, 5, 0, 0, 6)}, "is not a grid|cannot be read|no reference|does not cover"),
         ({"transform": Affine(float("nan"), 0, 5, 0, -1, 6)}, "is not a grid"),
     ],

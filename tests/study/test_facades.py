@@ -181,7 +181,7 @@ def test_a_facade_is_like_the_walls_that_it_is_part_of(tmp_path):
         ({"like": "marbel.relative_permittivity"}, "no other parameter"),
         ({"like": SHOP}, "no other parameter"),
         ({"like": "marble.relative_permittivity", "itu": "glass"}, "one of itu, value and like"),
-        ({"std": 1.0, "like": "marble.relative_permittivity"}, "leave itu, value, like"),
+        ({"std": 1.0, "like": "marble.relative_permittivity"}, "remove itu, value, like"),
     ],
 )
 def test_impossible_populations_are_refused(tmp_path, prior, message):

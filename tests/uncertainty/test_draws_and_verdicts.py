@@ -156,6 +156,6 @@ def test_wider_bounds_do_not_improve_a_verdict():
 
     assert told(10.0, None).name == told(40.0, np.full(1, 10.0)).name == "weakly identified"
     assert told(40.0, None).name == "identified"  # what shares of the bounds alone would say
-    assert "of a customary range" in reason_text(told(40.0, np.full(1, 10.0)).reason)
+    assert "of a usual range" in reason_text(told(40.0, np.full(1, 10.0)).reason)
     # Narrower bounds count as they are.
     assert told(10.0, np.full(1, 1000.0)).name == "weakly identified"

@@ -51,7 +51,8 @@ def diagnose_links(problem: Problem, best: NDArray[np.float64], paths: Paths | N
         best: The calibrated values [d].
         paths: The paths of the calibration, at the study's carrier; None if unavailable.
 
-    Returns: The diagnostics, without columns that the engine cannot provide.
+    Returns:
+        The diagnostics, without columns that the engine cannot provide.
     """
     columns: dict[str, NDArray[np.float64]] = {}
     if problem.differentiable:

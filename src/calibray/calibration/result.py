@@ -132,8 +132,9 @@ class Result(Record):
             progress: Called with the stage "tracing" after every launch.
             allow_changed_inputs: Predict although a file of the scene or an antenna has changed since the calibration.
 
-        Returns: One row per link: path_loss_db, lower_db, upper_db [dB]; basis, the source of the interval; the three
-            in the measured quantity if that is not path loss; and remark, a warning about an unlikely antenna position.
+        Returns:
+            One row per link: path_loss_db, lower_db, upper_db [dB]; basis, the source of the interval; the three in the
+            measured quantity if that is not path loss; and remark, a warning about an unlikely antenna position.
 
         Raises:
             InputError: `predict` would refuse the input, except for unknown groups; the level is not between 0 and 1;

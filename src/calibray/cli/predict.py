@@ -222,7 +222,8 @@ def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
     Args:
         suggestions: The suggestions, from `suggest`.
 
-    Returns: A table of positions, and a table of the gain expected from each suggestion together with those above it.
+    Returns:
+        A table of positions, and a table of the gain expected from each suggestion together with those above it.
     """
     from calibray.prediction.position_checks import POSITION_COLUMNS
 

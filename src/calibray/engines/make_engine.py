@@ -46,7 +46,8 @@ def make(
         workers: Run the calls of a batch on "command", or keep chunks of links on "replay" (`open_workers`).
         paths: Paths of the study's links for "replay"; if None, they are traced or read from the cache.
 
-    Returns: The engine, over all links of the study, including held-out links.
+    Returns:
+        The engine, over all links of the study, including held-out links.
 
     Raises:
         InputError: The engine is unknown, does not suit the study, or takes no workers; the ledger cannot be used; or

@@ -90,7 +90,8 @@ def path_loss(
             carrier, and "band" averages the coherent power over `bandwidth`.
         bandwidth: Bandwidth [Hz], for "band".
 
-    Returns: Path loss [L], [dB]; +inf for a link without a path.
+    Returns:
+        Path loss [L], [dB]; +inf for a link without a path.
 
     Raises:
         InputError: The combining or a material is unknown, or the bandwidth is missing.

@@ -287,7 +287,8 @@ class Nuisance:
             coefficients: Coefficients fitted to some links [n, q].
             counted: Mask of these links [L].
 
-        Returns: All coefficients [n, q], and their standard deviations [q]: the spread between groups for a filled-in
+        Returns:
+            All coefficients [n, q], and their standard deviations [q]: the spread between groups for a filled-in
             coefficient, otherwise 0.
         """
         measured = np.asarray(abs(self.design[counted]).sum(axis=0)).ravel() > 0

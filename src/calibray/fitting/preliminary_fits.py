@@ -242,7 +242,8 @@ def group_spread(
         column: The column [n].
         group: Group of every link [n], from 0.
 
-    Returns: The standard deviations; the one between groups is 0 if there are too few links.
+    Returns:
+        The standard deviations; the one between groups is 0 if there are too few links.
 
     Example:
         >>> shift = np.repeat([3.0, -2.0, 0.0, -1.0], 5)
@@ -287,7 +288,8 @@ def estimate_spreads(problem: Problem, progress: Progress | None = None) -> Prob
         problem: The problem.
         progress: Called with the stage "estimating spreads" after every estimate.
 
-    Returns: The problem with these spreads in its study and priors; unchanged without such a population.
+    Returns:
+        The problem with these spreads in its study and priors; unchanged without such a population.
     """
     fields, parameters = estimated_fields(problem.setup.study), problem.parameters
     if not fields or not problem.differentiable:

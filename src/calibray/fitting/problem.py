@@ -321,7 +321,8 @@ class Problem:
             slope: Their derivatives with respect to k variables [n, L, k]: the d search coordinates, then any others.
             observed_slope: The same for the further observables [n, K, L, k]; None if there are none.
 
-        Returns: Derivatives of the residuals with respect to the same variables [n, m, k].
+        Returns:
+            Derivatives of the residuals with respect to the same variables [n, m, k].
         """
         parts = [self.objective.jacobian(modelled, slope)]
         if len(self.priors):

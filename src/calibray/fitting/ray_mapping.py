@@ -91,7 +91,8 @@ def map_rays(
         most_calls: Calls after which it ends.
         seed: Seed of the random numbers.
 
-    Returns: The replay that replaces the engine, and its accuracy.
+    Returns:
+        The replay that replaces the engine, and its accuracy.
     """
     parameters, known = problem.parameters, problem.setup.known_antennas is not None
     understanding: Understanding | None = None

@@ -32,8 +32,9 @@ def search_rays(
         engine: That engine.
         progress: Called with the stage "calibrating" after every RT call.
 
-    Returns: The problem on the replay that replaces the engine, the search, and how well the engine's assumptions are
-    identified.
+    Returns:
+        The problem on the replay that replaces the engine, the search, and how well the engine's assumptions are
+        identified.
 
     Raises:
         EngineError: A call failed.

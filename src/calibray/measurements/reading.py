@@ -93,7 +93,8 @@ def links_from_frame(
         group: Column of group labels, or several columns whose labels are joined.
         frequency: Column of carrier frequencies [Hz]; if the table lacks it, all links have the study's carrier.
 
-    Returns: The links, with NaN as path loss.
+    Returns:
+        The links, with NaN as path loss.
 
     Raises:
         InputError: A column is missing, or a position is not finite.

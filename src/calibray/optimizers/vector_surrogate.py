@@ -4,9 +4,9 @@ The objective is a sum over links, so an evaluation that returns the residual of
 information than their sum. Residuals are smoother than the objective, and tens of them share one dependence on the
 parameters (`kriging.py`).
 
-A run begins with a maximin Latin hypercube. It has few points for many parameters, because residuals can be modelled as
-soon as a plane can be laid through them. Then three kinds of step take turns on a model that is refitted after every
-batch:
+A run begins with a maximin Latin hypercube. The design has few points for many parameters, because residuals can be
+modelled as soon as a plane fits through them. After the design, three kinds of step take turns on a model that is
+refitted after every batch:
 
 - *exploration*: the point of the largest expected improvement of the mean square of the residuals, over draws from the
   model (R. Astudillo, P. Frazier, ICML 2019). A normal distribution of the mean square instead (D. R. Jones, M.
@@ -17,10 +17,10 @@ batch:
 - *another basin*: the lowest minimum of the predicted objective where the model is still uncertain, so that polishing
   one basin does not keep the search from the next.
 
-Input scales are learned at every step up to `OFTEN` points, and then whenever the number of points has grown by a
-tenth; in between the model only takes new points, which saves most of the time.
+Input scales are estimated at every step up to `OFTEN` points, and then whenever the number of points has grown by a
+tenth. In between, the model only adds new points, which saves most of the time.
 
-In a batch every further candidate is chosen as if the earlier ones had been evaluated exactly as predicted. A failed
+In a batch, every further candidate is chosen as if the earlier ones had been evaluated exactly as predicted. A failed
 evaluation enters the model with the residuals of the worst successful one.
 """
 
@@ -42,31 +42,31 @@ from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, 
 from calibray.optimizers.sampling import distance_to_nearest, draw_around, maximin_design
 
 FIRST = 5
-"""Points of the initial design beyond the number of parameters, at most."""
+"""Largest number of points of the initial design beyond the number of parameters."""
 
 CANDIDATES = 600
-"""Candidates drawn over the box, and as many around the best points."""
+"""Number of candidates drawn over the box, and of candidates around the best points."""
 
 DRAWS = 256
-"""Draws of the residuals for the expected improvement."""
+"""Number of draws of the residuals for the expected improvement."""
 
 OFTEN = 80
-"""Points up to which input scales are learned at every step."""
+"""Number of points up to which input scales are estimated at every step."""
 
 REFIT = 1.1
-"""Growth of the number of points at which they are learned again beyond."""
+"""Growth of the number of points after which they are estimated again."""
 
 SEARCHES = 16
 """Local searches on the model."""
 
 SEPARATION = 1e-4
-"""Distance in the unit cube below which a point counts as evaluated already."""
+"""Distance in the unit cube below which a point counts as already evaluated."""
 
 UNCERTAIN = 1e-3
 """Share of the prior variance above which a predicted minimum counts as another basin."""
 
 PATIENCE = 4
-"""Batches in a row that promise too little before the search stops."""
+"""Number of successive batches with too small a predicted gain after which the search stops."""
 
 
 @final
@@ -75,13 +75,13 @@ class VectorSurrogate(Optimizer):
 
     Args:
         budget: Number of evaluations, 20 d if None.
-        initial: Points of the initial design, the lesser of 2 (d + 1) and d + 5 if None; points told before the first
-            `ask` count, those closer together than half of the design's spacing as one.
-        batch: Candidates asked for at once after the initial design, for engines that run in parallel.
-        logarithmic: Parameters that the model sees on a logarithmic scale, [d] or one for all.
+        initial: Points of the initial design, the lesser of 2 (d + 1) and d + 5 if None. Points passed to `tell` before
+            the first `ask` count; those closer together than half of the design's spacing count as one.
+        batch: Number of candidates per batch after the initial design, for engines that run in parallel.
+        logarithmic: Whether the model uses each parameter on a logarithmic scale, [d] or one for all.
         noisy: Whether the engine's answers scatter; the model then smooths instead of interpolating.
-        tolerance: Stop before the budget is used when the predicted gain stays below this, in the unit of the
-            residuals' root mean square; never if None.
+        tolerance: Stop before the budget is used if the predicted gain stays below this, in the unit of the residuals'
+            root mean square; never if None.
 
     Raises:
         InputError: An argument is out of range.
@@ -133,7 +133,7 @@ class VectorSurrogate(Optimizer):
     def trust(self) -> float | None:
         """How well the model ranks left-out points by their objective; None without a model.
 
-        Spearman's rank correlation: 1 is perfect, 0 is useless and calls for more initial points.
+        The measure is Spearman's rank correlation: 1 is perfect, and 0 is useless and calls for more initial points.
         """
         if self._model is None:
             return None
@@ -165,7 +165,7 @@ class VectorSurrogate(Optimizer):
             left, turn = left - count, turn + count
 
     def _design(self, earlier: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The initial design [k, d], less its points next to earlier ones [n, d] that are not clumped."""
+        """The initial design [k, d], without its points next to earlier ones [n, d] that are not clumped."""
         points = maximin_design(self.initial, self.box.dimension, self._rng)
         spacing, counted = 0.5 * float(pdist(points).min()), earlier[:0]
         for point in earlier:
@@ -189,7 +189,7 @@ class VectorSurrogate(Optimizer):
     def _choose(
         self, model: Kriging, taken: NDArray[np.float64], best: float, turn: int, count: int
     ) -> tuple[NDArray[np.float64], float]:
-        """The next batch [count, d] and the gain it promises; `taken` are the evaluated points, best first."""
+        """The next batch [count, d] and its predicted gain; `taken` are the evaluated points, best first."""
         d = self.box.dimension
         starts = np.vstack([taken[: SEARCHES // 2], self._rng.random((SEARCHES, d))])[:SEARCHES]
         minima = predicted_minima(model, starts)
@@ -212,7 +212,7 @@ class VectorSurrogate(Optimizer):
     def _explore(
         self, model: Kriging, taken: NDArray[np.float64], fresh: NDArray[np.float64], best: float
     ) -> tuple[NDArray[np.float64], float]:
-        """The point of the largest expected improvement [d], and the gain it promises."""
+        """The point of the largest expected improvement [d], and its predicted gain."""
         around = draw_around(taken[:5], CANDIDATES, -3.0, self._rng)
         candidates = np.vstack([self._rng.random((CANDIDATES, self.box.dimension)), around, fresh])
         candidates = candidates[distance_to_nearest(candidates, taken) > SEPARATION]
@@ -242,7 +242,7 @@ def mean_square(model: Kriging, x: NDArray[np.float64]) -> tuple[NDArray[np.floa
 
     With prediction r, prior covariance V of the residuals and share s^2 of it, which grows with the distance from
     evaluated points, Q has mean (r^T r + s^2 tr V) / m and variance (4 s^2 r^T V r + 2 s^4 tr V^2) / m^2. Errors of
-    different links are correlated: treating them as independent would stop exploration too soon.
+    different links are correlated: treating them as independent would stop exploration too early.
     """
     mean, share = model.predict(x)
     root, links = model.root, model.root.shape[1]
@@ -256,8 +256,8 @@ def improvement(
 ) -> NDArray[np.float64]:
     """Expected decrease [k] of the mean square of the residuals below the best one, by Monte Carlo.
 
-    From predictions [k, m], their variance relative to the prior's [k], and draws with the prior covariance [draws, m];
-    0 where no draw improves. `best` is the root mean square of the best residuals so far.
+    It follows from predictions [k, m], their variance relative to the prior's [k], and draws with the prior covariance
+    [draws, m]; it is 0 if no draw improves. `best` is the root mean square of the best residuals so far.
     """
     along, across = 2.0 * np.sqrt(share)[:, None] * (mean @ draws.T), np.sum(draws**2, axis=1)
     square = np.sum(mean**2, axis=1)[:, None] + along + share[:, None] * across
@@ -265,7 +265,7 @@ def improvement(
 
 
 def predicted_minima(model: Kriging, starts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Local minima of the predicted objective, lowest first [k, d], searched from starts in the unit cube [s, d]."""
+    """Local minima of the predicted objective, lowest first [k, d], from starting points in the unit cube [s, d]."""
     ends = descend_all(starts, model.mean_and_slope, 30, 1e-8)
     return ends.unit[np.argsort(ends.cost, kind="stable")]
 

@@ -1,4 +1,4 @@
-"""Parameters: what a calibration may change, the search space they span, and the laws that some of them belong to."""
+"""Parameters: the quantities that a calibration may change, their search space, and the laws to which some belong."""
 
 from calibray.parameters.parameter import (
     Parameter,

@@ -1,7 +1,7 @@
 """How a material's constants depend on frequency: eps_r = a f^b and sigma = c f^d [S/m], f in GHz (ITU-R P.2040).
 
-A material that ITU-R lists has the coefficients of Table 3. Any other keeps its constants at all frequencies: the same
-law with the exponents 0.
+A material that ITU-R lists has the coefficients of Table 3. Any other material has the same constants at all
+frequencies: the same law with the exponents 0.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ EFFECTS: Final[Mapping[str, Mapping[str, Bound]]] = MappingProxyType(
         "rx": {"dx": Bound(-1000.0, 1000.0, "m"), "dy": Bound(-1000.0, 1000.0, "m")},
     }
 )
-"""Kinds of things other than materials that have parameters, as in "region:trees.specific_attenuation", with the
+"""Kinds of effects other than materials that have parameters, as in "region:trees.specific_attenuation", with the
 physical bounds of each field."""
 
 ROUGHNESS: Final = "roughness_mm"
-"""Field of a material that acts as an effect on paths, not as a constant: the height of its roughness."""
+"""Field of a material that acts as an effect on paths instead of as a constant: its roughness."""
 
 PARAMETER_BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
     {
@@ -60,7 +60,7 @@ PARAMETER_BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
         **{field: bound for fields in EFFECTS.values() for field, bound in fields.items()},
     }
 )
-"""Physical bounds of each field; the value of a law is checked by `check_law`."""
+"""Physical bounds of each field; `check_law` checks the value of a law."""
 
 
 class PowerLaw(NamedTuple):
@@ -97,7 +97,7 @@ def check_law(
     exponents: Iterable[float],
     frequencies: Iterable[float],
 ) -> None:
-    """Refuse bounds of a law s f^e within which a constant takes an impossible value at some carrier [Hz].
+    """Refuse bounds of a law s f^e that allow an impossible value of a constant at some carrier [Hz].
 
     A power law is monotonic in both coefficients, so it is enough to check the corners of their bounds. A fixed
     coefficient has one value.

@@ -102,12 +102,12 @@ class Parameter:
 
     @property
     def constant(self) -> str:
-        """The constant of the material that it changes, one of `FIELDS`; the field itself of an effect."""
+        """The constant of the material that it changes, one of `FIELDS`; for an effect, the field itself."""
         return CONSTANT_OF_FIELD.get(self.field, self.field)
 
     @property
     def is_effect(self) -> bool:
-        """Whether it belongs to an effect, not to a material."""
+        """Whether it belongs to an effect and not to a material."""
         return is_effect(self.name)
 
 
@@ -115,7 +115,7 @@ def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:
     """A parameter for a constant that a scene fixes, within four standard deviations of its logarithm.
 
     Returns:
-        The parameter; None if the constant is 0 or cannot take such values.
+        The parameter; None if the constant is 0 or these values are impossible for it.
 
     Example:
         >>> fixed_constant("walls.thickness", 0.2, 0.1).upper
@@ -176,7 +176,7 @@ def make_parameter(
     scale: Scale = "linear",
     laws: Mapping[str, ItuLaw] | None = None,
 ) -> Parameter:
-    """Make a parameter of a scene and resolve its start value.
+    """Make a parameter of a scene and determine its start value.
 
     Args:
         name: Material and field, as "walls.relative_permittivity".
@@ -192,8 +192,8 @@ def make_parameter(
         The parameter.
 
     Raises:
-        InputError: The scene has no such material, the field has no effect with the material's scattering
-            pattern, or as for `Parameter` and `itu_material`.
+        InputError: The scene has no such material, the field has no effect with the material's scattering pattern, or
+            an error of `Parameter` or `itu_material`.
 
     Example:
         >>> walls = {"walls": Material(5.0, 0.1, 0.3)}
@@ -225,7 +225,7 @@ def itu_start(name: str, start: str, frequency: float) -> float:
     """Look up the value of ITU-R P.2040, in the field's unit, for a start such as "itu:concrete@P.2040-1".
 
     Raises:
-        InputError: The text has another form, the field has no ITU-R law, or as for `itu_material`.
+        InputError: The text has another form, the field has no ITU-R law, or an error of `itu_material`.
     """
     field = split_name(name)[1]
     if is_effect(name):

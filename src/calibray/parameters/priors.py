@@ -18,12 +18,12 @@ class LogNormal:
     """Gaussian priors of the logarithms of k parameters, or of the values of some of them.
 
     Attributes:
-        index: Numbers of the parameters that have a prior.
-        centre: Medians, in the parameters' units; of those in `like`, relative to the value of the other parameter.
-        spread: Standard deviations of the logarithms: 0.3 is about 30 %; of the values of those in `linear`.
-        linear: Numbers of the parameters whose prior is Gaussian in the value itself, which can be negative.
-        like: Number of a parameter with a prior, and of the one that it is like: members of a population scatter around
-            their common value.
+        index: Indices of the parameters that have a prior.
+        centre: Medians, in the parameters' units; for those in `like`, relative to the value of the other parameter.
+        spread: Standard deviations of the logarithms (0.3 is about 30 %), or of the values of those in `linear`.
+        linear: Indices of the parameters whose prior is Gaussian in the value itself, which can be negative.
+        like: Index of a parameter with a prior, and of the parameter around which the prior is centred: members of a
+            population scatter around their common value.
 
     Example:
         >>> prior = LogNormal((0,), (4.0,), (0.3,))
@@ -41,7 +41,7 @@ class LogNormal:
         return len(self.index)
 
     def extended(self, index: Sequence[int], centre: Sequence[float], spread: float) -> LogNormal:
-        """These priors, and independent ones of further parameters with one spread of their logarithms."""
+        """These priors, and independent priors of further parameters with one spread of their logarithms."""
         return replace(
             self,
             index=(*self.index, *index),
@@ -74,7 +74,8 @@ class LogNormal:
     ) -> NDArray[np.float64]:
         """Logarithm of the integral of exp(-residual^2 / 2) over the bounds of the parameters in `like` [n].
 
-        It depends on the parameters that they are like. The density is one of the search space.
+        The integral depends on the parameters around which these priors are centred. The density refers to the search
+        space.
         """
         total = np.zeros(len(candidates))
         for row, reference in self._pairs:
@@ -86,7 +87,7 @@ class LogNormal:
     def draw_like(
         self, candidates: NDArray[np.float64], parameters: Parameters, random: np.random.Generator
     ) -> NDArray[np.float64]:
-        """Candidates [n, d] with the parameters in `like` drawn given those that they are like."""
+        """Candidates [n, d] with the parameters in `like` drawn around the parameters on which they depend."""
         drawn = candidates.copy()
         for row, reference in self._pairs:
             middle, low, high, _ = self._interval(row, candidates[:, reference], parameters)
@@ -99,10 +100,10 @@ class LogNormal:
     def _interval(
         self, row: int, reference: NDArray[np.float64], parameters: Parameters
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
-        """Mean of the logarithm [n], and the bounds in standard deviations from there [n] each.
+        """Mean of the logarithm [n], and the distances of the bounds from it in standard deviations [n] each.
 
-        Returned too is 1 if the search space is that of the value, where exp(-residual^2 / 2) has another mean than in
-        that of the logarithm, else 0.
+        The last result is 1 if the search space is that of the value, where exp(-residual^2 / 2) has another mean than
+        in that of the logarithm, and otherwise 0.
         """
         item, spread = parameters.items[self.index[row]], self.spread[row]
         tilt = 0.0 if item.scale == "log" else 1.0
@@ -112,7 +113,7 @@ class LogNormal:
 
     @property
     def _pairs(self) -> tuple[tuple[int, int], ...]:
-        """Number of the prior and of the parameter that it is around."""
+        """Index of the prior, and of the parameter around which it is centred."""
         return tuple((self.index.index(parameter), reference) for parameter, reference in self.like)
 
     @property

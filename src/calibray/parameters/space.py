@@ -47,11 +47,12 @@ class Parameters:
     Attributes:
         items: The parameters, at least one.
         frequency: Carrier [Hz] at which laws are evaluated unless another one is given.
-        laws: Laws of materials of which a coefficient is a parameter, by material; the other coefficients keep the
-            values given here. The default is a law with the same constants at all frequencies.
+        laws: Laws of materials with a coefficient as parameter, by material; the other coefficients keep the values
+            given here. By default, the constants of a law are the same at all frequencies.
 
     Raises:
-        InputError: There is none, a name is repeated, or a constant and a coefficient of its law are both parameters.
+        InputError: There are no parameters, a name is repeated, or a constant and a coefficient of its law are both
+            parameters.
 
     Example:
         >>> wall = Parameter("walls.relative_permittivity", lower=1.0, upper=11.0, start=5.0)
@@ -142,7 +143,7 @@ class Parameters:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Constants that candidates set at one carrier, and their derivatives, each [..., parameters].
 
-        The carrier is `frequency` of the parameters if None. Two coefficients of one law have the same constant.
+        If None, the carrier is `frequency` of the parameters. Two coefficients of one law have the same constant.
 
         Raises:
             InputError: The candidates have another length.
@@ -164,8 +165,8 @@ class Parameters:
     def at_carrier(self, frequency: float) -> tuple[Parameters, NDArray[np.int64]]:
         """The constants that the parameters set at one carrier [Hz], as parameters themselves.
 
-        They have physical bounds alone if they follow a law. Returned too is the number of the constant that each of
-        these parameters sets [parameters].
+        If they follow a law, they have only physical bounds. The second result is the index of the constant that each
+        of these parameters sets [parameters].
         """
         if not self.has_laws:
             return self, np.arange(len(self))
@@ -181,7 +182,7 @@ class Parameters:
         return Parameters(tuple(constants.values()), frequency), np.array(indices, dtype=np.int64)
 
     def law_coefficients(self, candidate: ArrayLike) -> dict[str, dict[str, float]]:
-        """By material, both coefficients of each constant that has a coefficient among the parameters.
+        """For each material, both coefficients of each constant that has a coefficient among the parameters.
 
         Raises:
             InputError: The candidate has another length.
@@ -198,10 +199,10 @@ class Parameters:
         return coefficients
 
     def check_carriers(self, frequencies: Sequence[float]) -> None:
-        """Refuse bounds of laws within which a constant takes an impossible value at some carrier [Hz].
+        """Refuse bounds of laws that allow an impossible value of a constant at some carrier [Hz].
 
         Raises:
-            InputError: A law lies outside its constant's bound; the message names the carrier.
+            InputError: A law exceeds the bound of its constant; the message names the carrier.
         """
         for law in self._laws():
             scales = (law.fixed_scale,) if law.scale is None else self._bounds(law.scale)
@@ -236,7 +237,7 @@ class Parameters:
     ) -> dict[str, Material]:
         """All materials of `base`, in its order, with a candidate's values [parameters] at one carrier.
 
-        The carrier is `frequency` of the parameters if None.
+        If None, the carrier is `frequency` of the parameters.
 
         Raises:
             InputError: The candidate has another length, a value is physically impossible, or a material is unknown.
@@ -258,8 +259,8 @@ class Parameters:
     def matrix_indices(self, materials: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Row and column, in a matrix of constants [materials, fields], of each parameter of a material.
 
-        Replay scatters candidates with them: ``constants.at[..., rows, columns].set(candidates)``. Coefficients of laws
-        have no cell; take the parameters `at_carrier` first.
+        Replay uses them to insert candidates: ``constants.at[..., rows, columns].set(candidates)``. Coefficients of
+        laws have no cell; use the parameters of `at_carrier` for them.
 
         Raises:
             InputError: A parameter's material is not among them, or a parameter is a coefficient of a law.
@@ -282,8 +283,8 @@ class Parameters:
     ) -> NDArray[np.float64]:
         """The constants [..., materials, fields] of candidates [..., parameters] at one carrier.
 
-        Rows are in the order of `base`, columns in that of `FIELDS`. The carrier is `frequency` of the parameters if
-        None.
+        Rows are in the order of `base`, and columns in that of `FIELDS`. If None, the carrier is `frequency` of the
+        parameters.
 
         Raises:
             InputError: The candidates have another length, or a parameter's material is unknown.

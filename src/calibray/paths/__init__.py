@@ -1,4 +1,4 @@
-"""Paths: the path program, and the chains of interactions that any tracer hands over to make one."""
+"""Paths: the path program, and the chains of interactions from which any tracer makes one."""
 
 from typing import TYPE_CHECKING
 

@@ -1,10 +1,10 @@
 """Geometry of traced paths: from vertices and normals to the constants of the path program.
 
-The field of a path is a Jones vector. Each interaction has its own frame for it: first axis s = k x n / |k x n|
-(transverse electric), second axis k x s. Sionna RT expresses the field between interactions in the basis (theta, phi)
-of the direction of travel; here the two rotations, out of one frame and into the next, are merged into one. Sionna's
-conventions are followed (reference near the poles, orientation of normals and wedges, the mirrored direction instead of
-the traced one after a reflection), so that path gains also agree in phase.
+The field of a path is a Jones vector. Each interaction has its own frame for this vector: the first axis is s = k x n /
+|k x n| (transverse electric), and the second is k x s. Sionna RT expresses the field between interactions in the basis
+(theta, phi) of the direction of travel; here the two rotations, out of one frame and into the next, are combined.
+Sionna's conventions apply (reference near the poles, orientation of normals and wedges, the mirrored direction instead
+of the traced one after a reflection), so that path gains also agree in phase.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from calibray.paths.interactions import Diffraction, Diffuse, Kind
 
 @dataclass(frozen=True)
 class Chains:
-    """Paths as a tracer finds them, padded to the largest depth D.
+    """Paths as found by a tracer, padded to the largest depth D.
 
     Attributes:
         source: Start of every path [P, 3], [m].
         target: End of every path [P, 3], [m].
         vertex: Interaction points [P, D, 3], [m].
-        normal: Normals of the surfaces hit, on either side [P, D, 3].
+        normal: Normals of the hit surfaces, on either side [P, D, 3].
         kind: Kinds of interaction, 0 beyond the last one [P, D].
         material: Material of every interaction [P, D].
         probability: Probability with which the tracer chose the kind of interaction [P, D].
@@ -86,7 +86,7 @@ class Geometry:
 
 
 def compile_chains(chains: Chains) -> Geometry:
-    """Compute the geometry that the fields of traced paths depend on; interactions are in path order."""
+    """Compute the geometry that determines the fields of traced paths; interactions are in path order."""
     count, depth = chains.kind.shape
     present = chains.kind != 0
     length = present.sum(axis=1)
@@ -202,8 +202,8 @@ def spherical_basis(direction: NDArray[np.float64], pole_reference: bool = True)
 def transverse_electric(direction: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """First axis [..., 3] of the frame of incidence, k x n (ITU-R P.2040 section 2.2.2).
 
-    At normal incidence any transverse vector will do, because the transverse electric and magnetic coefficients then
-    describe the same reflection.
+    At normal incidence any transverse vector may be used, because the transverse electric and magnetic coefficients
+    then describe the same reflection.
     """
     cross = _cross(direction, normal)
     degenerate = _dot(cross, cross) < 1e-12

@@ -1,11 +1,11 @@
-"""Content of a path file: every dataset with its shape, type and range, all checked when a file is read; and its seal.
+"""Content of a path file: every dataset with its shape, type and range, checked on reading; and its seal.
 
 `docs/reference/path-file.md` explains the datasets.
 
-The seal is a checksum at the start of the file that is compared before anything else is read. HDF5 allows a user block
-in front of the file's content. It holds the SHA-256 of the content in one line of text. A damaged file can hang or
-crash the HDF5 library (among 3,000 files with flipped bits, one did each), so the library reads a file only if the
-checksum is right.
+The seal is a checksum at the start of the file, which is compared before anything else is read. HDF5 allows a user
+block in front of the file's content. The block contains the SHA-256 of the content in one line of text. A damaged file
+can hang or crash the HDF5 library (among 3,000 files with flipped bits, one did each), so the library reads a file only
+if the checksum is right.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ DATASETS: Final[Mapping[str, Dataset]] = MappingProxyType(
 OPTIONAL: Final[Mapping[str, Dataset]] = MappingProxyType(
     {"paths/correction": Dataset(("P",), "f", 1e-30, 1e30)}
 )
-"""Datasets that a file need not have."""
+"""Datasets that a file may omit."""
 
 
 def write(file: h5py.File, content: Content) -> None:
@@ -134,11 +134,11 @@ def write(file: h5py.File, content: Content) -> None:
 
 
 def read(file: h5py.File) -> Content:
-    """Read a path file and check all of it.
+    """Read a path file and check its whole content.
 
     Raises:
-        InputError: It has another format or version, or a dataset is missing, has another shape or type, or is out
-            of range; the message lacks the file's name.
+        InputError: It has another format or version, or a dataset is missing, has another shape or type, or is out of
+            range; the message omits the file's name.
     """
     if (name := file.attrs.get("format")) != FORMAT:
         raise InputError(f"is not a Calibray path file (attribute format = {name!r}, must be {FORMAT!r})")
@@ -178,7 +178,7 @@ def _settings(file: h5py.File) -> Iterator[tuple[str, object]]:
 
 
 def _array(file: h5py.File, name: str, dataset: Dataset) -> NDArray[Any]:
-    """One dataset. It must be stored in this file, contiguously, and not exceed the file's size."""
+    """One dataset. The dataset must be stored in this file, contiguously, and not exceed the file's size."""
     item, length = file.get(name), file.id.get_filesize()
     link = file.get(name, getlink=True)
     if not isinstance(item, h5py.Dataset) or not isinstance(link, h5py.HardLink):
@@ -290,7 +290,7 @@ def seal(path: str | Path) -> None:
 
 
 def write_checksum(partial: Path) -> str:
-    """Write the checksum into the empty user block of an HDF5 file; returns it in hexadecimal."""
+    """Write the checksum into the empty user block of an HDF5 file, and return it in hexadecimal."""
     with partial.open("r+b") as file:
         file.seek(BLOCK)
         block = _block(file)
@@ -300,10 +300,10 @@ def write_checksum(partial: Path) -> str:
 
 
 def verify(path: Path) -> str:
-    """Refuse a file whose content differs from the sealed one; returns its checksum in hexadecimal.
+    """Refuse a file whose content differs from the sealed one; return its checksum in hexadecimal.
 
     Raises:
-        InputError: The file is not a sealed HDF5 file, or was changed since; the message lacks its name.
+        InputError: The file is not a sealed HDF5 file, or has changed since; the message omits its name.
         OSError: The file cannot be read.
     """
     with path.open("rb") as file:
@@ -313,7 +313,7 @@ def verify(path: Path) -> str:
                 "has no checksum; trace again, or call calibray.paths.seal if you trust the file"
             )
         if not head.startswith(PATH_SEAL):
-            raise InputError("is damaged or no path file; trace again")
+            raise InputError("is damaged or not a path file; trace again")
         if _block(file) != head:
             raise InputError("is damaged (its checksum does not agree); trace again")
     return _digest(head)

@@ -1,13 +1,13 @@
 """The path program: traced paths in a form in which fields can be evaluated for any materials.
 
-A path is a transmit field, a chain of interactions, and a receive field. An interaction has all that its material acts
-through: the material, the cosine of the angle of incidence, the kind, and the real rotation from the frame of the
-previous interaction into its own (first axis k x n, transverse electric). The first rotation is part of the transmit
-field, the last one part of the receive field.
+A path is a transmit field, a chain of interactions, and a receive field. An interaction has everything that its
+material acts through: the material, the cosine of the angle of incidence, the kind, and the real rotation from the
+frame of the previous interaction into its own (first axis k x n, transverse electric). The first rotation is part of
+the transmit field, and the last one is part of the receive field.
 
-A path file of other origin is read first in a process with limits. The HDF5 library can hang or crash on a file whose
-content was changed and sealed again (5 of 3,000 such files did not end within a minute). A file that this user's
-Calibray wrote or validated before is known by its checksum and read at once.
+A path file from another source is first read in a process with limits. The HDF5 library can hang or crash on a file
+whose content was changed and sealed again (5 of 3,000 such files did not end within a minute). A file that this user's
+Calibray wrote or validated before is recognised by its checksum and read directly.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from calibray.support.messages import first_line
 from calibray.support.output_files import check_file, exists, replacing
 
 _WIDTH: Final = 80
-"""Longest line of the summary [characters]."""
+"""Largest length of a line of the summary [characters]."""
 
 
 @dataclass(frozen=True, repr=False)
 class Paths:
     """A traced campaign as a path program.
 
-    P paths, I interactions, L links, R receive and T transmit ports (2 for dual polarization, else 1).
+    P paths, I interactions, L links, R receive and T transmit ports (2 for dual polarization, otherwise 1).
 
     Attributes:
         frequency: Carrier frequency [Hz].
-        materials: The materials by name, as traced; `material` indexes them in this order.
+        materials: The materials by name, as in the trace; `material` indexes them in this order.
         tx_position: Transmitter of every link [L, 3], [m].
         rx_position: Receiver of every link [L, 3], [m].
         link: Link of every path [P], non-decreasing.
@@ -59,13 +59,13 @@ class Paths:
         material: Index of its material [I].
         cos_incidence: Cosine of the angle of incidence [I].
         rotation: (cos, sin) of the rotation from the previous frame into the interaction's own [I, 2].
-        vertex: Points of interaction [I, 3], [m], in single precision, or in double far from the origin, for drawing.
-            No field depends on them.
+        vertex: Points of interaction [I, 3], [m], for drawing; in single precision, or in double precision far from the
+            origin. No field depends on them.
         diffuse: Further constants of the diffuse interactions.
         diffraction: Further constants of the diffractions.
-        settings: How the paths were traced, for the record.
+        settings: How the paths were traced, for documentation.
         correction: Power of the path in the engine that found it over the power of its replay there [P]; the power of
-            the path is multiplied by it. None if the replay needs no correction.
+            the path is multiplied by this ratio. None if the replay needs no correction.
     """
 
     frequency: float
@@ -122,14 +122,14 @@ class Paths:
         return np.flatnonzero(np.bincount(self.link, minlength=self.num_links) == 0)
 
     def at(self, frequency: float, materials: Mapping[str, Material] | None = None) -> Paths:
-        """The same paths at another carrier, where the traced geometry is the same.
+        """The same paths at another carrier, at which the traced geometry is the same.
 
-        The share of the paths that diffuse reflection and refraction sample depends on the constants at the carrier of
-        the trace; the estimate stays unbiased at others.
+        Diffuse reflection and refraction sample a share of the paths that depends on the constants at the carrier of
+        the trace; the estimate stays unbiased at other carriers.
 
         Args:
             frequency: Carrier frequency [Hz].
-            materials: Constants at that carrier, by name; materials not named keep theirs.
+            materials: Constants at that carrier, by name; materials that are not named keep theirs.
 
         Returns:
             The program at that carrier.
@@ -142,7 +142,7 @@ class Paths:
         return replace(self, frequency=float(frequency), materials=self._with_materials(materials))
 
     def material_table(self, materials: Mapping[str, Material] | None = None) -> NDArray[np.float64]:
-        """Constants of the materials as a matrix [M, 8]; materials not named keep those of the trace.
+        """Constants of the materials as a matrix [M, 8]; materials that are not named keep the constants of the trace.
 
         Rows are in the order of `Paths.materials`, columns in that of `calibray.materials.FIELDS`.
 
@@ -170,7 +170,7 @@ class Paths:
         """Write an HDF5 file (format in docs/reference/path-file.md), readable by h5py and MATLAB.
 
         Args:
-            path: File to write; a path file there is replaced only once the new one is complete.
+            path: File to write; an existing path file is replaced only once the new one is complete.
             overwrite: Replace a file that Calibray did not write.
 
         Raises:
@@ -214,10 +214,10 @@ class Paths:
 
 
 def read_paths(file: str | Path) -> Paths:
-    """Read the path program of an HDF5 file, its checksum not compared.
+    """Read the path program of an HDF5 file without comparing its checksum.
 
     Raises:
-        InputError: It is not a path file, has another version, or is damaged; the message lacks its name.
+        InputError: It is not a path file, has another version, or is damaged; the message omits its name.
     """
     try:
         with h5py.File(file, "r") as stream:
@@ -225,7 +225,7 @@ def read_paths(file: str | Path) -> Paths:
     except InputError:
         raise
     except (OSError, KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
-        raise InputError(f"is damaged or no path file ({first_line(error)}); trace again") from None
+        raise InputError(f"is damaged or not a path file ({first_line(error)}); trace again") from None
 
 
 def _content(paths: Paths) -> Content:
@@ -334,7 +334,7 @@ _known_here: Final[set[str]] = set()
 
 
 def remember(digest: str) -> None:
-    """Note that this user's Calibray wrote or validated the file with a checksum."""
+    """Record that this user's Calibray wrote or validated the file with a checksum."""
     _known_here.add(digest)
     store = _known_files()
     if store is not None and store.trusted:
@@ -342,10 +342,10 @@ def remember(digest: str) -> None:
 
 
 def validate(file: Path, digest: str) -> None:
-    """Read a path file, whose checksum agrees, in another process, unless its checksum is known.
+    """Read a path file whose checksum is right, in another process unless the checksum is known.
 
     Raises:
-        InputError: The file is damaged, or reading it does not end; the message lacks its name.
+        InputError: The file is damaged, or reading it does not end; the message omits its name.
     """
     store = _known_files()
     if digest in _known_here or (store is not None and store.trusted and store.get(digest) is not None):
@@ -358,7 +358,7 @@ def validate(file: Path, digest: str) -> None:
             f"is damaged (the HDF5 library does not finish reading it {error}); trace again"
         ) from None
     if not is_read:
-        raise InputError("is damaged (the HDF5 library fails while it reads it); trace again")
+        raise InputError("is damaged (the HDF5 library fails while reading it); trace again")
     remember(digest)
 
 

@@ -36,7 +36,7 @@ def take(paths: Paths, index: NDArray[np.int64]) -> Paths:
 
 
 def take_links(paths: Paths, links: NDArray[np.int64]) -> Paths:
-    """The program of some links [n], in a given order; a link may be taken more than once."""
+    """The program of some links [n], in a given order; a link may be used more than once."""
     links = np.asarray(links, dtype=np.int64)
     start = np.searchsorted(paths.link, np.arange(paths.num_links + 1))
     count = np.diff(start)[links]
@@ -51,7 +51,7 @@ def take_links(paths: Paths, links: NDArray[np.int64]) -> Paths:
 
 
 def concatenate(parts: Sequence[Paths]) -> Paths:
-    """Join path programs of the same links, and sort their paths by link; within a link as in `parts`.
+    """Join path programs of the same links, and sort their paths by link; within a link, the order is that of `parts`.
 
     All share frequency, materials and link table.
     """
@@ -74,7 +74,7 @@ def concatenate(parts: Sequence[Paths]) -> Paths:
 def join_links(parts: Sequence[tuple[NDArray[np.int64], Paths]]) -> Paths:
     """Join path programs of different links, each with the indices of its links in the joined program.
 
-    Together they have every link once. All share frequency and materials; the settings are those of the first.
+    Together they contain every link once. All share frequency and materials; the settings are those of the first.
     """
     num_links = sum(len(links) for links, _ in parts)
     tx, rx = np.empty((num_links, 3)), np.empty((num_links, 3))

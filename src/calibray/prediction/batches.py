@@ -22,13 +22,13 @@ from calibray.support.progress import Progress, with_total
 from calibray.tracing.trace_plan import LANES_PER_SECOND
 
 BATCH: Final = 10_000
-"""Links that are traced and evaluated together."""
+"""Number of links that are traced and evaluated together."""
 
 DIFFUSE_BATCH: Final = 50
-"""The same with diffuse reflection, which gives tens of thousands of paths per link."""
+"""The same with diffuse reflection, which produces tens of thousands of paths per link."""
 
 CHUNKS_PER_BATCH: Final = 100
-"""Chunks that the workers are given together."""
+"""Number of chunks that the workers receive together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,17 +70,17 @@ def predict_links(
     Args:
         result: The calibration.
         setup: Its study, opened for the links.
-        level: Probability that the interval contains a measurement; None for path loss alone.
+        level: Probability that the interval contains a measurement; None for path loss without an interval.
         progress: Called with the stage "tracing" as links are traced.
         workers: Workers that predict chunks of links; None for this process.
         with_remarks: Whether positions are checked.
 
     Returns:
-        The table of `interval` with a column `remark`, empty where there is none or positions are not checked.
+        The table of `interval` with a column `remark`, empty if there is none or positions are not checked.
 
     Raises:
         InputError: What `interval` refuses.
-        EngineError: There are more paths than fit into memory, or workers fail repeatedly.
+        EngineError: The paths do not fit into memory, or workers fail repeatedly.
     """
     links = setup.links
     if workers is None and len(links) > batch_size(setup, None):
@@ -107,22 +107,22 @@ def predict_batches(
 ) -> Iterator[tuple[Measurements, pd.DataFrame]]:
     """Predict the links of a table batch by batch, so that memory does not grow with their number.
 
-    All rows are checked before any is traced.
+    All rows are checked before the first is traced.
 
     Args:
         result: The calibration.
-        table: The table, with the columns that `predict` takes.
-        level: Probability that the interval contains a measurement; None for path loss alone.
+        table: The table, with the columns that `predict` reads.
+        level: Probability that the interval contains a measurement; None for path loss without an interval.
         progress: Called with the stages "checking" and "tracing", the number of links done, and of all links.
         workers: Workers that predict chunks of links; None for this process.
-        allow_changed_inputs: Predict although a file of the scene or an antenna changed since the calibration.
+        allow_changed_inputs: Predict although a file of the scene or an antenna has changed since the calibration.
 
     Yields:
-        Links and their predictions, as `predict_links` returns them, in the order of the table.
+        Links and their predictions, as returned by `predict_links`, in the order of the table.
 
     Raises:
-        InputError: What `predict` and `predict_interval` refuse.
-        EngineError: There are more paths than fit into memory, or workers fail repeatedly.
+        InputError: See `predict` and `predict_interval`.
+        EngineError: The paths do not fit into memory, or workers fail repeatedly.
     """
     setup, done = None, 0
     for rows in table.pieces(BATCH):
@@ -163,7 +163,7 @@ LOG: Final = logging.getLogger(__name__)
 
 
 def announce(result: Record, links: int, what: str = "links") -> None:
-    """Log how many links are traced, and about how long that takes."""
+    """Log how many links are traced, and about how long this takes."""
     if result.prediction.model.parameters is None:
         LOG.info("%s %s, predicted without a trace: the log-distance model uses no scene", f"{links:,}", what)
         return
@@ -178,7 +178,7 @@ def announce(result: Record, links: int, what: str = "links") -> None:
 def _seconds(result: Record, links: int) -> float:
     """Estimated duration of a trace [s].
 
-    The calibration may have taken its trace from the cache, so the estimate from the number of rays is a lower limit.
+    The calibration may have read its trace from the cache, so the estimate from the number of rays is a lower limit.
     """
     settings = result.study.trace
     lanes = 0 if settings.adaptive else settings.rays * max(settings.max_depth, 1) * links

@@ -1,8 +1,8 @@
 """Coverage maps: path loss over an area with the calibrated scene, and its interval.
 
-Each cell is a link to its centre, predicted like any other link. Sionna's radio map solver averages over a cell
-instead, from the rays that cross it. In the demo district the two differ by more than 0.05 dB in 70 % of the cells, and
-by more than 0.7 dB in 10 % (`python benchmarks/coverage_map.py --solver`).
+Each cell is a link to its centre, which is predicted like any other link. Sionna's radio map solver instead averages
+over a cell, from the rays that cross it. In the demo district the two differ by more than 0.05 dB in 70 % of the cells,
+and by more than 0.7 dB in 10 % (`python benchmarks/coverage_map.py --solver`).
 """
 
 from __future__ import annotations
@@ -51,24 +51,25 @@ def coverage_map(
     workers: Workers | None = None,
     allow_changed_inputs: bool = False,
 ) -> CoverageMap:
-    """Predict path loss over an area, with the interval that contains a measurement there.
+    """Predict path loss over an area, with an interval for a measurement there.
 
     Args:
         result: The calibration.
-        tx: Position of the transmitter [3], [m]; that of the calibration if it had only one.
-        height: Height of the receivers above the ground, or above the scene's lowest point where it has none, [m].
+        tx: Position of the transmitter [3], [m]; if None, that of the calibration, if it had only one.
+        height: Height of the receivers above the ground or, where there is no ground, above the scene's lowest point
+            [m].
         cell: Width of the cells [m]; the receivers are at their centres.
         bounds: West, south, east and north of the area [4], [m]; those of the scene if None.
         level: Probability that the interval contains a measurement; None for no interval.
         power_dbm: Transmitted power for a map of received power [dBm]; a map of path loss if None. After a calibration
-            on RSRP it is 0 by default, because the offset contains the power.
-        samples: Number of rays instead of the study's; time is proportional to it, and too few miss paths. "auto" adds
-            rays until path loss has converged, which takes less time than a large number.
-        columns: Values of the study's columns of groups, carriers or nuisances for this transmitter, by name. The
-            group of an offset is taken from the links measured at this transmitter, if they have one.
+            on RSRP, the default is 0, because the offset contains the power.
+        samples: Number of rays, in place of the study's; the time is proportional to it, and too few rays miss paths.
+            "auto" adds rays until path loss has converged, which takes less time than a large number.
+        columns: Values of the study's columns of groups, carriers or nuisances for this transmitter, by name. The group
+            of an offset comes from the links measured at this transmitter, if they share one.
         progress: Called with the stage "tracing" after every launch.
         workers: Workers that trace and predict chunks of cells (`engines.open_workers`); this process if None.
-        allow_changed_inputs: Predict although a file of the scene or an antenna changed since the calibration.
+        allow_changed_inputs: Predict although a file of the scene or an antenna has changed since the calibration.
 
     Returns:
         The map.
@@ -76,7 +77,7 @@ def coverage_map(
     Raises:
         InputError: An argument is impossible, a column is missing, there would be more than a million cells, or
             `Result.predict_interval` refuses the links.
-        EngineError: There are more paths than fit into memory.
+        EngineError: The paths do not fit into memory.
     """
     if samples is not None:
         result = _with_samples(result, samples)

@@ -1,8 +1,8 @@
 """Design of the next measurements: candidates ranked by the uncertainty expected after measuring them.
 
-The posterior draws represent the possible values. In turn, each draw is taken as the truth, and the others are weighted
-by their agreement with the measurement that this truth would give. A candidate is ranked by the mean logarithm of the
-remaining standard deviations over draws and parameters (an A-optimal design in relative units, averaged over the
+The posterior draws represent the possible values. In turn, each draw is taken as the truth, and the other draws are
+weighted by their agreement with the measurement that this truth would give. A candidate is ranked by the mean logarithm
+of the remaining standard deviations over draws and parameters (an A-optimal design in relative units, averaged over the
 posterior; K. Chaloner and I. Verdinelli, Bayesian experimental design: a review, Statistical Science 10, 1995). The
 standard deviations are computed in two ways, and the logarithms added:
 
@@ -10,17 +10,17 @@ standard deviations are computed in two ways, and the logarithms added:
   whole range;
 - by curvature at each draw: this shows how much a single minimum narrows.
 
-Scatter hardly sees a range of a parameter with few draws. Where separate ranges of a parameter fit, the probability of
-ruling out all but one is therefore added to the rank. Values that explain the links so far lie in each range, each with
-its excess sum of squares over the best. At a candidate, the squared difference from the truth is added to it. The least
-sum in a range is what a fit would reach there with all other parameters free. A range is ruled out once its least sum
-exceeds that of the true range by the quantile of an interval. Between two models this is the T-optimal design of A. C.
-Atkinson and V. V. Fedorov, The design of experiments for discriminating between two rival models, Biometrika 62, 1975,
-with the expectation over the truth of G. E. P. Box and W. J. Hill, Discrimination among mechanistic models,
-Technometrics 9, 1967.
+Scatter shows little if a range of a parameter contains few draws. If separate ranges of a parameter fit, the
+probability of ruling out all but one is therefore added to the rank. Values that explain the links so far lie in each
+range, each with its excess sum of squares over the best. At a candidate, the squared difference from the truth is added
+to this excess. The smallest sum in a range is the value that a fit would reach there with all other parameters free. A
+range is ruled out if its smallest sum exceeds that of the true range by the quantile of an interval. Between two models
+this is the T-optimal design of A. C. Atkinson and V. V. Fedorov, The design of experiments for discriminating between
+two rival models, Biometrika 62, 1975, with the expectation over the truth of G. E. P. Box and W. J. Hill,
+Discrimination among mechanistic models, Technometrics 9, 1967.
 
-Candidates are chosen one after another. The part of the errors that candidates share, from an unknown offset or common
-clutter, is removed by conditioning after each choice, so that a second measurement at the same point is worth less.
+Candidates are chosen one after another. Candidates share part of their errors, from an unknown offset or common
+clutter. Conditioning after each choice removes this part, so that a second measurement at the same point gains less.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ UNIFORM_INFORMATION: Final = 12.0
 """Inverse variance of the uniform distribution over the unit interval: the information before any link."""
 
 LEAST_VARIANCE: Final = 1e-5
-"""Variance in the unit cube that scatter of about a hundred draws cannot resolve."""
+"""Variance in the unit cube that the scatter of about a hundred draws cannot resolve."""
 
 SEPARATION_WEIGHT: Final = 8.0
 """Weight of ruling out all ranges of a parameter but one, compared with narrowing it by a factor e."""
 
 RULED_OUT: Final = 4.3
-"""Excess of the sum of squares, in noise variances, that rules a range out: F(0.95; 1, about 20)."""
+"""Excess of the sum of squares, in noise variances, above which a range is ruled out: F(0.95; 1, about 20)."""
 
 EXCESS_DEVIATION: Final = 3.0
 """Standard deviation of the excess that the noise of the candidates causes, in noise variances."""
 
 BATCH: Final = 4_000_000
-"""Numbers per batch (draws times values times candidates), which bounds the memory."""
+"""Largest number of values per batch (draws times values times candidates), which limits the memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ class Outlook:
 
     Attributes:
         index: The candidate.
-        narrowed: Standard deviation of every parameter relative to that before any candidate [d]; at most 1.
+        narrowed: Standard deviation of every parameter relative to its value before any candidate [d]; at most 1.
         range_probability: Probability of knowing in which of its separate ranges a parameter lies [d]; 1 for one range.
     """
 
@@ -102,7 +102,7 @@ class Outlook:
 
 @dataclass(frozen=True, eq=False)
 class Beliefs:
-    """What the calibration says before any candidate is measured.
+    """The state of the calibration before any candidate is measured.
 
     Attributes:
         point: Draws from the posterior in the unit cube [n, d].
@@ -135,7 +135,8 @@ def choose_candidates(
         count: Number of candidates to choose.
 
     Returns:
-        The candidates in the order of their choice, each with the uncertainty expected after it and those before.
+        The candidates in the order of their choice, each with the expected uncertainty after measuring it and the
+        earlier ones.
     """
     prior_information = UNIFORM_INFORMATION * np.eye(beliefs.point.shape[1])
     beliefs = replace(beliefs, information=beliefs.information + prior_information)
@@ -197,7 +198,7 @@ def separation_probability(
     squares: NDArray[np.float64],
     predicted: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Probability of ruling out all ranges of a parameter but one, once a candidate is measured.
+    """Probability of ruling out all ranges of a parameter but one, after a candidate is measured.
 
     Args:
         excess: Sum of squares of every value above the least, in noise variances [m]; the first n values are the draws.
@@ -234,7 +235,7 @@ def _others_ruled_out(total: NDArray[np.float64], piece: NDArray[np.int64]) -> N
 def _rank_by_scatter(
     point: NDArray[np.float64], squares: NDArray[np.float64], predicted: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Mean logarithm of the draws' standard deviations once a candidate is measured [candidates]."""
+    """Mean logarithm of the draws' standard deviations after a candidate is measured [candidates]."""
     draws, candidates = predicted.shape
     rank, size = np.empty(candidates), max(BATCH // draws**2, 1)
     for start in range(0, candidates, size):
@@ -247,7 +248,7 @@ def _rank_by_scatter(
 
 
 def _rank_by_curvature(information: NDArray[np.float64], slope: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean logarithm of the standard deviations by curvature once a candidate is measured [candidates]."""
+    """Mean logarithm of the standard deviations by curvature after a candidate is measured [candidates]."""
     covariance = np.linalg.inv(information)
     # Sherman-Morrison: the inverse after adding one row of slopes.
     gain = slope @ covariance
@@ -265,7 +266,7 @@ def _scatter(point: NDArray[np.float64], squares: NDArray[np.float64]) -> NDArra
 
 
 def _by_curvature(information: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Expected standard deviation of every parameter by the information matrices at the draws [d]."""
+    """Expected standard deviation of every parameter from the information matrices at the draws [d]."""
     return np.sqrt(np.diagonal(np.linalg.inv(information), axis1=1, axis2=2)).mean(axis=0)
 
 
@@ -276,6 +277,6 @@ def _range_probability(piece: NDArray[np.int64], squares: NDArray[np.float64]) -
 
 
 def _weights(squares: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weights of the draws [..., n, n]: each row takes its own draw as the truth."""
+    """Weights of the draws [..., n, n]; each row takes its own draw as the truth."""
     weight = np.exp(-0.5 * squares)
     return weight / weight.sum(axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Predictions for links that no path reaches: the log-distance model, marked, with its own interval."""
+"""Predictions for links without a path: the log-distance model, marked, with its own interval."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def fill_missing(
     level: float | None = None,
     least_db: NDArray[np.float64] | float = 0.0,
 ) -> pd.DataFrame:
-    """Predict the links that no path reaches by the fallback.
+    """Predict the links without a path by the fallback.
 
     Args:
         prediction: The prediction model and its fallback.
@@ -31,7 +31,8 @@ def fill_missing(
         links: The links.
         table: Their predictions: path_loss_db, infinite without a path, basis and, with a level, lower_db and upper_db.
         level: Probability that the interval contains a measurement; None for no interval.
-        least_db: Half the width of the prediction model's interval [links], [dB]; the fallback's is not narrower.
+        least_db: Half the width of the prediction model's interval [links], [dB]; the fallback's interval is at least
+            as wide.
 
     Returns:
         The table, with the fallback's predictions for links without a path; unchanged if there are none.

@@ -36,7 +36,7 @@ WIDTH_COLORS: Final = "cividis"
 """Matplotlib's colour scales that keep their order for colour-blind readers and in grey; strong signals are bright."""
 
 QUANTILES: Final = (0.02, 0.98)
-"""Quantiles of the cells' values at which the colour scale ends, so that few extreme values do not flatten it."""
+"""Quantiles of the cells' values at which the colour scale ends, so that few extreme values do not compress it."""
 
 
 @final
@@ -51,14 +51,14 @@ class CoverageMap:
         x: Eastings of the cells' centres, ascending [nx], [m].
         y: Northings of the cells' centres, ascending [ny], [m].
         z: Heights of the receivers [ny, nx], [m].
-        path_loss_db: Path loss with nuisances [ny, nx], [dB]; that of the log-distance model where no path leads. NaN
-            at the transmitter, and inside buildings where no path leads.
+        path_loss_db: Path loss with nuisances [ny, nx], [dB]; for cells without a path, that of the log-distance model.
+            NaN at the transmitter, and inside buildings for cells without a path.
         lower_db: Lower end of the interval [ny, nx], [dB]; NaN without a prediction or without a level.
         upper_db: Upper end of the interval [ny, nx], [dB].
-        no_path: Cells predicted by the log-distance model, since no path leads there [ny, nx].
+        no_path: Cells predicted by the log-distance model, because they have no path [ny, nx].
         level: Probability that the interval contains a measurement; None for a map without interval.
         power_dbm: Transmitted power of a map of received power [dBm]; None for a map of path loss.
-        frame: Position of the scene on the globe; None where it is unknown.
+        frame: Position of the scene on the globe; None if unknown.
         triangles: The scene, for drawing.
         observables: Further observables of the study by name and unit, such as spread_ns [ny, nx].
     """
@@ -107,7 +107,7 @@ class CoverageMap:
         """Write the map as GeoTIFF, picture and table.
 
         Args:
-            folder: Folder to write `map.tif`, `map.png` and `map.csv` into; made if absent.
+            folder: Folder to write `map.tif`, `map.png` and `map.csv` into; created if absent.
             inputs: Files that the calculation reads; none of them is ever replaced.
             overwrite: Replace files that Calibray did not write.
 
@@ -133,7 +133,7 @@ class CoverageMap:
 
 
 def geotiff(coverage: CoverageMap, path: Path) -> None:
-    """Write a map as a GeoTIFF, north up: one band per layer and observable, then 1 where no path leads, else 0.
+    """Write a map as a GeoTIFF, north up: one band per layer and observable, then 1 for cells without a path, else 0.
 
     Args:
         coverage: The map. Without a frame, coordinates are those of the scene, and no reference system is declared.

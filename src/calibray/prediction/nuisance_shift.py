@@ -1,4 +1,4 @@
-"""The nuisance at new links: what it adds to path loss, and how uncertain it is for groups without measurements."""
+"""The contribution of the nuisance at new links, and its uncertainty for groups without measurements."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Shift(NamedTuple):
 
     Attributes:
         value_db: With the best coefficients, then with each draw [1 + draws, links], [dB].
-        spread_db: Standard deviation at links of groups without a coefficient, else 0 [links], [dB].
+        spread_db: Standard deviation at links of groups without a coefficient, otherwise 0 [links], [dB].
     """
 
     value_db: NDArray[np.float64]
@@ -78,8 +78,8 @@ def nuisance_shift(
 ) -> Shift:
     """The contribution of nuisance terms to the path loss of new links.
 
-    A group without a coefficient gets the mean of the others. Its spread is their standard deviation s, enlarged by the
-    uncertainty of a mean of n values: s sqrt(1 + 1 / n).
+    A group without a coefficient gets the mean of the other coefficients. Its spread is their standard deviation s,
+    enlarged by the uncertainty of a mean of n values: s sqrt(1 + 1 / n).
 
     Args:
         terms: The terms.

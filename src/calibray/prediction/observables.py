@@ -25,7 +25,8 @@ from calibray.study import Study
 from calibray.study.mounting import PORT_POWER, states_port_power
 
 MOST_DRAWS: Final = 64
-"""Most posterior draws for the width of an interval; the error of a standard deviation from them is 9 %."""
+"""Largest number of posterior draws for the width of an interval; the error of a standard deviation from them is 9
+%."""
 
 
 class Replayed(NamedTuple):
@@ -45,7 +46,7 @@ def observable_columns(study: Study, level: float | None) -> tuple[str, ...]:
 
     Args:
         study: The study.
-        level: Probability of an interval; None for values alone.
+        level: Probability of an interval; None for values without an interval.
 
     Returns:
         The names; empty without further observables.
@@ -59,12 +60,12 @@ def further_observables(
 ) -> dict[str, NDArray[np.float64]]:
     """Further observables at opened links [links] by column name; without the biases of devices.
 
-    The interval has two parts: the errors of single values, on held-out links where there are any, and the draws.
+    The interval has two parts: the errors of single values, from held-out links if there are any, and the draws.
 
     Args:
         result: The calibration.
         replayed: The engine over the links; None if the prediction model uses no scene.
-        level: Probability that an interval contains a measurement; None for values alone.
+        level: Probability that an interval contains a measurement; None for values without an interval.
 
     Returns:
         The columns; empty without further observables, or without a scene.
@@ -92,14 +93,14 @@ def further_observables(
 
 
 CHOICES: Final = (DELAY_SPREAD, EXCESS_DELAY, K_FACTOR, DEPARTURE_SPREAD, ARRIVAL_SPREAD)
-"""Observables that depend on materials without a bias of devices."""
+"""Observables that depend on materials and have no bias of devices."""
 
 RELATIVE_ERROR: Final = 0.1
-"""Expected error of a spread or an excess delay that the study lacks, relative to its root mean square. In downtown
-Boulder delay spreads vary by 3 % in sight and by 15 % out of sight when the receiving array turns."""
+"""Expected error of a spread or an excess delay that the study does not contain, relative to its root mean square. In
+downtown Boulder, delay spreads vary by 3 % in sight and by 15 % out of sight when the receiving array turns."""
 
 ERROR_DB: Final = 1.0
-"""Expected error of a K-factor that the study lacks [dB]."""
+"""Expected error of a K-factor that the study does not contain [dB]."""
 
 
 class Worth(NamedTuple):
@@ -107,7 +108,7 @@ class Worth(NamedTuple):
 
     Attributes:
         kind: The observable.
-        narrowed: Expected standard deviation of every parameter, relative to that with path loss alone [d].
+        narrowed: Expected standard deviation of every parameter, relative to its value with path loss alone [d].
     """
 
     kind: str
@@ -126,7 +127,7 @@ def worth_measuring(
     Args:
         result: The calibration.
         engine: The replay of the candidates.
-        draws: Draws of the parameters, and their derivatives by the coordinates of the unit cube [n, d].
+        draws: Draws of the parameters, and their derivatives with respect to the coordinates of the unit cube [n, d].
         index: The suggested candidates, the best first [suggestions].
         information: Information matrices with path loss of each suggestion and those above it [suggestions, n, d, d].
 
@@ -165,7 +166,7 @@ def _deviation(information: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
-    """Predictions in the quantity that the study's links were measured in.
+    """Predictions in the measured quantity of the study's links.
 
     Args:
         study: The study.
@@ -192,7 +193,7 @@ def as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[
 
 
 def _reference_level(study: Study, links: Measurements) -> NDArray[np.float64] | None:
-    """The level that path loss is subtracted from [links], [dBm] or [dB]; None where it is unknown."""
+    """The level from which path loss is subtracted [links], [dBm] or [dB]; None if unknown."""
     section = study.links
     if section.quantity == "path_loss":
         return None

@@ -17,10 +17,10 @@ UNDER: Final = "under the ground"
 INSIDE: Final = "inside a building"
 
 CLEARANCE: Final = 0.05
-"""Height above an antenna from which a surface counts as above it [m]."""
+"""Height above an antenna beyond which a surface counts as above it [m]."""
 
 PAIRS: Final = 5_000_000
-"""Triangles times points that are compared at a time; each pair takes some 100 bytes."""
+"""Number of triangles times points that are compared at a time; each pair needs some 100 bytes."""
 
 POSITION_COLUMNS: Final = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
 """Columns of a table of links with the positions of both ends [m]."""
@@ -29,7 +29,7 @@ POSITION_COLUMNS: Final = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
 def remarks(result: Record, setup: Setup) -> NDArray[np.str_]:
     """Remarks on the positions of links.
 
-    Indoors, where most calibrated receivers are inside a building, that remark is omitted.
+    Indoors, if most calibrated receivers are inside a building, that remark is omitted.
 
     Returns:
         A remark for every link [links]; empty where the positions are plausible.

@@ -1,4 +1,4 @@
-"""Path loss at new links with the calibrated scene and nuisances, and the interval of a measurement there."""
+"""Path loss at new links with the calibrated scene and nuisances, and an interval for a measurement there."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ NEIGHBOURS: Final = (0.125, 0.5)
 """Distances of the displaced antennas that are traced, as shares of the largest displacement: 1 and 4 m of 8 m."""
 
 NEAR_SHARE: Final = 0.1
-"""Share of the residual field's variance that measured links explain, above which a link is near measured links."""
+"""Share of the residual field's variance explained by measured links above which a link is near measured links."""
 
 
 def predict(
@@ -49,18 +49,18 @@ def predict(
 
     Args:
         result: The calibration.
-        links: The links, or a table with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], or with those that
-            the study names for positions, and with its group column, if it has one. The study's column of
-            frequencies gives the carriers; without it all links have the scene's.
+        links: The links, or a table with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], or with the position
+            columns that the study names, and with its group column, if it has one. The study's column of frequencies
+            gives the carriers; without it, all links have the scene's carrier.
         progress: Called with the stage "tracing" after every launch.
-        allow_changed_inputs: Predict although a file of the scene or an antenna changed since the calibration.
+        allow_changed_inputs: Predict although a file of the scene or an antenna has changed since the calibration.
 
     Returns:
-        Path loss with nuisances [links], [dB]; that of the fallback for a link that no path reaches.
+        Path loss with nuisances [links], [dB]; for a link without a path, that of the fallback.
 
     Raises:
         InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of the
-            scene or an antenna changed since the calibration.
+            scene or an antenna has changed since the calibration.
     """
     setup = open_for_links(result, as_links(result, links), allow_changed_inputs=allow_changed_inputs)
     return interval(result, setup, None, progress)["path_loss_db"].to_numpy()
@@ -74,27 +74,27 @@ def predict_interval(
     *,
     allow_changed_inputs: bool = False,
 ) -> pd.DataFrame:
-    """Predict path loss at new links, with the interval that contains a measurement there.
+    """Predict path loss at new links, with an interval for a measurement there.
 
-    The width of the interval has three parts: the residuals of single links, on held-out links where the calibration
-    has any; the draws of the parameters; and for groups without measurements the spread between groups.
+    The width of the interval has three parts: the residuals of single links, from held-out links if the calibration has
+    any; the draws of the parameters; and for groups without measurements, the spread between groups.
 
     Args:
         result: The calibration.
-        links: The links, or a table, as for `predict`; groups need not have been measured.
+        links: The links, or a table, as for `predict`; their groups need no measurements.
         level: Probability that the interval contains a measurement.
         progress: Called with the stage "tracing" after every launch.
-        allow_changed_inputs: Predict although a file of the scene or an antenna changed since the calibration.
+        allow_changed_inputs: Predict although a file of the scene or an antenna has changed since the calibration.
 
     Returns:
-        One row per link: path_loss_db, lower_db, upper_db [dB] and basis, the source of the interval. Where no path
-        leads, basis begins with "no path", and the log-distance model predicts. If the study measured another quantity,
-        the three follow in it. The last column is a remark on ends beyond the scene, under the ground or inside a
-        building.
+        One row per link: path_loss_db, lower_db, upper_db [dB] and basis, the source of the interval. For a link
+        without a path, basis begins with "no path", and the log-distance model predicts. If the study measured another
+        quantity, the three values follow in that quantity. The last column is a remark on ends outside the scene, under
+        the ground or inside a building.
 
     Raises:
-        InputError: What `predict` refuses except unknown groups, the level is not between 0 and 1, or the
-            calibration had too few links to estimate the size of residuals.
+        InputError: `predict` would refuse the input, except for unknown groups; the level is not between 0 and 1; or
+            the calibration had too few links to estimate the size of residuals.
     """
     setup = open_for_links(result, as_links(result, links), allow_changed_inputs=allow_changed_inputs)
     table = interval(result, setup, level, progress)
@@ -128,13 +128,14 @@ def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs:
     Args:
         result: The calibration.
         links: The links.
-        allow_changed_inputs: Open it although a file of the scene or an antenna changed since the calibration.
+        allow_changed_inputs: Open the study although a file of the scene or an antenna has changed since the
+            calibration.
 
     Returns:
         The opened study.
 
     Raises:
-        InputError: The scene or the parameters cannot be used, or such a file changed.
+        InputError: The scene or the parameters cannot be used, or one of these files has changed.
     """
     setup = Setup.open(result.study, links=links).placed_at(result.parameters, NEIGHBOURS)
     check_inputs(result, setup, allow_changed_inputs)
@@ -146,11 +147,12 @@ def traced_materials(result: Record, materials: dict[str, Material] | None) -> d
 
     Args:
         result: The calibration.
-        materials: Materials that the paths are evaluated with.
+        materials: Materials with which the paths are evaluated.
 
     Returns:
-        None if the paths do not depend on the materials, so that one cached trace serves for all of them: the tracer
-        samples only refraction and diffuse reflection by the materials. The powers of a program's rays depend on them.
+        None if the paths do not depend on the materials, so that one cached trace can be used for all of them: the
+        tracer samples only refraction and diffuse reflection by the materials. The powers of a program's rays depend on
+        the materials.
     """
     trace, rays = result.study.trace, result.study.engine.exports_rays
     return materials if trace.refraction or trace.diffuse_reflection or rays else None
@@ -168,7 +170,7 @@ def check_groups(result: Record, links: Measurements) -> None:
 
 
 def _with_columns(result: Record, setup: Setup) -> Setup:
-    """The study with the columns that follow from the scene, if the prediction model has terms by them."""
+    """The study with the columns that follow from the scene, if terms of the prediction model need them."""
     model = result.prediction.model
     used = any({term.by, term.per} & {*OBSTRUCTION, CLUSTER} for term in model.terms)
     differ = model.blocks is not None and model.blocks.out_of_sight > 1
@@ -178,12 +180,12 @@ def _with_columns(result: Record, setup: Setup) -> Setup:
 def interval(
     result: Record, setup: Setup, level: float | None = 0.9, progress: Progress | None = None
 ) -> pd.DataFrame:
-    """Predict path loss and its interval at links that are opened already.
+    """Predict path loss and its interval at links that are already opened.
 
     Args:
         result: The calibration.
         setup: Its study, opened for the links.
-        level: Probability that the interval contains a measurement; None for path loss alone.
+        level: Probability that the interval contains a measurement; None for path loss without an interval.
         progress: Called with the stage "tracing" after every launch.
 
     Returns:
@@ -250,10 +252,10 @@ def interval(
 
 
 def _quantiles(model: PredictionModel, level: float) -> tuple[float, float]:
-    """Quantile of Student's t for errors of links, and that for errors of blocks, relative to it.
+    """Quantile of Student's t for errors of links, and the quantile for errors of blocks relative to it.
 
-    Both are estimates with their own degrees of freedom. Blocks have as many as there are blocks, because their mean
-    errors count from zero.
+    Both variances are estimates with their own degrees of freedom. Blocks have as many degrees of freedom as there are
+    blocks, because their mean errors are deviations from zero.
     """
     count = 0 if model.blocks is None else model.blocks.blocks
     factor = float(stdtrit(max(model.links - count, 1), (1 + level) / 2))
@@ -263,9 +265,9 @@ def _quantiles(model: PredictionModel, level: float) -> tuple[float, float]:
 def _residual_db(result: Record, links: Measurements, ratio: float) -> NDArray[np.float64]:
     """Standard deviation of the prediction model's errors at new links [links], [dB]; between blocks times a ratio.
 
-    Beyond the distance that held-out links kept from the others, the error between blocks counts up to twice: a place
-    that far away differs from the blocks as these differ from each other. What random effects add to these errors is
-    taken out, because `nuisance_shift` adds their spread where a link's group is new.
+    Beyond the distance that held-out links had from the others, the error between blocks counts up to twice: a place
+    that far away differs from the blocks as these differ from each other. The contribution of random effects to these
+    errors is subtracted, because `nuisance_shift` adds their spread where a link's group is new.
     """
     model = result.prediction.model
     if model.blocks is None or not set(POSITION_COLUMNS) <= set(result.links):
@@ -303,7 +305,8 @@ def with_constants(result: Record, setup: Setup) -> Setup:
 def _draws(result: Record) -> dict[str, list[float]]:
     """Draws from the posterior, whose spread widens the intervals of predictions.
 
-    They are of the calibrated model. Errors of a model on held-out blocks include the uncertainty of its parameters.
+    They belong to the calibrated model. Errors of a model on held-out blocks already include the uncertainty of its
+    parameters.
     """
     calibrated = result.prediction.model.name == Model.CALIBRATED and result.held_out is None
     return result.uncertainty.draws if calibrated else {}

@@ -1,8 +1,8 @@
 """The residual field: the correlated part of the calibration residuals, kriged to nearby links.
 
-Clutter that the scene lacks affects neighbouring links alike, so that the residual near a measured link is partly
+Clutter that the scene lacks affects neighbouring links in the same way, so the residual near a measured link is partly
 known. The correlated part has an exponential covariance whose range and size maximize the restricted likelihood
-(`uncertainty.residual_correlation.fit_correlation`). Far from all measured links the field is zero and explains
+(`uncertainty.residual_correlation.fit_correlation`). Far from all measured links, the field is zero and explains
 nothing.
 """
 
@@ -20,13 +20,14 @@ from scipy.spatial.distance import cdist
 from calibray.result.held_out import ResidualField
 
 MOST_EXACT: Final = 1000
-"""Most measured links that are all used at every new link; with more, only the nearest ones are used."""
+"""Number of measured links up to which all of them are used at every new link; with more, only the nearest ones are
+used."""
 
 NEAREST: Final = 50
 """Number of nearest measured links used at each new link."""
 
 TOGETHER: Final = 500
-"""New links whose neighbours are solved for together; each takes some 150 kB."""
+"""Number of new links whose neighbours are solved for together; each needs some 150 kB."""
 
 
 def krige_residuals(
@@ -45,7 +46,7 @@ def krige_residuals(
 
     Returns:
         Correction of the modelled path loss [n], [dB], and the share of the field's variance that the measured links
-        explain, 0 far from all of them and below 1 near one [n].
+        explain, which is 0 far from all of them and below 1 near one [n].
     """
     if len(measured) <= MOST_EXACT:
         return _krige(field, measured, residuals, position)

@@ -34,13 +34,13 @@ from calibray.support.progress import Progress
 from calibray.uncertainty.residual_correlation import Correlation, shared_errors
 
 MOST_DRAWS: Final = 96
-"""Most posterior draws that the candidates are ranked by."""
+"""Largest number of posterior draws by which the candidates are ranked."""
 
 VALUES_PER_RANGE: Final = 24
-"""Further values in each separate range of a parameter, since few draws lie in some ranges."""
+"""Number of further values in each separate range of a parameter, because few draws lie in some ranges."""
 
 LEAST_GAIN: Final = 0.02
-"""Least narrowing of an interval, relative to its width, or gain in probability that is reported as text."""
+"""Smallest narrowing of an interval, relative to its width, or gain in probability that is reported as text."""
 
 
 def suggest(
@@ -54,29 +54,29 @@ def suggest(
 ) -> pd.DataFrame:
     """Suggest where to measure next, by the expected narrowing of the parameters' intervals.
 
-    Each candidate is traced and replayed for draws from the posterior. Where the draws predict the same path loss, a
-    measurement adds nothing; where they differ by more than the error of a link, it rules some of them out. Candidates
-    are chosen one after another, each as the best in addition to those before.
+    Each candidate is traced and replayed for draws from the posterior. If the draws predict the same path loss, a
+    measurement adds nothing; if they differ by more than the error of a link, it rules some of them out. Candidates are
+    chosen one after another, each as the best addition to the earlier ones.
 
     Args:
         result: The calibration, on the engine "replay" or "retrace", with draws from the posterior.
         candidates: Possible measurements: links, or a table, as for `Result.predict`.
         count: Number of suggestions.
         progress: Called with the stage "tracing" after every launch.
-        allow_changed_inputs: Continue although a file of the scene or an antenna changed since the calibration.
-        observables: Also say which further observable is worth measuring there.
+        allow_changed_inputs: Continue although a file of the scene or an antenna has changed since the calibration.
+        observables: Also report which further observable is worth measuring there.
 
     Returns:
         One row per suggestion, the best first: the candidate's row, its positions [m] and group; path_loss_db and
         spread_db, mean and standard deviation of the draws' predictions [dB]; NAME_width for every parameter, the
         expected width of its 95 % interval once this candidate and those above are measured; NAME_sure, where several
         ranges fit, the expected probability of knowing the right one; and gain, a summary as text. With `observables`
-        also observable, the one that narrows the intervals most if it is measured besides path loss at this candidate
+        also observable, which narrows the intervals most if it is measured in addition to path loss at this candidate
         and those above, and observable_gain, a summary as text.
 
     Raises:
-        InputError: What `Result.predict` refuses except unknown groups, the calibration has no draws, or no candidate
-            has a path.
+        InputError: `Result.predict` would refuse the input, except for unknown groups; the calibration has no draws; or
+            no candidate has a path.
     """
     if count < 1:
         raise InputError(f"count = {count}: must be at least 1")
@@ -154,7 +154,7 @@ class _ReplayedDraws:
         self.evaluation = self.problem.evaluate(parameters.to_search(self.values), derivatives=True)
 
     def beliefs(self) -> Beliefs:
-        """What the calibration says before any candidate is measured."""
+        """The state of the calibration before any candidate is measured."""
         evaluation, draws = self.evaluation, slice(self.num_draws)
         square = evaluation.value**2 * evaluation.num_rows / self.noise_db**2
         unit = (self.problem.parameters.to_search(self.values[draws]) - self.lower) / self.width
@@ -189,7 +189,7 @@ class _ReplayedDraws:
         """Further observables at suggested candidates; see `worth_measuring`.
 
         Raises:
-            InputError: The engine gives path loss only.
+            InputError: The engine computes only path loss.
         """
         engine, values = self._engine(setup), self.values[: self.num_draws]
         section = setup.study.engine
@@ -290,7 +290,7 @@ class _ReplayedDraws:
         return share * at_links.value[:, None], unknown
 
     def _correlation(self) -> Correlation | None:
-        """Correlation of the residuals of neighbouring links; None where they show none."""
+        """Correlation of the residuals of neighbouring links; None if there is none."""
         problem, objective = self.problem, self.problem.objective
         known = dict(zip(problem.parameters.names, problem.parameters.start, strict=True))
         values = np.array([list((known | self.result.parameters).values())])
@@ -347,7 +347,7 @@ def _table(
 
 
 def _gain(result: Record, narrowed: NDArray[np.float64]) -> str:
-    """What an observable adds, as text."""
+    """The gain from an observable, as text."""
     gains = [
         f"{name} to {ratio:.2g} of its width"
         for name, ratio in zip(result.study.parameters, narrowed, strict=False)
@@ -357,10 +357,10 @@ def _gain(result: Record, narrowed: NDArray[np.float64]) -> str:
 
 
 def _width(result: Record, name: str, narrowed: float) -> float:
-    """Width of a parameter's interval once the draws are narrowed by a factor, on the scale of the search.
+    """Width of a parameter's interval after the draws are narrowed by a factor, on the scale of the search.
 
-    The draws are those of the buildings that the links meet. How much other buildings differ is not known better
-    afterwards, so that this part of the width remains.
+    The draws refer to the buildings that the links meet. The measurement does not show how much other buildings differ,
+    so this part of the width remains.
     """
     section, interval = result.study.parameters[name], result.intervals.get(name)
     ends = np.array(section.bounds if interval is None else (interval.lower, interval.upper), dtype=float)

@@ -19,14 +19,14 @@ from calibray.uncertainty.residual_correlation import variogram
 from calibray.validation.held_out_statistics import spatial_blocks
 
 CLASSES: Final = 6
-"""Most classes of distance, each with about as many links as the others."""
+"""Largest number of classes of distance, with about the same number of links each."""
 
 MOST_UNKNOWNS: Final = 300
-"""Most unknowns whose draws are compared pair by pair."""
+"""Largest number of unknowns whose draws are compared pair by pair."""
 
 
 FEWEST: Final = 8
-"""Fewest links for which trends are tested."""
+"""Smallest number of links for which trends are tested."""
 
 STREETS: Final = 12
 """Most groups of neighbouring receivers."""
@@ -133,7 +133,7 @@ def _by_obstruction(result: Record) -> pd.DataFrame:
 
 
 def _by_street(result: Record) -> pd.DataFrame:
-    """Groups of neighbouring receivers, named by the position of their middle."""
+    """Groups of neighbouring receivers, named by the position of their centre."""
     links, residuals = calibration_links(result)
     ends = _ends(links)
     if ends is None or len(residuals) < 2 * FEWEST:
@@ -171,7 +171,7 @@ def _missing_region(result: Record) -> pd.DataFrame:
 
 @lru_cache(maxsize=4)
 def _searched(rows: bytes) -> MissingRegion | None:
-    """The search over links: both ends, excess loss and whether out of sight. A page and its figures take it twice."""
+    """The search over links: both ends, excess loss and whether out of sight. A page and its figures use it twice."""
     links = np.frombuffer(rows).reshape(-1, 8)
     return missing_region(links[:, :3], links[:, 3:6], links[:, 6], [links[:, 7]])
 

@@ -29,7 +29,7 @@ FILES: Final = (
     "scene.xml", "load_scene.py", "calibration.json", "links.csv", "materials.csv", "materials.json", "materials.m",
 )  # fmt: skip
 VERIFIED_LINKS: Final = 3
-"""Links whose path loss is compared before an export is done."""
+"""Number of links whose path loss is compared before an export is finished."""
 
 SOLVER: Final = {"line_of_sight": "los", "samples": "samples_per_src"}
 """Settings that have another name in Sionna RT's path solver."""
@@ -59,12 +59,12 @@ def export(
         overwrite: Replace files that Calibray did not write.
 
     Returns:
-        Names of the files in the folder. `wording.scene_alone_text` says how far the scene alone is from the
+        Names of the files in the folder. `wording.scene_alone_text` describes how far the scene alone is from the
         predictions.
 
     Raises:
-        InputError: The folder cannot be written, a file in it must not be replaced, the scene or the links cannot be
-            read any more, or Sionna RT loads another scene than the calibrated one.
+        InputError: The folder cannot be written, a file in it must not be replaced, the scene or the links can no
+            longer be read, or Sionna RT loads another scene than the calibrated one.
     """
     study = result.study
     target = check_outputs(folder, FILES, study.files(), overwrite)
@@ -74,7 +74,7 @@ def export(
     links = survey(result)
     if links is None:
         raise InputError(
-            f"{study.path}: its links {study.links.file} cannot be read any more; restore the file"
+            f"{study.path}: its links {study.links.file} can no longer be read; restore the file"
         )
     positions = {
         f"{end}_{axis}": position[:, k]
@@ -107,7 +107,7 @@ def export(
 
 
 def _verify(scene: Scene, result: Record, target: Path, links: Survey) -> None:
-    """Load the written scene as the user will, and compare it with the calibrated one."""
+    """Load the written scene in the same way as the user, and compare it with the calibrated one."""
     # Sionna RT takes seconds to import.
     from calibray.tracing.sionna.exported import LinkPositions, verify_export
 
@@ -212,13 +212,13 @@ def _calibration(result: Record) -> dict[str, Any]:
 
 
 def _with_samples(settings: TraceSettings) -> dict[str, object]:
-    """The settings with a fixed number of rays, since Sionna RT's solver does not add rays in rounds."""
+    """The settings with a fixed number of rays, because Sionna RT's solver does not add rays in rounds."""
     record: dict[str, object] = dict(settings.record())
     return {**record, "samples": TraceSettings.samples} if settings.adaptive else record
 
 
 def _without_unknown(row: dict[str, Any]) -> dict[str, Any]:
-    """A row without its name and without unknown values, since JSON has no NaN."""
+    """A row without its name and without unknown values, because JSON has no NaN."""
     return {
         name: value
         for name, value in row.items()

@@ -31,22 +31,23 @@ from calibray.support.figure_style import (
 from calibray.support.messages import shortened
 
 SYMBOLS: Final = 60
-"""Most links that are drawn as symbols on a line."""
+"""Largest number of links that are drawn as symbols on a line."""
 
 FILE_ORDER: Final = 500
-"""Most links that are drawn in the order of the study's file with held-out links shaded; more are sorted."""
+"""Largest number of links that are drawn in the order of the study's file with held-out links shaded; more links are
+sorted."""
 
 RASTERIZED: Final = 2000
-"""Most points that are drawn as vectors; more are rasterized."""
+"""Largest number of points that are drawn as vectors; more points are rasterized."""
 
 UNEQUAL: Final = 4
 """Ratio between the RT calls of two methods above which their axis is logarithmic."""
 
 LONG: Final = 1000
-"""RT calls above which their axis is logarithmic, since the first calls improve the RMSE most."""
+"""Number of RT calls above which their axis is logarithmic, because the first calls improve the RMSE most."""
 
 GROUPS: Final = 24
-"""Most groups that are shown: those with the most links."""
+"""Largest number of groups that are shown: those with the most links."""
 
 
 @styled()
@@ -266,12 +267,12 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 MOST: Final = 6
-"""Observables that are drawn, the first ones of the study."""
+"""Largest number of observables that are drawn, the first ones of the study."""
 
 
 @styled()
 def measured_over_modelled(result: Record) -> Figure | None:
-    """Draw measured over modelled values of the observables, with biases of devices taken off.
+    """Draw measured over modelled values of the observables, without the biases of devices.
 
     Returns:
         The figure; None without further observables.

@@ -17,7 +17,7 @@ WIDTH: Final = 1000
 
 MOST_HEIGHT: Final = 1000
 LEAST_ASPECT: Final = 0.45
-"""Least height over width, so that links along a street do not make a thin strip."""
+"""Smallest ratio of height to width, so that links along a street do not make a thin strip."""
 
 MARGIN: Final = 0.12
 """Margin around the links, as a share of their extent."""
@@ -26,7 +26,7 @@ LEAST_EXTENT: Final = 5.0
 """Least extent of the map [m]."""
 
 MOST_WALLS: Final = 20_000
-"""Most lines that are drawn for vertical faces, the longest first."""
+"""Largest number of lines that are drawn for vertical faces, the longest first."""
 
 STEEP: Final = 0.1
 """A face is a wall if the vertical part of its unit normal is below this [1]."""
@@ -36,7 +36,7 @@ RAMP: Final = ("#1f5fa8", "#5b94cf", "#a9b4bd", "#e0953f", "#b34a00")
 
 
 OUTLINED: Final = 400
-"""Most links that the map draws with an outline each."""
+"""Largest number of links that the map draws with an outline each."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Plan:
         north: Coordinate of the upper edge [m].
         scale: Units of the map per metre [1/m].
         buildings: Outlines of buildings, as data of an SVG path.
-        walls: Vertical faces seen from above, likewise.
+        walls: Vertical faces seen from above, in the same form.
         bar: Length of the scale bar [m].
     """
 
@@ -80,7 +80,7 @@ def plan(survey: Survey, triangles: Triangles | None) -> Plan:
 
     Args:
         survey: The links.
-        triangles: The scene; None where it cannot be read.
+        triangles: The scene; None if it cannot be read.
 
     Returns:
         The map.
@@ -93,7 +93,7 @@ def lay_out(ends: NDArray[np.float64], triangles: Triangles | None) -> Plan:
 
     Args:
         ends: The positions [n, 2 or 3], [m].
-        triangles: The scene; None where it cannot be read.
+        triangles: The scene; None if it cannot be read.
 
     Returns:
         The map.
@@ -115,7 +115,7 @@ def lay_out(ends: NDArray[np.float64], triangles: Triangles | None) -> Plan:
 
 
 def marks(links: Survey, layout: Plan) -> dict[str, Any]:
-    """What the map shows of links: discs at the ends with more positions, triangles at the others."""
+    """The symbols of links on the map: discs at the ends with more positions, triangles at the others."""
     residuals = links.residual_db
     limit = ramp_limit(residuals)
     by_rx = len(np.unique(links.rx, axis=0)) >= len(np.unique(links.tx, axis=0))

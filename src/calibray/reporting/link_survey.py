@@ -1,4 +1,4 @@
-"""The links of a calibration as the report shows them: positions, groups and residuals."""
+"""The links of a calibration in the form that the report shows: positions, groups and residuals."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Survey:
 
     @property
     def has_path(self) -> NDArray[np.bool_]:
-        """Whether a path leads to a link [L]; otherwise the log-distance model predicts it."""
+        """Whether a link has a path [L]; otherwise the log-distance model predicts it."""
         return self.table["has_path"].to_numpy(bool)
 
 
@@ -55,7 +55,7 @@ class Quantity(NamedTuple):
     Attributes:
         name: Its name.
         unit: Its unit.
-        sign: 1 if it rises with path loss, else -1.
+        sign: 1 if it rises with path loss, otherwise -1.
     """
 
     name: str
@@ -104,7 +104,7 @@ def residual(table: pd.DataFrame, sign: int) -> NDArray[np.float64]:
 
     Args:
         table: A result's links.
-        sign: 1 if the quantity rises with path loss, else -1.
+        sign: 1 if the quantity rises with path loss, otherwise -1.
 
     Returns:
         Residuals [L], [dB]; those of the fallback for links without a path, NaN without a prediction.

@@ -1,7 +1,7 @@
 """Where a region of extra loss, such as trees, would explain most of the residuals, without a map of trees.
 
 All rectangles of a grid are tried, at several heights: the residuals are regressed on the length of the straight lines
-inside each. Chance is known from the same search over residuals in random order (a scan statistic; M. Kulldorff,
+inside each. The same search over residuals in random order shows the effect of chance (a scan statistic; M. Kulldorff,
 Communications in Statistics 26, 1997).
 """
 
@@ -16,29 +16,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 GRID: Final = 20
-"""Cells along the longer side of the area."""
+"""Number of cells along the longer side of the area."""
 
 SAMPLES: Final = 128
-"""Points along each line, several in each cell that it crosses."""
+"""Number of points along each line, several in each cell that it crosses."""
 
 HEIGHTS: Final = (5.0, 10.0, 20.0)
 """Heights above the lowest antenna up to which the rectangles reach [m]: hedges, street trees, tall trees."""
 
 FEWEST: Final = 8
-"""Fewest links that must cross a rectangle."""
+"""Smallest number of links that must cross a rectangle."""
 
 FEWEST_LINKS: Final = 30
 """Fewest links that are searched."""
 
 MOST: Final = 20_000
-"""Most links that are searched; of more, every second, third, ... one is taken."""
+"""Largest number of links that are searched; of more, every second, third, ... one is taken."""
 
 SHUFFLES: Final = 99
-"""Random orders of the residuals; a rectangle is reported if none of them has a better one."""
+"""Number of random orders of the residuals; a rectangle is reported if none of them has a better one."""
 
 
 NEGLIGIBLE: Final = 1e-6
-"""Sum of squares of a rectangle's column, relative to the largest, below which rounding decides."""
+"""Sum of squares of a rectangle's column, relative to the largest, below which rounding dominates."""
 
 
 class Explained(NamedTuple):
@@ -48,7 +48,7 @@ class Explained(NamedTuple):
         explained: Sum of squares that it explains.
         attenuation: Its attenuation [dB/m].
         cells: Its corners, counted in cells [2, 2].
-        chance: What the best of this size explains of residuals in random order [k - 1].
+        chance: Sum of squares that the best rectangle of this size explains for residuals in random order [k - 1].
     """
 
     explained: float
@@ -67,7 +67,7 @@ class MissingRegion:
         attenuation: Loss per length inside [dB/m].
         links: Number of links whose straight line crosses it.
         share: Share of the mean square of the residuals that it explains.
-        chance: Median share that the best rectangle explains where residuals are in random order.
+        chance: Median share that the best rectangle explains if residuals are in random order.
         significant: Whether it explains more than in any random order.
     """
 
@@ -92,7 +92,7 @@ def missing_region(
         tx: Transmitters [n, 3], [m].
         rx: Receivers [n, 3], [m].
         excess_db: Measured minus predicted path loss [n], [dB].
-        known: Columns that explain residuals otherwise, such as whether a link is out of sight [n].
+        known: Columns that explain residuals in another way, such as whether a link is out of sight [n].
 
     Returns:
         The rectangle; None if there are too few links, or no extra loss explains anything.
@@ -167,7 +167,7 @@ def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> 
     """What extra loss in rectangles of the grid explains, size by size.
 
     Args:
-        moments: Products of residuals and the columns of the cells, the residuals in order first [k, cells].
+        moments: Products of residuals and the columns of the cells, with the residuals in order first [k, cells].
         products: Products of the columns of the cells [cells, cells].
 
     Yields:
@@ -197,7 +197,7 @@ def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> 
 
 
 def _summed(values: NDArray[np.float64], axes: Sequence[int]) -> NDArray[np.float64]:
-    """Cumulative sums along axes, from 0, so that sums over ranges are differences."""
+    """Cumulative sums along axes, starting at 0, so that sums over ranges are differences."""
     for axis in axes:
         values = np.insert(np.cumsum(values, axis=axis), 0, 0.0, axis=axis)
     return values

@@ -47,7 +47,7 @@ from calibray.validation.validation import Validation, observables_table
 FILE: Final = "report.html"
 FIGURES: Final = "figures"
 WORST: Final = 10
-"""Links with the largest residuals that are listed."""
+"""Number of links with the largest residuals that are listed."""
 
 CAPTIONS: Final = {
     "convergence": "Best RMSE over RT calls (runs of the ray tracer over all links).",
@@ -64,13 +64,14 @@ CAPTIONS: Final = {
     "neighbours": "Semivariance of the residuals over the distance between links (both ends counted). Where it rises, "
     "neighbouring links share part of their errors.",
     "leverage": "Residual over leverage. A link with a leverage near 1 determines an unknown almost alone, so its "
-    "residual says nothing about its error.",
+    "residual contains no information about its error.",
     "residual-by-depth": "Mean residual by the number of interactions of the strongest path, with two standard errors. "
     "Number of links in brackets.",
     "observables": "Measured over modelled values of further observables, link by link, without biases of devices: the "
     "line marks equal values.",
     "residual-by-direction": "Predicted minus measured path loss around each transmitter, by compass direction: points "
-    "outside the black circle received more than was predicted. Orange: the stated pattern on the horizon, from its "
+    "outside the black circle received more power than predicted. Orange: the stated pattern "
+    "on the horizon, from its "
     "maximum at the rim to 30 dB less at the centre.",
     "residual-by-group": "Residual by group: median, quartiles, and whiskers that contain 90 % of the links.",
 }
@@ -84,10 +85,10 @@ class PageData:
 
     Attributes:
         links: The links with positions; None if these are unknown.
-        scene: The scene; None if it cannot be read any more.
+        scene: The scene; None if it can no longer be read.
         triangles: Its meshes.
         rays: Paths of the links; None without paths.
-        missing: What is not shown, and why.
+        missing: What is not shown, with the reason.
     """
 
     links: Survey | None
@@ -138,7 +139,7 @@ def report(
 
 
 def collect(result: Record, progress: Progress | None = None) -> PageData:
-    """Collect what a page shows in addition to the result; what is unavailable is listed, not an error.
+    """Collect what a page shows in addition to the result; unavailable items are listed and are not an error.
 
     Args:
         result: The calibration.
@@ -233,7 +234,7 @@ def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
 
 
 def _title(study: Path) -> str:
-    """A study's name: that of its folder where the file has the usual name."""
+    """A study's name: if the file has the usual name, that of its folder."""
     return (study.resolve().parent.name if study.stem == "study" else "") or study.stem
 
 
@@ -284,7 +285,7 @@ def _held_out_errors(result: Record) -> tuple[float | None, float | None, float 
 
 
 def _laws(result: Record) -> Table:
-    """The coefficients of the power laws of ITU-R P.2040, where they were calibrated."""
+    """The coefficients of the power laws of ITU-R P.2040, if they were calibrated."""
     names = ("itu_a", "itu_b", "itu_c", "itu_d")
     rows = tuple(
         (material, *(f"{law[name]:.4g}" for name in names)) for material, law in result.fit.laws.items()

@@ -37,7 +37,7 @@ def heading(result: Record) -> str:
 
 
 def summary(result: Record) -> tuple[Table | str, ...]:
-    """What Python and notebooks show of a calibration.
+    """What Python and notebooks display for a calibration.
 
     Returns:
         The heading with the number of RT calls, and the tables of parameters, nuisances and accuracy.
@@ -57,7 +57,7 @@ def tables(result: Record) -> tuple[Table, ...]:
 
 
 def links(result: Record) -> Table:
-    """Numbers of links, and the rows that need a look."""
+    """Numbers of links, and the rows to check."""
     count = result.counts
     censored = result.study.objective.no_path == "censor"
     treatment = (
@@ -84,11 +84,11 @@ def _held_out(result: Record) -> tuple[str, str]:
 def suspicious_rows(
     without_path: Sequence[int], treatment: str, enclosed: EnclosedAntennas | None
 ) -> Iterator[tuple[str, str, str]]:
-    """Lines about links that need a look, for a table of links.
+    """Lines about links to check, for a table of links.
 
     Args:
         without_path: Rows of the links without a path.
-        treatment: What the calibration does with them; appended to the row numbers.
+        treatment: How the calibration treats them; appended to the row numbers.
         enclosed: Antennas inside closed bodies; None if this was not checked.
 
     Yields:
@@ -100,7 +100,7 @@ def suspicious_rows(
         return
     for end, rows in (("transmitter", enclosed.tx), ("receiver", enclosed.rx)):
         if enclosed.indoors:
-            remedy = "as most are: assumed to be an indoor scene"
+            remedy = "as for most receivers: assumed to be an indoor scene"
         else:
             remedy = f"{rows_text(rows)}: check the positions"
         yield f"{end} inside a building", str(len(rows)), remedy if rows else ""
@@ -213,7 +213,7 @@ def costs(result: Record) -> Table:
 
 @dataclass(frozen=True)
 class Value:
-    """A parameter as the report shows it: text, and positions on a bar over its bounds.
+    """A parameter in the form of the report: text, and positions on a bar over its bounds.
 
     Attributes:
         name: Its name.
@@ -221,14 +221,14 @@ class Value:
         before: Its value before calibration.
         after: Its calibrated value.
         interval: Its 95 % interval; empty if unknown.
-        verdict: What the links say about it.
+        verdict: The verdict of the links on it.
         bounds: Its bounds, lower and upper.
         scale: "linear" or "log".
         positions: Positions of the values "before" and "after" on the bar, 0 to 1.
         pieces: Ends of every piece of the interval on the bar, 0 to 1.
         reason: The reason of the verdict; empty if unknown.
         approximate: Whether the interval comes from an emulator of the engine.
-        predicted: The value that predictions use; empty if it is the calibrated one, or predictions use no scene.
+        predicted: The value that predictions use; empty if it is the calibrated one, or if predictions use no scene.
     """
 
     name: str
@@ -252,7 +252,7 @@ class Value:
 
 
 def values(result: Record) -> list[Value]:
-    """The parameters of a calibration as the report shows them.
+    """The parameters of a calibration in the form of the report.
 
     Returns:
         One entry per parameter, in the study's order.

@@ -19,7 +19,7 @@ from calibray.tracing.convergence import Convergence
 from calibray.tracing.protocol import EnclosedAntennas
 
 LISTED: Final = 12
-"""Names and findings that are listed before the rest is only counted."""
+"""Number of names and findings that are listed; the others are only counted."""
 
 _HEIGHT_SOURCES: Final = {
     "levels": "height from the number of storeys",
@@ -129,11 +129,11 @@ def warning_lines(findings: Sequence[Finding]) -> str:
 
 
 VISIBLE_DB: Final = 0.005
-"""Change [dB] that is not 0 when rounded to 0.01 dB."""
+"""Smallest change that is not 0 when rounded to 0.01 dB [dB]."""
 
 
 def overview(paths: Paths, row: NDArray[np.int64], enclosed: EnclosedAntennas | None) -> Table:
-    """Numbers of links, paths and interactions, and the links that need a look.
+    """Numbers of links, paths and interactions, and the links to check.
 
     Args:
         paths: The traced paths.

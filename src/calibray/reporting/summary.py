@@ -22,13 +22,13 @@ RARE: Final = 0.05
 """Share of the links below which more links that interact with a material are advised."""
 
 LISTED_VALUES: Final = 6
-"""Identified values that are listed one by one."""
+"""Number of identified values up to which they are listed one by one."""
 
 MEANINGS: Final = {
     Verdict.WEAKLY_IDENTIFIED: "weakly identified: each interval covers much of its range",
     Verdict.AMBIGUOUS: "ambiguous: several separate ranges fit the links",
     Verdict.AT_BOUND: "at a bound: the best value may lie beyond it, or the model lacks something",
-    Verdict.NOT_IDENTIFIABLE: "not identifiable: any value within the interval fits the links about as well",
+    Verdict.NOT_IDENTIFIABLE: "not identifiable: all values within the interval fit the links about equally well",
 }
 
 
@@ -37,9 +37,9 @@ class Sentence:
     """One statement of the summary.
 
     Attributes:
-        heading: The question that it answers; empty if it continues the answer of the sentence before.
+        heading: The question that it answers; empty if it continues the previous answer.
         text: The answer.
-        kind: Whether it is plain, good news, or calls for caution.
+        kind: Whether it is neutral, good news, or a caution.
     """
 
     heading: str
@@ -117,7 +117,7 @@ def _certainty(result: Record) -> Iterator[Sentence]:
         yield Sentence(
             heading,
             f"Unknown: the engine {result.study.engine.name} gives no derivatives, so there are no intervals. "
-            "The values fit best among those that were tried; the true ones may be far away.",
+            "The values fit best among those that were tried; the true values may be far away.",
             "caution",
         )
         return
@@ -168,10 +168,10 @@ def _coverage(count: int, total: int) -> str:
             "no path of any link interacts with it, so these links cannot identify it; measure where paths do"
         )
     if count < RARE * total:
-        return f"only {count:,} of {total:,} links have paths that interact with it; measure more such links"
+        return f"only {count:,} of {total:,} links have paths that interact with it; measure more links of this kind"
     return (
         f"{count:,} of {total:,} links have paths that interact with it, but these paths are too weak, or other "
-        "unknowns compensate; measure where such a path is the strongest"
+        "unknowns compensate; measure where a path of this kind is the strongest"
     )
 
 
@@ -197,7 +197,7 @@ def _cautions(result: Record) -> Iterator[Sentence]:
         )
     if result.nuisance.groups_without_path:
         sentences.append(
-            f"No calibration link of {named(result.nuisance.groups_without_path)} has a path, so the offset there is "
+            f"No calibration link of {named(result.nuisance.groups_without_path)} has a path, so their offset is "
             "unknown."
         )
     yield from _headed("What calls for caution?", sentences, "caution")

@@ -36,19 +36,19 @@ from calibray.tracing.mounting import Mounting, Pose, jones_vectors, wave_basis
 from calibray.validation.validation import Validation
 
 PARAMETERS: Final = 12
-"""Most parameters that are shown, the least certain first."""
+"""Largest number of parameters that are shown, the least certain first."""
 
 BARS: Final = 36
-"""Bars of the histogram over a parameter's bounds."""
+"""Number of bars of the histogram over a parameter's bounds."""
 
 ROWS: Final = 14
-"""Most rows of the figure of power."""
+"""Largest number of rows of the figure of power."""
 
 POLAR_FIGURES: Final = 6
-"""Transmitters that are drawn, those with the most links."""
+"""Largest number of transmitters that are drawn, those with the most links."""
 
 DEEPEST_DB: Final = -30.0
-"""Level of the pattern at the centre of a figure [dB]; sectors radiate backwards with about this."""
+"""Level of the pattern at the centre of a figure [dB]; sector antennas radiate backwards at about this level."""
 
 
 def trust_figures(result: Record) -> dict[str, Figure]:
@@ -218,7 +218,7 @@ def residuals_by_direction(result: Record) -> Figure | None:
     """Draw the residuals of links over the direction from their transmitter, and its pattern on the horizon.
 
     Returns:
-        The figure; None if the study does not state how transmitters are mounted, or its links cannot be read.
+        The figure; None if the study does not state the mounting of transmitters, or its links cannot be read.
     """
     study = result.study
     if "tx" not in study.links.mountings:

@@ -1,6 +1,6 @@
 """Data of the report's 3-D viewer: the scene and the strongest paths of every link, packed as text.
 
-Positions are whole steps of a grid over the scene, 65,536 in each direction: 3 cm in a scene of 2 km.
+Positions are whole steps of a grid over the scene, with 65,536 steps in each direction: 3 cm in a scene of 2 km.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from calibray.study import Setup
 from calibray.support.progress import Progress
 
 PER_LINK: Final = 12
-"""Most paths per link that are shown."""
+"""Largest number of paths per link that are shown."""
 
 INTERACTIONS: Final = 400_000
-"""Most interactions that are shown in all; in larger scenes, fewer paths per link are shown."""
+"""Largest number of interactions that are shown in total; in larger scenes, fewer paths per link are shown."""
 
 TRIANGLES: Final = 250_000
-"""Most triangles that are drawn, the largest first."""
+"""Largest number of triangles that are drawn, the largest first."""
 
 STEPS: Final = 65_535
 
@@ -64,7 +64,7 @@ def rays(result: Record, progress: Progress | None = None) -> Rays:
         The paths.
 
     Raises:
-        InputError: The scene or the links of the study cannot be used any more.
+        InputError: The scene or the links of the study can no longer be used.
         EngineError: The ray tracer failed.
     """
     paths = result.paths
@@ -78,7 +78,7 @@ def strongest(paths: Paths, result: Record) -> Rays:
 
     Args:
         paths: All traced paths.
-        result: The calibration whose materials the paths are evaluated with.
+        result: The calibration with whose materials the paths are evaluated.
 
     Returns:
         The paths that are shown.
@@ -111,7 +111,7 @@ def strongest(paths: Paths, result: Record) -> Rays:
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid that positions are rounded to.
+    """A grid to which positions are rounded.
 
     Attributes:
         low: Its lower corner [3], [m].
@@ -140,12 +140,12 @@ def packed(
 
     Args:
         survey: The links.
-        triangles: The scene; None where it cannot be read.
+        triangles: The scene; None if it cannot be read.
         rays: The paths; None without paths.
         materials: Names of the scene's materials, in the scene's order.
 
     Returns:
-        Plain values; arrays are base64 of little-endian whole numbers.
+        A dictionary; arrays are base64 of little-endian whole numbers.
     """
     points = [survey.tx, survey.rx]
     if triangles is not None and len(triangles.face):

@@ -15,7 +15,7 @@ from calibray.tables import Column, Table
 from calibray.tables.text import rows_text
 
 SCENE_ALONE_DB: Final = 0.05
-"""Difference between the exported scene and the predictions that is not reported."""
+"""Largest difference between the exported scene and the predictions that is not reported."""
 
 
 def prediction_text(record: Record) -> str:
@@ -38,14 +38,14 @@ def prediction_text(record: Record) -> str:
     if fallback is None:
         return text
     error = "" if fallback.residual_db is None else f", with an error of {fallback.residual_db:.1f} dB (RMS)"
-    return f"{text} Where no path leads, predictions use the log-distance model{error}, and are marked."
+    return f"{text} For links without a path, predictions use the log-distance model{error}, and are marked."
 
 
 def scene_alone_text(record: Record) -> str:
     """How far the exported scene alone is from the predictions.
 
     Returns:
-        One or two sentences; empty if the scene gives the predictions.
+        One or two sentences; empty if the scene alone gives the predictions.
     """
     links, model = record.links, record.prediction.model
     scene_db, predicted_db = (links[name].to_numpy(float) for name in ("scene_db", "predicted_db"))
@@ -56,8 +56,8 @@ def scene_alone_text(record: Record) -> str:
     near = (
         ""
         if field is None
-        else f" Within some {field.range_m:.3g} m of measured links, predictions also add what "
-        f"their residuals have in common ({field.shared_db:.2f} dB RMS), which no scene contains."
+        else f" Within about {field.range_m:.3g} m of measured links, predictions also add the "
+        f"correlated part of their residuals ({field.shared_db:.2f} dB RMS), which no scene contains."
     )
     if rms_db < SCENE_ALONE_DB:
         return near.lstrip()
@@ -86,20 +86,20 @@ def scene_alone_text(record: Record) -> str:
 
 
 def sampling_text(record: Record) -> str:
-    """Why the exported scene can give another path loss than the reported one; empty if it cannot."""
+    """The reason why the exported scene can give another path loss than the reported one; empty if it cannot."""
     trace, model = record.study.trace, record.prediction.model
     calibrated = model.parameters is None or model.parameters == record.parameters
     causes = []
     if trace.adaptive:
         causes.append(
-            f"The exported script sends out {type(trace).samples:,} rays, a calibration with trace.samples = "
-            '"auto" as many as it needs.'
+            f"The exported script launches {type(trace).samples:,} rays, but a calibration with trace.samples "
+            '= "auto" adds as many as it needs.'
         )
     sampled = record.study.engine.name == "replay" and (trace.refraction or trace.diffuse_reflection)
     if sampled and not (calibrated and record.fit.retrace_gap_db is not None):
         causes.append(
-            "Which refracted and diffuse paths are traced depends on the materials, and the reported path loss was "
-            "computed on paths that may have been traced with others than those of the exported scene."
+            "The traced set of refracted and diffuse paths depends on the materials. The reported path loss was "
+            "computed on paths that may have been traced with other materials than those of the exported scene."
         )
     return " ".join([*causes, "load_scene.py prints the difference of every link."]) if causes else ""
 
@@ -118,7 +118,7 @@ def block_sentence(held_out: HeldOutErrors) -> str:
 
 
 TRADE_OFF: Final = 0.7
-"""Correlation of the draws from which two unknowns are reported as compensating for each other."""
+"""Correlation of the draws above which two unknowns are reported as compensating for each other."""
 
 
 DECIDING: Final = 0.5
@@ -126,7 +126,7 @@ DECIDING: Final = 0.5
 
 
 CLEAR: Final = 2.0
-"""Standard errors above which a difference counts as significant."""
+"""Number of standard errors above which a difference counts as significant."""
 
 
 EVEN_DB: Final = 0.1
@@ -223,7 +223,7 @@ def _missing_region_text(tables: dict[str, pd.DataFrame]) -> str:
         f"losses of {row['attenuation']:.2g} dB/m within x = {row['west']:.0f} to {row['east']:.0f} m, "
         f"y = {row['south']:.0f} to {row['north']:.0f} m, up to z = {row['height']:.0f} m, on the straight line of "
         f"{row['links']} links, would explain {percent(float(row['share']))} of the mean square of the residuals "
-        f"(chance alone {percent(float(row['chance']))}): see whether trees stand there, and give them as [regions]"
+        f"(chance alone {percent(float(row['chance']))}): check whether there are trees, and state them under [regions]"
     )
 
 
@@ -249,7 +249,10 @@ def _leverage_text(tables: dict[str, pd.DataFrame]) -> str:
         rows = rows_text(deciding["row"].tolist())
         return f"{links} an unknown almost alone (leverage above {DECIDING:g}): {rows}"
     largest = table.iloc[int(np.argmax(table["leverage"]))]
-    return f"no link determines an unknown alone; the largest is {largest['leverage']:.2f}, in row {largest['row']:.0f}"
+    return (
+        f"no link determines an unknown alone; the largest leverage is {largest['leverage']:.2f}, "
+        f"in row {largest['row']:.0f}"
+    )
 
 
 def _trade_offs_text(tables: dict[str, pd.DataFrame]) -> str:

@@ -1,4 +1,4 @@
-"""The files of a result: written whole, and read back into the same sections by a closed model."""
+"""The files of a result: written completely, and read back into the same sections by a closed model."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ FILES: Final = ("result.json", "result-links.csv", "result-history.csv", "result
 
 RESULT_FILE, LINKS_FILE, HISTORY_FILE, SCENE_FILE = FILES
 SIGNED_FILES: Final = (LINKS_FILE, HISTORY_FILE, SCENE_FILE)
-"""The files whose digests `result.json` holds."""
+"""The files whose digests `result.json` contains."""
 
 VALIDATION_FILE: Final = "result-validation.json"
 
@@ -89,7 +89,7 @@ SECTIONS: Final = ("fit", "accuracy", "uncertainty", "nuisance", "prediction", "
 def content(
     record: Record, sentences: tuple[str, ...] = (), files: dict[str, str] | None = None
 ) -> dict[str, Any]:
-    """A result as plain values, without its tables.
+    """A result as a dictionary, without its tables.
 
     Args:
         record: The result.
@@ -127,12 +127,13 @@ def write(
 ) -> None:
     """Write `result.json`, its tables, the calibrated scene and, if there is one, the validation.
 
-    Each file is written under a temporary name and then renamed, so that none is ever half-written. `result.json` comes
-    last and holds the digests of the others: if the run is killed before that, `read` refuses the mixture of two runs.
+    Each file is written under a temporary name and then renamed, so every file is complete or absent. `result.json` is
+    written last and contains the digests of the others: if the run is killed before that, `read` refuses the mixture of
+    two runs.
 
     Args:
         record: The result.
-        folder: Folder to write into; made if absent.
+        folder: Folder to write into; created if absent.
         overwrite: Replace files that Calibray did not write.
         sentences: Its remarks as text.
         validation: Figures of the validation, for readers of the file.
@@ -167,13 +168,13 @@ def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str,
 
     Args:
         folder: The folder.
-        allow_changed_inputs: Read it although its files were changed after they were written.
+        allow_changed_inputs: Read the result although its files were changed after they were written.
 
     Returns:
         The fields of a `Record`.
 
     Raises:
-        InputError: The folder holds no result, one of another version, one that was damaged or edited, or files of
+        InputError: The folder contains no result, one of another version, one that was damaged or edited, or files of
             several runs.
     """
     source = Path(folder) / RESULT_FILE
@@ -190,7 +191,7 @@ def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str,
 
 
 def _check_one_run(folder: Path, digests: dict[str, str], allow_edits: bool) -> None:
-    """Refuse files of several runs, and edited ones unless edits are allowed."""
+    """Refuse files of several runs, and edited files unless edits are allowed."""
     for name in SIGNED_FILES:
         file = folder / name
         if name not in digests:
@@ -315,7 +316,7 @@ def _rounded(values: NDArray[np.float64]) -> list[float | None]:
 
 
 def _problem_digest(study: Study) -> str:
-    """SHA-256 of what a study's validation depends on: `run` may use another method, seed or engine."""
+    """SHA-256 of what determines a study's validation: `run` may use another method, seed or engine."""
     content = {
         key: value for key, value in study.content().items() if key not in ("method", "engine", "holdout")
     }
@@ -334,7 +335,7 @@ def read_validation(folder: Path, study: Study, measured_db: NDArray[np.float64]
         The errors; None without validation.
 
     Raises:
-        InputError: The file was damaged, edited, or belongs to another study or other links.
+        InputError: The file was damaged or edited, or belongs to another study or other links.
     """
     file = folder / VALIDATION_FILE
     if not file.is_file():

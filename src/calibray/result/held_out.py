@@ -1,4 +1,4 @@
-"""Held-out errors: residuals of several models on links that none of them was fitted to."""
+"""Held-out errors: residuals of several models on links to which none of them was fitted."""
 
 from __future__ import annotations
 
@@ -70,17 +70,16 @@ class ObservableErrors:
 
 @dataclass(frozen=True, eq=False)
 class HeldOutErrors:
-    """Residuals of several models on the same links, each link predicted without its block.
+    """Residuals of several models on the same links, with each link predicted without its block.
 
     Attributes:
         labels: Names of the blocks.
-        block: Block of every link [links]; -1 where it is not judged.
-        errors: Modelled minus measured path loss by name of the model [links], [dB]; NaN where it is not judged.
+        block: Block of every link [links]; -1 if it is not judged.
+        errors: Modelled minus measured path loss by name of the model [links], [dB]; NaN if it is not judged.
         position: Positions of the receivers [links, 3], [m].
         measured_db: Measured path loss [links], [dB].
         level: Nominal coverage of the intervals.
-        observables: Errors of the further observables by name; empty in a result that was loaded, whose accuracy has
-            them.
+        observables: Errors of the further observables by name; empty in a loaded result, whose accuracy contains them.
     """
 
     labels: tuple[str, ...]
@@ -94,7 +93,7 @@ class HeldOutErrors:
 
 @dataclass(frozen=True)
 class Judgement:
-    """The calibrated model compared with its best baseline, on links that neither was fitted to.
+    """The calibrated model compared with its best baseline, on links to which neither was fitted.
 
     Attributes:
         links: Number of links.
@@ -114,7 +113,7 @@ class Judgement:
 
     @property
     def gain_db(self) -> float:
-        """RMSE of the baseline minus that of the calibrated model [dB]; positive where calibration helped."""
+        """RMSE of the baseline minus that of the calibrated model [dB]; positive if calibration helped."""
         return self.baseline_rmse_db - self.rmse_db
 
     @property
@@ -126,7 +125,7 @@ class Judgement:
 
 
 NO_PATH: Final = "no path"
-"""Beginning of the column `basis` of predictions where no path leads."""
+"""Beginning of the column `basis` of predictions for links without a path."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ class FittedTerm:
         by: Its column: "constant", "log_distance", or a column of the links' table.
         per: Its groups: "offset" for those of the study's offset, "transmitter", a column, or "" for none.
         coefficients: Coefficient by group, [dB] per unit of the column; groups without data have the others' mean.
-        centre: What is subtracted from the column.
+        centre: Value that is subtracted from the column.
         spread_db: Standard deviation between groups of a random effect, [dB] per unit of the column; None for the
             standard deviation of the coefficients.
     """
@@ -159,9 +158,10 @@ class BlockErrors:
         within_db: Standard deviation of a link's own error [dB].
         between_db: Standard deviation of the error that a new block's links have in common [dB].
         blocks: Number of blocks.
-        reach_m: Distance to the nearest calibration link that nine of ten held-out links kept [m].
-        groups_db: Root mean square of what random effects of groups without other links add to these errors [dB].
-        out_of_sight: Errors of links out of sight relative to those of all; at least 1.
+        reach_m: Distance to the nearest calibration link that nine of ten held-out links did not exceed [m].
+        groups_db: Root mean square of the contribution of random effects of groups without other links to these errors
+            [dB].
+        out_of_sight: Errors of links out of sight relative to those of all links; at least 1.
     """
 
     within_db: float
@@ -178,10 +178,10 @@ class PredictionModel:
 
     Attributes:
         name: Its name; see `held_out.Model`.
-        parameters: Values of the parameters in the fields' units; None where the model uses no scene.
+        parameters: Values of the parameters in the fields' units; None if the model uses no scene.
         terms: Its nuisance terms.
         residual_db: Root mean square of its residuals on new links [dB]; None if there are too few links.
-        basis: The links that these residuals were computed on.
+        basis: Description of the links on which these residuals were computed.
         links: Number of these links, or degrees of freedom if they are calibration links.
         sizes_db: Absolute held-out residuals, ascending, at most 400 quantiles of them [dB].
         blocks: These residuals in two levels; None if no links, or too few, were held out.

@@ -32,7 +32,7 @@ Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 @dataclass(frozen=True)
 class ObservableFit:
-    """How well the calibrated model fits a further observable of the calibration links.
+    """Accuracy of the calibrated model for a further observable of the calibration links.
 
     Attributes:
         kind: What was measured.
@@ -40,10 +40,10 @@ class ObservableFit:
         links: Number of calibration links with a value.
         rmse: RMSE of the calibrated model.
         initial_rmse: RMSE with the initial materials.
-        mean_rmse: RMSE of the mean value, as a rival.
+        mean_rmse: RMSE of the mean value, as a baseline.
         error: Standard deviation of a value's error, stated or estimated.
-        biases: Bias by group; the group "" stands for all links.
-        bias_errors: Standard error of each bias, that of the parameters included.
+        biases: Bias by group; the group "" means all links.
+        bias_errors: Standard error of each bias, including that of the parameters.
     """
 
     kind: str
@@ -59,21 +59,21 @@ class ObservableFit:
 
 @dataclass(frozen=True)
 class Fit:
-    """The candidate of least RMSE, and how well it fits the calibration links.
+    """The candidate with the lowest RMSE, and its accuracy on the calibration links.
 
     Attributes:
         parameters: Calibrated values by name, in the fields' units.
         initial_parameters: Values before calibration.
         materials: All materials of the scene at its carrier, with the calibrated values.
-        laws: Coefficients itu_a to itu_d of ITU-R P.2040 by material, where one of them is a parameter.
+        laws: Coefficients itu_a to itu_d of ITU-R P.2040 by material, if one of them is a parameter.
         rmse_db: RMSE over the calibration links (paper eq. 1) [dB].
         initial_rmse_db: RMSE with the initial materials and no nuisance [dB].
         nuisance_only_rmse_db: RMSE with the initial materials and fitted nuisances [dB]; None without nuisances.
         log_distance_rmse_db: RMSE of a log-distance model fitted to the calibration links [dB].
         retrace_gap_db: Largest change of a calibration link's path loss when the scene is traced again with the
-            calibrated materials [dB]; None where the paths do not depend on the materials.
+            calibrated materials [dB]; None if the paths do not depend on the materials.
         power_shares: Share of the links' power by material and kind of interaction; "line of sight" for paths
-            without interaction. Shares add up to more than 1, since a path counts for each of its interactions.
+            without interaction. Shares add up to more than 1, because a path counts for each of its interactions.
         observables: The further observables by name.
     """
 
@@ -92,7 +92,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Accuracy on held-out links; every RMSE is None where no link is held out.
+    """Accuracy on held-out links; every RMSE is None if no link is held out.
 
     Attributes:
         holdout_rmse_db: RMSE of the calibrated model [dB].
@@ -117,11 +117,11 @@ class Uncertainty:
 
     Attributes:
         intervals: 95 % interval and verdict by parameter.
-        draws: Draws from the posterior by parameter, constant and nuisance coefficient; empty where none could be made.
+        draws: Draws from the posterior by parameter, constant and nuisance coefficient; empty if none could be made.
         constants_db: Constants that the scene fixes and that vary in the draws, with the change of path loss by one
             standard deviation of each [dB].
         noise: Posterior weights of the noise models and of an undeclared offset.
-        undeclared_offset_db: The best-fitting offset where the study declares none [dB]; None where not estimated.
+        undeclared_offset_db: The best-fitting offset if the study declares none [dB]; None if it was not estimated.
         undeclared_offset_error_db: Its standard error [dB].
         remarks: Warnings and advice.
     """
@@ -137,13 +137,13 @@ class Uncertainty:
 
 @dataclass(frozen=True)
 class Nuisance:
-    """Coefficients of the study's nuisances at the candidate of least RMSE.
+    """Coefficients of the study's nuisances at the candidate with the lowest RMSE.
 
     Attributes:
         coefficients: By term and group, [dB] per unit of the term's column; the offset is the term "offset", and the
-            group "" stands for all links.
-        centres: What is subtracted from the column of a term, by term.
-        groups_without_path: Groups without an offset, since no calibration link of theirs has a path.
+            group "" means all links.
+        centres: Value that is subtracted from the column of a term, by term.
+        groups_without_path: Groups without an offset, because none of their calibration links has a path.
     """
 
     coefficients: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -163,8 +163,8 @@ class Prediction:
     Attributes:
         model: The model: the one that held-out links choose, or the calibrated one if no links were held out.
         materials: All materials of the scene at its carrier with the model's parameters; None if it uses no scene.
-        residual_field: The correlated part of its residuals; None where they are uncorrelated.
-        fallback: The model for links that no path reaches; None if the model uses no scene.
+        residual_field: The correlated part of its residuals; None if they are uncorrelated.
+        fallback: The model for links without a path; None if the model uses no scene.
     """
 
     model: PredictionModel
@@ -178,13 +178,13 @@ class Cost:
     """RT calls, replays and time.
 
     Attributes:
-        rt_calls: RT calls of the method, those answered by the ledger included.
+        rt_calls: RT calls of the method, including those answered by the ledger.
         ledger_hits: RT calls that the ledger answered.
         seconds: Time of the method, without tracing [s].
         trace_seconds: Time of tracing and loading before the search [s].
         uncertainty_replays: Replays for intervals and draws.
         uncertainty_seconds: Their time [s].
-        cheap_replays: Replays of the cheap model; none of them is an RT call.
+        cheap_replays: Number of replays of the cheap model; none of them is an RT call.
         cheap_seconds: Their time [s].
     """
 
@@ -203,9 +203,9 @@ class Provenance:
     """The inputs of the calibration.
 
     Attributes:
-        files: SHA-256 of every file of the scene and the antennas, by path; empty where unknown.
+        files: SHA-256 of every file of the scene and the antennas, by path; empty if unknown.
         rows: Numbers of rows that were left out, averaged or moved before they became links, by cause.
-        enclosed: Antennas inside closed bodies of the scene; None where this was not checked.
+        enclosed: Antennas inside closed bodies of the scene; None if this was not checked.
     """
 
     files: dict[str, Digest] = field(default_factory=dict)
@@ -232,9 +232,9 @@ class Record:
             frequency [Hz], path loss with the nuisances alone [dB], the values in the
             measured quantity, leverage, depth, and whether the link is censored or expected near the noise floor.
         history: One row per RT call: number, iteration, RMSE, best so far, seconds since the start.
-        held_out: Held-out errors of every model, where blocks were held out in turn; None otherwise.
-        scene: The scene as it was read; None in a result that was loaded.
-        paths: The paths that were replayed, for drawing; None in a result that was loaded.
+        held_out: Held-out errors of every model, if blocks were held out in turn; None otherwise.
+        scene: The scene as it was read; None in a loaded result.
+        paths: The paths that were replayed, for drawing; None in a loaded result.
     """
 
     study: Study
@@ -283,19 +283,19 @@ class Record:
 
     @property
     def holdout_rmse_db(self) -> float | None:
-        """RMSE over the held-out links [dB]; None where there are none."""
+        """RMSE over the held-out links [dB]; None if there are none."""
         return self.accuracy.holdout_rmse_db
 
     @property
     def rt_calls(self) -> int:
-        """RT calls of the method, those answered by the ledger included."""
+        """RT calls of the method, including those answered by the ledger."""
         return self.cost.rt_calls
 
     @property
     def counts(self) -> dict[str, Any]:
         """Numbers of links, and rows with possible problems.
 
-        Held-out links count only where the hold-out RMSE includes them.
+        Held-out links count only if the hold-out RMSE includes them.
         """
         has_path = self.links["has_path"].to_numpy(bool)
         held_out = self.links["held_out"].to_numpy(bool)

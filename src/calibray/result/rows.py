@@ -24,7 +24,7 @@ OPTIONAL: Final = ("leverage", "depth", "out_of_sight", "obstruction_m", "region
 """Columns of numbers that are optional."""
 
 FINITE: Final = ("measured_db", "log_distance_db", "best_db", "seconds")
-"""Columns without infinite or missing values; in the others a link without a path is infinite or empty."""
+"""Columns without infinite or missing values; in other columns, a link without a path is infinite or empty."""
 
 
 def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:

@@ -1,4 +1,4 @@
-"""Verdicts: what the measurements say about one parameter, as data. `wording` turns them into sentences."""
+"""Verdicts: what the measurements show about one parameter, as data. `wording` turns them into sentences."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ CONFIDENCE: Final = 0.95
 
 
 class Verdict(StrEnum):
-    """What the measurements say about a parameter."""
+    """What the measurements show about a parameter."""
 
     IDENTIFIED = "identified"
     WEAKLY_IDENTIFIED = "weakly identified"
@@ -39,7 +39,7 @@ class ReasonKind(StrEnum):
 
 
 class Cause(StrEnum):
-    """What can make an interval wide, besides the noise itself."""
+    """Possible causes of a wide interval, besides the noise itself."""
 
     BUILDINGS = "buildings that differ"
     CORRELATION = "correlated errors"
@@ -70,15 +70,15 @@ class Interval:
 
     Attributes:
         standard_error: From the curvature of the sum of squares at the optimum, in the parameter's unit.
-        lower: Lower end of the 95 % interval, within the bounds; of the lowest piece where there are several.
-        upper: Upper end, of the highest piece.
-        verdict: What the links say about the parameter.
-        pieces: Lower and upper end of every piece, ascending, where the interval was computed from draws.
+        lower: Lower end of the 95 % interval, within the bounds; if there are several pieces, of the lowest.
+        upper: Upper end of the interval; if there are several pieces, of the highest.
+        verdict: The verdict of the links on the parameter.
+        pieces: Lower and upper end of every piece, ascending, if the interval was computed from draws.
         reason: The reason for the verdict.
         approximate: Whether an emulator replaced an engine that gives no derivatives.
-        seen: Pieces of the 95 % interval for the buildings that the links meet, which predictions use; empty where it
-            does not differ from that of the mean over all such buildings.
-        without: Share of the width that is left if a cause is ruled out, for the causes that matter.
+        seen: Pieces of the 95 % interval for the buildings that the links meet, which predictions use; empty if they
+            equal those for the mean over all buildings of this kind.
+        without: Share of the width that remains if a cause is ruled out, for the causes that matter.
     """
 
     standard_error: float
@@ -101,7 +101,7 @@ class Interval:
 
         Args:
             value: The value.
-            slack: Distance outside a piece that still counts as inside.
+            slack: Distance outside a piece up to which a value still counts as inside.
 
         Returns:
             True if it does.

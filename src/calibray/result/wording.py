@@ -1,4 +1,4 @@
-"""The sentences of a result, for terminal, page and JSON. Statistics return data; this module turns it into text."""
+"""The sentences of a result, for terminal, page and JSON. Statistics return data; this module converts it to text."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MOST_ODDS: Final = 1000.0
 """Largest odds that are reported as a number."""
 
 SHOWN_PIECES: Final = 3
-"""Most pieces of an interval that are listed one by one."""
+"""Largest number of pieces of an interval that are listed one by one."""
 
 NOT_JUDGED: Final = (
     "No links were held out, so nothing shows which model predicts new links best. Set [holdout] blocks = 4, or run "
@@ -23,7 +23,7 @@ NOT_JUDGED: Final = (
 
 
 def interval_text(interval: Interval) -> str:
-    """The ends of an interval, of each piece while they are few.
+    """The ends of an interval, or of each piece if there are few.
 
     Returns:
         The ends, as "2.1 to 3.4".
@@ -34,7 +34,7 @@ def interval_text(interval: Interval) -> str:
 
 
 def reason_text(reason: Reason | None) -> str:
-    """Why a verdict is what it is.
+    """The reason of a verdict.
 
     Returns:
         A clause without a full stop; empty without a reason.
@@ -43,7 +43,7 @@ def reason_text(reason: Reason | None) -> str:
 
 
 def explanation_text(interval: Interval) -> str:
-    """Why a verdict is what it is, and what would narrow the interval.
+    """The reason of a verdict, and what would narrow the interval.
 
     Returns:
         Clauses separated by semicolons, without a full stop; empty if nothing is known.
@@ -61,7 +61,7 @@ def explanation_text(interval: Interval) -> str:
 
 
 _STATEMENTS: Final = {
-    Cause.BUILDINGS: "if all buildings were known to be alike (noise.heterogeneity = 0),",
+    Cause.BUILDINGS: "if all buildings were known to be equal (noise.heterogeneity = 0),",
     Cause.CORRELATION: "if errors of neighbouring links were known to be independent (noise.range_m = 0),",
     Cause.STRUCTURE: "if errors were known not to depend on obstruction, distance and angles (noise.range_m = 0),",
     Cause.HEAVY_TAILS: "if errors were known to be Gaussian (noise.kind = 'gaussian'),",
@@ -71,7 +71,7 @@ _STATEMENTS: Final = {
 
 
 def _range(values: dict[str, Any]) -> str:
-    return "a customary range" if values.get("customary") else "the range"
+    return "a usual range" if values.get("customary") else "the range"
 
 
 def _width(values: dict[str, Any], ranges: tuple[tuple[float, ...], ...]) -> str:
@@ -115,7 +115,7 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
         f"{values['noise_db']:.1f} dB"
     ),
     ReasonKind.OUTSIDE_INTERVAL: lambda values, _: (
-        f"the value of least RMSE, {values['value']:.4g}, is outside the interval"
+        f"the value with the lowest RMSE, {values['value']:.4g}, is outside the interval"
     ),
     ReasonKind.TOO_FEW_LINKS: lambda values, _: (
         f"{values['links']:.0f} links are too few for this number of unknowns"
@@ -139,15 +139,15 @@ def remark_text(remark: Remark) -> str:
 def _noise_remark(finding: str) -> Callable[[dict[str, Any]], str]:
     return lambda values: (
         f"{finding} (posterior weight {values['weight']:.2f}, independent Gaussian noise "
-        f"{values['gaussian_weight']:.2f}). The intervals allow for it."
+        f"{values['gaussian_weight']:.2f}). The intervals account for it."
     )
 
 
 _CAUSES: Final = {
     "correlated": "neighbouring links share part of their noise, so that many links count as few",
-    "structured": "links with like obstruction, distance and angles share errors, so that many count as few",
-    "student-t": "outliers count less where noise has heavy tails",
-    "heterogeneous": "links that depend on single buildings count less where buildings differ",
+    "structured": "links with similar obstruction, distance and angles share errors, so that many count as few",
+    "student-t": "outliers count less if noise has heavy tails",
+    "heterogeneous": "links that depend on single buildings count less if buildings differ",
     "gaussian": "their noise model differs from the one that RMSE assumes",
 }
 
@@ -165,15 +165,17 @@ def _outside_interval(values: dict[str, Any]) -> str:
         for name, value, ends, probable in rows
     )
     text = (
-        f"The candidate of least RMSE is not the most probable one: {parameters}. RMSE treats the "
-        f"noise of all links as independent; the intervals do not, since {_CAUSES[values['cause']]}. The most probable "
-        f"values are {times} times as probable. Do not use the values of least RMSE as constants of the materials."
+        f"The candidate with the lowest RMSE is not the most probable one: {parameters}. RMSE treats the noise of all "
+        f"links as independent; the intervals do not, because {_CAUSES[values['cause']]}. The most probable "
+        f"values are {times} times as probable. Do not use the values with the lowest RMSE as constants of the "
+        "materials."
     )
     if values["blocks"]:
         return text + " Held-out blocks show which model predicts best."
     return (
         text
-        + " Predictions use the values of least RMSE unless validation chooses another model: set [holdout] blocks = 4."
+        + " Predictions use the values with the lowest RMSE unless validation chooses another model: set [holdout] "
+        "blocks = 4."
     )
 
 
@@ -181,8 +183,8 @@ def _approximate_intervals(values: dict[str, Any]) -> str:
     replay = ", with the corrected replay of its scene" if values["replay"] else ""
     return (
         f"The intervals are approximate: the engine {values['engine']!r} gives no derivatives, so an emulator was "
-        f"fitted to {values['calls']} of its calls{replay}. In cross-validation it predicts the "
-        f"better half of these calls to {values['error_db']:.2g} dB."
+        f"fitted to {values['calls']} of its calls{replay}. In cross-validation, it predicts the better half of these "
+        f"calls to {values['error_db']:.2g} dB."
     )
 
 
@@ -192,27 +194,30 @@ def _conflict(values: dict[str, Any]) -> str:
     observables = ", ".join(values["observables"])
     if "slope" in values:
         return (
-            f"Measured {observables} changes from link to link by {values['slope']:.2f} times what the calibrated "
-            f"model predicts (standard error {values['slope_error']:.2f}), {values['standard_errors']:.1f} standard "
-            f"errors below 1. Path loss or further observables alone want {answers}. Check that the values belong to "
-            "these links and this scene, and the receiver's range."
+            f"Measured {observables} changes from link to link by {values['slope']:.2f} times the change that the "
+            f"calibrated model predicts (standard error {values['slope_error']:.2f}), "
+            f"{values['standard_errors']:.1f} standard errors below 1. Path loss or further observables alone require "
+            f"{answers}. Check that the values belong to these links and this scene, and the receiver's range."
         )
     return (
-        f"Path loss and {observables} want different parameters, by {values['standard_errors']:.1f} standard errors: "
-        f"{answers}. Check units, the receiver's range and the scene; the common fit explains neither."
+        f"Path loss and {observables} require different parameters, by {values['standard_errors']:.1f} standard "
+        f"errors: {answers}. Check units, the receiver's range and the scene; the common fit explains neither."
     )
 
 
 def _unreached_links(values: dict[str, Any]) -> str:
     trials = zip(values["switches"], values["reached"], strict=True)
-    reached = ", ".join(f"{switch} reaches {count:.0f}" for switch, count in trials)
+    reached = ", ".join(f"{switch} gives {count:.0f} of them a path" for switch, count in trials)
     text = (
-        f"{values['links']:,} of {values['of']:,} links have no path. They count in no RMSE, and no material is fitted "
-        "to them."
+        f"{values['links']:,} of {values['of']:,} links have no path. They enter no RMSE, and no material is fitted to "
+        "them."
     )
     if max(values["reached"], default=0.0) == 0:
-        return f"{text} No setting of [trace] reaches any of {values['sample']} that were tried: check their positions."
-    return f"{text} Of {values['sample']} that were tried, {reached}: change [trace]."
+        return (
+            f"{text} No setting of [trace] gives any of {values['sample']} sampled links a path: check their "
+            "positions."
+        )
+    return f"{text} Of {values['sample']} sampled links, {reached}: change [trace]."
 
 
 def _antenna_directions(values: dict[str, Any]) -> str:
@@ -226,9 +231,9 @@ def _antenna_directions(values: dict[str, Any]) -> str:
         sentences.append(f"{name!r}: add to {' and to '.join(angles)}")
     first = values["transmitters"][0]
     return (
-        "Residuals depend on direction, as if antennas pointed elsewhere than stated. This would explain them: "
-        f"{'; '.join(sentences)}. Check how they are mounted, or calibrate parameters such as "
-        f'"tx:{first}.azimuth".'
+        "Residuals depend on direction, as if antennas pointed in other directions than stated. These corrections "
+        f"would explain them: {'; '.join(sentences)}. Check the mounting of the antennas, or calibrate parameters such "
+        f'as "tx:{first}.azimuth".'
     )
 
 
@@ -237,16 +242,16 @@ def _ray_mapping(values: dict[str, Any]) -> str:
     constants = ", ".join(f"{name} {value:.3g}" for name, value in assumed)
     surfaces = "half-spaces" if values["half_space"] else "slabs"
     text = (
-        f"In {values['calls']} calls, ratios of the powers of the program's rays are explained with a misfit of "
-        f"{values['misfit_db']:.3f} dB, and path loss at the last call was predicted within {values['gap_db']:.3f} dB"
+        f"The model explains the ratios of the ray powers in {values['calls']} calls with a misfit of "
+        f"{values['misfit_db']:.3f} dB, and predicted path loss at the last call within {values['gap_db']:.3f} dB"
     )
     if values["understood"]:
-        text = f"The program is understood. {text}. Its surfaces are {surfaces}"
+        text = f"The assumptions of the program are identified. {text}. Its surfaces are {surfaces}"
         text += f" with {constants}." if constants else "."
     else:
         text = (
-            f"The program is not understood. {text}. A replay that agrees with it at the best call stands for it: the "
-            "optimum may be missed, and intervals are approximate."
+            f"The assumptions of the program are not identified. {text}. A replay that agrees with the program at "
+            "the best call replaces it: the optimum may be missed, and intervals are approximate."
         )
     if values["changed"]:
         text += (
@@ -260,20 +265,20 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.CORRELATED_NOISE: _noise_remark("Neighbouring links share part of their noise"),
     RemarkKind.HEAVY_TAILS: _noise_remark("The noise has heavy tails, as with outliers"),
     RemarkKind.STRUCTURED_NOISE: _noise_remark(
-        "Errors depend on what stands between the ends of links, on distance or on angles, as if the scene lacked "
-        "objects or the paths lacked physics, such as diffraction"
+        "Errors depend on the obstruction of links, on distance or on angles, as if the scene lacked objects or the "
+        "traced paths lacked a mechanism such as diffraction"
     ),
     RemarkKind.HETEROGENEITY: _noise_remark(
         "The noise is larger where materials matter more, as if buildings of one material differed"
     ),
     RemarkKind.UNDECLARED_OFFSET: lambda values: (
         f"The data show an undeclared offset of {values['offset_db']:+.1f} dB, standard error {values['error_db']:.1f} "
-        f"dB. With it the RMSE would be {values['rmse_db']:.2f} instead of {values['rmse_without_db']:.2f} dB. Add "
-        "[offset] if cable losses or antenna gains are uncertain."
+        f"dB. With this offset, the RMSE would be {values['rmse_db']:.2f} instead of "
+        f"{values['rmse_without_db']:.2f} dB. Add [offset] if cable losses or antenna gains are uncertain."
     ),
     RemarkKind.MISSED_OPTIMUM: lambda values: (
-        f"The method missed the optimum: draws from the posterior reach an RMSE of {values['draws_db']:.2f} dB, the "
-        f"method {values['found_db']:.2f} dB. The intervals are around the optimum."
+        f"The method missed the optimum: posterior draws reach an RMSE of {values['draws_db']:.2f} dB, but the "
+        f"method reached {values['found_db']:.2f} dB. The intervals are around the optimum."
     ),
     RemarkKind.OUTSIDE_INTERVAL: _outside_interval,
     RemarkKind.FEW_DRAWS: lambda values: (
@@ -304,11 +309,11 @@ def judgement_text(judgement: Judgement) -> str:
 
 
 def choice_text(chosen: str, best: str) -> str:
-    """Which model predictions use, and why.
+    """Which model predictions use, with the reason.
 
     Args:
         chosen: The prediction model.
-        best: The model of least held-out RMSE among those that predict anywhere.
+        best: The model with the lowest held-out RMSE among those that predict anywhere.
 
     Returns:
         A sentence.
@@ -323,17 +328,17 @@ def choice_text(chosen: str, best: str) -> str:
 
 
 def chosen_model_text(record: Record) -> str:
-    """The held-out accuracy of the prediction model, where it is not the calibrated one.
+    """The held-out accuracy of the prediction model, if it is not the calibrated one.
 
     Returns:
-        A sentence; empty where predictions use the calibrated model.
+        A sentence; empty if predictions use the calibrated model.
     """
     model, calibrated_db = record.prediction.model, record.accuracy.holdout_rmse_db
     if model.name == Model.CALIBRATED or model.residual_db is None or calibrated_db is None:
         return ""
     return (
-        f"On held-out links the prediction model {str(model.name)!r} has an RMSE of {model.residual_db:.2f} dB, the "
-        f"calibrated model {calibrated_db:.2f} dB."
+        f"On held-out links, the prediction model {str(model.name)!r} has an RMSE of {model.residual_db:.2f} dB, and "
+        f"the calibrated model {calibrated_db:.2f} dB."
     )
 
 
@@ -342,7 +347,7 @@ def remarks(record: Record, choice: str = "") -> tuple[str, ...]:
 
     Args:
         record: The result.
-        choice: Why predictions use their model, where validation chose it.
+        choice: The reason for the prediction model, if validation chose it.
 
     Returns:
         The sentences: warnings and advice, the judgement on held-out links, the choice of the prediction model.

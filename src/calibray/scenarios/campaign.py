@@ -5,9 +5,9 @@ of 511 chips over 200 MHz and records 100 impulse responses at every position (s
 delay profile of 511 taps of 5 ns. Between snapshots, traffic and swaying masts change the phases of the paths, so that
 paths within a tap fade. The receiver adds noise.
 
-The world is richer than the model that is calibrated. Every building has its own concrete and glass, surfaces scatter
-diffusely, lamp posts stand along the streets, and the recorded positions have errors of about a metre. A calibration
-can therefore find at best the means over the buildings, and residuals remain.
+The true world is more detailed than the calibrated model. Every building has its own concrete and glass, surfaces
+scatter diffusely, lamp posts stand along the streets, and the recorded positions have errors of about a metre. A
+calibration can therefore at best find the means over the buildings, and residuals remain.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ANTENNA_HEIGHT: Final = 4.0  # [m]
 POSITION_ERROR: Final = 0.8  # [m], standard deviation of recorded positions, in x and in y
 LEVELS: Final = np.linspace(-2.0, 2.0, 8)
 """Permittivities of buildings, in standard deviations from the mean. They are quantized, because two materials for each
-of 196 buildings would slow the ray tracer down."""
+of 196 buildings would slow down the ray tracer."""
 
 TRANSMITTERS: Final = ((-381.5, 140.0), (153.5, -330.0))
 """Planned positions of the transmitter, x and y [m]."""
@@ -284,7 +284,7 @@ def links_csv(truth: World, path_loss: NDArray[np.float64]) -> str:
 
 
 def truth_json(truth: World) -> str:
-    """The planted truth, which a calibration does not know: materials, buildings, links and lamp posts, as JSON."""
+    """The planted truth, which a calibration does not use: materials, buildings, links and lamp posts, as JSON."""
     content = {
         "materials": {
             name: {

@@ -5,8 +5,8 @@ buildings are 60 m to 70 m high, of concrete with glass windows, on soil and asp
 published. This district has the same extent, heights and materials; a seeded generator draws the rest. The
 sea is in the south.
 
-All coordinates are multiples of 1/64 m. These are exact in 32-bit floats, so all panels of a wall lie in exactly one
-plane, as the image method of the ray tracer requires.
+All coordinates are multiples of 1/64 m. These coordinates are exact in 32-bit floats, so all panels of a wall lie in
+exactly one plane, as the image method of the ray tracer requires.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Scenes: geometry and materials that a ray tracer reads.
+"""Scenes: the geometry and materials that a ray tracer reads.
 
 This package reads and writes scenes; `scenes.checks` finds faults in a scene and in positions, and `scenes.authoring`
 makes scenes from maps and floor plans. Both import from here, and not from each other.

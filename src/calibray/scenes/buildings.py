@@ -1,4 +1,4 @@
-"""Which building a position belongs to: all objects that touch in plan are one building.
+"""The building of a position: all objects that touch in plan are one building.
 
 The edges of all triangles except the ground's are drawn on a raster of the plan. Cells that touch, corners included,
 form one building. Streets separate buildings; a wall with its windows, or a row of houses, is one building.
@@ -19,16 +19,16 @@ CELL: Final = 1.0
 """Width of a raster cell [m]; objects less than one or two cells apart touch."""
 
 MAX_CELLS: Final = 8_000_000
-"""Largest number of raster cells, which bounds memory; larger scenes get wider cells."""
+"""Largest number of raster cells, which limits memory; larger scenes get wider cells."""
 
 MAX_POINTS: Final = 2_000_000
 """Largest number of points on edges that are held in memory at once."""
 
 
 def building_numbers(triangles: Triangles, position: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Number of the building [n], from 0, that each position [n, 3], [m], lies on or is nearest to in plan.
+    """Number of the building [n], from 0, that contains each position [n, 3], [m], or is nearest to it in plan.
 
-    It is -1 everywhere if the scene is ground alone.
+    The number is -1 everywhere if the scene is only ground.
     """
     # SciPy's spatial modules are slow to import, and few callers of this package need them.
     from scipy import ndimage
@@ -69,9 +69,9 @@ def _edge_cells(corners: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
 def footprints(
     triangles: Triangles, west: float, south: float, east: float, north: float
 ) -> list[NDArray[np.float64]]:
-    """Outlines of all that lies, whole or in part, within an area given by its bounds [m], the ground apart.
+    """Outlines of everything that lies, wholly or partly, within an area given by its bounds [m], except the ground.
 
-    They are closed lines, the first corner not repeated, each [n, 2], [m].
+    They are closed lines without a repeated first corner, each [n, 2], [m].
     """
     normal = triangles.normal
     area = np.linalg.norm(normal, axis=1)

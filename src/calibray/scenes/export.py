@@ -28,7 +28,7 @@ def export_scene(
 ) -> None:
     """Write a scene file with other constants; it refers to the original meshes or to copies.
 
-    Materials and objects get names that Sionna RT takes (`exported_names`). Sionna's scene files support the
+    Materials and objects get names that Sionna RT accepts (`exported_names`). Sionna's scene files support the
     Lambertian scattering pattern only; set another pattern after loading the scene.
 
     Args:
@@ -71,7 +71,7 @@ def export_scene(
 
 
 def exported_names(names: Iterable[str]) -> dict[str, str]:
-    """The names of materials in an exported scene: letters, digits, `_` and `-`, no two alike.
+    """The names of materials in an exported scene: letters, digits, `_` and `-`, and no name twice.
 
     Sionna RT refuses a plain `radio-material` with an ITU name, so such a name becomes `calibrated-NAME`. Mitsuba
     misreads names with dots, quotes or line breaks.

@@ -1,11 +1,11 @@
 """Triangle meshes: joined and welded, read from PLY and OBJ files, and written as PLY.
 
-Mitsuba and Sionna RT find wedges between faces that share vertices within one mesh. Where two meshes meet there is no
-wedge and hence no diffraction.
+Mitsuba and Sionna RT find wedges between faces that share vertices within one mesh. Where two meshes meet, there is no
+wedge and therefore no diffraction.
 
-Mitsuba trusts mesh files. A vertex index out of range ends the process or removes a reflection without a message;
-vertices that are not numbers are never hit. `read_mesh` refuses such files before Mitsuba sees them. Integer
-coordinates, which are legal, remove the reflections of the whole mesh: the tracer gets a copy in single precision.
+Mitsuba trusts mesh files. A vertex index out of range ends the process or removes a reflection without a message; rays
+never hit vertices that are not numbers. `read_mesh` refuses these files before Mitsuba reads them. Integer coordinates,
+which are legal, remove the reflections of the whole mesh: the tracer gets a copy in single precision.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class Mesh:
         vertices: Positions [V, 3], [m].
         faces: Vertex indices of each triangle, counter-clockwise seen from outside [F, 3].
         step: Spacing of the numbers with which its file stores the largest coordinate [m]; 0 if that is negligible.
-        misread: Whether the tracer gets a copy as PLY: a file stores coordinates as integers, or it is a rectangle,
-            which is not a mesh in Mitsuba.
+        misread: Whether the tracer gets a copy as PLY: a file stores coordinates as integers, or the shape is a
+            rectangle, which is not a mesh in Mitsuba.
     """
 
     vertices: NDArray[np.float64]
@@ -71,7 +71,7 @@ class MeshObject:
 
 
 def join_meshes(meshes: Iterable[Mesh]) -> Mesh:
-    """Join at least one mesh into one; vertices of different meshes stay separate, unused ones are dropped."""
+    """Join at least one mesh into one; vertices of different meshes stay separate, and unused ones are dropped."""
     parts = list(meshes)
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])

@@ -1,6 +1,6 @@
-"""What stands between the ends of links: the straight line through buildings, over roofs and across walls.
+"""The obstruction of links: the straight line through buildings, over roofs and across walls.
 
-Buildings reach from the ground to their roofs. A line is inside a building where a roof is above it. All lengths follow
+Buildings extend from the ground to their roofs. A line is inside a building if a roof is above it. All lengths follow
 from the crossings of the line with the scene's triangles, in plan for roofs and in space for walls.
 """
 
@@ -20,14 +20,14 @@ OUT_OF_SIGHT: Final = "out_of_sight"
 WALLS: Final = "walls_crossed"
 
 COLUMNS: Final = (OUT_OF_SIGHT, WALLS, "obstruction_m", "knife_edge_db")
-"""Columns of links that a scene gives: whether the straight line between the ends is blocked, how many walls it
+"""Columns of links that follow from a scene: whether the straight line between the ends is blocked, how many walls it
 crosses, its length inside buildings [m], and the knife-edge loss of the highest roof [dB]."""
 
 SAME_CROSSING: Final = 1e-3
-"""Crossings closer than this are one, on an edge that two triangles share [m]."""
+"""Crossings closer than this count as one, on an edge that two triangles share [m]."""
 
 BATCH: Final = 2_000_000
-"""Pairs of a line and a triangle in memory at once."""
+"""Largest number of pairs of a line and a triangle in memory at once."""
 
 CLEAR: Final = -0.78
 """Fresnel parameter below which an edge causes no loss (ITU-R P.526-15, section 4.1)."""
@@ -70,7 +70,7 @@ class Obstruction:
 
 
 def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[np.float64]) -> Obstruction:
-    """What stands between the ends of links.
+    """Compute the obstruction of links.
 
     Args:
         triangles: The scene's triangles; those of the ground are not obstacles.

@@ -1,4 +1,4 @@
-"""Regions of extra loss, such as trees: upright prisms over polygons, which rays pass undeflected."""
+"""Regions of extra loss, such as trees: upright prisms over polygons, through which rays pass undeflected."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def _between(
     bottom: NDArray[np.float64],
     top: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The part of lines between two heights, as shares of the line [k] each; empty where low exceeds high."""
+    """The part of lines between two heights, as shares of the line [k] each; empty if low exceeds high."""
     rise = last - first
     level = np.abs(rise) < 1e-9
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,8 +1,8 @@
 """Scenes: a Mitsuba XML file read into materials and objects, and rewritten for the tracer.
 
-In the scene for the tracer each surface material is a plain `radio-material` of Sionna's with explicit constants and a
+In the scene for the tracer, each surface material is a plain `radio-material` of Sionna's with explicit constants and a
 name that Calibray chooses. This keeps the constants in one place (`Material`), allows a frequency outside an ITU table
-when the study gives the constants (NVlabs/sionna-rt#71, #72), and avoids Sionna's rules on names: an ITU name needs the
+if the study gives the constants (NVlabs/sionna-rt#71, #72), and avoids Sionna's rules on names: an ITU name needs the
 prefix `itu_`, and an object must not have the name of a material.
 """
 
@@ -34,7 +34,7 @@ from calibray.scenes.shapes import SurfaceSize, local_origin, read_surface, writ
 from calibray.support.messages import did_you_mean, shortened
 
 DEFAULT_THICKNESS: Final = 0.1
-"""Sionna's thickness of a material that states none [m]."""
+"""Sionna's default thickness of a material [m]."""
 
 TRACED: Final = "mat-calibray-"
 """Prefix of the ids of materials in the scene for the tracer; the index in `Scene.materials` follows."""
@@ -66,10 +66,10 @@ class Scene:
     Attributes:
         source: The user's name for the scene: a path or `sionna:NAME`.
         path: The XML file.
-        materials: The materials that objects use, by name, at the frequency that the scene was read for.
+        materials: The materials that objects use, by name, at the frequency for which the scene was read.
         objects: The meshes, in the file's order.
         xml: The scene for the tracer; the id of material k of `materials` is `mat-calibray-k`.
-        laws: How the constants of each material depend on frequency: ITU-R's law for ITU materials, else constant.
+        laws: How the constants of each material depend on frequency: ITU-R's law for ITU materials, otherwise constant.
         sizes: Size of every object.
     """
 
@@ -83,7 +83,7 @@ class Scene:
 
     @property
     def local_origin(self) -> NDArray[np.float64]:
-        """Origin of the frame that the scene is traced in [3], [m]; zero unless the scene lies far from its origin."""
+        """Origin of the frame in which the scene is traced [3], [m]; zero unless the scene lies far from its origin."""
         return local_origin(self.sizes)
 
 
@@ -230,14 +230,14 @@ def _file_material_name(
 def _split_name(
     object_name: str, split: Mapping[str, str], definitions: Mapping[str, ElementTree.Element]
 ) -> str | None:
-    """The separate material of an object: that of the first pattern that matches; None if none does."""
+    """The separate material of an object: that of the first matching pattern; None if no pattern matches."""
     name = next((name for name, pattern in split.items() if fnmatchcase(object_name, pattern)), None)
     if name is None:
         return None
     name = name[:-1] + object_name if name.endswith("*") else name
     if name in definitions:
         raise InputError(
-            f"[objects] {name}: the scene has a material of that name already; choose another name"
+            f"[objects] {name}: the scene already has a material of that name; choose another name"
         )
     return name
 
@@ -261,7 +261,7 @@ def _material(
     frequency: float,
     path: Path,
 ) -> tuple[Material, ItuLaw]:
-    """The constants of one material, from the override and else the file, and their law over frequency."""
+    """The constants of one material, from the override or otherwise the file, and their law over frequency."""
     if isinstance(override, Material):
         return override, frequency_independent_law(override)
     constants = {key: value for key, value in (override or {}).items() if value is not None}
@@ -310,7 +310,7 @@ def _file_material(name: str, bsdf: ElementTree.Element | None, frequency: float
 
 
 def _itu_type(name: str, bsdf: ElementTree.Element | None) -> str | None:
-    """The ITU name that Sionna takes from a BSDF: its `type` string, or its own name after `itu_`."""
+    """The ITU name that Sionna derives from a BSDF: its `type` string, or its own name after `itu_`."""
     has_itu_name = name.startswith(("itu_", "itu-"))
     declared = None if bsdf is None else bsdf.find("string[@name='type']")
     if (
@@ -348,7 +348,7 @@ def _refer(shape: ElementTree.Element, identifier: str) -> None:
 
 
 def material_element(identifier: str, material: Material) -> ElementTree.Element:
-    """Make the BSDF of a material, with the constants that Sionna's scene files can hold."""
+    """Make the BSDF of a material, with the constants that Sionna's scene files can contain."""
     bsdf = ElementTree.Element("bsdf", {"type": "radio-material", "id": identifier})
     for name in (
         "relative_permittivity",

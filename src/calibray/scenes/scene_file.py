@@ -1,4 +1,4 @@
-"""The XML file of a scene: found, parsed and checked before a ray tracer sees it; written for new scenes."""
+"""The XML file of a scene: located, parsed and checked before a ray tracer reads it; written for new scenes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from calibray.support.output_files import check_outputs, exists, write_bytes, wr
 BUNDLED_PREFIX: Final = "sionna:"
 
 SHAPES: Final = ("cube", "obj", "ply", "rectangle")
-"""Types of shapes that are triangle meshes. Mitsuba's compressed `serialized` meshes are refused, since their size is
+"""Types of shapes that are triangle meshes. Mitsuba's compressed `serialized` meshes are refused, because their size is
 known only after Mitsuba has decompressed them."""
 
 MESHES: Final = "meshes"
@@ -165,7 +165,7 @@ class _ShallowTree(ElementTree.TreeBuilder):
 def shape_mesh(shape: ElementTree.Element, path: Path) -> Mesh | None:
     """Read the mesh of a shape, and refuse a shape that cannot be traced. Its transform is not applied.
 
-    It is None for a rectangle or cube, which have no file.
+    The result is None for a rectangle or cube, which have no file.
 
     Raises:
         InputError: The shape is not a triangle mesh or has a degenerate transform, or its mesh is missing or malformed.
@@ -198,7 +198,7 @@ def mesh_filename(shape: ElementTree.Element) -> str | None:
 
 
 def _check_transform(shape: ElementTree.Element, path: Path) -> None:
-    """Refuse a transform that flattens a shape or moves it to infinity: rays would pass through without a message."""
+    """Refuse a transform that flattens a shape or moves it to infinity: rays would pass without a message."""
     for step in shape.findall("transform/*"):
         words = [value for key, value in step.attrib.items() if key in ("x", "y", "z", "value", "angle")]
         try:
@@ -217,7 +217,7 @@ def _check_transform(shape: ElementTree.Element, path: Path) -> None:
 
 
 def keep_traced_elements(root: ElementTree.Element, path: Path) -> None:
-    """Reduce a scene to the elements that a trace needs, so that Mitsuba sees no others.
+    """Reduce a scene to the elements that a trace needs, so that Mitsuba reads no others.
 
     Mitsuba would load textures, emitters and sensors, and end the process on some that are malformed. They have no
     effect on radio waves and are dropped.
@@ -321,7 +321,7 @@ def _scene_xml(
 
 
 def read_frame(source: str | Path) -> Frame | None:
-    """Read where a scene lies on the globe; None if its file does not state it.
+    """Read the position of a scene on the globe; None if its file does not state it.
 
     Raises:
         InputError: The scene does not exist, or its file states an invalid frame.

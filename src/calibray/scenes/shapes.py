@@ -26,14 +26,14 @@ FAR: Final = 1000.0
 """Coordinate beyond which a scene may be traced in a local frame [m].
 
 Single precision rounds by at most 0.03 mm up to here. Three scenes of 100 m that were moved by 1 km kept all paths,
-with path loss within 0.001 dB; moved by 2 km it changed by 0.0015 dB, and by 10 km paths were found twice.
+with path loss within 0.001 dB. Moved by 2 km, path loss changed by 0.0015 dB, and at 10 km paths were found twice.
 """
 
 COARSE: Final = 1e-3
-"""Spacing of stored coordinates that is worth a warning [m]; path loss changes by more than 0.005 dB."""
+"""Spacing of stored coordinates above which there is a warning [m]; path loss changes by more than 0.005 dB."""
 
 TOO_COARSE: Final = 1e-2
-"""Spacing of stored coordinates that cannot be traced [m]: walls meet no longer, and paths are lost."""
+"""Spacing of stored coordinates above which a scene cannot be traced [m]: walls no longer meet, and paths are lost."""
 
 _SQUARE: Final = Mesh(
     np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float), np.array([[0, 1, 2], [0, 2, 3]])
@@ -43,7 +43,7 @@ _SQUARE: Final = Mesh(
 
 @dataclass(frozen=True)
 class SurfaceSize:
-    """Where the surface of an object lies, and how large it is.
+    """Position and size of the surface of an object.
 
     Attributes:
         low: Least coordinates [3], [m].
@@ -115,8 +115,7 @@ def transform_matrix(shape: ElementTree.Element, path: Path) -> NDArray[np.float
     """Compute the transform of a shape in double precision, a matrix for homogeneous coordinates [4, 4].
 
     Raises:
-        InputError: An element is not a translate, scale, rotate or matrix, or has another number of values than it
-            takes.
+        InputError: An element is not a translate, scale, rotate or matrix, or has the wrong number of values.
     """
     matrix = np.eye(4)
     for step in shape.findall("transform/*"):
@@ -179,10 +178,11 @@ def _cube() -> Mesh:
 
 
 def local_origin(sizes: tuple[SurfaceSize, ...]) -> NDArray[np.float64]:
-    """Choose the origin [3], [m], of the frame that a scene is traced in.
+    """Choose the origin [3], [m], of the frame in which a scene is traced.
 
-    It is the centre of the scene, rounded to metres, if the scene lies far from the origin of its coordinates: beyond
-    `FAR`, and further than it is wide, so that the local frame gains at least one bit. Otherwise it is zero.
+    If the scene lies far from the origin of its coordinates, it is the centre of the scene, rounded to metres. Far
+    means beyond `FAR`, and farther than the scene is wide, so that the local frame gains at least one bit. Otherwise it
+    is zero.
     """
     if not sizes:
         return np.zeros(3)

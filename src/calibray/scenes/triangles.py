@@ -1,4 +1,4 @@
-"""The meshes of a scene as Calibray uses them outside the tracer: for checks, maps and drawings; and its ground."""
+"""The meshes of a scene for use outside the tracer (checks, maps and drawings), and its ground."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ WITHOUT_GAPS: Final = 0.9
 """Share of its extent that a sheet over the whole scene covers, such as a floor or a ceiling [1]."""
 
 _EDGE: Final = 1e-9
-"""Points up to this far outside a triangle count as over it, as a share of its size [1]."""
+"""Points up to this distance outside a triangle count as over it, as a share of its size [1]."""
 
 
 def read_meshes(source: str | Path) -> Iterator[MeshObject]:
     """Read the PLY and OBJ meshes of a scene, one after the other.
 
-    Faces are reversed where the file flips normals. Transforms of shapes are not applied, and shapes without a file
+    Faces are reversed if the file flips normals. Transforms of shapes are not applied, and shapes without a file
     (rectangles, cubes) are skipped.
 
     Raises:
@@ -86,7 +86,7 @@ class Triangles:
 def read_triangles(scene: Scene) -> Triangles:
     """Read the triangles of a scene.
 
-    Objects without a mesh file, with a transform, or whose file became unreadable are left out and named.
+    Objects without a mesh file, with a transform, or whose file can no longer be read are left out and named.
     """
     materials = list(scene.materials)
     meshes: list[Mesh] = []
@@ -123,7 +123,7 @@ def read_triangles(scene: Scene) -> Triangles:
 def _ground(triangles: Triangles, owner: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Triangles of the objects that are level and extend under most of the scene [F].
 
-    A mesh of all roofs is level and wide as well, but it has gaps, or lies above the walls.
+    A mesh of all roofs is also level and wide, but it has gaps, or lies above the walls.
     """
     ground = np.zeros(len(owner), dtype=bool)
     if not len(owner):
@@ -147,7 +147,7 @@ def _ground(triangles: Triangles, owner: NDArray[np.int64]) -> NDArray[np.bool_]
 def is_ground(mesh: Mesh, extent: NDArray[np.float64]) -> bool:
     """Whether a mesh is a sheet under the whole scene, of an extent east and north [2], [m].
 
-    This is stricter than `Triangles.ground`, which also takes a ceiling for ground: here a ceiling covers the rooms. No
+    This is stricter than `Triangles.ground`, which also counts a ceiling as ground: here a ceiling covers the rooms. No
     face may be steep, and the mesh must cover most of the scene.
     """
     sides = mesh.vertices[mesh.faces[:, 1:]] - mesh.vertices[mesh.faces[:, :1]]
@@ -163,7 +163,7 @@ def ground_heights(
 ) -> NDArray[np.float64]:
     """Heights of the lowest ground [ny, nx], [m], over a grid of ascending, equally spaced x [nx] and y [ny].
 
-    Where there is none, it is the height of the scene's lowest point.
+    Where there is no ground, the height is that of the scene's lowest point.
     """
     heights = np.full((len(y), len(x)), np.inf)
     corners = triangles.corners[triangles.ground]

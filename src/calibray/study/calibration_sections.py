@@ -1,4 +1,4 @@
-"""The sections of a study file that say what is calibrated and how, each a closed model: an unknown key is an error."""
+"""The sections of a study file on what is calibrated and how, each a closed model: an unknown key is an error."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from calibray.support.strict_models import Section, Text
 
 
 class ObjectiveSection(Section):
-    """``[objective]``: how paths combine to a path loss, and how a link without a path counts.
+    """``[objective]``: how paths are combined to a path loss, and how a link without a path counts.
 
     Attributes:
         combining: "power" (sum of path powers), "coherent" (sum of fields) or "band" (coherent power averaged
@@ -40,7 +40,7 @@ class ObjectiveSection(Section):
             )
         if self.no_path == "exclude" and self.ceiling_db is not None:
             raise InputError(
-                f"ceiling_db = {self.ceiling_db:g} has no effect; set no_path = 'censor' or leave it out"
+                f"ceiling_db = {self.ceiling_db:g} has no effect; set no_path = 'censor' or remove it"
             )
         return self
 
@@ -51,10 +51,10 @@ class PriorSection(Section):
     Attributes:
         itu: ITU-R P.2040 material that gives the value, with or without "@REVISION".
         value: The value itself, in the field's unit, in place of `itu`.
-        like: Another parameter that this one scatters around, in place of `itu`: they are of one population.
+        like: Another parameter around which this one scatters, in place of `itu`: both belong to one population.
         spread: Standard deviation of the logarithm: 0.3 is about 30 %.
         std: Standard deviation of a Gaussian prior around the start value, in the field's unit, in place of the others.
-        shared: Whether `std` is the spread of a population of transmitters, which is estimated if theirs is "auto".
+        shared: Whether `std` is the spread of a population of transmitters; it is estimated if their spread is "auto".
     """
 
     itu: Text | None = None
@@ -69,14 +69,15 @@ class PriorSection(Section):
         if self.std is not None:
             if any(stated is not None for stated in (self.itu, self.value, self.like, self.spread)):
                 raise InputError(
-                    "a prior with std is Gaussian around the start value: leave itu, value, like and spread out"
+                    "a prior with std is Gaussian around the start value: remove itu, value, like and spread"
                 )
             return self
         if self.spread is None:
             raise InputError("a prior needs spread, the standard deviation of its logarithm, or std")
         if sum(stated is not None for stated in (self.itu, self.value, self.like)) != 1:
             raise InputError(
-                "a prior is centred on an ITU material, a value or another parameter: give one of itu, value and like"
+                "a prior is centred on an ITU material, a value or another parameter: give only one of itu, value and "
+                "like"
             )
         return self
 
@@ -86,11 +87,12 @@ class ParameterSection(Section):
 
     Attributes:
         bounds: Lower and upper bound, in the field's unit.
-        start: Value before calibration, a number, "itu:NAME" or "itu:NAME@REVISION"; if absent, the scene's.
+        start: Value before calibration, a number, "itu:NAME" or "itu:NAME@REVISION"; if absent, the scene's value.
         scale: "linear" or "log".
         prior: Its prior; uniform within the bounds if absent.
-        spread: Standard deviation, in the field's unit, of the values of single transmitters around the common one of a
-            parameter such as "tx:*.azimuth", or "auto" to estimate it; if absent, only the common value is calibrated.
+        spread: Standard deviation, in the field's unit, of the values of single transmitters around the common value of
+            a parameter such as "tx:*.azimuth", or "auto" to estimate it. If absent, only the common value is
+            calibrated.
     """
 
     bounds: tuple[float, float]
@@ -100,7 +102,7 @@ class ParameterSection(Section):
     spread: Literal["auto"] | Annotated[float, Field(gt=0)] | None = None
 
     def centre(self, name: str, frequency: float) -> float:
-        """The value that the prior is centred on, in the field's unit; 1 if it is like another parameter.
+        """The centre of the prior, in the field's unit; 1 if it is like another parameter.
 
         Args:
             name: The parameter.
@@ -136,10 +138,10 @@ class NuisanceTerm:
         by: "constant", "log_distance" (decades of distance), a column that follows from the scene ("out_of_sight",
             "walls_crossed", "obstruction_m", "knife_edge_db", "region_m", "clutter_db"), or a numeric column of the
             links.
-        per: Columns whose joined labels are the groups; one coefficient for all links if there are none.
+        per: Columns whose joined labels are the groups; without columns, one coefficient for all links.
         bounds: Lower and upper bound of the coefficient, [dB] per unit of the column; unbounded if None.
-        prior: Standard deviation of a Gaussian prior around zero, in the same unit; flat if None; "auto" around the
-            mean of the groups, its standard deviation estimated.
+        prior: Standard deviation of a Gaussian prior around zero, in the same unit; flat if None; "auto" for a prior
+            around the mean of the groups with an estimated standard deviation.
     """
 
     by: str
@@ -164,7 +166,7 @@ class OffsetSection(Section):
     _ordered = field_validator("bounds")(_ordered)
 
     def term(self) -> NuisanceTerm:
-        """The nuisance term that this section is the short form of."""
+        """The nuisance term of which this section is the short form."""
         per = (self.per,) if isinstance(self.per, str) else self.per or ()
         return NuisanceTerm("constant", per, self.bounds, self.prior_db)
 
@@ -181,7 +183,7 @@ class NuisanceSection(Section):
         cluster_m: Side of the squares in which receivers form the groups of "cluster" [m].
         bounds: Lower and upper bound of the coefficient, [dB] per unit of the column; unbounded if absent.
         prior: Standard deviation of a Gaussian prior around zero, in the same unit; flat if absent. "auto" is a prior
-            around the mean of the groups, whose standard deviation is estimated (a random effect).
+            around the mean of the groups with an estimated standard deviation (a random effect).
     """
 
     by: Text
@@ -209,12 +211,12 @@ class NoiseSection(Section):
     """``[noise]``: the errors of measured links.
 
     Attributes:
-        std_db: Standard deviation of a link's error [dB], which weighs the priors; estimated if absent.
-        kind: "gaussian", "student-t", or "auto" for intervals that cover both.
+        std_db: Standard deviation of a link's error [dB], which scales the priors; estimated if absent.
+        kind: "gaussian", "student-t", or "auto" for intervals that account for both.
         range_m: Correlation distance of neighbouring links' errors [m], 0 for none, or "auto".
         heterogeneity: Between-building spread of a material's constants, 0 for none, or "auto".
         constants_spread: Standard deviation of the logarithm of thickness, conductivity and scattering coefficient of
-            calibrated materials, where they are no parameters: how well the scene's values are known; 0 if exactly.
+            calibrated materials that are not parameters: how well the scene's values are known; 0 if they are exact.
     """
 
     std_db: Annotated[float, Field(gt=0)] | None = None
@@ -240,7 +242,7 @@ class NoiseSection(Section):
 
 
 class HoldoutSection(Section):
-    """``[holdout]``: links that are not calibrated on, for validation; chosen in one of three ways.
+    """``[holdout]``: links that are not used for calibration but for validation; chosen in one of three ways.
 
     Attributes:
         where: Row filter; links that pass it are held out.
@@ -255,12 +257,12 @@ class HoldoutSection(Section):
     @model_validator(mode="after")
     def _one_way(self) -> Self:
         if sum(way is not None for way in (self.where, self.blocks, self.by)) != 1:
-            raise InputError("holdout: give one of where, blocks and by")
+            raise InputError("holdout: give only one of where, blocks and by")
         return self
 
 
 class FidelitySection(Section):
-    """``[fidelity]``: tracing again with the calibrated materials, because paths may depend on them.
+    """``[fidelity]``: a second trace with the calibrated materials, because paths may depend on them.
 
     Attributes:
         tolerance_db: Largest change of a link's path loss [dB] that is accepted.
@@ -308,7 +310,7 @@ _TYPES: Final[Mapping[str, tuple[tuple[type, ...], str]]] = {
 
 
 def check_options(name: str, options: Mapping[str, Any]) -> None:
-    """Refuse settings that a method does not have; the method itself checks whether their values suit it.
+    """Refuse settings that a method does not have; the method itself checks their values.
 
     If the method is unknown or chosen later, only the size of values is checked.
 

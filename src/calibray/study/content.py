@@ -1,4 +1,4 @@
-"""The sections of a study file together: a closed model, and the keys that do not go together."""
+"""The sections of a study file together: a closed model, and the checks of keys that cannot be combined."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ BUNDLED: Final = "sionna:"
 """Prefix of the name of a scene bundled with Sionna RT."""
 
 OFFSET: Final = "offset"
-"""Name of the nuisance term that ``[offset]`` is the short form of."""
+"""Name of the nuisance term of which ``[offset]`` is the short form."""
 
 
 class StudyContent(Section, ABC):
-    """The sections of a study file, with the checks of keys that do not go together."""
+    """The sections of a study file, with the checks of keys that cannot be combined."""
 
     version: int
     scene: SceneSection
@@ -94,8 +94,8 @@ class StudyContent(Section, ABC):
             )
         if self.links.below_floor == "censor" and self.noise.range_m not in ("auto", 0):
             raise InputError(
-                f"links.below_floor = 'censor' with noise.range_m = {self.noise.range_m:g}: censored links are "
-                "counted as if their errors were independent; leave one of them out"
+                f"links.below_floor = 'censor' with noise.range_m = {self.noise.range_m:g}: censored links are counted "
+                f"as if their errors were independent; remove one of them"
             )
         self._check_rays()
         self._check_observables()
@@ -147,8 +147,8 @@ class StudyContent(Section, ABC):
             section.file is None for section in self.observables.values()
         ):
             raise InputError(
-                "links.average with [observables]: averages keep the columns of the first sample; average the table "
-                "itself, or remove one of them"
+                "links.average with [observables]: averages keep only the columns of the first sample; average the "
+                "table itself, or remove one of them"
             )
         if self.engine.name == "retrace":
             raise InputError("[observables] with engine.name = 'retrace': use 'replay' or 'command'")
@@ -259,7 +259,7 @@ class StudyContent(Section, ABC):
                     raise InputError(f"{dotted(('materials', name))}: {error}") from None
 
     def _check_parameters(self) -> None:
-        """Check all that does not need the scene; `parameter_set` checks the rest."""
+        """Check everything that does not need the scene; `parameter_set` checks the rest."""
         frequency, parameters = self.scene.frequency, []
         for name, entry in self.parameters.items():
             start = itu_start(name, entry.start, frequency) if isinstance(entry.start, str) else entry.start
@@ -268,7 +268,7 @@ class StudyContent(Section, ABC):
             if entry.spread is not None and not name.startswith(f"{POSE}{EVERY}."):
                 raise InputError(
                     f"{name}: spread is that of a population of transmitters; give it to '{POSE}{EVERY}.azimuth' or "
-                    "another field, or leave it out"
+                    f"another field, or remove it"
                 )
             if entry.prior is not None and entry.prior.std is not None:
                 if not name.startswith((POSE, RECEIVER)):

@@ -38,7 +38,7 @@ METAL_CONDUCTIVITY: Final = 1e6
 """Conductivity above which path loss does not depend on its value [S/m]."""
 
 MOST_MATERIALS: Final = 6
-"""Materials that are calibrated at most; links seldom identify more."""
+"""Largest number of materials that are calibrated; links seldom identify more."""
 
 
 BLOCKS: Final = 4
@@ -78,9 +78,9 @@ def draft(
         target: The future study file; other files are named relative to its folder.
         transmitters: Table of the transmitters' positions, unless the links have them.
         frequency: Carrier frequency [Hz], unless the links have it.
-        tx: Transmitter position (x, y, z) [m] in the scene's frame, unless a table has it.
-        track: GPX track with the position of each row, unless the links have it.
-        antennas: Folder of MSI files, named like the transmitters' antennas.
+        tx: Transmitter position (x, y, z) [m] in the scene's frame, unless a table contains it.
+        track: GPX track with the position of each row, unless the links contain it.
+        antennas: Folder of MSI files named after the transmitters' antennas.
 
     Returns:
         The draft.
@@ -103,7 +103,7 @@ def _content(links: LinksDraft, antennas: Path | None) -> dict[str, Any]:
     indoors = _indoors(links)
     if section.get("position") == "geographic" and not indoors:
         section["inside"] = "move"
-        reason = "satellite positions are metres off, and some are inside walls"
+        reason = "satellite positions have errors of metres, and some are inside walls"
         links.assume("links.inside", "move", reason)
     antenna_section = add_antennas(links, antennas)
     trace = {"max_depth": _depth(links) if indoors else 3, "samples": 200_000}
@@ -136,9 +136,7 @@ def _hold_out_blocks(links: LinksDraft, content: dict[str, Any]) -> None:
     if count_unknowns(study, measured) or places < BLOCKS * LINKS_PER_UNKNOWN:
         return
     content["holdout"] = {"blocks": BLOCKS}
-    reason = (
-        "each block of neighbours is predicted from the others; predictions use the model that does it best"
-    )
+    reason = "each block of neighbours is predicted from the others; predictions use the model with the lowest error"
     links.assume("holdout.blocks", BLOCKS, reason)
 
 
@@ -165,7 +163,7 @@ def _depth(links: LinksDraft) -> int:
 def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
     """The scene, and the constants of materials for which ITU-R P.2040 has no law at the carrier.
 
-    They are those of the law at the nearest frequency that it covers.
+    These are the constants of the law at the nearest frequency that it covers.
     """
     try:
         return read_scene(links.scene, links.frequency), {}
@@ -178,7 +176,7 @@ def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
         if nearest != links.frequency / 1e9:
             permittivity, conductivity = law.a * nearest**law.b, law.c * nearest**law.d
             constants[name] = {"relative_permittivity": permittivity, "conductivity": conductivity}
-    reason = f"ITU-R P.2040 does not cover {links.frequency / 1e9:g} GHz: the constants at the nearest that it covers"
+    reason = f"ITU-R P.2040 does not cover {links.frequency / 1e9:g} GHz: constants at the nearest frequency covered"
     links.assume("materials", ", ".join(constants), reason)
     return read_scene(links.scene, links.frequency, constants), constants
 
@@ -195,14 +193,14 @@ def _trees(links: LinksDraft) -> tuple[dict[str, Any], dict[str, Any]]:
     section = RegionSection.model_validate_json(json.dumps(content))
     region, measured = section.region(file, Place(frame, lambda: links.overhead)), links.measurements()
     crossing = int((region.length_inside(measured.tx, measured.rx) > 0).sum())
-    reason = f"trees are on the straight line of {crossing} of {len(measured)} links; dense trees in leaf attenuate so"
+    reason = f"trees are on the straight line of {crossing} of {len(measured)} links; typical of dense trees in leaf"
     links.assume("regions", f"trees, {specific:g} dB/m", reason)
     parameter = {"region:trees.specific_attenuation": {"bounds": [0.0, 3.0]}} if crossing else {}
     return {"trees": content}, parameter
 
 
 def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dict[str, Any]]:
-    """The entries of ``[parameters]``: permittivities, and indoors conductivities, which walls attenuate by."""
+    """The entries of ``[parameters]``: permittivities, and indoors also conductivities, which attenuate walls."""
     materials = {
         name: material
         for name, material in scene.materials.items()
@@ -219,7 +217,7 @@ def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dic
         if indoors and conductivity > 0:
             bounds = [min(1e-3, float(f"{conductivity / 10:.0e}")), 3.0]
             entries[f"{name}.conductivity"] = {"bounds": bounds, "scale": "log"}
-    reason = "the scene's materials except metal; start values are the scene's"
+    reason = "the scene's materials except metal; start values are those of the scene"
     links.assume("parameters", ", ".join(names), reason)
     return entries
 
@@ -232,7 +230,7 @@ def add_antennas(links: LinksDraft, folder: Path | None) -> dict[str, Any]:
 
     Args:
         links: The draft.
-        folder: Folder of MSI files that are named like the antennas; None if there is none.
+        folder: Folder of MSI files named after the antennas; None if there is none.
 
     Returns:
         The section ``[antennas]``.
@@ -264,7 +262,7 @@ def add_antennas(links: LinksDraft, folder: Path | None) -> dict[str, Any]:
     elif "azimuth_deg" in mount:
         reason = "azimuths are stated: 3GPP's 65-degree sectors, iso receivers"
     else:
-        reason = "unknown; state yours, with their orientation"
+        reason = "unknown; state your antennas with their orientation"
     if folder is None and name is not None:
         reason += f"; give --antennas, a folder of the MSI files that column {name} names"
     links.assume("antennas", f"{antennas['tx']['pattern']}, V" if folder is None else folder.name, reason)
@@ -280,7 +278,7 @@ def _range(values: Any) -> str:
 
 
 def _patterns(links: LinksDraft, folder: Path, mount: dict[str, str]) -> dict[str, Any]:
-    """Antennas by the names of a column, with the files of these names; one file serves all transmitters."""
+    """Antennas by the names of a column, with the files of these names; a single file is used for all transmitters."""
     try:
         files = sorted(file for file in folder.iterdir() if file.suffix.lower() in TWO_CUT_SUFFIXES)
     except OSError as error:

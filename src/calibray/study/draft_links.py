@@ -41,10 +41,10 @@ TRANSMITTER_HEIGHT: Final = 10.0
 """Height of a transmitter without a column of heights [m]: a small cell on a mast."""
 
 AVERAGING_WAVELENGTHS: Final = 40
-"""Width of the cells that fading is averaged over (Lee 1985; see `calibray.measurements.averaging`)."""
+"""Width of the cells over which fading is averaged (Lee 1985; see `calibray.measurements.averaging`)."""
 
 PLACE_SAMPLES: Final = 20
-"""Median number of samples at one position from which samples are averaged by position: a stationary scan. The
+"""Median number of samples at one position above which samples are averaged by position: a stationary scan. The
 logarithm of the mean of 20 samples of Rayleigh fading is biased by 0.1 dB."""
 
 LEVEL_GROUND: Final = 0.5
@@ -118,7 +118,7 @@ class LinksDraft:
 
     @cached_property
     def overhead(self) -> SceneSurfaces:
-        """The ground below and the roofs above positions of the scene."""
+        """The ground below and the roofs above positions in the scene."""
         return SceneSurfaces.read(self.scene)
 
     @property
@@ -283,7 +283,7 @@ class LinksDraft:
     def _projected(
         self, rx: PositionColumns, tx: PositionColumns | None
     ) -> tuple[PositionColumns, PositionColumns | None]:
-        """The columns, which are on the globe if their numbers are far from the scene, but on it in a projection."""
+        """The columns; their numbers are on the globe if they are far from the scene, but on it in a projection."""
         frame = read_frame(self.scene) if rx.position == "scene" else None
         if frame is None or (tx is not None and tx.position != "scene"):
             return rx, tx
@@ -301,7 +301,7 @@ class LinksDraft:
         return next(ends), next(ends)  # type: ignore[return-value]
 
     def _name_in_links(self, column: str | None) -> str | None:
-        """A column of transmitters gets another name if the links have one of that name."""
+        """A column of transmitters is renamed if the links have a column of the same name."""
         taken = column in self._table.frame and column != self._transmitter_key
         return f"{self._transmitter_key}_{column}" if taken else column
 
@@ -319,14 +319,14 @@ class LinksDraft:
         self.section["position"] = "geographic"
         if read_frame(self.scene) is None:
             raise InputError(
-                f"{self.links}: positions are in degrees, but {self.scene} has no place on the globe; make the scene "
-                "with `calibray scene`, or write a study yourself with scene.origin"
+                f"{self.links}: positions are in degrees, but {self.scene} has no position on the globe; make the "
+                f"scene with `calibray scene`, or write a study yourself with scene.origin"
             )
-        reason = f"{unit}; {Path(self.scene).name} has the scene's place on the globe"
+        reason = f"{unit}; {Path(self.scene).name} has the scene's position on the globe"
         self.assume("links.position", "geographic", reason)
 
     def _add_position_unit(self, tx: PositionColumns | None, rx: PositionColumns) -> None:
-        """The unit of the position columns, if their names state another one than the metre."""
+        """The unit of the position columns, if their names state a unit other than the metre."""
         ends = [end for end in (tx, rx) if end is not None]
         if any(end.position == "geographic" for end in ends):
             names = [end.height for end in ends if end.height is not None]
@@ -376,7 +376,7 @@ class LinksDraft:
             self.assume("links.transmitter", name, "each of its names has one transmitter position")
 
     def _transmitter_at_origin(self, rx: PositionColumns) -> list[float | str]:
-        """A transmitter at the scene's origin, if the table's distances are distances from there."""
+        """A transmitter at the scene's origin, if the table's distances are measured from there."""
         frame, name = self._table.frame, column_names.find_distance(self._table.frame)
         height = column_names.find_transmitter_height(frame)
         if (
@@ -414,7 +414,7 @@ class LinksDraft:
     def _powers(self, value: ValueColumn) -> dict[str, str]:
         """Column of EIRP or transmitted power by the key of ``[links]``; empty if there is none.
 
-        Tables of transmitters state the power of the whole carrier, of which a reference signal is a part.
+        Tables of transmitters state the power of the whole carrier, but a reference signal is only a part of it.
         """
         power = column_names.find_transmit_power(self._table.frame)
         if power is not None:

@@ -1,4 +1,4 @@
-"""``[facades.NAME]``: materials of parts of one mesh, by where on it a path interacts: storey, side, place, windows."""
+"""``[facades.NAME]``: materials of parts of one mesh by the place of an interaction: storey, side, place, windows."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ NEAR: Final = 0.5
 """Distance from a polygon up to which a wall belongs to it [m]: walls stand on the outlines of buildings."""
 
 BESIDE: Final = 0.1
-"""Distance from a wall at which its sides are told apart [m]."""
+"""Distance from a wall at which its sides are distinguished [m]."""
 
 
 class FacadeSection(Section):
-    """``[facades.NAME]``: a material of the parts of walls that all stated rules apply to.
+    """``[facades.NAME]``: a material of the parts of walls to which all stated rules apply.
 
     Attributes:
-        of: Material of the scene whose surfaces are divided; the new one has its constants unless ``[materials]`` says
-            otherwise.
+        of: Material of the scene whose surfaces are divided; the new one has its constants unless ``[materials]``
+            states others.
         storeys: First and last storey, counted from 1 at the ground.
         storey_height: Height of a storey [m].
         facing: Compass bearings [deg] between which the outward normal of the wall lies, clockwise. The inside of a
-            wall is under a roof; without one, the order of the corners of its triangles tells.
-        boxes: Rectangles that the wall stands in: west, south, east, north [m] in the scene's frame.
-        file: GeoJSON file, Shapefile, GeoPackage or FlatGeobuf file of polygons that it stands on.
+            wall is under a roof; without a roof, the order of the corners of its triangles determines it.
+        boxes: Rectangles that contain the wall: west, south, east, north [m] in the scene's frame.
+        file: GeoJSON file, Shapefile, GeoPackage or FlatGeobuf file of polygons with the wall on their outlines.
         column: Column of the file; the polygons are those whose value is NAME. All of them if absent.
         position: "geographic" or "scene", as for ``[regions]``.
-        share: Share of the wall that strips of this material take, such as windows.
+        share: Share of the wall that strips of this material cover, such as windows.
         module: Distance between the middles of two strips [m]; rounded so that a wall has a whole number of them.
     """
 
@@ -137,17 +137,17 @@ def with_facades(
     place: Place,
     materials: Mapping[str, Material],
 ) -> Paths:
-    """The paths with the materials of facades where their interactions happen; the first facade that applies counts.
+    """The paths with the materials of facades at their interactions; if several facades apply, the first one counts.
 
     Args:
         paths: The paths.
         facades: The facades by name.
         files: Their files, resolved.
-        place: What is known of the scene.
+        place: Known data of the scene.
         materials: The materials of the scene and of the facades.
 
     Raises:
-        InputError: A file cannot be used, or a wall stands on no ground.
+        InputError: A file cannot be used, or there is no ground below a wall.
     """
     surfaces, names = place.surfaces(), list(paths.materials)
     material, free = paths.material.copy(), np.ones(paths.num_interactions, dtype=bool)

@@ -25,16 +25,16 @@ PATTERN_GAIN_DB: Final = {"iso": 0.0, "dipole": 1.8, "hw_dipole": 2.2, "tr38901"
 """Largest gain of Sionna's antenna patterns [dB]."""
 
 BELOW_FREE_SPACE_DB: Final = 6.0
-"""Path loss this far below free space is suspicious [dB]; a ground reflection alone gains up to 6 dB."""
+"""Path loss more than this below free space is suspicious [dB]; a ground reflection alone gains up to 6 dB."""
 
 FAR: Final = 10.0
 """Distance from the scene, in scene sizes, at which links cannot belong to it."""
 
 MIN_LINKS: Final = 8
-"""Number of links below which shares of links prove nothing."""
+"""Number of links below which shares of links show nothing."""
 
 CELL_SHARE: Final = 0.05
-"""Largest width of the areas that samples are averaged over, as a share of the scene's shorter side."""
+"""Largest width of the areas over which samples are averaged, as a share of the scene's shorter side."""
 
 LINKS_PER_UNKNOWN: Final = 5
 """Number of links per unknown below which a fit hardly constrains its unknowns."""
@@ -128,7 +128,7 @@ def _positions(
     inside = roofed & ~overhead.underground(rx)
     if inside.any():
         problem = f"{int(inside.sum())} of {len(rx)} receivers are inside buildings"
-        yield problem, "correct them, leave them out, or set links.inside = 'move'"
+        yield problem, "correct them, remove them, or set links.inside = 'move'"
     inside = overhead.under_roof(tx) & ~overhead.underground(tx)
     if inside.any():
         problem = f"{int(inside.sum())} of {len(tx)} transmitters are inside buildings"
@@ -145,7 +145,7 @@ def _refuse_far_links(
             f"{source}: all receivers are more than {FAR * size:.0f} m from the scene, near ({centre[0]:.0f}, "
             f"{centre[1]:.0f}) m; "
             + (
-                "check the order of longitude and latitude, and that the scene is one of this place"
+                "check the order of longitude and latitude, and that the scene is at this place"
                 if is_geographic
                 else "give positions relative to the scene's origin, or state their map projection as links.crs"
             )
@@ -158,7 +158,7 @@ def _misplaced(overhead: SceneSurfaces, rx: NDArray[np.float64]) -> int:
 
 
 def _better_turn(overhead: SceneSurfaces, rx: NDArray[np.float64], wrong: int) -> tuple[str, int] | None:
-    """Rotations of the axes after which at most a quarter of the receivers are still misplaced, and how many are."""
+    """Rotations of the axes after which at most a quarter of the receivers are misplaced, and the number of these."""
     if len(rx) < MIN_LINKS or wrong < 0.15 * len(rx):
         return None
     misplaced = {name: _misplaced(overhead, turn(rx)) for name, turn in _TURNS.items()}
@@ -199,7 +199,7 @@ def _levels(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str]]
         median = float(np.median(excess[below]))
         yield (
             f"{int(below.sum())} of {len(links)} path losses are below free space, by a median of {median:.0f} dB",
-            "check tx_power_dbm (30 dB: watts for milliwatts), gains that are in the values, scene.frequency, the sign",
+            "check tx_power_dbm (30 dB: watts for milliwatts), gains included in the values, scene.frequency, the sign",
         )
 
 
@@ -220,7 +220,7 @@ def _angles(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str]]
             yield (
                 f"the values fit antennas.{name} better with a yaw of {compass:.2f} rad: {spread_compass:.1f} dB "
                 f"around a line over distance, compared with {spread:.1f} dB",
-                "yaw counts from x (east) towards y (north); a compass bearing b is pi/2 - b",
+                "yaw is measured from x (east) towards y (north); a compass bearing b is pi/2 - b",
             )
 
 

@@ -39,13 +39,13 @@ def with_obstruction(
     clutter: bool = False,
     cluster_m: float | None = None,
 ) -> Measurements:
-    """The links with the columns that the scene gives; columns of these names in their table are kept.
+    """The links with the columns that follow from the scene; columns of these names in their table are kept.
 
     Args:
         links: The links.
         scene: The scene.
         frequency: Carrier [Hz] of the links that state none.
-        regions: The regions of extra loss by name; without any, `REGION` is left out.
+        regions: The regions of extra loss by name; if there are none, `REGION` is left out.
         clutter: Whether `CLUTTER` is wanted.
         cluster_m: Side of the squares of `CLUSTER`, a lattice through the scene's origin; left out if None.
 
@@ -83,7 +83,7 @@ def clutter_loss_db(distance: ArrayLike, frequency: ArrayLike) -> NDArray[np.flo
         frequency: Carrier of all or of each [n], [Hz].
 
     Returns:
-        The losses; 0 for paths shorter than `SHORTEST`, for which the recommendation has none.
+        The losses; 0 for paths shorter than `SHORTEST`, which the recommendation does not cover.
 
     Raises:
         InputError: A carrier is outside `CARRIERS`.

@@ -95,7 +95,7 @@ def _links(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> pd.DataFrame:
 
 
 def _matrix(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> NDArray[np.float64]:
-    """Measured values [tx, rx] in the order of the scene, NaN where nothing was measured."""
+    """Measured values [tx, rx] in the order of the scene; NaN where nothing was measured."""
     if isinstance(measured, pd.DataFrame):
         for what, labels, names in (("row", measured.index, live.tx), ("column", measured.columns, live.rx)):
             if unknown := [str(label) for label in labels if label not in names]:

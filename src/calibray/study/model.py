@@ -1,4 +1,4 @@
-"""What a study file states: its content read, and what follows from it without another file."""
+"""The content of a study file, and everything that follows from it without another file."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from calibray.tracing.settings import Antenna
 
 
 class StudyModel(StudyContent, ABC):
-    """A study file that is read; `calibray.Study` is the class to use."""
+    """A study file that has been read; use the class `calibray.Study`."""
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -51,7 +51,7 @@ class StudyModel(StudyContent, ABC):
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any], path: str | Path = "study.toml") -> Self:
-        """A study from sections as TOML gives them; it is not checked that its files exist.
+        """A study from sections in the form of TOML; the existence of its files is not checked.
 
         Other files are relative to the folder of `path`, which need not exist.
 
@@ -125,7 +125,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def region_paths(self) -> dict[str, Path | None]:
-        """The file of every region by name; None for one of boxes."""
+        """The file of every region by name; None for a region of boxes."""
         return {
             name: section.source and self._resolve(f"regions.{name}.{section.source[0]}", section.source[1])
             for name, section in self.regions.items()
@@ -141,9 +141,9 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def antenna_pair(self) -> tuple[Antenna, Antenna]:
-        """The transmit and the receive antenna that links are traced with, with resolved paths of gain tables.
+        """The transmit and the receive antenna with which links are traced, with resolved paths of gain tables.
 
-        An end whose antennas differ between links is traced with an isotropic vertical one.
+        If the antennas of an end differ between links, it is traced with an isotropic vertical antenna.
         """
         mounted, (tx, rx) = self.links.mountings, self.stated_antennas.values()
         return Antenna() if "tx" in mounted else tx, Antenna() if "rx" in mounted else rx
@@ -198,7 +198,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def uses_obstruction(self) -> bool:
-        """Whether a nuisance is by a column that follows from the scene, or per cluster of receivers."""
+        """Whether a nuisance uses a column that follows from the scene, or has groups by cluster of receivers."""
         by_scene = any(section.by in OBSTRUCTION for section in self.nuisance.values())
         return by_scene or self.cluster_m is not None
 
@@ -209,7 +209,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def uses_clutter(self) -> bool:
-        """Whether a nuisance is by the clutter loss of ITU-R P.2108."""
+        """Whether a nuisance uses the clutter loss of ITU-R P.2108."""
         return any(section.by == CLUTTER for section in self.nuisance.values())
 
     @property
@@ -266,7 +266,7 @@ class StudyModel(StudyContent, ABC):
         return parameters
 
     def _effect_parameter(self, name: str, materials: Collection[str]) -> Parameter:
-        """The parameter of a region or rough surface, or of a transmit antenna, whose stated pose is the start 0."""
+        """The parameter of a region, rough surface or transmit antenna, whose stated pose is the start value 0."""
         entry = self.parameters[name]
         if name.endswith(f".{ROUGHNESS}"):
             check_material(name, materials)
@@ -281,16 +281,16 @@ class StudyModel(StudyContent, ABC):
         )
 
     def content(self) -> dict[str, Any]:
-        """The study as plain values with every default written out; `Study.from_content` reads it."""
+        """The study as a dictionary with all defaults; `Study.from_content` reads it."""
         content = self.model_dump(mode="json", exclude_none=True)
         content["engine"] |= self._other_engines
         return content
 
     def digest(self) -> str:
-        """Fingerprint of the study: SHA-256 of its content, however the file is laid out.
+        """Fingerprint of the study: SHA-256 of its content, independent of the layout of the file.
 
         The order of the parameters counts, because it is the order of a candidate's values. The content of the files
-        that it names does not.
+        that it names is not included.
         """
         content = self.content() | {"parameters": list(self.content()["parameters"].items())}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

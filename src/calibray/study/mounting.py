@@ -1,4 +1,4 @@
-"""From a study and the columns of its links: the antenna of every link, where it points, and the power at its port."""
+"""From a study and the columns of its links: the antenna of every link, its direction, and the power at its port."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ PORT_POWER: Final = "tx_port_power_dbm"
 """Column of the links: the power that their transmitters feed into the antenna [dBm]."""
 
 LEAST_GAIN: Final = 1e-3
-"""Least gain along the straight line. In nulls, paths in other directions carry the power; the patterns of 3GPP TR
+"""Smallest gain along the straight line. In nulls, paths in other directions carry the power; the patterns of 3GPP TR
 38.901 end 30 dB below their largest gain."""
 
 
 def mounting_columns(study: StudyModel) -> tuple[str, ...]:
-    """The columns that say which antenna a link has and where it points, and whose parameters change that."""
+    """The columns that state the antenna of a link and its direction, and those whose parameters change it."""
     columns = [name for section in study.links.mountings.values() for name in section.columns]
     own = [
         name for name in study.parameters if name.startswith(POSE) and not name.startswith(POSE + EVERY + ".")
@@ -42,7 +42,7 @@ def mounting_columns(study: StudyModel) -> tuple[str, ...]:
 
 
 def link_mountings(study: StudyModel, links: Measurements) -> dict[str, Mounting]:
-    """The antennas at the ends, "tx" or "rx", where they differ between links.
+    """The antennas at the ends, "tx" or "rx", if they differ between links.
 
     Raises:
         InputError: A column is missing or malformed, or names an unknown antenna.
@@ -68,8 +68,9 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
     single = np.array([not antenna.is_array for antenna in antennas])[index]
     if (steering[single] != 0).any():
         raise InputError(
-            f"{study.path}: links.{end}_antenna.steering_deg: the antenna is no array; give antennas.{end} rows and "
-            "columns, or leave the key out"
+            f"{study.path}: links.{end}_antenna.steering_deg: the antenna is not an array; give antennas.{end} rows "
+            f"and "
+            f"columns, or remove the key"
         )
     return Mounting(antennas, index, Pose(yaw, downtilt, electrical, steering))
 
@@ -77,7 +78,7 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
 def direct_gain(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
     """Gain of the stated antennas of both ends along the straight line of each link [L], [dBi].
 
-    An end with one of Sionna's patterns without a main direction for all links counts 0.
+    For an end with one of Sionna's patterns without a main direction for all links, the gain is 0.
 
     Raises:
         InputError: A column is missing or malformed, or names an unknown antenna.
@@ -133,7 +134,7 @@ def pose_effects(
 
 
 def transmitter_labels(study: StudyModel, table: SourceTable, items: Sequence[Parameter]) -> NDArray[np.str_]:
-    """Name of every row's transmitter [rows]; empty names if all parameters are those of every transmitter.
+    """Name of every row's transmitter [rows]; empty names if all parameters apply to every transmitter.
 
     Raises:
         InputError: The column of transmitters is missing.
@@ -160,7 +161,7 @@ def link_antennas(
         name = str(labels[unknown[0]])
         known = did_you_mean(name, types) if types else "there is none"
         raise InputError(
-            f"{table.cell(int(unknown[0]), section.type)}: {name!r} is no antenna of [antennas.types]; {known}"
+            f"{table.cell(int(unknown[0]), section.type)}: {name!r} is not an antenna of [antennas.types]; {known}"
         )
     names, index = np.unique(labels, return_inverse=True)
     return tuple(types[name] for name in names.tolist()), index.reshape(-1)
@@ -183,7 +184,7 @@ def states_port_power(study: StudyModel) -> bool:
 def port_power(study: StudyModel, table: SourceTable, optional: bool = False) -> NDArray[np.float64] | None:
     """Power that the transmitters feed into their antennas [rows], [dBm].
 
-    It is the transmitted power without the loss of the cable, or the EIRP without the antenna's largest gain. With
+    It is the transmitted power minus the loss of the cable, or the EIRP minus the antenna's largest gain. With
     `optional`, a missing column gives None.
 
     Raises:
@@ -208,7 +209,8 @@ def largest_gain_dbi(antenna: Antenna) -> float:
 
 
 FIRST_SPREAD: Final = 0.25
-"""Spread before it is estimated, as a share of the width of the bounds: nearly that of a uniform distribution, 0.29."""
+"""Initial spread before it is estimated, as a share of the width of the bounds: nearly that of a uniform distribution,
+0.29."""
 
 
 def estimated_fields(study: StudyModel) -> tuple[str, ...]:
@@ -221,7 +223,8 @@ def estimated_fields(study: StudyModel) -> tuple[str, ...]:
 def with_population(study: StudyModel, links: Measurements) -> dict[str, Any]:
     """The content of a study with a parameter of every transmitter for each `spread`.
 
-    One more stands for transmitters without measured links: its prior, which no link narrows, is the population.
+    A further parameter represents transmitters without measured links: its prior, which no link narrows, is the
+    population.
 
     Raises:
         InputError: The column of transmitters is missing.

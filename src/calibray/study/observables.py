@@ -1,4 +1,4 @@
-"""``[observables.NAME]``: what else was measured of the links, besides path loss."""
+"""``[observables.NAME]``: a further measured quantity of the links."""
 
 from __future__ import annotations
 
@@ -37,15 +37,16 @@ class ObservableSection(Section):
         where: Row filter: the links that have this observable; all if absent.
         compass: Whether azimuths in the file are bearings, clockwise from north.
         sample_rate: Sample rate of impulse responses without delays [Hz].
-        margin_db: How far above its noise a sample of an impulse response counts [dB].
+        margin_db: Distance above its noise from which a sample of an impulse response counts [dB].
         unit: Unit of the values: "s", "ms", "us" or "ns"; "dB"; "rad" or "deg".
         std: Standard deviation of a value's error, in the unit; estimated if absent.
         bias: "all" for one unknown bias of all values, or a column of labels for one bias per label; none if absent.
         path: Path of a time of flight: "mean" of all, "first" or "strongest".
-        dynamic_range_db: How far below the strongest path the receiver sees paths [dB]; all if absent.
-        floor_db: Path gain below which it sees none [dB]; no limit if absent.
+        dynamic_range_db: Largest level below the strongest path at which the receiver detects paths [dB]; all paths if
+            absent.
+        floor_db: Path gain below which it detects no paths [dB]; no limit if absent.
         window: Longest delay after the first path [s]; no limit if absent.
-        bandwidth: Bandwidth of the receiver [Hz]; it resolves all paths if absent.
+        bandwidth: Bandwidth of the receiver [Hz]; if absent, it resolves all paths.
         edges: Ends of the bins of a power delay profile, one more than bins: delays after the first path [s].
         edges_deg: Ends of angular sectors: azimuths, counterclockwise from the x axis [deg].
     """

@@ -2,8 +2,8 @@
 
 Usage: python load_scene.py [ROW ...]
 
-ROW is the row of a link in the measured table; without any, all links are computed. Needs Sionna RT and the other files
-of this folder; Calibray is not needed.
+ROW is the row of a link in the measured table; without any row, all links are computed. This script needs Sionna RT and
+the other files of this folder, but not Calibray.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def received(gain: np.ndarray, delay: np.ndarray) -> float:
 
 
 def batches(links: list[dict[str, str]]) -> list[list[dict[str, str]]]:
-    """Links of one transmitter each, as many as a call of the solver traces at once."""
+    """Links of one transmitter each, as many as one call of the solver traces together."""
     solver = CALIBRATION["solver"]
     lanes = solver["samples_per_src"] * max(solver["max_depth"], 1)
     # Diffuse paths of one receiver can fill the solver's buffer.
@@ -107,7 +107,7 @@ def main() -> None:
     links = [link for link in links if not wanted or link["row"] in wanted]
     carrier = CALIBRATION["frequency_hz"]
     for link in [link for link in links if float(link.get("frequency") or carrier) != carrier]:
-        print(f"{link['row']}: left out, since its carrier is not that of the scene", file=sys.stderr)
+        print(f"{link['row']}: left out, because its carrier is not that of the scene", file=sys.stderr)
         links.remove(link)
     parts = batches(links)
     print(f"{len(links)} links in {len(parts)} calls of the solver", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Scenes of buildings and ground, made of footprints.
+"""Scenes of buildings and ground, made from footprints.
 
 By default roofs and walls have separate materials. Sionna RT finds wedges within one mesh only, so eaves diffract only
 if roofs and walls share a material (`Palette(roof=None)`). The upright edges of walls always diffract.
@@ -56,18 +56,18 @@ def make_scene(
 
     Args:
         footprints: The buildings.
-        folder: Where to write `scene.xml`, `scene.json` and the meshes.
-        frame: Where the scene lies on the globe; kept in the files.
-        terrain: The ground; by default it is level, z = 0, and extends `margin` beyond the buildings. On a terrain the
-            heights of a building count from the lowest ground under its walls.
+        folder: Folder for `scene.xml`, `scene.json` and the meshes.
+        frame: Position of the scene on the globe, which the files store.
+        terrain: The ground; by default it is level, z = 0, and extends `margin` beyond the buildings. On a terrain, the
+            heights of a building are measured from the lowest ground under its walls.
         palette: The materials.
         windows: How walls are divided into wall and window; None for walls without windows.
         margin: Distance by which level ground extends beyond the buildings [m].
-        ground: Whether to make ground; without it buildings are closed at the bottom.
+        ground: Whether to make ground; without it, buildings are closed at the bottom.
         per_building: One mesh per building and material, named `BUILDING-MATERIAL`, instead of one per material.
             Calibray can then give some buildings a separate material. Tracing many meshes takes longer.
         overwrite: Replace files that Calibray did not write.
-        trees: Trees, of which those over the ground are written next to the scene as `TREES_FILE`; needs a frame.
+        trees: Trees, of which those over the ground are written next to the scene as `TREES_FILE`; this needs a frame.
 
     Returns:
         The scene.
@@ -79,7 +79,7 @@ def make_scene(
     folder = check_outputs(folder, (*SCENE_FILES, TREES_FILE), overwrite=overwrite)
     palette = palette or Palette()
     if not len(footprints):
-        raise InputError("there is no building to make a scene of; check the file and its columns")
+        raise InputError("there is no building to make a scene from; check the file and its columns")
     if not 0 <= margin <= WIDEST:
         raise InputError(f"margin = {margin!r}: must be 0 to {WIDEST:g} m")
     base = _base_heights(footprints, terrain)

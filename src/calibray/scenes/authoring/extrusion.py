@@ -1,12 +1,12 @@
-"""Walls, windows, roofs and undersides of buildings, raised on cells: pieces of ground that lie side by side.
+"""Walls, windows, roofs and undersides of buildings, raised on cells: adjacent pieces of ground.
 
-In each cell every building that covers it stands once, between its bottom and its top. Where buildings overlap, the
-taller one owns the ground. Where parts of a building are mapped, they replace the building's outline. Neighbouring
-cells have the same corners along their common border, so walls and roofs that meet share their vertices.
+In each cell, every building that covers it occurs once, between its bottom and its top. Where buildings overlap, the
+taller one is used. Where parts of a building are mapped, they replace the building's outline. Neighbouring cells have
+the same corners along their common border, so walls and roofs that meet share their vertices.
 
 A wall stands at each height where one side of a border is built and the other is not: between neighbours of different
-heights it begins at the lower one's roof, and between equals there is none. A column of corners rises from each end of
-a border. All walls that meet there use the same corners, so the surface is closed and its wedges are connected. Lengths
+heights it begins at the lower one's roof, and between equals there is none. A column of corners is at each end of a
+border. All walls that meet there use the same corners, so the surface is closed and its wedges are connected. Lengths
 are whole millimetres, so that corners are either equal or different.
 """
 
@@ -100,7 +100,7 @@ def _overlay(polygons: NDArray[Any]) -> tuple[list[Any], NDArray[np.bool_]]:
 
 
 def _stack(stands: list[Interval]) -> tuple[Interval, ...]:
-    """Resolve overlaps in height: what two buildings share belongs to the one with the higher top."""
+    """Resolve overlaps in height: the common part belongs to the building with the higher top."""
     stack: list[Interval] = []
     for bottom, top, owner in sorted(stands, key=lambda stand: (-stand[1], stand[0], stand[2])):
         free = [(bottom, top, owner)]
@@ -140,8 +140,8 @@ Strips = dict[Edge, list[tuple[Point, int]]]  # where the strips of an edge begi
 class Windows:
     """How outer walls are divided into alternating upright strips of wall and window, with wall at both ends.
 
-    The strips are as high as the wall, so the share holds at the height of every antenna. The wall at both ends keeps
-    the wedges at the corners of the building in one material.
+    The strips are as high as the wall, so the share is the same at the height of every antenna. A strip of wall at both
+    ends keeps the wedges at the corners of the building in one material.
 
     Attributes:
         share: Share of window in each wall, from 0 to below 1 [1].
@@ -201,8 +201,8 @@ def extrude(
 ) -> Shell:
     """Raise buildings on their cells, with heights in the scene's frame.
 
-    Without `windows` walls are whole. `ground` is the height of the ground under each building [n], [m]; bodies that
-    stand on it stay open at the bottom, and the shell is closed but for these. None closes all bodies.
+    Without `windows` walls are whole. `ground` is the height of the ground under each building [n], [m]; bodies on it
+    stay open at the bottom, and the shell is closed otherwise. None closes all bodies.
     """
     outlines = [_rings(cell.polygon) for cell in cells]
     standing = [
@@ -251,7 +251,7 @@ def _edges(ring: Sequence[Point]) -> Iterator[Edge]:
 
 
 def _wall_stands(standing: Sequence[tuple[Stand, ...]], cell_of: dict[Edge, int], edge: Edge) -> list[Stand]:
-    """The buildings to the left of an edge, at the heights where nothing stands to its right [mm]."""
+    """The buildings to the left of an edge, at the heights where there is none to its right [mm]."""
     opposite = cell_of.get((edge[1], edge[0]))
     free = list(standing[cell_of[edge]])
     for low, high, _ in standing[opposite] if opposite is not None else ():

@@ -1,4 +1,4 @@
-"""Floor plans: walls drawn as lines, polylines or outlines, with doors and windows, read into upright rectangles."""
+"""Floor plans: walls drawn as lines, polylines or outlines, with doors and windows, converted to upright rectangles."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OPENINGS: Final = frozenset({"door", "window"})
 
 SHORTEST: Final = 0.001  # length of a segment [m]
 VECTOR_SUFFIXES: Final = (".dxf", ".geojson", ".json", ".gpkg", ".shp", ".fgb", ".gdb")
-"""Endings of vector files; any other file is read as CSV."""
+"""Extensions of vector files; any other file is read as CSV."""
 
 Lines = list[list[NDArray[np.float64]]]
 """For each row the points [n, 2] of its lines."""
@@ -84,10 +84,10 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[
 
     Args:
         path: A table as text with the columns x0, y0, x1, y1 and type, or, instead of the coordinates, a column wkt
-            with lines, polylines or outlines; optionally thickness, bottom and height. Similar names are understood,
-            and a unit of length in a name, as in `width_cm`, counts for its column. Or a DXF, GeoJSON or other vector
-            file with these attributes, whose coordinates are taken as those of the plan; without an attribute type,
-            the layer of DXF is the type. Points and texts of such files are left out.
+            with lines, polylines or outlines; thickness, bottom and height are optional. Similar names are understood,
+            and a unit of length in a name, as in `width_cm`, applies to its column. The file can also be a DXF, GeoJSON
+            or other vector file with these attributes, whose coordinates are those of the plan; without an attribute
+            type, the layer of DXF is the type. Points and texts of such files are left out.
         height: Height of the top of segments without a height [m].
         unit: The plan's unit of length [m]: 0.001 for millimetres.
 
@@ -182,7 +182,7 @@ def _read_vector(path: Path) -> tuple[pd.DataFrame, Lines]:
 
 
 def _known_names(columns: Iterable[str]) -> dict[str, str]:
-    """The name that this module uses by the name of a column, without case and unit.
+    """Maps the name of a column, without case and unit, to the name that this module uses.
 
     Example:
         >>> _known_names(["X1 [cm]", "Y1 [cm]", "X2 [cm]", "Y2 [cm]", "Material", "width_cm"])["X2 [cm]"]
@@ -215,7 +215,7 @@ def _parts(geometry: Any) -> list[NDArray[np.float64]]:
 
 
 def _numbers(path: str | Path, frame: pd.DataFrame, name: str) -> NDArray[np.float64]:
-    """A column as numbers [n], NaN where it is empty or absent."""
+    """A column as numbers [n]; NaN if it is empty or absent."""
     if name not in frame:
         return np.full(len(frame), np.nan)
     column = frame[name]

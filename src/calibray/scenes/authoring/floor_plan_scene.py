@@ -69,20 +69,20 @@ def make_plan_scene(
 ) -> MadeScene:
     """Make a scene of a floor plan.
 
-    Walls that cross or meet share their corners, and ends that stop at the face of another wall are extended to its
-    centre line. A door or window replaces the wall on which it is drawn, between its own bottom and top; the wall
-    continues above and below.
+    Walls that cross or meet share their corners, and ends at the face of another wall are extended to its centre line.
+    A door or window replaces the wall on which it is drawn, between its own bottom and top; the wall continues above
+    and below.
 
     Args:
         segments: Lines of the plan.
-        folder: Where to write `scene.xml`, `scene.json` and the meshes.
+        folder: Folder for `scene.xml`, `scene.json` and the meshes.
         types: Materials by type, in addition to `TYPES` or replacing them. A type that is a material of ITU-R P.2040,
             such as `brick`, becomes the material `brick_wall`. Several thicknesses of one type that the
             plan states become several materials.
-        floor: Whether to make a floor: a sheet over all that walls enclose, at the lowest bottom.
+        floor: Whether to make a floor: a sheet over the whole area that walls enclose, at the lowest bottom.
         ceiling: Whether to make a ceiling, at the highest top.
         merge: Whether two parallel lines are merged into one wall (`merge_faces`).
-        frame: Where the scene lies on the globe, if known.
+        frame: Position of the scene on the globe, if known.
         overwrite: Replace files that Calibray did not write.
 
     Returns:
@@ -104,8 +104,8 @@ def make_plan_scene(
     outline = _enclosed(pieces)
     if (floor or ceiling) and outline.area == 0:
         raise InputError(
-            "the floor plan encloses no area, so that it has no floor or ceiling; draw walls around the room, or leave "
-            "both out (--no-floor --no-ceiling)"
+            "the floor plan encloses no area, so it has no floor or ceiling; draw walls around the room, or omit both "
+            "(--no-floor --no-ceiling)"
         )
     lids = {}
     if floor:
@@ -155,7 +155,7 @@ def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) 
 
 
 def _extend_to_walls(sheets: Sequence[Segment]) -> list[Segment]:
-    """Move the ends of sheets to the centre line of a wall that they stop at."""
+    """Move the ends of sheets to the centre line of a wall at which they end."""
     extended = list(sheets)
     for index, sheet in enumerate(extended):
         start, end = np.array(sheet.start), np.array(sheet.end)

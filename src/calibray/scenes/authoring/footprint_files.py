@@ -44,13 +44,13 @@ def read_openstreetmap(
     Args:
         path: The extract, .osm or .osm.pbf.
         frame: The scene's frame; by default a local frame centred on the buildings.
-        rule: How to guess heights that are not given.
+        rule: Assumptions for heights that are not given.
 
     Returns:
         The footprints, and their frame.
 
     Raises:
-        InputError: The file does not exist, is not an extract or holds no building, or pyosmium is not installed.
+        InputError: The file does not exist, is not an extract or contains no building, or pyosmium is not installed.
     """
     path, rule = Path(path), rule or HeightRule()
     osmium, shapely = library("osmium", "scenes"), library("shapely", "scenes")
@@ -105,20 +105,20 @@ def read_footprints(
     Args:
         path: A GeoJSON file, Shapefile, GeoPackage, FlatGeobuf file or Esri geodatabase that states its reference
             system.
-        height: Column with the heights of the buildings above the ground [m], or one height for all; a text that is a
-            number and the name of a column means the column.
+        height: Column with the heights of the buildings above the ground [m], or one height for all; a text that is
+            both a number and the name of a column means the column.
         bottom: Column with the heights at which the buildings begin [m], or one height for all.
         name: Column with their names; by default they are numbered.
         levels: Column with the numbers of storeys, for buildings without a height.
         layer: Layer of the file, if it has several.
         frame: The scene's frame; by default a local frame centred on the footprints.
-        rule: How to guess heights that are not given.
+        rule: Assumptions for heights that are not given.
 
     Returns:
         The footprints, and their frame.
 
     Raises:
-        InputError: The file does not exist, cannot be read, states no reference system, lacks a column or holds no
+        InputError: The file does not exist, cannot be read, states no reference system, lacks a column or contains no
             polygon; or a height is negative or not a number.
     """
     path, rule = Path(path), rule or HeightRule()
@@ -187,12 +187,12 @@ def _is_number(text: str) -> bool:
 def _numbers(
     path: Path, columns: dict[str, NDArray[Any]], source: str | float, count: int
 ) -> NDArray[np.float64]:
-    """Numbers from a column or a constant [count], NaN where the column has none; texts are parsed as lengths."""
+    """Numbers from a column or a constant [count]; NaN if the column has none; texts are parsed as lengths."""
     if isinstance(source, str) and source not in columns:
         with suppress(ValueError):
             source = float(source)
     elif isinstance(source, str) and _is_number(source):
-        _LOG.warning("%s: %s is taken for the column of that name, not for a number", path, source)
+        _LOG.warning("%s: %s is interpreted as the column of that name, not as a number", path, source)
     values = _column(path, columns, source) if isinstance(source, str) else np.full(count, float(source))
     if values.dtype == object:
         lengths = [parse_length(None if value is None else str(value)) for value in values]

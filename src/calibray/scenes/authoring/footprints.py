@@ -1,4 +1,4 @@
-"""Footprints: the outlines of buildings in the scene's frame, with the heights between which the buildings stand."""
+"""Footprints: the outlines of buildings in the scene's frame, with their lower and upper heights."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GRID: Final = 0.01
 """Grid to which the corners of buildings are rounded [m]."""
 
 HIGHEST: Final = 1000.0
-"""Largest height of a building or part of one [m]; the highest building stands 828 m."""
+"""Largest height of a building or part of one [m]; the highest building is 828 m high."""
 
 WIDEST: Final = 50_000.0
 """Largest extent of a scene that is made [m]."""
@@ -36,7 +36,7 @@ _FEET_AND_INCHES: Final = re.compile(r"\s*(\d+)'\s*(\d+(?:\.\d+)?)\"\s*")
 
 @dataclass(frozen=True)
 class HeightRule:
-    """How to guess the height of a building whose height is not given.
+    """Assumptions for the height of a building whose height is not given.
 
     Attributes:
         storey: Height of one storey [m].
@@ -128,7 +128,7 @@ class Footprints:
         return library("shapely", "scenes").total_bounds(self.polygon)
 
     def guessed(self) -> dict[HeightSource, list[str]]:
-        """Names of the buildings whose height is a guess, by the source of the guess."""
+        """Names of the buildings whose height is assumed, by the source of the assumption."""
         guesses: dict[HeightSource, list[str]] = {"levels": [], "default": []}
         for name, source in zip(self.name, self.height_from, strict=True):
             if source != "height":
@@ -143,7 +143,7 @@ def clean_footprints(raw: Footprints, grid: float = GRID, smallest: float = 1.0)
     are counted, and names are unique.
 
     Raises:
-        InputError: A height is not a number or above `HIGHEST`, or the buildings lie further apart than `WIDEST`.
+        InputError: A height is not a number or above `HIGHEST`, or the buildings are farther apart than `WIDEST`.
     """
     shapely = library("shapely", "scenes")
     valid = shapely.is_valid(raw.polygon)
@@ -213,7 +213,7 @@ def project(polygons: NDArray[Any], frame: Frame, crs: str) -> NDArray[Any]:
 
 
 def make_unique(names: Sequence[str]) -> list[str]:
-    """Make names usable for files and objects: letters, digits, `_` and `-` only, and no two alike.
+    """Make names usable for files and objects: only letters, digits, `_` and `-`, and no name twice.
 
     Example:
         >>> make_unique(["Town hall", "Town/hall", '"><x'])

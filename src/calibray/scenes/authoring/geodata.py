@@ -1,8 +1,8 @@
 """Vector files and height models, opened with a closed list of drivers.
 
 GDAL has drivers that fetch network addresses, open other files or run pipelines that a file names (VRT, WMS, WFS,
-GDALG), and it chooses the driver by the file's content. Only formats that hold their data themselves are opened here,
-recognised by their first bytes, and what they declare is bounded before anything is read.
+GDALG), and it chooses the driver by the file's content. Only formats without references to other files are opened here.
+They are recognised by their first bytes, and the sizes that they declare are checked before anything is read.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from calibray.support.messages import first_line, shortened
 from calibray.support.output_files import exists
 
 RASTER_DRIVER: Final = "GTiff"
-"""The driver of rasters: GeoTIFF, cloud-optimized ones included."""
+"""The driver of rasters: GeoTIFF, including cloud-optimized files."""
 
 VECTOR_FORMATS: Final = "GeoJSON, a Shapefile, a GeoPackage, a FlatGeobuf file or an Esri geodatabase"
 """Formats of vector files, for messages."""
 
 MOST_CELLS: Final = 25_000_000
-"""Cells of a height model that are read at most; filling gaps takes about 40 bytes for each."""
+"""Largest number of cells of a height model that are read; filling gaps needs about 40 bytes for each."""
 
 LARGEST_BLOCK: Final = 2**28
 """Largest block of a raster [bytes]; GDAL decompresses a block as a whole."""
 
 FEATURE_BYTES: Final = 500
-"""Memory of a feature with its outline and attributes [bytes], at least."""
+"""Smallest memory of a feature with its outline and attributes [bytes]."""
 
 TEXT_GROWTH: Final = 15
 """Memory of parsed GeoJSON or DXF as a multiple of the file's size."""
 
 HEIGHTS: Final = (-1000.0, 10_000.0)
-"""Range of heights on land [m]; -32768 and -9999 are gaps that the file does not declare."""
+"""Range of heights on land [m]; -32768 and -9999 mark gaps that the file does not declare."""
 
 _MAGIC: Final = (
     (b"SQLite format 3\0", "GPKG"),
@@ -56,7 +56,7 @@ _MAGIC: Final = (
 
 _LOG: Final = logging.getLogger(__name__)
 _DXF: Final = re.compile(rb"\s*(?:999\s*\n[^\n]*\n\s*)*0\s*\n\s*SECTION\s*\n[^<{]*", re.DOTALL)
-"""Start of a DXF file, without `<` and `{`, with which files of other drivers start."""
+"""Start of a DXF file, without `<` and `{`, which start files of other drivers."""
 
 _METRES: Final = {
     **dict.fromkeys(("", "m", "metre", "meter", "metres", "meters"), 1.0),
@@ -194,7 +194,7 @@ def _read_geojson(path: Path) -> Features:
 
 
 def _column(values: list[Any]) -> NDArray[Any]:
-    """A column: numbers if all of its values are numbers or missing, else objects."""
+    """A column: numbers if all of its values are numbers or missing, otherwise objects."""
     if all(
         value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in values
     ):
@@ -212,7 +212,7 @@ class HeightModel:
         path: Its file.
         dataset: The raster of rasterio.
         crs: Its reference system as WKT, without heights.
-        metres: What its numbers, after scale and offset, are in metres.
+        metres: Unit in metres of its numbers, after scale and offset.
     """
 
     path: Path
@@ -328,12 +328,12 @@ def _systems(path: Path, dataset: Any) -> tuple[str, float]:
     horizontal = next((part for part in parts if part.is_projected or part.is_geographic), None)
     if horizontal is None:
         raise InputError(
-            f"height model {path}: its reference system {shortened(crs.name, 100)!r} has no place on the globe; give "
-            "one with a projection, or longitude and latitude"
+            f"height model {path}: its reference system {shortened(crs.name, 100)!r} has no position on the globe; "
+            f"give one with a projection, or longitude and latitude"
         )
     axes = [axis for part in parts for axis in part.axis_info if axis.direction in ("up", "down")]
     if any(axis.direction == "down" for axis in axes):
-        raise InputError(f"height model {path}: contains depths, not heights; turn the sign")
+        raise InputError(f"height model {path}: contains depths, not heights; invert the sign")
     declared = {axis.unit_conversion_factor for axis in axes}
     unit = (dataset.units[0] or "").strip()
     if unit:

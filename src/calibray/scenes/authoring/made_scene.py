@@ -34,7 +34,7 @@ class SurfaceMaterial:
     """A material of a new scene, with the constants of ITU-R P.2040.
 
     Attributes:
-        name: Name of the material; not a name of ITU-R P.2040, which Sionna RT reserves.
+        name: Name of the material; not a name of ITU-R P.2040, because Sionna RT reserves these.
         itu: Material of ITU-R P.2040 that gives the constants.
         thickness: Thickness of the slab [m].
 
@@ -67,7 +67,7 @@ class SurfaceMaterial:
             )
 
     def constants(self) -> dict[str, float | str]:
-        """The constants as a scene file holds them."""
+        """The constants in the form of a scene file."""
         return {"type": self.itu, "thickness": self.thickness}
 
 
@@ -106,12 +106,12 @@ class MadeScene:
 
     Attributes:
         path: Its XML file.
-        frame: Where it lies on the globe; None if unknown.
+        frame: Position on the globe; None if unknown.
         bounds: West, south, bottom, east, north and top [6], [m].
         triangles: Number of triangles by material.
-        counts: Number of objects used, repaired or left out, by what they are.
-        guessed: The buildings whose height is a guess, by the source of the guess.
-        walls: What became of the lines of a floor plan.
+        counts: Number of objects used, repaired or left out, by kind.
+        guessed: The buildings whose height is assumed, by the source of the assumption.
+        walls: How the lines of a floor plan were used.
     """
 
     path: Path
@@ -146,10 +146,9 @@ def write_made_scene(
 ) -> MadeScene:
     """Write a scene and the assumptions made.
 
-    Other materials and repeated ones are ignored. `counts` is the number of objects used, repaired
-    or left out, by what they are; `guessed` are the buildings whose height is a guess, by the source of the guess;
-    `walls` says what became of the lines of a floor plan. With `overwrite`, files are replaced that Calibray did not
-    write.
+    Other materials and repeated ones are ignored. `counts` is the number of objects used, repaired or left out, by
+    kind; `guessed` are the buildings whose height is assumed, by the source of the assumption; `walls` describes how
+    the lines of a floor plan were used. With `overwrite`, files that Calibray did not write are replaced.
 
     Raises:
         InputError: Two different materials, or a material and a mesh, have the same name; or a file must not be

@@ -17,7 +17,7 @@ from calibray.scenes.authoring.geodata import open_height_model
 from calibray.scenes.meshes import Mesh
 
 MAX_POINTS: Final = 4_000_000
-"""Largest number of points of a ground sheet, which bounds memory."""
+"""Largest number of points of a ground sheet, which limits memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Terrain:
     repairs: dict[str, int] = field(default_factory=dict)
 
     def heights(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Interpolate heights [n], [m], on the triangles; outside the grid the height at its border is taken."""
+        """Interpolate heights [n], [m], on the triangles; outside the grid, use the height at its border."""
         x = np.clip(np.asarray(x, dtype=float), self.x[0], self.x[-1])
         y = np.clip(np.asarray(y, dtype=float), self.y[0], self.y[-1])
         column = np.clip(np.searchsorted(self.x, x, side="right") - 1, 0, len(self.x) - 2)
@@ -85,7 +85,7 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
 
     Returns:
         The terrain, interpolated linearly between the centres of the model's cells. Where the model has no height, as
-        on water, the nearest height is taken and counted.
+        on water, the nearest height is used and counted.
 
     Raises:
         InputError: The file does not exist, cannot be read or used (see `open_height_model`), does not cover the bounds

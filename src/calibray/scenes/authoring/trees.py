@@ -32,17 +32,18 @@ KINDS: Final = {
 """Kinds of trees by the tag of OpenStreetMap."""
 
 HEIGHTS: Final = {"tree": 10.0, "tree row": 10.0, "wood": 15.0, "forest": 15.0}
-"""Assumed heights [m]: 15 m is the mean of the wood that ITU-R P.833's largest loss was measured in; few maps state
-any."""
+"""Assumed heights [m]: 15 m is the mean of the wood in which ITU-R P.833's largest loss was measured; few maps state
+heights."""
 
 CROWN: Final = 6.0
 """Assumed diameter of a crown [m]."""
 
 CLEARANCE: Final = 2.5
-"""Height at which crowns of single trees and rows begin [m], where people walk below; woods begin at the ground."""
+"""Height at which crowns of single trees and rows begin [m], because people walk below them; woods begin at the
+ground."""
 
 TALLEST: Final = 120.0
-"""Largest height of a tree [m]; the tallest stands 116 m."""
+"""Largest height of a tree [m]; the tallest tree is 116 m high."""
 
 WIDEST_CROWN: Final = 60.0
 """Largest diameter of a crown [m]."""
@@ -110,7 +111,7 @@ class Trees:
 def read_trees(path: str | Path, frame: Frame) -> Trees:
     """Read the trees of an extract: nodes, ways and areas with a tag of `KINDS`.
 
-    The tags `height` and `diameter_crown` are used where they are stated, else `HEIGHTS` and `CROWN`.
+    The tags `height` and `diameter_crown` are used if they are stated, otherwise `HEIGHTS` and `CROWN`.
 
     Raises:
         InputError: The file cannot be read, or pyosmium is not installed.

@@ -1,10 +1,10 @@
 """Wall alignment: walls that lie in one plane except for the rounding of a map are moved into one plane.
 
-Corners of maps are rounded: OpenStreetMap's to a centimetre, and here to a millimetre. The front of a row of houses,
-or a wall cut where another one meets it, then consists of several planes that almost coincide. Sionna RT accepts images
-within 1 cm of each other but distinguishes planes by much smaller differences, so it finds one reflection several
-times. Therefore edges that continue each other get one straight line by least squares, and corners move onto the lines
-of their walls. Input is in whole millimetres, output in metres.
+Maps round corners: OpenStreetMap to a centimetre, and Calibray to a millimetre. The front of a row of houses, or a wall
+cut where another one meets it, then consists of several planes that almost coincide. Sionna RT accepts images within 1
+cm of each other but distinguishes planes by much smaller differences, so it finds one reflection several times.
+Edges that continue each other therefore get one straight line by least squares, and corners move onto the lines of
+their walls. Input is in whole millimetres, output in metres.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def _lines(segments: NDArray[np.float64], edges: NDArray[np.int64], tolerance: f
 
 
 def _touching(edges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Pairs of edges that share a corner, each edge with itself included [P, 2]."""
+    """Pairs of edges that share a corner, including each edge with itself [P, 2]."""
     order = np.argsort(edges.reshape(-1), kind="stable")
     degree = np.bincount(edges.reshape(-1))
     first = np.cumsum(degree) - degree

@@ -29,12 +29,12 @@ _SAME: Final = ("kind", "bottom", "top", "thickness")  # what sheets of one wall
 
 @dataclass(frozen=True)
 class MergedPlan:
-    """The sheets of a plan, and what became of its lines.
+    """The sheets of a plan, and how its lines were used.
 
     Attributes:
         sheets: One for each wall, door and window.
         lines: Number of lines that were merged as faces.
-        report: What was merged, kept and left out, a sentence each.
+        report: What was merged, kept and left out, in one sentence each.
     """
 
     sheets: Sequence[Segment]
@@ -45,18 +45,18 @@ class MergedPlan:
 def merge_faces(segments: Sequence[Segment], thickest: float = THICKEST) -> MergedPlan:
     """Merge the two faces of each wall into one sheet.
 
-    Two lines are faces of one wall if they have the same type, bottom and top, are parallel, lie next to each other at
-    the distance of a wall's thickness over more than that distance, and no line nearer to one of them could be its
+    Two lines are faces of one wall if they have the same type, bottom and top, are parallel, and are adjacent at the
+    distance of a wall's thickness over more than that distance. In addition, no line nearer to one of them may be its
     other face. The distance is at most `thickest`, and within a fifth or 2 cm of the thickness if that is given. Where
-    one long face has several short ones opposite, as between the rooms along a corridor, each pair makes a sheet, and
+    one long face is opposite several short ones, as between the rooms along a corridor, each pair makes a sheet, and
     gaps between the sheets up to `thickest` are closed. Ends lie midway between the faces' ends, so that corners meet.
 
-    What is left of a face that is longer than the other one is kept as a sheet in the same plane. The short lines that
-    close the outline of a wall are left out. All walls of a type without a given thickness get the median of the
+    The remaining part of a face that is longer than the other one is kept as a sheet in the same plane. The short lines
+    that close the outline of a wall are left out. All walls of a type without a given thickness get the median of the
     distances of their faces, weighted with their lengths.
 
-    Where less than half the length of a type's lines has another face, that type is drawn as single lines: two of them
-    that lie close together are two walls, and are kept.
+    If less than half the length of a type's lines has another face, that type is drawn as single lines: two of them
+    that are close together are two walls, and are kept.
 
     Args:
         segments: Lines of a plan.
@@ -119,7 +119,7 @@ def _face_pairs(segments: Sequence[Segment], thickest: float) -> list[tuple[int,
 
 
 def _types_drawn_as_faces(segments: Sequence[Segment], pairs: Sequence[tuple[int, int]]) -> set[str]:
-    """The types of which lines have another face along at least half of their length."""
+    """The types whose lines have another face along at least half of their length."""
     length: dict[str, float] = defaultdict(float)
     faced: dict[str, float] = defaultdict(float)
     for segment in segments:
@@ -173,7 +173,7 @@ def _part(segment: Segment, start: float, end: float, offset: float) -> Segment:
 
 
 def _merge_pair(one: Segment, other: Segment, thickest: float) -> Segment:
-    """The sheet between two faces: over their overlap, its ends midway where both faces end near each other."""
+    """The sheet between two faces: over their overlap, with its ends midway where both faces end near each other."""
     low, high = sorted(_relative(one, other)[0].tolist())
     start = low / 2 if abs(low) <= thickest else max(low, 0.0)
     end = (high + one.length) / 2 if abs(high - one.length) <= thickest else min(high, one.length)

@@ -1,4 +1,4 @@
-"""Checks of scenes: faults of their files and meshes, and positions that do not fit them."""
+"""Checks of scenes: faults of their files and meshes, and positions that do not match them."""
 
 from calibray.scenes.checks.positions import (
     SceneSurfaces,

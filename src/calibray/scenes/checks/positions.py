@@ -1,4 +1,4 @@
-"""Positions in a scene: under a roof, under the ground, outside the scene, behind walls; moved out of buildings."""
+"""Positions in a scene: under a roof, under the ground, outside the scene, behind walls; and moved out of buildings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CLEARANCE: Final = 0.05
 """A surface is above an antenna if it is higher by more than this [m]."""
 
 SAME_CROSSING: Final = 1e-3
-"""Crossings closer than this are one, on an edge that two triangles share [m]."""
+"""Crossings closer than this count as one, on an edge that two triangles share [m]."""
 
 _STEEP: Final = 0.1  # a face is a wall if the vertical part of its unit normal is at most this [1]
 _BATCH: Final = 2_000_000  # pairs of a line and a triangle in memory at once
@@ -31,7 +31,7 @@ def _is_wall(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class SceneSurfaces:
-    """The faces of a scene, walls apart from ground, floors and roofs.
+    """The faces of a scene, with walls separated from ground, floors and roofs.
 
     Attributes:
         level: Corners of the faces that are not walls [F, 3, 3], [m].
@@ -112,7 +112,7 @@ class SceneSurfaces:
         return lowest
 
     def _count_surfaces(self, position: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Number of surfaces at each position, and how many of them are above it [n]."""
+        """Number of surfaces at each position, and number of those above it [n]."""
         index, height = self._surfaces(position)
         above = height > position[index, 2] + CLEARANCE
         return np.bincount(index, minlength=len(position)), np.bincount(index[above], minlength=len(position))
@@ -182,7 +182,7 @@ def building_outlines(source: str | Path, height: float = 2.0) -> Any:
 
     Args:
         source: Path of a Mitsuba XML file, or `sionna:NAME`.
-        height: Faces lower than this above the scene's lowest point cover nothing: kerbs, floors, the ground [m].
+        height: Faces less than this above the scene's lowest point cover nothing: kerbs, floors, the ground [m].
 
     Returns:
         A shapely Polygon or MultiPolygon [m], empty if there is no body.
@@ -208,11 +208,11 @@ def move_outside(
     Args:
         points: Positions [n, 3], [m]; heights do not change.
         outlines: The area that buildings cover, from `building_outlines`.
-        clearance: Distance from the wall at which a moved position lies [m].
-        furthest: Positions that would move further than this are given up [m].
+        clearance: Distance of a moved position from the wall [m].
+        furthest: Positions that would move farther than this are not moved [m].
 
     Returns:
-        The positions [n, 3], [m], NaN where given up; and the distance that each was moved [n], [m].
+        The positions [n, 3], [m], NaN if not moved out; and the distance that each was moved [n], [m].
 
     Raises:
         InputError: The clearance is not greater than 0, or a position is not finite.
@@ -228,7 +228,7 @@ def move_outside(
     if not clearance > 0:
         raise InputError(f"clearance = {clearance!r}: must be greater than 0 m")
     if not np.isfinite(moved).all():
-        raise InputError("positions must be finite numbers of metres; correct or leave out the others")
+        raise InputError("positions must be finite numbers of metres; correct or remove the others")
     inside = np.flatnonzero(shapely.contains_xy(outlines, moved[:, 0], moved[:, 1]))
     distance = np.zeros(len(moved))
     if not len(inside):

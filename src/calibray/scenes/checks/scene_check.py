@@ -1,4 +1,4 @@
-"""Faults of a scene, found before an hour of tracing shows them: materials, names, units and meshes."""
+"""Faults of a scene, detected before an hour of tracing: materials, names, units and meshes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from calibray.support.progress import Progress
 Severity = Literal["error", "warning", "note"]
 
 LARGEST: Final = 50_000.0
-"""Extent above which a scene is hardly in metres about a local origin [m]."""
+"""Extent above which a scene is probably not in metres about a local origin [m]."""
 
 _SAME: Final = 0.001  # corners closer than this count as one position [m]
 _FLAT: Final = 1e-10  # a face of less area counts as empty [m^2]
@@ -34,7 +34,8 @@ class Finding:
     """One fault of a scene or of positions in it.
 
     Attributes:
-        severity: "error" if Sionna RT or Calibray will refuse the scene, "warning" if results suffer, else "note".
+        severity: "error" if Sionna RT or Calibray will refuse the scene, "warning" if results may be wrong, otherwise
+            "note".
         subject: The object, material or file concerned; empty for the scene itself.
         problem: The fault.
         remedy: What to do about it.
@@ -145,7 +146,8 @@ def _mesh_findings(item: MeshFaults) -> list[Finding]:
         (
             item.flipped_faces,
             "note",
-            f"{share} with the normal inward or against their neighbours'; Sionna RT accepts this, others may not",
+            f"{share} with the normal inward or against their neighbours'; Sionna RT accepts this, but other programs "
+            f"may not",
             "recalculate normals outside (Blender: Shift-N)",
         ),
         (item.empty_faces, "warning", f"{share} without area", "dissolve degenerate faces, and export again"),
@@ -240,9 +242,9 @@ def _count_flipped(
 ) -> int:
     """Count the faces with a wrong normal.
 
-    Faces of a connected piece are first oriented alike. The right orientation of a piece is known if it is closed, or
-    open only at its bottom (its volume is positive), or a level sheet (it looks up). For any other piece, such as a
-    wall, either side may be outside, and the faces that differ from the majority are counted.
+    Faces of a connected piece are first given the same orientation. The right orientation of a piece is known if it is
+    closed, or open only at its bottom (its volume is positive), or a level sheet (its normal points up). For any other
+    piece, such as a wall, either side may be outside, and the faces that differ from the majority are counted.
     """
     if not len(faces):
         return 0
