@@ -146,7 +146,7 @@ def test_a_conflict_is_reported_with_both_answers(tmp_path, table, engine):
         (SPREAD | {"path": "first"}, "only a time of flight"),
         (SPREAD | {"kind": "doppler"}, "rms_delay_spread"),
         (SPREAD | {"std": 0.0}, "std"),
-        (SPREAD | {"file": "multipath.csv"}, "give one of column"),
+        (SPREAD | {"file": "multipath.csv"}, "give only one of column"),
         (SPREAD | {"edges": [0.0, 1e-7]}, "takes no edges"),
         (PROFILE | {"edges": [0.0, 1e-7]}, "2 bin"),
         (PROFILE | {"edges": [0.0, 2e-7, 1e-7]}, "increasing"),

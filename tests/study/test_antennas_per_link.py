@@ -197,12 +197,12 @@ def test_arrays_are_steered_per_transmitter_from_columns(planted: Study) -> None
 @pytest.mark.parametrize(
     ("tx", "links", "message"),
     [
-        ({"steering_deg": 5.0}, {}, "links.tx_antenna.steering_deg: the antenna is not an array; give antennas.tx rows"),
+        ({"steering_deg": 5.0}, {}, "tx_antenna.steering_deg: the antenna is not an array; give antennas.tx rows"),
         ({"type": "transmitter"}, {}, r"row 2, column 'transmitter': 'north' is not an antenna of .antennas.types."),
         ({"azimuth_deg": "heading"}, {}, "no column 'heading'"),
         ({"azimuth_deg": 720.0}, {}, "links.tx_antenna.azimuth_deg: 720 must be -360 to 360; give degrees"),
-        ({"azimuth_deg": 1.0, "aim": "other end"}, {}, "leave azimuth_deg and downtilt_deg out"),
-        ({}, {"cable_loss_db": 2.0}, "leave tx_power_dbm and cable_loss_db out"),
+        ({"azimuth_deg": 1.0, "aim": "other end"}, {}, "remove azimuth_deg and downtilt_deg"),
+        ({}, {"cable_loss_db": 2.0}, "remove tx_power_dbm and cable_loss_db"),
     ],
 )  # fmt: skip
 def test_impossible_mountings_are_refused(

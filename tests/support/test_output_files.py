@@ -41,7 +41,7 @@ def test_an_output_may_be_replaced_unless_it_was_changed(tmp_path):
         file.write_text(file.read_text() + "by hand")
         assert not is_unchanged_output(file)
         with pytest.raises(
-            InputError, match=r"was not written by Calibray, or was changed since.*--overwrite"
+            InputError, match=r"was not written by Calibray, or has changed since.*--overwrite"
         ):
             check_file(file)
         assert check_file(file, overwrite=True) == file

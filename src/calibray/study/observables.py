@@ -94,7 +94,9 @@ class ObservableSection(Section):
                 f"path = {self.path!r}: only a time of flight or a round-trip time is that of one path"
             )
         if (self.column is not None) + bool(self.columns) + (self.file is not None) != 1:
-            raise InputError("give one of column, the measured values; columns, one for each bin; and file")
+            raise InputError(
+                "give only one of column, the measured values; columns, one for each bin; and file"
+            )
         self._check_bins()
         return self
 
@@ -138,7 +140,7 @@ class ObservableSection(Section):
         )
 
     def wanted(self, name: str) -> Wanted:
-        """What an external program is asked for."""
+        """The request to an external program."""
         return Wanted(name, self.statistic, self.unit, self.scale)
 
 

@@ -55,8 +55,8 @@ class RegionSection(Section):
         heights: "ground" for heights above the scene's ground below each polygon, as those of a canopy are; above z = 0
             of the scene if absent.
         bottom: Height at which the region begins [m], a number or a column of the file.
-        top: Height at which it ends, likewise; the canopy gives it.
-        specific_attenuation: Loss per length of a short path inside at the study's carrier [dB/m], the start value if
+        top: Height at which it ends, in the same form; a canopy defines it.
+        specific_attenuation: Loss per length of a short path inside at the study's carrier [dB/m]; the start value if
             it is a parameter.
         frequency_exponent: Exponent [1] of the specific attenuation over frequency, for links of other carriers.
         maximum_db: Loss of a very long path inside [dB]; that of woodland in ITU-R P.833 if absent.
@@ -76,7 +76,7 @@ class RegionSection(Section):
     @model_validator(mode="after")
     def _one_source(self) -> Self:
         if sum((self.file is not None, self.canopy is not None, bool(self.boxes))) != 1:
-            raise InputError("a region is given by a file, by a canopy or by boxes: give one of them")
+            raise InputError("a region is given by a file, by a canopy or by boxes: give only one of them")
         for box in self.boxes:
             west, south, east, north = box
             if not (west < east and south < north):
@@ -86,7 +86,7 @@ class RegionSection(Section):
                 )
         if (self.top is None) != (self.canopy is not None):
             raise InputError(
-                "a region of polygons or boxes needs top [m]; a canopy gives it: leave it out there"
+                "a region of polygons or boxes needs top [m]; a canopy defines it: remove top there"
             )
         if self.file is None and (isinstance(self.bottom, str) or isinstance(self.top, str)):
             raise InputError("bottom and top must be numbers [m]; columns need a file")
@@ -110,11 +110,11 @@ class RegionSection(Section):
 
         Args:
             path: The file, resolved.
-            place: What the region needs to know of the scene.
+            place: The data of the scene that the region needs.
 
         Raises:
-            InputError: The file cannot be read or holds no polygon, a height is not a number, or the scene's place is
-                unknown.
+            InputError: The file cannot be read or contains no polygon, a height is not a number, or the scene's
+                position on the globe is unknown.
         """
         shapely = library("shapely", "scenes")
         columns: dict[str, NDArray] = {}
@@ -153,10 +153,10 @@ def read_polygons(path: Path, position: str, frame: Frame | None) -> tuple[NDArr
     Args:
         path: The file.
         position: "geographic" if its coordinates are those of its reference system, "scene" for the scene's frame.
-        frame: Place of the scene on the globe, if it is known.
+        frame: Position of the scene on the globe, if known.
 
     Raises:
-        InputError: The file cannot be read or holds no polygon, or the scene's place is unknown.
+        InputError: The file cannot be read or contains no polygon, or the scene's position on the globe is unknown.
     """
     shapely = library("shapely", "scenes")
     from calibray.scenes.authoring.footprints import project
@@ -175,17 +175,18 @@ def read_polygons(path: Path, position: str, frame: Frame | None) -> tuple[NDArr
 def _known(frame: Frame | None, path: Path) -> Frame:
     if frame is None:
         raise InputError(
-            f"{path}: the place of the scene on the globe is unknown; give [scene] origin or crs, or position = 'scene'"
+            f"{path}: the position of the scene on the globe is unknown; give [scene] origin or crs, or position = "
+            f"'scene'"
         )
     return frame
 
 
 @dataclass(frozen=True)
 class Place:
-    """What regions need to know of a scene.
+    """The data of a scene that regions need.
 
     Attributes:
-        frame: Its place on the globe, if it is known.
+        frame: Its position on the globe, if known.
         surfaces: Reads its surfaces.
     """
 

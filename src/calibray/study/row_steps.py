@@ -1,4 +1,4 @@
-"""The steps by which the rows of a study's table become links."""
+"""The steps that convert the rows of a study's table to links."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ _COLUMN_KEYS: Final = {"tx", "rx", "value", "quantity", "weight", "std", "tx_pow
 
 
 def study_links(study: StudyModel) -> Measurements:
-    """All links of a study, held-out ones included.
+    """All links of a study, including held-out links.
 
     Raises:
-        InputError: The table cannot be used, or the scene's place on the globe is unknown.
+        InputError: The table cannot be used, or the scene's position on the globe is unknown.
     """
     return measured_links(read_table(study.links_path), link_columns(study), row_steps(study))
 
@@ -55,7 +55,7 @@ def row_steps(study: StudyModel) -> Preparation:
     """The steps from rows to links that a study states.
 
     Raises:
-        InputError: The scene's place on the globe is unknown, or the scene cannot be read.
+        InputError: The scene's position on the globe is unknown, or the scene cannot be read.
     """
     links = study.links
     inside = None if links.inside == "keep" else links.inside
@@ -91,7 +91,7 @@ def row_track(study: StudyModel) -> Track | None:
 
 
 def position_steps(study: StudyModel) -> Preparation:
-    """The steps that position a row's antennas; they leave no row out.
+    """The steps that position a row's antennas; they leave out no row.
 
     Raises:
         InputError: As for `row_steps`.
@@ -122,7 +122,7 @@ def _move_outside(study: StudyModel) -> MoveOutside:
 
 
 def scene_frame(study: StudyModel) -> Frame:
-    """The place of a study's scene on the globe, stated by the study or else by the scene file.
+    """The position of a study's scene on the globe, stated by the study or otherwise by the scene file.
 
     Raises:
         InputError: Neither states it, or the projection is unknown.
@@ -130,14 +130,14 @@ def scene_frame(study: StudyModel) -> Frame:
     frame = known_frame(study)
     if frame is None:
         raise InputError(
-            f"{study.path}: links.position = 'geographic': the scene's place on the globe is unknown; give "
-            "scene.origin = [longitude, latitude], and scene.crs if the scene is in a map projection"
+            f"{study.path}: links.position = 'geographic': the scene's position on the globe is unknown; give "
+            f"scene.origin = [longitude, latitude], and scene.crs if the scene is in a map projection"
         )
     return frame
 
 
 def known_frame(study: StudyModel) -> Frame | None:
-    """The place of a study's scene on the globe; None if neither the study nor the scene file states it.
+    """The position of a study's scene on the globe; None if neither the study nor the scene file states it.
 
     Raises:
         InputError: The projection is unknown.
@@ -159,7 +159,7 @@ def study_regions(study: StudyModel) -> dict[str, Region]:
     """The regions of a study by name.
 
     Raises:
-        InputError: A file cannot be read, or the scene's place on the globe is unknown.
+        InputError: A file cannot be read, or the scene's position on the globe is unknown.
     """
     if not study.regions:
         return {}
@@ -169,7 +169,7 @@ def study_regions(study: StudyModel) -> dict[str, Region]:
 
 
 def scene_place(study: StudyModel) -> Place:
-    """What regions and facades need to know of the scene."""
+    """The data of a scene that regions and facades need."""
     return Place(known_frame(study), partial(_surfaces, study.scene_source))
 
 

@@ -52,7 +52,7 @@ class MaterialSection(Section):
 
     Attributes:
         itu: ITU-R P.2040 material that gives permittivity and conductivity.
-        revision: Revision of ITU-R P.2040, with `itu` only.
+        revision: Revision of ITU-R P.2040; only with `itu`.
         relative_permittivity: Real part of the relative permittivity [1].
         conductivity: Conductivity [S/m].
         thickness: Thickness [m].
@@ -82,7 +82,7 @@ class MaterialSection(Section):
     def _physical(self) -> Self:
         if self.revision is not None and self.itu is None:
             raise InputError(
-                f"revision = {self.revision!r} without itu; name the ITU-R material, or leave it out"
+                f"revision = {self.revision!r} without itu; name the ITU-R material, or remove it"
             )
         stated = self.model_dump(exclude_none=True, exclude={"itu", "revision", "roughness_mm"})
         Material(**{"relative_permittivity": 1.0, "conductivity": 0.0, "thickness": 1.0, **stated})
@@ -90,15 +90,15 @@ class MaterialSection(Section):
 
 
 class AverageSection(Section):
-    """``[links.average]``: samples close together are averaged to one link, in linear power.
+    """``[links.average]``: samples that are close together are averaged to one link, in linear power.
 
     Attributes:
         by: "place" of equal receiver positions, "cell" of a square grid, "distance" travelled in the order of the
             rows, or window of "time".
         size: Width or length [m], or duration [s]; required except for "place".
-        time: Column of times, for "time" only.
+        time: Column of times; only for "time".
         unbiased: Whether to correct the bias of the logarithm of a mean of few samples.
-        minimum_count: Averages of fewer samples are left out.
+        minimum_count: Smallest number of samples of an average; averages of fewer samples are left out.
     """
 
     by: Literal["place", "cell", "distance", "time"]
@@ -110,14 +110,14 @@ class AverageSection(Section):
     @model_validator(mode="after")
     def _sized(self) -> Self:
         if (self.by == "place") != (self.size is None):
-            remedy = "takes no size; leave it out" if self.by == "place" else "needs size, in m or s"
+            remedy = "takes no size; remove it" if self.by == "place" else "needs size, in m or s"
             raise InputError(f"links.average: by = {self.by!r} {remedy}")
         return self
 
     @model_validator(mode="after")
     def _timed(self) -> Self:
         if (self.by == "time") != (self.time is not None):
-            remedy = "needs time, the column of times" if self.by == "time" else "takes no time; leave it out"
+            remedy = "needs time, the column of times" if self.by == "time" else "takes no time; remove it"
             raise InputError(f"links.average: by = {self.by!r} {remedy}")
         return self
 
@@ -140,7 +140,7 @@ class TrackSection(Section):
         file: GPX file, relative to the study file's folder.
         time: Column of the rows' times: ISO 8601, or seconds since 1970.
         longest_gap: Longest time between two points of the track [s]; rows in a longer gap are left out.
-        clock: How much the table's clock is ahead of the track's [s].
+        clock: Time by which the table's clock is ahead of the track's [s].
     """
 
     file: Text
@@ -150,17 +150,18 @@ class TrackSection(Section):
 
 
 class MountingSection(Section):
-    """``[links.tx_antenna]`` or ``[links.rx_antenna]``: which antenna each link has at this end, and where it points.
+    """``[links.tx_antenna]`` or ``[links.rx_antenna]``: the antenna of each link at this end, and its direction.
 
     Attributes:
-        type: Column of names of ``[antennas.types]``; all have the antenna of ``[antennas]`` if absent.
-        azimuth_deg: Azimuth [deg], a number or a column; along x if absent. It turns the antenna's own orientation.
+        type: Column of names of ``[antennas.types]``; if absent, all links have the antenna of ``[antennas]``.
+        azimuth_deg: Azimuth [deg], a number or a column; along x if absent. The azimuth rotates the antenna's own
+            orientation.
         azimuth_from: "north" for compass bearings (clockwise from y), "east" for angles counter-clockwise from x.
         downtilt_deg: Mechanical downtilt [deg], a number or a column.
-        electrical_downtilt_deg: Shift of the pattern downwards in the antenna's frame [deg], a number or a column; of
-            the beam of an array.
-        steering_deg: Direction to which an array's beam is turned electrically, relative to the antenna [deg], a number
-            or a column; clockwise if azimuths are compass bearings.
+        electrical_downtilt_deg: Downward shift of the pattern in the antenna's frame [deg], a number or a column; for
+            an array, of its beam.
+        steering_deg: Direction to which an array's beam is steered electrically, relative to the antenna [deg], a
+            number or a column; clockwise if azimuths are compass bearings.
         aim: "other end" points every antenna at the other end of its link, in place of azimuth and downtilt.
     """
 
@@ -176,7 +177,7 @@ class MountingSection(Section):
     def _one_direction(self) -> Self:
         if self.aim is not None and (self.azimuth_deg is not None or self.downtilt_deg != 0):
             raise InputError(
-                "aim = 'other end' gives azimuth and downtilt; leave azimuth_deg and downtilt_deg out"
+                "aim = 'other end' gives azimuth and downtilt; remove azimuth_deg and downtilt_deg"
             )
         return self
 
@@ -225,8 +226,8 @@ class LinksSection(Section):
         transmitter: Column of both tables with the name of the transmitter.
         missing: Numbers that mean that nothing was measured, in addition to usual ones such as 100 or -999.
         noise_floor_dbm: Noise floor [dBm]; a missing received power counts as below it.
-        below_floor: How rows at or below the noise floor are treated: "exclude" leaves them out, "censor" keeps them as
-            upper bounds of the received power, which the intervals take into account.
+        below_floor: How rows at or below the noise floor are treated: "exclude" leaves them out, and "censor" keeps
+            them as upper bounds of the received power, which the intervals account for.
         inside: How receivers inside buildings are treated: "keep", "drop", or "move" to the nearest street.
         average: How samples are averaged.
     """
@@ -266,7 +267,7 @@ class LinksSection(Section):
         if self.position == "geographic" and self.position_unit != 1:
             raise InputError(
                 f"links.position_unit = {self.position_unit:g} with position = 'geographic': degrees have no length; "
-                "leave it out"
+                f"remove it"
             )
         return self
 
@@ -283,8 +284,8 @@ class LinksSection(Section):
     def _one_power(self) -> Self:
         if self.eirp_dbm is not None and (self.tx_power_dbm is not None or self.cable_loss_db is not None):
             raise InputError(
-                "links.eirp_dbm includes the transmitted power, cables and the antenna's gain; leave tx_power_dbm and "
-                "cable_loss_db out"
+                "links.eirp_dbm includes the transmitted power, cables and the antenna's gain; remove tx_power_dbm and "
+                "cable_loss_db"
             )
         if self.cable_loss_db is not None and self.tx_power_dbm is None:
             raise InputError("links.cable_loss_db needs tx_power_dbm [dBm], the power before the cable")
@@ -309,8 +310,8 @@ class LinksSection(Section):
             )
         if self.below_floor == "censor" and self.average is not None:
             raise InputError(
-                "links.below_floor = 'censor' with [links.average]: averages already count samples below the "
-                "noise floor at half of the floor; leave one of them out"
+                "links.below_floor = 'censor' with [links.average]: averages already count samples below the noise "
+                "floor at half of the floor; remove one of them"
             )
         return self
 

@@ -69,9 +69,9 @@ class Setup:
 
     Attributes:
         study: The study.
-        links: All its links, held-out links included.
-        scene: Its scene with the parameters' start values, because materials steer the rays that are followed.
-        parameters: The parameters that a candidate gives values to.
+        links: All its links, including held-out links.
+        scene: Its scene with the parameters' start values, because the tracer chooses rays according to the materials.
+        parameters: The parameters whose values a candidate contains.
         held_out: Mask of the held-out links [L].
         factory: Opens the scene in a ray tracer.
         placed: Values of the parameters at which paths are traced, if some displace antennas; start values if absent.
@@ -91,7 +91,7 @@ class Setup:
     def open(
         cls, study: StudyModel, tracer: TracerFactory = SIONNA, links: Measurements | None = None
     ) -> Setup:
-        """Read the files of a study; nothing is traced yet.
+        """Read the files of a study without tracing.
 
         Args:
             study: The study.
@@ -123,7 +123,7 @@ class Setup:
         return setup.with_obstruction() if study.uses_obstruction else setup
 
     def opened(self) -> Setup:
-        """Itself, so that functions can take a study, opened or not."""
+        """Itself, so that functions accept a study, opened or not."""
         return self
 
     def replace(self, method: str | None = None, seed: int | None = None, engine: str | None = None) -> Setup:
@@ -140,7 +140,7 @@ class Setup:
         return setup.with_obstruction() if self.study.uses_obstruction else setup
 
     def with_obstruction(self) -> Setup:
-        """The same with the columns that the scene gives in the links' table (`link_obstruction.COLUMNS`)."""
+        """The same with the columns of the links' table that follow from the scene (`link_obstruction.COLUMNS`)."""
         study = self.study
         links = with_obstruction(
             self.links,
@@ -153,7 +153,7 @@ class Setup:
         return self if links is self.links else self._with_tracer(replace(self, links=links))
 
     def effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
-        """Effects on paths that no constant has: wrong directions of antennas, regions, and rough surfaces.
+        """Effects on paths that are not material constants: wrong directions of antennas, regions, and rough surfaces.
 
         Args:
             paths: The paths of some links.
@@ -239,7 +239,7 @@ class Setup:
 
     @property
     def known_antennas(self) -> tuple[Antenna, Antenna] | None:
-        """Transmit and receive antenna, if the study states them; else those of an engine are unknown."""
+        """Transmit and receive antenna, if the study states them; otherwise those of an engine are unknown."""
         return self.radio.antennas if self.study.antennas != AntennasSection() else None
 
     @property
@@ -298,7 +298,7 @@ class Setup:
 
     @cached_property
     def files(self) -> dict[str, str]:
-        """SHA-256 of every file of the scene and the antennas, by the path that the study resolves to."""
+        """SHA-256 of every file of the scene and the antennas, by its resolved path."""
         antennas = [*self.study.stated_antennas.values(), *self.study.antenna_types.values()]
         gains = [Path(antenna.gain_file) for antenna in antennas if antenna.gain_file is not None]
         digests = {str(self.scene.path): hashlib.sha256(scene_content(self.scene.path)).hexdigest()}
@@ -316,7 +316,7 @@ class Setup:
     def trace(
         self, materials: Mapping[str, Material] | None = None, progress: Progress | None = None
     ) -> Paths:
-        """The paths of the links, from the cache if they were traced before; or from the ray table of the study.
+        """The paths of the links, from the cache if they were traced before, or from the ray table of the study.
 
         A program that answers with rays is called once. Links that differ only in their carrier are traced once.
 
@@ -396,7 +396,7 @@ class Setup:
 
     @cached_property
     def mountings(self) -> dict[str, Mounting]:
-        """The antennas at the ends, "tx" or "rx", where they differ between links.
+        """The antennas at the ends, "tx" or "rx", if they differ between links.
 
         Raises:
             InputError: A column is missing or malformed, or names an unknown antenna.
@@ -448,7 +448,7 @@ def _scene_of(study: StudyModel, frequency: float) -> Scene:
 
 
 def _paths_of_table(setup: Setup, file: Path, materials: Mapping[str, Material]) -> Paths:
-    """The paths of the study's ray table, whose powers are those at the start values."""
+    """The paths of the study's ray table, whose powers apply at the start values."""
     from calibray.engines.rays.compile import RaySetting, compile_rays
     from calibray.engines.rays.files import read_ray_file
     from calibray.engines.rays.table import RayTable
@@ -458,7 +458,7 @@ def _paths_of_table(setup: Setup, file: Path, materials: Mapping[str, Material])
 
 
 def _paths_of_program(setup: Setup, materials: Mapping[str, Material], progress: Progress | None) -> Paths:
-    """The paths that the study's program answers with, whose powers are those at these materials."""
+    """The paths that the study's program returns, whose powers apply at these materials."""
     from calibray.engines.rays.export import Exporting
 
     scene = replace(setup.scene, materials={**setup.scene.materials, **materials})

@@ -1,4 +1,4 @@
-"""The study: one calibration problem, as its file states it."""
+"""The study: one calibration problem, as stated in its file."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from calibray.tables.display import hertz
 
 @final
 class Study(StudyModel):
-    """One calibration problem, as its study file states it; see ``docs/reference/study-file.md``.
+    """One calibration problem, as stated in its study file; see ``docs/reference/study-file.md``.
 
     Attributes:
         version: Version of the file format.
@@ -40,10 +40,10 @@ class Study(StudyModel):
         links: The measured links.
         antennas: The antennas.
         trace: Settings of the ray tracer.
-        objective: How paths combine to a path loss.
+        objective: How paths are combined to a path loss.
         parameters: The free parameters by name, in the order of a candidate's values.
         offset: The short form of the nuisance term "offset", or None.
-        nuisance: Further nuisance terms by name; `nuisance_terms` has all.
+        nuisance: Further nuisance terms by name; `nuisance_terms` contains all terms.
         noise: The errors of measured links.
         holdout: The held-out links, or None.
         fidelity: When to trace again.
@@ -59,10 +59,10 @@ class Study(StudyModel):
 
         Args:
             scene: The `sionna.rt.Scene`.
-            measured: Path loss [tx, rx], [dB], in the order of the scene's transmitters and receivers, NaN where
+            measured: Path loss [tx, rx], [dB], in the order of the scene's transmitters and receivers, with NaN where
                 nothing was measured; or a DataFrame with names of transmitters as rows and of receivers as columns.
-            folder: Folder to write the scene, the links and `study.toml` into, for `Study.load`; if None, a temporary
-                one.
+            folder: Folder to write the scene, the links and `study.toml` into, for `Study.load`; a temporary folder if
+                None.
             **sections: Sections of the study file in place of the defaults, as ``trace={"max_depth": 5}`` or
                 ``links={"quantity": "received_power"}``. Without `parameters`, the permittivity of every material is
                 calibrated.
@@ -90,10 +90,10 @@ class Study(StudyModel):
         return display.html(*summary(self))
 
     def measurements(self) -> Measurements:
-        """All links of the study, held-out ones included, with the groups of the offset.
+        """All links of the study, including held-out links, with the groups of the offset.
 
         Raises:
-            InputError: The table cannot be used (see `read_measurements`), or the scene's place on the globe is
+            InputError: The table cannot be used (see `read_measurements`), or the scene's position on the globe is
                 unknown.
         """
         return study_links(self)
@@ -103,8 +103,8 @@ class Study(StudyModel):
 
         Args:
             table: Rows with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] in the scene's frame, as in
-                `result-links.csv`; or else rows like those of the study's table, in the same units. No row is left
-                out, and a row of a wide table is one link per transmitter.
+                `result-links.csv`; or rows like those of the study's table, in the same units. No row is left out, and
+                a row of a wide table is one link per transmitter.
 
         Returns:
             One link per row, with carriers if the table has the study's carrier column.
@@ -129,8 +129,8 @@ class Study(StudyModel):
             rows, table = len(table), select_rows(table, Preparation(track=row_track(self)))
             if len(table) < rows:
                 raise InputError(
-                    f"{table.source}: {rows - len(table)} of {rows} rows are at no time of the track, and have no "
-                    "position; remove them"
+                    f"{table.source}: {rows - len(table)} of {rows} rows are outside the times of the track, and have "
+                    f"no position; remove them"
                 )
         elif not wide and not columns & {*links.tx, *links.rx}:
             return links_from_table(table, group, links.frequency)

@@ -1,4 +1,4 @@
-"""The text of a study file: its TOML, environment variables in the names of files, and keys of several engines."""
+"""The text of a study file: its TOML, environment variables in file names, and keys of several engines."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def study_text(content: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
         reasons: Reasons by the dotted name of a section or key.
 
     Raises:
-        InputError: A name has characters that TOML cannot hold.
+        InputError: A name has characters that TOML cannot contain.
     """
     document, text, agrees = tomlkit.document(), "", False
     try:
@@ -68,7 +68,9 @@ def study_text(content: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
         pass
     # Whatever names a table has, the file must say what was drafted and nothing else.
     if not agrees:
-        raise InputError("draft: a column or group has a name that no study can hold; rename it in the table")
+        raise InputError(
+            "draft: a column or group has a name that a study cannot contain; rename it in the table"
+        )
     return text
 
 
@@ -121,7 +123,7 @@ def _item(value: Any) -> Any:
 
 
 def _with_lists(value: Any) -> Any:
-    """A value with lists in place of tuples, as TOML reads them."""
+    """A value with lists in place of tuples, as in parsed TOML."""
     if isinstance(value, Mapping):
         return {key: _with_lists(part) for key, part in value.items()}
     return [_with_lists(part) for part in value] if isinstance(value, list | tuple) else value
@@ -163,9 +165,9 @@ def expand(text: str, environment: Mapping[str, str]) -> str:
 
 
 def split_engine_keys(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
-    """Split the table ``[engine]`` into the keys of the engine it names and those of other engines.
+    """Split the table ``[engine]`` into the keys of the engine that it names and those of other engines.
 
-    A study may state how its program is called and yet use replay; `calibray run --engine command` then calls it.
+    A study may state how its program is called and still use replay; `calibray run --engine command` then calls it.
 
     Raises:
         InputError: Another engine cannot use the value of its key.
@@ -188,7 +190,7 @@ def split_engine_keys(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
 
 
 def _fault(field: FieldInfo, value: Any) -> str | None:
-    """What is wrong with the value of a key; None if nothing is."""
+    """The error in the value of a key; None if there is none."""
     # The type is composed at run time, which type checkers cannot follow.
     annotated: Any = Annotated
     checker = TypeAdapter[Any](annotated[field.annotation, Field(), *field.metadata], config=CLOSED)

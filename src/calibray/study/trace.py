@@ -64,8 +64,8 @@ def trace(
     """Find the paths of every link and compile them.
 
     Args:
-        scene: Mitsuba XML file, `sionna:NAME` for a bundled scene, or a scene already read. Or a study, which states
-            its links, carrier, antennas and settings; its trace is cached.
+        scene: Mitsuba XML file, `sionna:NAME` for a bundled scene, or a scene already read. Alternatively a study,
+            which states its links, carrier, antennas and settings; its trace is cached.
         measurements: The links; their values and carriers do not matter (use `Paths.at` for another carrier). With a
             study, links in place of the study's.
         frequency: Carrier frequency [Hz].
@@ -77,7 +77,7 @@ def trace(
         **settings: The attributes of `TraceSettings`.
 
     Returns:
-        The path program; `links_without_path` lists the links that no path reaches.
+        The path program; `links_without_path` lists the links without a path.
 
     Raises:
         InputError: The study, the scene, an antenna, a setting or a position cannot be used; or an argument is missing,
@@ -135,17 +135,19 @@ def read_rays(
     study's start values, every path then has the power of the table.
 
     Args:
-        rays: The table: a .csv, .parquet, .json or .h5 file, or its rows. Or the paths of another program: a .p2m file
-            of Wireless InSite, the folder of an AODT run or of a DeepMIMO scenario, or Sionna RT's `Paths`.
-        scene: Mitsuba XML file, `sionna:NAME`, or a scene already read, with the constants that the engine used. Or a
-            study, which states carrier and links; its start values are those that the engine used.
+        rays: The table: a .csv, .parquet, .json or .h5 file, or its rows. Alternatively the paths of another program: a
+            .p2m file of Wireless InSite, the folder of an AODT run or of a DeepMIMO scenario, or Sionna RT's `Paths`.
+        scene: Mitsuba XML file, `sionna:NAME`, or a scene already read, with the constants that the engine used.
+            Alternatively a study, which states carrier and links; its start values must be those that the engine used.
         frequency: Carrier frequency [Hz]; without a study.
-        antennas: Transmit and receive antenna, if the engine used these; else the correction contains the antennas.
+        antennas: Transmit and receive antenna, if the engine used these; otherwise the correction contains the
+            antennas.
         axes: The table's axes along x, y and z of the scene, as "x -z y" for a table whose y axis points up.
         tx_power_dbm: Transmitted power of a file that states received power [dBm]: Wireless InSite.
 
     Returns:
-        The path program. Its links are those of the study; without a study, those of the table by label or position.
+        The path program. With a study, the links are those of the study; without one, those of the table by label or
+        position.
 
     Raises:
         InputError: The table, the scene or an antenna cannot be used, or they do not agree.

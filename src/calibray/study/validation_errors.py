@@ -1,4 +1,4 @@
-"""Errors that Pydantic finds in a study file, with the keys and values of the file."""
+"""Converts Pydantic's errors in a study file to messages with the keys and values of the file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from calibray.errors import InputError
 from calibray.support.messages import did_you_mean, shortened
 
 MOST_ERRORS: Final = 20
-"""Number of errors that are listed; further ones are only counted."""
+"""Number of errors that are listed; further errors are only counted."""
 
 _UNKNOWN: Final = ("extra_forbidden", "unexpected_keyword_argument")
 
@@ -47,9 +47,9 @@ def explain(
     source: str,
     tagged: Sequence[str] = (),
 ) -> InputError:
-    """One message for all errors, a line each: file, dotted key, value, bound.
+    """One message for all errors, with one line each: file, dotted key, value, bound.
 
-    Keys of the model are suggested for misspelled ones. `tagged` are tables of which there are several kinds,
+    For misspelled keys, it suggests keys of the model. `tagged` are tables of which there are several kinds,
     distinguished by their `name`.
     """
     lines: dict[str, str] = {}
@@ -72,7 +72,7 @@ def explain(
         lines.setdefault(key, line)
     listed = list(lines.values())[:MOST_ERRORS]
     if len(lines) > len(listed):
-        listed.append(f"and {len(lines) - len(listed)} more like these; correct them first")
+        listed.append(f"and {len(lines) - len(listed)} more errors of this kind; correct these first")
     return InputError("\n".join(f"{source}: {line}" for line in listed))
 
 
@@ -86,7 +86,7 @@ def describe_fault(fault: Mapping[str, Any]) -> str:
 
 
 def dotted(path: Sequence[str | int]) -> str:
-    """A key as TOML writes it, for instance ``parameters."walls.thickness".bounds[1]``."""
+    """A key in the form of TOML, for instance ``parameters."walls.thickness".bounds[1]``."""
     text = ""
     for part in path:
         if isinstance(part, int):
@@ -122,7 +122,7 @@ def _shown(path: Sequence[str | int], content: Any) -> str:
 
 
 def _keys(model: Any, path: Sequence[str | int]) -> list[str]:
-    """The keys of a model at a path, of all kinds of tables that it may have there."""
+    """The keys of a model at a path, of all kinds of tables that are possible there."""
     models = [model]
     for part in path:
         models = [table for known in models for table in _tables(_annotation(known, str(part)))]

@@ -1,6 +1,7 @@
 """Calibray's cache folder: data kept between runs that can be computed again.
 
-The folder is `CALIBRAY_CACHE`, else `calibray` in the user's cache folder; an empty `CALIBRAY_CACHE` disables caching.
+The folder is `CALIBRAY_CACHE`, otherwise `calibray` in the user's cache folder; an empty `CALIBRAY_CACHE` disables
+caching.
 """
 
 from __future__ import annotations
@@ -38,14 +39,14 @@ def cache_folder() -> Path | None:
 
 @dataclass(frozen=True)
 class Store:
-    """Checksummed entries in a folder that nobody else can write, for data that must be trusted, such as machine code.
+    """Checksummed entries in a folder that nobody else can write to, for data that must be trusted.
 
-    An entry is complete or absent: it is moved into place once it is written, and a damaged one is removed when it is
+    An entry is complete or absent: it is moved into place once it is written, and a damaged entry is removed when it is
     read. Entries that cannot be read or written are skipped without an error.
 
     Attributes:
         path: The folder, which need not exist.
-        suffix: The end of the entries' file names.
+        suffix: The file extension of the entries.
         limit: Size limit [bytes]; the entries read least recently are removed above it, after one written entry in
             `_PRUNED_AT`.
     """
@@ -56,7 +57,7 @@ class Store:
 
     @property
     def trusted(self) -> bool:
-        """Whether the folder, created if need be, belongs to the user and nobody else can write to it."""
+        """Whether the folder, created if needed, belongs to the user and nobody else can write to it."""
         with suppress(OSError), self._folder():
             return True
         return False
@@ -93,10 +94,10 @@ class Store:
 
     @contextmanager
     def _folder(self) -> Iterator[int | None]:
-        """Open the folder, created if need be, and check who may write to it.
+        """Open the folder, created if needed, and check who may write to it.
 
-        The check applies to the open folder. Under the path there may be another one a moment later, if others can
-        write to a folder above it.
+        The check applies to the open folder. If others can write to a folder above it, another folder may have its path
+        a moment later.
 
         Yields:
             Its descriptor; None on Windows, which keeps other users out of a user's folders.
@@ -120,7 +121,7 @@ class Store:
             os.close(folder)
 
     def entries(self) -> list[Path]:
-        """The files of the entries, the one read last first; no other file of the folder."""
+        """The files of the entries, most recently read first; no other file of the folder."""
         ages = []
         with suppress(OSError):
             for path in self.path.glob(f"*{self.suffix}"):

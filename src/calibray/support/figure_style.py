@@ -1,7 +1,7 @@
-"""One restrained style for every figure: colours that colour-blind people tell apart, few lines, units on axes.
+"""One restrained style for every figure: colours that colour-blind people can distinguish, few lines, units on axes.
 
-The colours of lines are those of Okabe and Ito (2008). A figure in a page takes its ink from the page, so that it is
-read on light and on dark alike.
+The colours of lines are those of Okabe and Ito (2008). A figure in a page takes its line and text colour from the page,
+so that it is readable on light and dark backgrounds.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ PALETTE: Final = (
     "#5c6bc0",
     "#777777",
 )
-"""For lines beyond the named ones."""
+"""Colours for lines beyond the named ones."""
 
 COLORS: Final = {"gwo": GREEN, "sgwo-im": BLUE, "space-mapping": FAINT, "auto": ORANGE}
-"""The paper's methods, and what Calibray itself does."""
+"""The paper's methods, and Calibray's own."""
 
 _VARIABLES: Final = {INK: "--ink", FAINT: "--faint", LINE: "--line", PAPER: "--paper", BLUE: "--accent"}
 _SETTINGS: Final[dict[Any, Any]] = {
@@ -78,14 +78,14 @@ def plain_figure(x: str, y: str, width: float = 6.4, height: float = 4.2) -> tup
 
 
 def residual_figure(x: str) -> tuple[Figure, Axes]:
-    """An empty figure for what is left of links' path loss, with a line where nothing is left."""
+    """An empty figure for residuals of links' path loss, with a line at zero."""
     figure, axes = plain_figure(x, "Predicted − measured [dB]")
     axes.axhline(0, color=INK, lw=0.8)
     return figure, axes
 
 
 def dress(axes: Axes, x: str, y: str) -> None:
-    """Label axes, and take away what says nothing."""
+    """Label axes, and remove elements without information."""
     axes.set(xlabel=x, ylabel=y)
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y", color=LINE)
@@ -98,7 +98,7 @@ def plain_number(value: float) -> str:
 
 
 def logarithmic(axes: Axes, direction: Literal["x", "y"]) -> None:
-    """Make an axis logarithmic, its numbers written out: powers would be formulas, which texts here are not."""
+    """Make an axis logarithmic with its numbers written out, because texts in these figures cannot contain formulas."""
     axes.set(**{f"{direction}scale": "log"})
     axis = axes.xaxis if direction == "x" else axes.yaxis
     low, high = sorted(axis.get_view_interval())
@@ -109,7 +109,7 @@ def logarithmic(axes: Axes, direction: Literal["x", "y"]) -> None:
 
 
 def write(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG or, if the file's name ends so, as SVG; returns the file."""
+    """Write a figure as SVG if the file has this extension, otherwise as PNG, and return the file."""
     with styled(), replacing(path) as partial:
         if path.suffix == ".svg":
             FigureCanvasSVG(figure).print_svg(partial, metadata={"Date": None})
@@ -119,9 +119,9 @@ def write(figure: Figure, path: Path) -> Path:
 
 
 def inline(figure: Figure, name: str) -> str:
-    """A figure as an SVG element that takes its ink and its font from the page around it.
+    """A figure as an SVG element that takes its colour and its font from the surrounding page.
 
-    Its ids begin with `name`, and it refers to nothing outside it.
+    Its ids begin with `name`, and it has no external references.
     """
     written = StringIO()
     figure.patch.set_visible(False)

@@ -1,4 +1,4 @@
-"""Ctrl-C during compiled code, where libraries turn it into an error of their own or drop it."""
+"""Ctrl-C during compiled code, where libraries convert it to an error of their own or drop it."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ INTERRUPTED: Final = 130
 """Exit status after Ctrl-C: 128 plus the number of the signal, as in shells."""
 
 GRACE: Final = 1.0
-"""Time that an interruption may take to reach the code that saves results, before it is raised again [s]."""
+"""Time for an interruption to reach the code that saves results, before it is raised again [s]."""
 
 
 @contextmanager
 def unwrap_interruption() -> Iterator[None]:
-    """Raise KeyboardInterrupt in place of the error that a library made of it.
+    """Raise KeyboardInterrupt in place of the error that a library made from it.
 
     Yields:
         Nothing; the block may call Dr.Jit or import compiled modules.
 
     Raises:
-        KeyboardInterrupt: It caused the error of a library.
+        KeyboardInterrupt: Ctrl-C caused the error of a library.
         RuntimeError: Raised in the block, with another cause.
         SystemError: The same.
         ImportError: The same.
@@ -76,10 +76,10 @@ def ensure_interruption() -> Iterator[None]:
 
 
 def raise_pending_interruption() -> None:
-    """Raise a KeyboardInterrupt that was dropped within `ensure_interruption`, after a time of grace.
+    """Raise a KeyboardInterrupt that was dropped within `ensure_interruption`, after a grace period.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C was pressed longer than `GRACE` ago and the block still runs.
+        KeyboardInterrupt: Ctrl-C was pressed more than `GRACE` ago, and the block still runs.
     """
     if _pressed and time.monotonic() - _pressed[-1] > GRACE:
         raise KeyboardInterrupt
@@ -96,7 +96,7 @@ def _press(_: int, __: FrameType | None) -> None:
 
 @contextmanager
 def defer_interruption() -> Iterator[None]:
-    """Delay Ctrl-C to the end of a short block that must not be left half done.
+    """Delay Ctrl-C to the end of a short block that must not be interrupted.
 
     Yields:
         Nothing.

@@ -18,7 +18,7 @@ def lazy_attributes(
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Make `__getattr__` and `__dir__` of a package (PEP 562), given the module that defines each name.
 
-    For a submodule that is its own name in full.
+    For a submodule, this is its own full name.
     """
 
     def find(name: str) -> Any:
@@ -40,7 +40,7 @@ def library(name: str, extra: str) -> ModuleType:
     """Import an optional module, which an extra of Calibray installs.
 
     Raises:
-        InputError: It is not installed, or cannot be loaded.
+        InputError: The module is not installed, or cannot be loaded.
 
     Example:
         >>> library("zipfile", "scenes").is_zipfile("no such file")

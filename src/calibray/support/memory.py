@@ -1,4 +1,4 @@
-"""What of this machine the process may use: memory, and threads of BLAS."""
+"""The resources of this machine that the process may use: memory, and threads of BLAS."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CONTROL_GROUP = Path("/sys/fs/cgroup")
 
 
 def check_address_space() -> None:
-    """Refuse to work where the address space (`ulimit -v`) is too small for the libraries.
+    """Refuse to work if the address space (`ulimit -v`) is too small for the libraries.
 
     Raises:
         InputError: The limit is below `LEAST_ADDRESS_SPACE`.
@@ -43,7 +43,7 @@ def check_address_space() -> None:
 def available_memory() -> int:
     """Memory that can be allocated before the system ends the process or refuses more [bytes].
 
-    The least of what the system, the container and the limit of the address space (`ulimit -v`) leave.
+    This is the smallest amount that the system, the container and the limit of the address space (`ulimit -v`) leave.
     """
     import psutil  # not needed to check the limit of the address space
 
@@ -63,7 +63,7 @@ def available_memory() -> int:
 
 
 def single_blas_thread(wanted: bool = True) -> AbstractContextManager[object]:
-    """Context in which the linear algebra uses one thread; nothing changes unless it is wanted."""
+    """Context in which the linear algebra uses one thread; without effect unless requested."""
     return _libraries().limit(limits=1, user_api="blas") if wanted else nullcontext()
 
 
@@ -78,7 +78,7 @@ def _libraries() -> ThreadpoolController:
 
 
 SECONDS: Final = 20.0
-"""Time that a small file may take to be read [s]; most of it is the start of the process on a busy machine."""
+"""Time limit for reading a small file [s]; on a busy machine, most of it is the start of the process."""
 
 BYTES_PER_SECOND: Final = 20e6
 """Slowest rate at which a large file is read [bytes/s]."""
@@ -101,19 +101,19 @@ def refuse(reason):
 
 
 def run_limited(code: str, memory: int, size: int) -> bool:
-    """Run code in another process, which loads what this one can import.
+    """Run code in another process, which can import the same modules as this one.
 
     Args:
         code: The code. It may call `refuse(reason)`.
         memory: Limit of the address space [bytes].
-        size: Size of the file that is read [bytes], from which follows how long that may take.
+        size: Size of the file that is read [bytes], which determines the time limit.
 
     Returns:
-        Whether the code came to its end; False if the process failed.
+        Whether the code finished; False if the process failed.
 
     Raises:
         InputError: The code refused the file, for the reason given.
-        TimeoutError: It did not end; the message says within which time.
+        TimeoutError: The code did not finish; the message states the time limit.
     """
     if not sys.executable:
         return True  # an embedded interpreter cannot start another one

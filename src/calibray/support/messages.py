@@ -8,15 +8,15 @@ from itertools import islice
 from typing import Final
 
 MAX_LENGTH: Final = 80
-"""Characters above which a value is shortened in a message."""
+"""Number of characters above which a value is shortened in a message."""
 MAX_LISTED: Final = 20
-"""Names above which a message does not list them all."""
+"""Number of names above which a message does not list them all."""
 MAX_COMPARED: Final = 2_000
-"""Names that a misspelled one is compared with at most."""
+"""Largest number of names with which a misspelled one is compared."""
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """The remedy for an unknown name, to end a message with: a close valid name, else the first twenty.
+    """The remedy for an unknown name at the end of a message: a close valid name, otherwise the first twenty.
 
     Example:
         >>> did_you_mean("concret", ["brick", "concrete"])

@@ -1,10 +1,10 @@
-"""Output files: refused before the work if they could not be written, and never half-written.
+"""Output files: refused before the work if they cannot be written, and always written completely.
 
-An output never replaces an input, a link or a device, nor a file that Calibray did not write or that was changed since.
+An output never replaces an input, a link or a device, or a file that Calibray did not write or that has changed since.
 Calibray signs the files that it writes: `.calibray` in the same folder lists the digest and the name of each.
 
 All files are written by `replacing`: under a random name in the same folder, created by this process and not through a
-link, then moved into place in one step.
+link, and then moved into place in one step.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ def exists(file: str | Path) -> bool:
 
 
 def check_folder(folder: str | Path) -> Path:
-    """Refuse a folder that no file can be written into; it need not exist.
+    """Refuse a folder into which no file can be written; the folder need not exist.
 
     Raises:
-        InputError: The folder, or the one that it would be created in, is a file or cannot be written.
+        InputError: The folder, or the folder in which it would be created, is a file or cannot be written to.
     """
     target = _valid_name(folder, "output folder")
     nearest = next(path for path in (target, *target.absolute().parents) if path.exists())
@@ -67,13 +67,13 @@ def check_folder(folder: str | Path) -> Path:
 def check_outputs(
     folder: str | Path, names: Sequence[str], inputs: Iterable[Path] = (), overwrite: bool = False
 ) -> Path:
-    """Refuse a folder that files cannot be written into, or with files that must not be replaced.
+    """Refuse a folder into which files cannot be written, or that contains files that must not be replaced.
 
-    `inputs` are files that the work reads, which are never replaced. With `overwrite`, files are replaced that Calibray
-    did not write.
+    `inputs` are files that the work reads, which are never replaced. With `overwrite`, files that Calibray did not
+    write are replaced.
 
     Raises:
-        InputError: As for `check_folder` and `check_replaceable`; or `.calibray` in the folder is not Calibray's.
+        InputError: See `check_folder` and `check_replaceable`; or `.calibray` in the folder is not Calibray's.
     """
     target, sources = check_folder(folder), list(inputs)
     _check_signature_file(target)
@@ -86,7 +86,7 @@ def check_file(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = 
     """Refuse a file that cannot be written; it need not exist, but its folder must. Else as `check_outputs`.
 
     Raises:
-        InputError: It is a folder, its folder does not exist or cannot be written, or as for `check_outputs`.
+        InputError: It is a folder, its folder does not exist or cannot be written to, or an error of `check_outputs`.
     """
     target = _valid_name(file, "output file")
     if target.is_dir():
@@ -106,7 +106,7 @@ def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool =
     """Refuse to replace a file that must be kept; a file that does not exist may be written.
 
     Raises:
-        InputError: It is an input, a link, a device or a folder; or a file that Calibray did not write, or that was
+        InputError: It is an input, a link, a device or a folder; or a file that Calibray did not write, or that has
             changed since, unless `overwrite`.
     """
     status = _status(file, "output file")
@@ -121,16 +121,16 @@ def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool =
             raise InputError(f"output file {file}: is an input; name another")
     if status.st_size and not overwrite and not is_unchanged_output(file):
         raise InputError(
-            f"output file {file}: was not written by Calibray, or was changed since; name another, move it away, or "
+            f"output file {file}: was not written by Calibray, or has changed since; name another, move it away, or "
             "give --overwrite"
         )
 
 
 def check_unchanged(file: Path) -> None:
-    """Refuse a file that Calibray signed and that was changed since; an unsigned file may have any content.
+    """Refuse a file that Calibray signed and that has changed since; an unsigned file may have any content.
 
     Raises:
-        InputError: The file changed since it was written.
+        InputError: The file has changed since it was written.
     """
     signatures = [line for line in _signatures(file.parent) if line.partition("  ")[2] == file.name]
     if signatures and _signature(file, file.name) not in signatures:
@@ -149,7 +149,7 @@ def is_unchanged_output(file: Path) -> bool:
 
 
 def _valid_name(path: str | Path, role: str) -> Path:
-    """The path of an output; refused if no file can have the name."""
+    """The path of an output; refused if a file cannot have this name."""
     target = Path(path)
     _status(target, role)
     return target
@@ -249,7 +249,7 @@ def replacing(path: Path, signed: bool = True) -> Iterator[Path]:
     empty; it is removed if writing fails.
 
     Raises:
-        InputError: The file is a link, a device or a folder, `.calibray` is not Calibray's, or somebody exchanged the
+        InputError: The file is a link, a device or a folder, `.calibray` is not Calibray's, or somebody replaced the
             temporary file.
     """
     check_replaceable(
@@ -286,7 +286,7 @@ def _sign(partial: Path, path: Path) -> None:
 
 
 def _remove_unfinished(path: Path) -> None:
-    """Remove the unfinished files of processes that were killed while they wrote this file."""
+    """Remove unfinished files of processes that were killed while they wrote this file."""
     for partial in path.parent.iterdir():
         if not partial.name.startswith(path.name):
             continue
@@ -315,7 +315,7 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def append_text(path: Path, text: str) -> None:
-    """Append to a file of finished work, which is made if it does not exist.
+    """Append to a file of finished work, which is created if it does not exist.
 
     Raises:
         InputError: The file is a link, a device or a folder.

@@ -1,4 +1,4 @@
-"""Tables as output files: CSV and Parquet, whole or in parts, without cells that a spreadsheet would compute."""
+"""Tables as output files: CSV and Parquet, complete or in parts, without cells that a spreadsheet would compute."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _FORMULA: Final = re.compile("'*[=+\\-@\t\r\n\uff1d\uff0b\uff0d\uff20].", re.DOT
 
 
 def check_table(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = False) -> Path:
-    """Refuse a table that cannot be written: as `check_file`, and the name must end in .csv or .parquet.
+    """Refuse a table that cannot be written: see `check_file`; the name must end in .csv or .parquet.
 
     Raises:
-        InputError: The ending is another one, or as for `check_file`.
+        InputError: The extension is another one, or an error of `check_file`.
     """
     target = check_file(file, inputs, overwrite)
     if target.suffix.lower() not in TABLES:
@@ -59,7 +59,7 @@ def csv_text(table: pd.DataFrame, float_format: str | None = None, header: bool 
 
 
 def formula_free(cell: Any) -> Any:
-    """Mark a text that a spreadsheet would take for a formula; numbers and other texts stay.
+    """Mark a text that a spreadsheet would read as a formula; numbers and other texts are unchanged.
 
     Example:
         >>> formula_free("=HYPERLINK(1)"), formula_free("-80.5"), formula_free("- east")
@@ -83,10 +83,10 @@ def without_formula_mark(cell: str) -> str:
 def growing_table(path: str | Path) -> Iterator[Callable[[pd.DataFrame], None]]:
     """Write a CSV or Parquet file in parts and move it into place once it is complete.
 
-    Yields a function that appends rows without their index; all calls must give the columns and types of the first one.
+    Yields a function that appends rows without their index; all calls must have the columns and types of the first one.
 
     Raises:
-        InputError: As for `check_table`, or Parquet without pyarrow, or a column changes its type.
+        InputError: An error of `check_table`, or Parquet without pyarrow, or a column changes its type.
     """
     # Whether the file may be replaced was checked before the work.
     target = check_table(path, overwrite=True)

@@ -12,7 +12,7 @@ What a stage has found so far follows its name after a colon: "calibrating: best
 
 
 def with_stage(progress: Progress | None, stage: str) -> Progress | None:
-    """Report progress under another stage, as "checking" for a trace that checks another one.
+    """Report progress under another stage, such as "checking" for a trace that checks another one.
 
     Example:
         >>> progress = with_stage(lambda *parts: print(*parts), "checking")

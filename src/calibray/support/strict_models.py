@@ -1,4 +1,4 @@
-"""Strict models of file contents: unknown keys and wrong types are refused, not ignored."""
+"""Strict models of file contents: unknown keys and wrong types are refused instead of ignored."""
 
 from __future__ import annotations
 

@@ -11,13 +11,13 @@ from calibray.tables.table import Table
 from calibray.tables.text import render, render_html
 
 ROWS: Final = 10
-"""Most rows of a table; the rest is only counted."""
+"""Largest number of rows of a table; the others are only counted."""
 
 CHARACTERS: Final = 60
-"""Most characters of a cell or a name; longer ones are cut."""
+"""Largest number of characters of a cell or a name; longer ones are cut."""
 
 SENTENCE: Final = 200
-"""Most characters of a sentence; longer ones are cut."""
+"""Largest number of characters of a sentence; longer ones are cut."""
 
 
 def text(*parts: Table | str) -> str:
@@ -31,7 +31,7 @@ def html(*parts: Table | str) -> str:
 
 
 def named(names: Iterable[str], count: int = 4) -> str:
-    """List names with commas between them, the first ones if there are many.
+    """List names with commas between them; if there are many, only the first ones.
 
     Example:
         >>> named(["east", "west"])

@@ -12,7 +12,7 @@ class Column:
 
     Attributes:
         name: Meaning of its cells; empty for the column that names the rows.
-        unit: Unit of all its cells; empty if they have none or different ones.
+        unit: Unit of all its cells; empty if they have no unit or different ones.
         align: "left" for text, "right" for numbers.
 
     Example:
@@ -81,7 +81,7 @@ class Table:
         return (first, *(column.heading for column in self.columns[1:]))
 
     def head(self, count: int) -> Table:
-        """The first rows, and a last one with the number of rows that are left out, if any.
+        """The first rows, and a last row with the number of rows that are left out, if any.
 
         Example:
             >>> Table("", (Column("link"),), (("a",), ("b",), ("c",))).head(1).rows

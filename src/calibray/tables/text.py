@@ -1,6 +1,6 @@
 """Tables and sentences as plain text for terminals, files and pipes, as HTML and as Markdown.
 
-Control characters and markup are escaped, since names come from files.
+Control characters and markup are escaped, because names come from files.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from calibray.support.messages import printable
 from calibray.tables.table import Table
 
 LISTED: Final = 12
-"""Most rows of a file that are listed; the rest is only counted."""
+"""Largest number of rows of a file that are listed; the others are only counted."""
 
 WIDEST: Final = 100_000
-"""Characters per line: large, so that no cell is cut; output also goes to files and pipes."""
+"""Characters per line: many, so that no cell is cut; output also goes to files and pipes."""
 
 
 def render(*parts: Table | str) -> str:
-    """Render tables and sentences as plain text, with an empty line between them, none for an empty string.
+    """Render tables and sentences as plain text, with an empty line between them; empty strings are omitted.
 
     Example:
         >>> from calibray.tables import Column, numbers
@@ -55,13 +55,13 @@ def render_html(*parts: Table | str) -> str:
 
 
 def render_markdown(table: Table) -> str:
-    """Render a table in Markdown, without a title above it and a line break at the end."""
+    """Render a table in Markdown, without a title above it and without a final line break."""
     rules = ["---" if column.align == "left" else "---:" for column in table.columns]
     return "\n".join(_markdown_line(line) for line in [table.headings, rules, *table.rows])
 
 
 def rows_text(rows: Sequence[int]) -> str:
-    """List rows of a file, the first ones if there are many; empty without rows.
+    """List rows of a file; if there are many, only the first ones; empty without rows.
 
     Example:
         >>> rows_text([3, 4, 9])

@@ -1,7 +1,7 @@
 """Tracing: finding the paths of links.
 
-`protocol` defines what any ray tracer must do, `default_tracer` opens Sionna RT, and `tracing.sionna` is the only room
-that imports it. Names are loaded when first used.
+`protocol` defines what any ray tracer must do, `default_tracer` opens Sionna RT, and only the room `tracing.sionna`
+imports it. Names are loaded when first used.
 """
 
 from typing import TYPE_CHECKING

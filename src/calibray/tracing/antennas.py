@@ -40,7 +40,8 @@ class AntennaPattern:
 
     Attributes:
         antenna: The antenna.
-        element: Amplitude of its field, 1 in every direction for an isotropic one; of one antenna if it is an array.
+        element: Amplitude of its field, which is 1 in every direction for an isotropic one; for an array, of one
+            antenna.
     """
 
     antenna: Antenna
@@ -48,7 +49,7 @@ class AntennaPattern:
 
     @classmethod
     def of(cls, antenna: Antenna) -> AntennaPattern:
-        """Make the pattern of an antenna; reads its gain table, if it has one.
+        """Make the pattern of an antenna, and read its gain table if it has one.
 
         Raises:
             InputError: The gain table cannot be used.
@@ -80,7 +81,7 @@ class AntennaPattern:
     def jones_vectors(self, direction: NDArray[np.float64], arriving: bool = False) -> NDArray[np.complex128]:
         """Jones vectors [P, ports, 2] in the wave's basis (theta, phi), for directions seen from the antenna [P, 3].
 
-        The waves arrive from there, or depart.
+        The waves arrive from this direction, or depart in it.
         """
         to_world = rotation_matrix(self.antenna.orientation)
         local = direction @ to_world
@@ -121,10 +122,10 @@ def tr38901(zenith: Any, azimuth: Any, xp: Any = np) -> Any:
 def array_factor(
     antenna: Antenna, zenith: Any, azimuth: Any, downtilt: Any = 0.0, steering: Any = 0.0, xp: Any = np
 ) -> Any:
-    """Field of a planar array of isotropic antennas, in which equal amplitudes share the power of one.
+    """Field of a planar array of isotropic antennas, in which equal amplitudes share the power of one antenna.
 
     Its main direction is `downtilt` below the horizon and `steering` from the x axis towards the y axis [rad]. `xp` has
-    cosine and sine. Coupling between the antennas is left out, as in Sionna RT and 3GPP TR 38.901, section 7.3.
+    cosine and sine. Coupling between the antennas is neglected, as in Sionna RT and 3GPP TR 38.901, section 7.3.
     """
     horizontal, vertical = (2 * np.pi * distance for distance in antenna.spacing)
     of_columns = horizontal * (xp.sin(zenith) * xp.sin(azimuth) - xp.cos(downtilt) * xp.sin(steering))

@@ -1,7 +1,7 @@
-"""Stored traces: the same scene, links, antennas, settings and versions are traced once.
+"""Stored traces: the same scene, links, antennas, settings and versions are traced only once.
 
-Traces lie in Calibray's cache folder (`support.cache_folder`). A damaged one is removed, with a warning in the log. If
-several users share the folder, each uses only the traces that the user or root has written.
+Traces are stored in Calibray's cache folder (`support.cache_folder`). A damaged trace is removed, with a warning in the
+log. If several users share the folder, each uses only the traces that the user or root has written.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ def trace_digest(
     tx: NDArray[np.float64],
     rx: NDArray[np.float64],
 ) -> str:
-    """Fingerprint (SHA-256, in hexadecimal) of everything that a trace depends on.
+    """Fingerprint (SHA-256, in hexadecimal) of everything that determines a trace.
 
-    The scene's materials count, because they decide how rays continue.
+    The scene's materials are included, because they determine how rays continue.
     """
     record = {
         "calibray": version("calibray"),
@@ -97,7 +97,7 @@ def load_trace(digest: str) -> Paths | None:
 
 
 def _is_trusted(status: os.stat_result) -> bool:
-    """Whether a file is the user's or root's, and nobody else can write to it: the paths in it become results."""
+    """Whether a file belongs to the user or root, and nobody else can write to it: the paths in it become results."""
     if not stat.S_ISREG(status.st_mode):
         return False
     if not hasattr(os, "geteuid"):  # Windows keeps other users out of a user's folders

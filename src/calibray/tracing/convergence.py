@@ -1,7 +1,7 @@
-"""Check whether a trace sent out enough rays, by tracing again with twice as many and another seed.
+"""Check whether a trace launched enough rays, by tracing again with twice as many and another seed.
 
-Rays find paths by chance. With more rays fewer paths are missed, and diffuse reflection, an average over rays, scatters
-less. The change from a trace to a finer one estimates what the first one lacks.
+Rays find paths by chance. With more rays, fewer paths are missed, and diffuse reflection, an average over rays,
+scatters less. The change from a trace to a finer one estimates what the first one lacks.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class Convergence:
 
     Attributes:
         samples: Rays per transmitter of the trace that was checked.
-        change_db: Path loss of every link with more rays minus that before [L], [dB]: 0 where neither trace has a path,
-            -inf where only the finer one has, +inf where only the coarser one has.
+        change_db: Path loss of every link with more rays minus that before [L], [dB]. It is 0 if neither trace has a
+            path, -inf if only the finer one has, and +inf if only the coarser one has.
         paths_before: Number of paths of every link [L].
         paths_after: The same with more rays [L].
     """
@@ -56,7 +56,7 @@ class Convergence:
     def quantile(self, share: float) -> float:
         """Size of change [dB] that a share of the links does not exceed, 0.5 for the median.
 
-        It is +inf if too many links have a path in one trace only.
+        It is +inf if too many links have a path in only one trace.
         """
         return float(np.quantile(np.abs(self.change_db), share, method="higher"))
 
@@ -94,8 +94,8 @@ def check(
     """Trace links again with twice the rays and the next seed, and compare with the paths found before.
 
     Raises:
-        InputError: `before` holds other links, or its rays were added in rounds, of which the last is the check.
-        EngineError: There are more paths than the tracer can hold.
+        InputError: `before` contains other links, or its rays were added in rounds, of which the last is the check.
+        EngineError: The paths exceed what the tracer can store.
     """
     settings = tracer.settings
     if settings.samples == "auto":

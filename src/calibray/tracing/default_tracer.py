@@ -33,7 +33,7 @@ class SionnaFactory:
         tx_antenna: Antenna,
         rx_antenna: Antenna,
     ) -> Tracer:
-        """Open a scene; see `TracerFactory`. Fails on a machine with neither a GPU nor an LLVM to trace with."""
+        """Open a scene; see `TracerFactory`. The machine has neither a GPU nor an LLVM for tracing."""
         from calibray.tracing.sionna import Tracer as SionnaTracer
 
         return SionnaTracer(scene, frequency, settings, tx_antenna, rx_antenna)
@@ -58,7 +58,7 @@ def trace(
 
     Raises:
         InputError: The scene, an antenna, a setting or a position cannot be used.
-        EngineError: There are more paths than fit into memory.
+        EngineError: The paths do not fit into memory.
     """
     tracer = SIONNA(
         scene if isinstance(scene, Scene) else read_scene(scene, frequency, materials),

@@ -1,8 +1,8 @@
 """Measured antenna patterns: the gain of an antenna on a grid of directions, from a CSV file or an MSI file.
 
 Between grid points the gain is interpolated bilinearly in decibels, also across the end of the azimuth axis. In
-decibels main lobes are nearly parabolas (3GPP TR 38.901, Table 7.3-1, is one), so the error is least where the antenna
-radiates most. Nulls narrower than the grid lose depth.
+decibels, main lobes are nearly parabolas (3GPP TR 38.901, Table 7.3-1, is one), so the error is smallest where the
+antenna radiates most. Nulls that are narrower than the grid become shallower.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class GainTable:
 
     Attributes:
         first_azimuth_deg: Azimuth of the first column [deg], from the antenna's x axis towards its y axis.
-        gain_dbi: Gain [elevations, azimuths], [dBi]. Elevations run from -90 to 90 degrees in equal steps, ends
-            included; azimuths in equal steps around a full turn, whose end is not repeated.
+        gain_dbi: Gain [elevations, azimuths], [dBi]. Elevations run from -90 to 90 degrees in equal steps, including
+            the ends; azimuths run in equal steps around a full turn, whose end is not repeated.
 
     Example:
         >>> GainTable(-180.0, np.zeros((181, 360))).efficiency
@@ -96,8 +96,8 @@ def read_gain_table(path: str | Path) -> GainTable:
     """Read the gain of an antenna: a CSV file of all directions, or an MSI file of two cuts (`read_two_cuts`).
 
     The CSV file has the columns azimuth_deg, elevation_deg and gain_dbi, one row per direction, in any order. Azimuths
-    cover a full turn (-180 to 180 or 0 to 360, with or without the end), elevations -90 to 90, both in equal steps of
-    at most 15 degrees; every pair of them has its row. Principal cuts alone are not enough.
+    cover a full turn (-180 to 180 or 0 to 360, with or without the end), and elevations -90 to 90, both in equal steps
+    of at most 15 degrees; every pair of them has its row. Principal cuts alone are not sufficient.
 
     Raises:
         InputError: The file or a column is missing or malformed, a number is out of range, a direction is missing or

@@ -1,10 +1,10 @@
-"""Choose the compiler library below the ray tracer: which libLLVM, or which GPU, Dr.Jit runs on.
+"""Chooses the compiler library of the ray tracer: which libLLVM, or which GPU, Dr.Jit uses.
 
 Without CUDA, Dr.Jit compiles its kernels with the newest libLLVM that it finds, and an incompatible version aborts the
 whole process. The choice is therefore made here, before Dr.Jit is imported: every library is opened in a separate
 process, and `DRJIT_LIBLLVM_PATH` is set to the best one.
 
-`python -m calibray.tracing.llvm` prints what the ray tracer will run on, or what to install, and then exits with 2.
+`python -m calibray.tracing.llvm` prints what the ray tracer will use, or what to install, and then exits with 2.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Dr.Jit 1.5 refuses 14 and older and aborts on x86 with 15 and 16 ("Cannot select
 """
 
 TESTED_MAJORS = frozenset({19, 22})
-"""Major versions that Sionna RT 2.2 was tested with; others are accepted with a note."""
+"""Major versions with which Sionna RT 2.2 was tested; others are accepted with a note."""
 
 PROBE_TIMEOUT = 30.0
 """Time limit for opening one library [s]."""
@@ -79,8 +79,8 @@ class Llvm:
 
     Attributes:
         path: The file, or a bare name that the dynamic loader resolves.
-        version: Major, minor and patch number; the major number alone, or nothing, where less is known.
-        problem: Why Dr.Jit cannot use it; None if it can.
+        version: Major, minor and patch number; only the major number, or nothing, if less is known.
+        problem: The reason why Dr.Jit cannot use it; None if it can.
     """
 
     path: str
@@ -157,10 +157,10 @@ def installed_libraries() -> tuple[Llvm, ...]:
 
 
 def select() -> Llvm:
-    """Set Dr.Jit's libLLVM, to be called before Dr.Jit is imported; returns the library in use.
+    """Set Dr.Jit's libLLVM, to be called before Dr.Jit is imported; return the library in use.
 
-    A library named by `DRJIT_LIBLLVM_PATH` is used or refused, never ignored. Without one, the best installed library
-    is chosen and `DRJIT_LIBLLVM_PATH` set to it, for this process and its children.
+    A library named by `DRJIT_LIBLLVM_PATH` is either used or refused, never ignored. Without one, the best installed
+    library is chosen and `DRJIT_LIBLLVM_PATH` set to it, for this process and its children.
 
     Raises:
         InputError: No library is usable, `DRJIT_LIBLLVM_PATH` names one that is missing or unusable, Dr.Jit was
@@ -202,7 +202,7 @@ def mitsuba_variant() -> str:
 
 
 def prepare() -> str:
-    """Make Dr.Jit safe to import: returns the Mitsuba variant to set first, and chooses the LLVM that it needs.
+    """Make Dr.Jit safe to import: return the Mitsuba variant to set first, and choose the LLVM that it needs.
 
     Raises:
         InputError: libatomic is missing, or there is no usable GPU and `select` finds no usable library.
@@ -267,7 +267,7 @@ def _loader_cache() -> list[Path]:
 
 
 def _probe(code: str, *arguments: str) -> tuple[str, str | None]:
-    """Run Python code in an interpreter without site packages; returns its output and its error, if any."""
+    """Run Python code in an interpreter without site packages; return its output and its error, if any."""
     command = [sys.executable, "-I", "-S", "-c", code, *arguments]
     try:
         run = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_TIMEOUT, check=False)

@@ -1,7 +1,7 @@
-"""Antennas that are mounted in their own direction on every link, applied to paths of isotropic antennas.
+"""Antennas with their own direction on every link, applied to paths of isotropic antennas.
 
-Where paths lead does not depend on the antennas. Paths traced with isotropic vertical antennas hold the frame of their
-first and last interaction, so that any pattern in any direction gives their fields without a new trace.
+The paths themselves do not depend on the antennas. Paths traced with isotropic vertical antennas store the frame of
+their first and last interaction, so any pattern in any direction gives their fields without a new trace.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ POSE: Final = "tx:"
 """Beginning of the names of the parameters of transmit antennas."""
 FIELDS: Final = ("azimuth", "downtilt", "gain")
 EVERY: Final = "*"
-"""Name of the transmitter that stands for all of them."""
+"""Name of the transmitter that represents all of them."""
 
 
 NEW: Final = "new transmitters"
-"""Name of the transmitter that stands for those without measured links, in a population."""
+"""Name of the transmitter that represents those without measured links, in a population."""
 
 
 def concerned(names: NDArray[np.str_], label: str, own: Collection[str]) -> NDArray[np.bool_]:
-    """Which transmitters a parameter of the transmitter `label` concerns; `own` have their own one of that field."""
+    """The transmitters that a parameter of the transmitter `label` affects; `own` have their own one of that field."""
     if label == EVERY:
         return np.ones(len(names), dtype=bool)
     return ~np.isin(names, list(own)) if label == NEW else names == label
@@ -42,14 +42,14 @@ def turns(name: str) -> bool:
 
 
 class Pose(NamedTuple):
-    """Where antennas point, of P paths or L links.
+    """Directions of antennas, of P paths or L links.
 
     Attributes:
         yaw: Rotation about z [rad], from the scene's x axis towards its y axis.
-        downtilt: Mechanical downtilt [rad]: the antenna leans forward after it was turned by `yaw`.
+        downtilt: Mechanical downtilt [rad]: the antenna leans forward after it was rotated by `yaw`.
         electrical_downtilt: Shift of the pattern downwards in the antenna's own frame [rad].
-        steering: Direction in the antenna's own frame, from its x axis towards its y axis, to which the phases of an
-            array turn its beam [rad].
+        steering: Direction in the antenna's own frame, from its x axis towards its y axis, to which phases steer the
+            beam of an array [rad].
     """
 
     yaw: Any
@@ -68,7 +68,7 @@ class Mounting:
         pose: Where they point [L].
 
     Raises:
-        InputError: The antennas differ in their number of ports.
+        InputError: The antennas have different numbers of ports.
     """
 
     antennas: tuple[Antenna, ...]
@@ -106,7 +106,7 @@ def mount(paths: Paths, mountings: Mapping[str, Mounting]) -> Paths:
 def theta_axis(paths: Paths, mounting: Mounting) -> NDArray[np.float64]:
     """Theta vector of departing paths in the frame of their first interaction [P, 2], from mounted transmit antennas.
 
-    A path that leaves in a perfect null of its antenna has none, and gets zeros: it stays without power.
+    A path that leaves in a perfect null of its antenna has no theta vector, and gets zeros: it stays without power.
     """
     theta, phi = stated_jones(mounting.of_paths(paths.link), paths.departure)[:, 0].T
     field = paths.tx_field[:, 0].real
@@ -151,11 +151,11 @@ def antenna_response(
     index: Any = None,
     stored: Callable[[Any], Any] = lambda values: values,
 ) -> tuple[Any, Any, Any]:
-    """What a mounted antenna does to waves: amplitude, cosine and sine of its theta vector in their basis [P] each.
+    """The response of a mounted antenna: amplitude, cosine and sine of its theta vector in the waves' basis [P] each.
 
-    The basis is that of `wave_basis`. The pose is that of every path, or with `index` [P] those that paths share. `xp`
-    is the array library: NumPy, or a namespace of `jax.numpy` within a JAX function, which has derivatives by the pose.
-    `stored` keeps intermediate values from being computed again at each use.
+    The basis is that of `wave_basis`. The pose is that of every path, or with `index` [P] a pose that several paths
+    share. `xp` is the array library: NumPy, or a namespace of `jax.numpy` within a JAX function, which has derivatives
+    by the pose. `stored` keeps intermediate values from being computed again at each use.
     """
     cos_yaw, sin_yaw = xp.cos(pose.yaw), xp.sin(pose.yaw)
     cos_tilt, sin_tilt = xp.cos(pose.downtilt), xp.sin(pose.downtilt)
@@ -203,7 +203,7 @@ def in_frame(jones: Any, axis: Any, arriving: bool, xp: Any = np) -> Any:
     """Jones vectors [P, ports, 2] in the frame of the interaction next to the antenna.
 
     `axis` is the unit theta vector in that frame [P, 2]: the field of an isotropic vertical antenna. An arriving wave
-    travels against its direction, so that its phi axis is mirrored.
+    travels against its direction, so its phi axis is mirrored.
     """
     sign = -1.0 if arriving else 1.0
     phi = sign * xp.stack([-axis[:, 1], axis[:, 0]], axis=-1)

@@ -1,7 +1,8 @@
-"""The interface to ray tracers: what Calibray calls, and how a tracer hands over its paths.
+"""The interface to ray tracers: what Calibray calls, and how a tracer returns its paths.
 
-A tracer only has to know the geometry. It gives its paths as `calibray.paths.chains.Chains`, with the material of every
-interaction. `compile_paths` combines them with the antennas into the path program that all further computations use.
+A tracer only has to compute the geometry. It returns its paths as `calibray.paths.chains.Chains`, with the material of
+every interaction. `compile_paths` combines them with the antennas into the path program that all further computations
+use.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from calibray.tracing.trace_plan import TracePlan
 
 
 class Links(Protocol):
-    """An object with the positions of transmitters and receivers [L, 3], [m], as `Measurements`."""
+    """An object with the positions of transmitters and receivers [L, 3], [m], such as `Measurements`."""
 
     @property
     def tx(self) -> NDArray[np.float64]: ...  # noqa: D102
@@ -35,7 +36,7 @@ class Links(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Path gains of links as the tracer's own field computation gives them.
+    """Path gains of links from the tracer's own field computation.
 
     Attributes:
         gain: Complex gain of every path, without the phase of its delay [P, R, T].
@@ -51,7 +52,7 @@ class Solution:
 class Tracer(Protocol):
     """A scene opened in a ray tracer, with antennas and settings.
 
-    No call changes the result of a later one.
+    No call affects the result of a later call.
     """
 
     @property
@@ -74,7 +75,7 @@ class Tracer(Protocol):
         ...
 
     def plan(self, links: Links) -> TracePlan:
-        """Plan the launches of a trace, with an estimate of the memory that they take.
+        """Plan the launches of a trace, with an estimate of the memory that they need.
 
         Raises:
             InputError: There is no link, a position is not finite, or the ends of a link coincide.
@@ -91,18 +92,19 @@ class Tracer(Protocol):
         Raises:
             InputError: There is no link, a position is not finite, the ends of a link coincide, or the scene lacks a
                 material.
-            EngineError: There are more paths than fit into memory.
+            EngineError: The paths do not fit into memory.
         """
         ...
 
     def solve(self, links: Links, materials: Mapping[str, Material]) -> Solution:
         """Find the paths of every link and compute their gains with the tracer's own field computation.
 
-        A tracer without one can replay the paths: `calibray.path_gains`. Materials replace the scene's by name.
+        A tracer without its own field computation can replay the paths: `calibray.path_gains`. Materials replace the
+        scene's by name.
 
         Raises:
             InputError: As for `trace`.
-            EngineError: There are more paths than fit into memory.
+            EngineError: The paths do not fit into memory.
         """
         ...
 
@@ -128,7 +130,7 @@ class TracerFactory(Protocol):
         rx_antenna: Antenna,
         /,
     ) -> Tracer:
-        """Open a scene, with the materials to trace with.
+        """Open a scene with the materials for the trace.
 
         Raises:
             InputError: The tracer cannot load the scene, or does not support a setting or an antenna.
@@ -217,12 +219,12 @@ def link_positions(links: Links) -> tuple[NDArray[np.float64], NDArray[np.float6
 
 @dataclass(frozen=True)
 class EnclosedAntennas:
-    """Antennas inside closed bodies of the scene, most often because of a wrong position.
+    """Antennas inside closed bodies of the scene, usually because of a wrong position.
 
     Attributes:
         tx: Rows of the source file whose transmitter is enclosed.
         rx: Rows of the source file whose receiver is enclosed.
-        indoors: Whether most links are enclosed, as in an indoor scene; then none of them is suspect.
+        indoors: Whether most links are enclosed, as in an indoor scene; then none of them is suspicious.
     """
 
     tx: tuple[int, ...] = ()

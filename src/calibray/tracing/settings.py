@@ -16,12 +16,12 @@ POLARIZATIONS: Final = ("V", "H", "VH", "cross")
 LARGEST_ARRAY: Final = 64
 """Largest number of rows, and of columns, of an array."""
 LARGEST_SPACING: Final = 10.0
-"""Largest distance of the antennas of an array [wavelengths]."""
+"""Largest distance between the antennas of an array [wavelengths]."""
 
 AUTO: Final = "auto"
 """Value of `samples` with which the tracer chooses the number of rays."""
 RAYS_PER_ROUND: Final = 250_000
-"""Rays of one launch if rays are added in rounds."""
+"""Number of rays of one launch if rays are added in rounds."""
 
 RANGES: Final = {"max_depth": (0, 100), "samples": (1, 10**12), "seed": (0, 2**32 - 1)}
 """Allowed ranges of the numbers: no machine traces more, and Sionna RT's seeds have 32 bits."""
@@ -29,7 +29,7 @@ RANGES: Final = {"max_depth": (0, 100), "samples": (1, 10**12), "seed": (0, 2**3
 
 @dataclass(frozen=True)
 class TraceSettings:
-    """Settings of the tracer, with Sionna RT's meaning.
+    """Settings of the tracer, with the same meaning as in Sionna RT.
 
     Attributes:
         max_depth: Largest number of interactions of a path, 0 to 100.
@@ -37,8 +37,8 @@ class TraceSettings:
         specular_reflection: Follow specular reflections.
         refraction: Follow transmission through surfaces.
         diffraction: Follow first-order diffraction at wedges.
-        edge_diffraction: Let free edges diffract as well.
-        diffraction_lit_region: Keep diffraction where the edge's source or image is in sight.
+        edge_diffraction: Whether free edges diffract as well.
+        diffraction_lit_region: Keep diffraction where the edge is in sight of the source or its image.
         diffuse_reflection: Follow diffuse reflections.
         samples: Rays per transmitter, 1 to 10^12; or "auto": rays are added in rounds until path loss converges,
             without diffuse reflection.
@@ -87,7 +87,7 @@ class TraceSettings:
 
     @property
     def rays(self) -> int:
-        """Rays per transmitter; those of one launch if rays are added in rounds."""
+        """Rays per transmitter; if rays are added in rounds, rays per launch."""
         return RAYS_PER_ROUND if self.samples == "auto" else self.samples
 
     def record(self) -> dict[str, int | bool | str]:
@@ -104,13 +104,13 @@ class Antenna:
         polarization: "V", "H", or dual "VH" or "cross". The field has this polarization in every direction of the
             antenna's frame (3GPP TR 38.901, eq. 7.3-4/5), with the gain of the pattern.
         orientation: Rotation about z, y and x [rad]: yaw, pitch, roll.
-        rows: Rows of a planar array of such antennas along its z axis, which one signal feeds.
+        rows: Rows of a planar array of these antennas along its z axis, which one signal feeds.
         columns: Columns along its y axis.
         spacing: Horizontal and vertical distance of its antennas [wavelengths].
 
     Raises:
-        InputError: The pattern or polarization is unknown, the orientation is not three numbers, or the array has no
-            such size.
+        InputError: The pattern or polarization is unknown, the orientation is not three numbers, or the array size is
+            invalid.
     """
 
     pattern: str = "iso"

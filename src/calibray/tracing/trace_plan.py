@@ -1,9 +1,9 @@
-"""Split a trace into launches that fit into memory, for any number of rays and receivers.
+"""Splits a trace into launches that fit into memory, for any number of rays and receivers.
 
-A launch sends rays from one transmitter and looks for paths to some receivers, or the other way round
+A launch sends rays from one transmitter and searches paths to some receivers, or the other way round
 (`starts_at_receivers`); *transmitter* below means the end that sends. The tracer stores some numbers for every
 combination of ray, interaction and receiver, a *lane*. The receivers of a transmitter are therefore split over
-launches; if one receiver is too much already, so are the rays. Sionna's rays form a lattice of directions that no seed
+launches; if one receiver is already too much, so are the rays. Sionna's rays form a lattice of directions that no seed
 changes: each launch takes a share of the lattice, so that all launches together send the same rays as a single one.
 """
 
@@ -20,9 +20,9 @@ from calibray.support.messages import duration
 from calibray.tracing.settings import TraceSettings
 
 LONG_TRACE_SECONDS: Final = 30.0
-"""Longer traces are announced before they start [s]."""
+"""Traces longer than this are announced before they start [s]."""
 SHORT_TRACE_SECONDS: Final = 1.0
-"""A shorter trace of one launch needs no announcement [s]."""
+"""A trace of one launch shorter than this needs no announcement [s]."""
 LANE_BYTES: Final = 40
 """Bytes of a lane at the peak of tracing, measured by benchmarks/memory.py --lanes."""
 PATH_BYTES: Final = (650, 260)
@@ -30,11 +30,11 @@ PATH_BYTES: Final = (650, 260)
 BUFFER_BYTES: Final = (50, 30)
 """Bytes of a path, and of each interaction, in the tracer's buffer."""
 LANES_PER_SECOND: Final = 3e7
-"""Lanes that two processor cores trace in a second, to estimate the duration of a trace."""
+"""Number of lanes that two processor cores trace per second, to estimate the duration of a trace."""
 ADAPTIVE_SECONDS: Final = 3.0
 """Approximate duration on two cores for one transmitter if rays are added in rounds [s]."""
 POINT_TOLERANCE: Final = 0.01
-"""Interaction points closer than this are the same; points of different paths seldom are [m]."""
+"""Interaction points closer than this are equal; points of different paths seldom are [m]."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Launch:
 
 
 class Launches(Sequence[Launch]):
-    """The launches of a trace, each made on request: 10^12 rays take too many to be stored.
+    """The launches of a trace, each made on request: 10^12 rays need too many launches to be stored.
 
     Args:
         receivers: Transmitter [3], [m], and links [n] of each set of receivers that are traced together.
@@ -94,12 +94,12 @@ class Launches(Sequence[Launch]):
 
 @dataclass(frozen=True)
 class TracePlan:
-    """The launches of a trace and what they cost.
+    """The launches of a trace and their costs.
 
     Attributes:
-        launches: The launches; those to the same receivers follow each other.
+        launches: The launches; those to the same receivers are consecutive.
         lanes: Rays x interactions x receivers of the largest launch.
-        buffer: Bytes of the buffer that holds the paths of a launch.
+        buffer: Bytes of the buffer for the paths of a launch.
         adaptive: Whether each launch is the first of several, because rays are added until path loss converges.
     """
 
@@ -137,9 +137,9 @@ class TracePlan:
 def starts_at_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64], settings: TraceSettings) -> bool:
     """Whether the receivers send the rays: they do if there are fewer of them than transmitters.
 
-    A path is the same in both directions and is reversed after it was found. Diffuse reflection is not: the scattered
-    direction, and the probability with which the tracer chose it, belong to one direction of travel. Such traces start
-    at the transmitters.
+    A path is the same in both directions, and is reversed after it was found. Diffuse reflection is not: the scattered
+    direction, and the probability with which the tracer chose it, belong to one direction of travel. Traces with
+    diffuse reflection therefore start at the transmitters.
     """
     return not settings.diffuse_reflection and len(np.unique(rx, axis=0)) < len(np.unique(tx, axis=0))
 
@@ -147,7 +147,7 @@ def starts_at_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64], settin
 def plan_trace(source: NDArray[np.float64], settings: TraceSettings, lanes: int, buffer: int) -> TracePlan:
     """Split a trace into launches, given the end of every link that sends the rays [L, 3], [m].
 
-    A launch may have `lanes` rays x interactions x receivers, and its buffer holds `buffer` paths at first.
+    A launch may have `lanes` rays x interactions x receivers, and its buffer has room for `buffer` paths at first.
     """
     depth = max(settings.max_depth, 1)
     rays, adaptive = settings.rays, settings.adaptive
@@ -199,11 +199,11 @@ def find_repeats(
     vertex: NDArray[np.float64],
     is_sample: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """Find the paths that an earlier one of several launches to the same receivers found already [P].
+    """Find the paths that an earlier launch to the same receivers has already found [P].
 
-    A deterministic path is the same whichever ray found it: it meets the same objects in the same points. Paths with a
-    diffuse reflection are random samples, and each counts. The numbers of the launches ascend [P]; kinds of interaction
-    are 0 beyond the last one [P, D]; interaction points are [P, D, 3], [m].
+    A deterministic path is the same for any ray that finds it: it meets the same objects at the same points. Paths with
+    a diffuse reflection are random samples, and each counts. The numbers of the launches ascend [P]; kinds of
+    interaction are 0 beyond the last one [P, D]; interaction points are [P, D, 3], [m].
     """
     repeats = np.zeros(len(link), dtype=bool)
     rows = np.flatnonzero(~is_sample)

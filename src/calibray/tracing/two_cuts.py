@@ -1,7 +1,7 @@
-"""Antenna patterns as planning tools exchange them: a horizontal and a vertical cut, in MSI Planet's text format.
+"""Antenna patterns in the form of planning tools: a horizontal and a vertical cut, in MSI Planet's text format.
 
-Attenuations are relative to the gain of the header. Horizontal angles run clockwise from the main direction, seen from
-above; vertical angles run downwards from the horizon in front of the antenna, over the ground to its back.
+Attenuations are relative to the gain of the header. Horizontal angles are clockwise from the main direction as seen
+from above; vertical angles are downwards from the horizon in front of the antenna, via the ground to its back.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ TWO_CUT_SUFFIXES: Final = (".msi", ".pln", ".ant")
 DIPOLE_GAIN_DBI: Final = 2.15
 """Gain of a half-wave dipole, the reference of dBd [dBi]."""
 RANGES: Final = {"GAIN": (-30.0, 60.0), "angle": (-180.0, 360.0), "attenuation": (-0.5, 100.0)}
-"""Ranges of the gain [dBi], of angles [deg] and of attenuations [dB]; rounded cuts exceed their gain a little."""
+"""Ranges of the gain [dBi], of angles [deg] and of attenuations [dB]; rounded cuts slightly exceed their gain."""
 LARGEST_STEP_DEG: Final = 15.0
 _NUMBER: Final = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?")
 
@@ -31,7 +31,7 @@ class TwoCuts:
     """Two cuts of an antenna's gain through its main direction.
 
     Attributes:
-        gain_dbi: Gain that attenuations refer to [dBi].
+        gain_dbi: Gain to which attenuations refer [dBi].
         horizontal_db: Attenuation at whole degrees clockwise from the main direction [360], [dB].
         vertical_db: Attenuation at whole degrees downwards from the horizon in front [360], [dB].
     """
@@ -43,9 +43,9 @@ class TwoCuts:
     def gain(self, azimuth_deg: ArrayLike, elevation_deg: ArrayLike) -> NDArray[np.float64]:
         """Gain in any direction of the antenna's frame [...], [dBi]; azimuths counter-clockwise from the x axis.
 
-        Between the cuts it is interpolated by horizontal projection, which keeps both cuts exactly (Gil et al., "A 3D
-        interpolation method for base-station-antenna radiation patterns", IEEE Antennas and Propagation Magazine 43,
-        2001).
+        Between the cuts, the gain is interpolated by horizontal projection, which keeps both cuts exactly (Gil et al.,
+        "A 3D interpolation method for base-station-antenna radiation patterns", IEEE Antennas and Propagation Magazine
+        43, 2001).
         """
         azimuth = (np.asarray(azimuth_deg, dtype=float) + 180.0) % 360.0 - 180.0
         down = -np.asarray(elevation_deg, dtype=float)
@@ -62,8 +62,8 @@ def read_two_cuts(path: str | Path) -> TwoCuts:
     """Read an MSI file (also .pln, .ant): header lines, then the cuts HORIZONTAL and VERTICAL.
 
     Each cut states its number of lines, each with an angle [deg] and an attenuation [dB], in any order, around a full
-    turn in steps of at most 15 degrees. Separators are blanks, tabs or semicolons; decimal commas are read. GAIN is in
-    dBd unless its line says dBi, as the format defines.
+    turn in steps of at most 15 degrees. Blanks, tabs or semicolons are separators; decimal commas are accepted. GAIN is
+    in dBd unless its line says dBi, as the format defines.
 
     Raises:
         InputError: The file cannot be read, lacks the gain or a cut, or a line is malformed; the message names the

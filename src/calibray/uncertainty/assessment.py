@@ -35,29 +35,30 @@ EQUAL: Final = 0.1
 """Difference between emulators, relative to the errors of the links, below which only their mean is used."""
 
 MOST_PROBABLE: Final = 64
-"""Draws of highest density of which the most probable one is chosen."""
+"""Number of draws of highest density from which the most probable one is chosen."""
 
 KEPT_DRAWS: Final = 128
 """Draws kept with the result."""
 
 FEW_LINKS: Final = 500
-"""Links up to which linear algebra takes one thread."""
+"""Number of links up to which linear algebra uses one thread."""
 
 MAX_LINKS: Final = 100_000
-"""Links beyond which no draws are made: the whitening of correlated errors would take minutes."""
+"""Number of links above which no draws are made: the whitening of correlated errors would take minutes."""
 
 MAX_COLUMNS: Final = 100
-"""Columns of the nuisance up to which the draws include its coefficients."""
+"""Number of columns of the nuisance up to which the draws include its coefficients."""
 
 SHOWN_DIFFERENCE: Final = 0.1
-"""Difference between the intervals of measured and of all buildings that is reported, as a share of the width."""
+"""Smallest difference between the intervals of measured and of all buildings that is reported, as a share of the
+width."""
 
 CUSTOMARY: Final = {("relative_permittivity", "linear"): 10.0, ("conductivity", "log"): float(np.log(1000.0))}
-"""Widths of customary ranges: permittivities of building materials lie between 2 and 12, conductivities within three
-decades. Wider bounds do not make a verdict better."""
+"""Usual widths of ranges: permittivities of building materials are between 2 and 12, and conductivities within three
+decades. Wider bounds therefore do not improve a verdict."""
 
 EXACT_DB: Final = 1e-6
-"""RMSE below which the data have no noise, so that linear theory is exact [dB]."""
+"""RMSE below which the data contain no noise, so that linear theory is exact [dB]."""
 
 
 @dataclass(frozen=True)
@@ -287,7 +288,7 @@ def _intervals(
 
 
 def _customary(parameters: Parameters) -> NDArray[np.float64]:
-    """Customary widths of the parameters' ranges in the search space [d]; infinite where there is none."""
+    """Usual widths of the parameters' ranges in the search space [d]; infinite if there is none."""
     keys = ((parameter.field, parameter.scale) for parameter in parameters)
     return np.array([CUSTOMARY.get(key, np.inf) for key in keys])
 

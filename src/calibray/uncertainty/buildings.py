@@ -23,17 +23,17 @@ from calibray.paths import Paths
 from calibray.scenes import Scene, building_numbers, read_triangles
 
 BATCHES: Final = (1, 128)
-"""Fewest and most candidates per replay."""
+"""Smallest and largest number of candidates per replay."""
 
 BATCH_INTERACTIONS: Final = 400_000
-"""Interactions per replay, which bounds the memory: larger programs take fewer candidates at once."""
+"""Number of interactions per replay, which limits the memory: larger programs use fewer candidates at once."""
 
 MANY: Final = 10_000
-"""Interactions above which weak paths are left out."""
+"""Number of interactions above which weak paths are left out."""
 
 WEAK: Final = 0.03
-"""Share of a link's power that the paths left out carry together, summed over 16 candidates. On an office floor, half
-of the interactions are left out, and path loss of other candidates changes by 0.01 dB on average."""
+"""Share of a link's power that the omitted paths have together, summed over 16 candidates. On an office floor, half of
+the interactions are left out, and path loss of other candidates changes by 0.01 dB on average."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +42,8 @@ class SplitReplay:
 
     Attributes:
         engine: The replay; its c parameters are the constants of one building each, or of all objects.
-        parameter_of: Index of the parameter that each constant belongs to [c].
-        building_of: Building of each constant, from 0; -1 for objects that are no building, as the ground [c].
+        parameter_of: Index of the parameter to which each constant belongs [c].
+        building_of: Building of each constant, from 0; -1 for objects that are not buildings, such as the ground [c].
     """
 
     engine: Replay
@@ -86,7 +86,7 @@ def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool)
         by_building: Whether buildings have their own constants.
 
     Returns:
-        The replay. No constant belongs to a building if the paths meet fewer than two.
+        The replay. If the paths meet fewer than two buildings, no constant belongs to a building.
     """
     study, engine = problem.setup.study, problem.engine
     paths, effects = engine.paths, engine.effects  # type: ignore[attr-defined]

@@ -1,9 +1,9 @@
-"""Likelihood of censored links, whose path loss is only known to lie above the noise floor.
+"""Likelihood of censored links, whose path loss is only known to be above the noise floor.
 
-A measured link contributes the density of its error, a censored one the probability that its error is at least as large
-as the floor requires (J. Tobin, Econometrica 26, 1958). Leaving out censored links would keep those that chance made
-strong. For errors e = s u, with u standard normal or Student's t, and nuisance coefficients b, damped Newton steps in b
-and log s maximise the logarithm of
+A measured link contributes the density of its error, and a censored one the probability that its error is at least as
+large as the floor requires (J. Tobin, Econometrica 26, 1958). Without the censored links, only those with favourable
+errors would remain near the floor. For errors e = s u, with u standard normal or Student's t, and nuisance coefficients
+b, damped Newton steps in b and log s maximise the logarithm of
 
     p(b, s) = prod_measured f((y - z.b) / s) / s  x  prod_censored S((y - z.b) / s)  x  prior(b) / s.
 
@@ -22,14 +22,14 @@ MAX_STEPS: Final = 40
 """Largest number of Newton steps."""
 
 TOLERANCE: Final = 1e-9
-"""Predicted gain of the log density that ends the iteration."""
+"""Predicted gain of the log density at which the iteration ends."""
 
 LARGEST: Final = 1e4
 """Limit for errors, in median errors; applies to a censored link without a path, whose error is infinite."""
 
 
 class _Terms(NamedTuple):
-    """Log probabilities of the links, and their first and second derivatives by the error [n, m]."""
+    """Log probabilities of the links, and their first and second derivatives with respect to the error [n, m]."""
 
     value: NDArray[np.float64]
     first: NDArray[np.float64]
@@ -117,7 +117,7 @@ def joint(
 
     Args:
         point: Coefficients and log scale [n, q + 1].
-        gap: Measured minus modelled path loss, or the floor's for a censored link [n, m], [dB].
+        gap: Measured minus modelled path loss; for a censored link, with the floor as measured value [n, m], [dB].
         censored: Mask of the censored links [m].
         design: Columns of the nuisance [m, q].
         ridge: Inverse standard deviations of the coefficients' priors [q]; 0 for a flat prior.

@@ -4,8 +4,8 @@ They may want different parameters. The parameters are fitted to path loss alone
 to both. The increase of both sums of squares at the common fit, in units of the errors' variances, follows Fisher's F
 if one set of parameters explains everything.
 
-Or no parameters explain an observable, as if it was measured in another scene. Measured values are regressed on
-modelled ones: the slope is 1 if the model is right, and near 0 if the two have nothing to do with each other.
+Another possibility is that no parameters explain an observable, as if it was measured in another scene. Measured values
+are regressed on modelled ones: the slope is 1 if the model is right, and near 0 if the two are unrelated.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from calibray.fitting.search import BASINS, least_squares
 from calibray.result.verdict import Remark, RemarkKind, Value
 
 SIGNIFICANT: Final = 0.005
-"""Probability of a larger increase without a conflict, below which one is reported; errors that neighbouring links
-share make small probabilities somewhat more frequent."""
+"""Probability of a larger increase without a conflict, below which a conflict is reported; errors that neighbouring
+links share make small probabilities somewhat more frequent."""
 
 UNRELATED: Final = 0.02
 """Probability of a slope, if the model is right, below which an observable does not belong to the scene; shared among
@@ -34,18 +34,18 @@ FEWEST: Final = 5
 """Degrees of freedom below which no slope is judged."""
 
 STARTS: Final = 32
-"""Local searches of the fits to one kind of data."""
+"""Number of local searches of the fits to one kind of data."""
 
 DOMINANT: Final = 1e3
-"""Weight of the further observables' rows, relative to path loss, where they alone are fitted; its inverse where path
-loss alone is. The same compiled program then serves all fits."""
+"""Weight of the further observables' rows, relative to path loss, in a fit to them alone; its inverse in a fit to path
+loss alone. All fits can then use the same compiled program."""
 
 
 def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...]:
-    """Compare what path loss and the further observables of a problem with minima [k, d] say of the parameters.
+    """Compare the parameters that path loss and the further observables of a problem with minima [k, d] require.
 
     Returns:
-        Remarks with both answers and the conflict in standard errors; none without a conflict.
+        Remarks with both fits and the conflict in standard errors; none without a conflict.
     """
     objective, width = problem.objective, len(problem.parameters)
     starts = minima[:BASINS]
@@ -92,7 +92,7 @@ class Slope(NamedTuple):
         name: The observable.
         value: The slope.
         error: Its standard error.
-        probability: Probability of as small a slope if the model is right.
+        probability: Probability of a slope this small if the model is right.
     """
 
     name: str

@@ -18,16 +18,16 @@ QUANTILES: Final = 400
 """Quantiles that represent the draws."""
 
 GRID: Final = 101
-"""Equally spaced points over the whole range, in addition to the quantiles."""
+"""Number of equally spaced points over the whole range, in addition to the quantiles."""
 
 STEPS: Final = np.array([0.5, 1.0, 1.5, 2.0, 3.0])
-"""Points beyond the outermost quantiles, in kernel widths."""
+"""Distance of points beyond the outermost quantiles, in kernel widths."""
 
 KERNEL_SHARE: Final = 0.08
 """Share of the draws within the width of a kernel."""
 
 LEAST_SHARE: Final = 0.005
-"""Smallest share of the posterior in a piece; less is chance."""
+"""Smallest share of the posterior in a piece; smaller shares are chance."""
 
 REACH: Final = 8.5
 """Kernel widths beyond which a Gaussian is zero in double precision."""

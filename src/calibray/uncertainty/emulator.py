@@ -1,10 +1,11 @@
 """Emulators of an engine without derivatives, made from its calls.
 
 Intervals need thousands of evaluations, and calls are expensive. A Gaussian process for the path loss of every link
-interpolates the calls (`multifidelity/discrepancy.py`). Its mean is the corrected replay of the study's scene, if
-there is one that does not mislead; otherwise a constant. The uncertainty of the process must widen the intervals. We
+interpolates the calls (`multifidelity/discrepancy.py`). Its mean is the corrected replay of the study's scene, if there
+is one that is not misleading; otherwise a constant. The uncertainty of the process must widen the intervals. We
 therefore draw functions from it, use each as an engine, and pool their posteriors. Every call is also predicted from
-all others; if these leave-one-out errors exceed the expected ones, the drawn functions vary by as much more.
+all others; if these leave-one-out errors exceed the expected ones, the spread of the drawn functions is increased by
+the same factor.
 """
 
 from __future__ import annotations
@@ -41,10 +42,11 @@ FUNCTIONS: Final = 8
 """Number of functions drawn."""
 
 MAX_CALLS: Final = 200
-"""Largest number of calls that the process interpolates; its matrix is factored some hundred times."""
+"""Largest number of calls that the process interpolates; its matrix is factored about a hundred times."""
 
 TRIALS: Final = 8
-"""Starting points of the input mapping, drawn from the prior of the constants, in addition to the declared values."""
+"""Number of starting points of the input mapping, drawn from the prior of the constants, in addition to the declared
+values."""
 
 NEAR: Final = 0.005
 """Distance in the unit cube below which a call is redundant, if there are more than `MAX_CALLS`."""
@@ -91,7 +93,7 @@ class ConstantMean:
 class ResponseRows:
     """The path loss of the links with weight, then the further observables, as residuals of a cheap model.
 
-    Further observables are in units of their errors times the error of path loss, so that all rows compare.
+    Further observables are in units of their errors times the error of path loss, so that all rows are comparable.
 
     Attributes:
         problem: The problem.
@@ -120,7 +122,7 @@ class ResponseRows:
     def residuals(
         self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64], observed: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """See `Rows.residuals`; without a path, an observable is taken as measured."""
+        """See `Rows.residuals`; without a path, the measured value of an observable is used."""
         rows = [self.problem.objective.capped(path_loss)[:, self.links]]
         for index, (each, used) in enumerate(zip(self.problem.observed, self.used, strict=True)):
             values = observed[:, index, used] / each.scale
@@ -205,7 +207,7 @@ class EmulatedEngine:
     def respond(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
     ) -> Responses:
-        """See `Observing.respond`; the emulator knows the study's observables, or none of them."""
+        """See `Observing.respond`; the emulator computes the study's observables, or none of them."""
         unit, count = self._unit(candidates), len(candidates)
         if not derivatives:
             base, inputs = self.mean.base(unit)
@@ -244,7 +246,7 @@ class EmulatedEngine:
     def _further(
         self, rows: NDArray[np.float64], wanted: tuple[Statistic, ...]
     ) -> Iterator[tuple[Observed, NDArray[np.int64], NDArray[np.float64]]]:
-        """The observables, the links that have them, and the part of emulated rows [n, m, ...] that is theirs."""
+        """The observables, the links that have them, and their part of emulated rows [n, m, ...]."""
         first = len(self.rows.links)
         every = self.rows.problem.observed if wanted else ()
         for each, used in zip(every, self.rows.used, strict=False):
@@ -262,7 +264,7 @@ class Ensemble:
         apart_db: Root mean square difference of these from the mean, over the whole range of the parameters [dB].
         error_db: Root mean square leave-one-out error of the better half of the calls [dB].
         calls: Number of calls that the process interpolates.
-        replayed: The corrected replay in the mean function; None if there is none, or if it misleads.
+        replayed: The corrected replay in the mean function; None if there is none, or if it is misleading.
     """
 
     mean: EmulatedEngine
@@ -331,7 +333,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
 
 
 def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Calls:
-    """The calls with a path loss for every link with weight; of too many, the most informative."""
+    """The calls with a path loss for every link with weight; if there are too many, the most informative ones."""
     parameters = problem.parameters
     candidates, modelled = np.array(trail.candidates), np.array(trail.modelled)
     observed = np.array(trail.observed)

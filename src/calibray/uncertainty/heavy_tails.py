@@ -1,7 +1,7 @@
 """Density of heavy-tailed errors, with nuisance and scale integrated out.
 
-The tails of Student's t fall off evenly. If most errors are ordinary and a few are gross, for example because a link
-was measured at a wrong position, the ordinary ones are Gaussian: a share of the errors then has a larger standard
+The tails of Student's t decrease gradually. If most errors are ordinary and a few are gross, for example because a link
+was measured at a wrong position, the ordinary errors are Gaussian, and a share of the errors has a larger standard
 deviation (J. W. Tukey, in: Contributions to Probability and Statistics, 1960). We fit both by iteratively reweighted
 least squares (K. L. Lange, R. J. A. Little, J. M. G. Taylor, J. Am. Stat. Assoc. 84 (1989) 881) and integrate by
 Laplace's approximation at the mode, with the Fisher information.
@@ -21,7 +21,7 @@ MAX_STEPS: Final = 25
 """Largest number of steps to the mode."""
 
 TOLERANCE: Final = 1e-3
-"""Relative change of errors and scale that ends the iteration; the density is flat at the mode."""
+"""Relative change of errors and scale at which the iteration ends; the density is flat at the mode."""
 
 GROSS_SHARE: Final = 0.1
 """Share of gross errors."""
@@ -38,9 +38,9 @@ class Tail(NamedTuple):
 
     Attributes:
         log_density: Its log density as a function of the squared errors.
-        weight: Minus the derivative of the log density by half the square; 1 for a Gaussian.
-        location: Fisher information of an error on its mean, a number or [n].
-        size: Fisher information of an error on the logarithm of its scale, a number or [n].
+        weight: Minus the derivative of the log density with respect to half the square; 1 for a Gaussian.
+        location: Fisher information of an error about its mean, a number or [n].
+        size: Fisher information of an error about the logarithm of its scale, a number or [n].
         by_weights: Whether to update the scale with the sum of the weights instead of the number of links, which
             converges faster.
         select: The distributions of the gaps with given indices.
@@ -78,7 +78,7 @@ def _student(freedom: NDArray[np.float64], constant: NDArray[np.float64]) -> Tai
 
 @cache
 def gross(share: float = GROSS_SHARE, times: float = GROSS_RATIO) -> Tail:
-    """Gaussian errors, a share of which is gross, with a standard deviation so many times that of the others."""
+    """Gaussian errors, of which a share is gross, with a standard deviation larger by a factor."""
     ratio, fall = share / (1.0 - share) / times, 0.5 * (1.0 - 1.0 / times**2)
     constant = float(np.log1p(-share) - 0.5 * np.log(2 * np.pi))
 
@@ -162,7 +162,7 @@ def products(design: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArra
 
 
 def regular(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Normal equations [..., q, q] with the diagonal raised slightly, for linearly dependent columns."""
+    """Normal equations [..., q, q] with slightly increased diagonal, for linearly dependent columns."""
     size = matrix.shape[-1]
     trace = np.trace(matrix, axis1=-2, axis2=-1)[..., None, None]
     return matrix + (1e-10 * trace / size + 1e-300) * np.eye(size)

@@ -2,9 +2,9 @@
 
 - The study's parameters have flat priors over their bounds, or the priors that the study declares.
 - Constants of the same materials that the scene fixes, such as thickness, have a log-normal prior around the scene's
-  value, since nobody knows them exactly.
-- The walls of building b have the constants x exp(s z_b): x is the material's mean, z_b is standard normal. The
-  between-building spread s is zero with probability `ALIKE`, otherwise exponential.
+  value, because nobody knows them exactly.
+- The walls of building b have the constants x exp(s z_b), where x is the material's mean and z_b is standard normal.
+  The between-building spread s is zero with probability `ALIKE`, otherwise exponential.
 - Errors follow one of several noise models (`noise_models.py`), whose level, nuisances and undeclared offset are
   integrated out.
 
@@ -30,10 +30,11 @@ from calibray.uncertainty.noise_models import Marginal, noise_models
 from calibray.uncertainty.quadratic_forms import MAX_LINKS, QuadraticForms
 
 FEWEST: Final = 8
-"""Links below which only independent Gaussian noise is tried; fewer cannot distinguish other noise models."""
+"""Number of links below which only independent Gaussian noise is tried; fewer links cannot distinguish other noise
+models."""
 
 FIXED_FIELDS: Final = ("thickness", "conductivity", "scattering_coefficient")
-"""Constants that are taken from the scene where they are no parameters."""
+"""Constants that come from the scene if they are not parameters."""
 
 NO_EFFECT: Final = 0.02
 """Change of path loss by one standard deviation of a fixed constant, relative to the noise, below which it stays
@@ -63,16 +64,16 @@ class JointModel:
 
     Attributes:
         study: The study's d parameters.
-        parameters: These, then k constants that the scene fixes.
-        priors: Log-normal priors, on top of flat ones over the unit cube.
+        parameters: The study's parameters, then k constants that the scene fixes.
+        priors: Log-normal priors, in addition to flat ones over the unit cube.
         gaps: Computes measured minus modelled path loss.
         loss: Path loss of all links for values of the parameters [n, d + k] and equal buildings [n, L], [dB].
         marginal: The density of the gaps under every noise model.
-        parameter_of: Index of the parameter that each of the c constants of single buildings belongs to [c].
+        parameter_of: Index of the parameter to which each of the c constants of single buildings belongs [c].
         building_of: Building of each of these constants, from 0 [c].
         only_buildings: Indices of the parameters whose constants all belong to buildings, so that these determine the
             mean.
-        spread: The between-building spread if the study declares it; else None.
+        spread: The between-building spread if the study declares it; otherwise None.
         interactions: Interactions that one evaluation takes.
         effects_db: Change of path loss by one standard deviation of each fixed constant [dB].
         observed: Number of rows of each further observable, which follow the m gaps of path loss; its degrees of
@@ -106,7 +107,7 @@ class JointModel:
     def _split(self, gaps: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Gaps of path loss [n, m], and the log likelihood of the further observables [n].
 
-        Where their error is not stated, it is integrated out with a prior inversely proportional to it.
+        If their error is not stated, it is integrated out with a prior inversely proportional to it.
         """
         last = gaps.shape[1] - sum(count for count, _, _ in self.observed)
         links, further = gaps[:, :last], np.zeros(len(gaps))
@@ -124,7 +125,7 @@ class JointModel:
     def at_scene_constants(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log posterior [n] at points of the study's search space [n, d], up to a constant.
 
-        Buildings are equal, and constants those of the scene. It is averaged over the noise models.
+        Buildings are equal, and constants are those of the scene. It is averaged over the noise models.
         """
         constants = [item.start for item in self.parameters.items[len(self.study) :]]
         values = np.hstack([self.study.from_search(points), np.tile(constants, (len(points), 1))])
@@ -159,7 +160,7 @@ class JointModel:
         return points
 
     def draw_spread(self, count: int, random: np.random.Generator) -> NDArray[np.float64]:
-        """Draw between-building spreads from their prior, 0 where buildings are equal [count]."""
+        """Draw between-building spreads from their prior, with 0 for equal buildings [count]."""
         if self.spread is not None or not len(self.parameter_of):
             return np.full(count, self.spread or 0.0)
         differing = np.clip(random.exponential(MEAN_SPREAD, count), *SPREAD_BOUNDS)
@@ -167,7 +168,7 @@ class JointModel:
 
 
 def joint_model(problem: Problem, best: NDArray[np.float64], square: float, freedom: int) -> JointModel:
-    """Set up what a study leaves open.
+    """Set up the unknowns that a study does not fix.
 
     Args:
         problem: The problem.
@@ -244,7 +245,7 @@ def _with_constants(
     best: NDArray[np.float64],
     gap: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> JointModel:
-    """The model with the constants that the scene fixes and have an effect, and with buildings."""
+    """The model with the constants that the scene fixes and that have an effect, and with buildings."""
     study, known_to = model.study, problem.setup.study.noise.constants_spread
     fixed = _fixed_constants(problem)
     every = replace(study, items=(*study.items, *fixed))
@@ -306,7 +307,7 @@ def _with_constants(
 
 
 def _further(problem: Problem, observed: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Rows of the further observables [n, m] each, in units of the error where that is stated."""
+    """Rows of the further observables [n, m] each, in units of the error if it is stated."""
     rows = []
     for index, each in enumerate(problem.observed):
         residuals, _ = each.residuals(observed[:, index], problem.objective.weight)
@@ -344,8 +345,8 @@ def _fixed_constants(problem: Problem) -> list[Parameter]:
 def _weights_and_censoring(problem: Problem) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Weights of the links in the likelihood [L], and mask of the censored ones [L].
 
-    With censored links in the likelihood, links measured near the noise floor are used as well: both together are no
-    selection by measured values.
+    With censored links in the likelihood, links measured near the noise floor are used as well: together they are not
+    selected by measured values.
     """
     objective, links = problem.objective, problem.setup.links
     if links.censored is None or problem.faint is None:

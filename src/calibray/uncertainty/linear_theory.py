@@ -1,6 +1,6 @@
 """Linear theory: intervals and covariances from the curvature of the sum of squares at the optimum.
 
-The intervals replace those of the posterior if it cannot be sampled.
+These intervals replace those of the posterior if it cannot be sampled.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def with_reason(local: dict[str, Interval], reason: Reason) -> dict[str, Interva
     """Add to intervals by linear theory the reason why the posterior was not sampled.
 
     Curvature alone does not show other minima and correlated errors, so no parameter is more than weakly identified,
-    except where the data have no noise.
+    unless the data contain no noise.
     """
     exact, identified = reason.kind == ReasonKind.NO_NOISE, Verdict.IDENTIFIED
     capped = {identified: identified if exact else Verdict.WEAKLY_IDENTIFIED}

@@ -1,7 +1,7 @@
-"""Features of links that errors of a wrong scene or of missing physics depend on.
+"""Features of links that determine errors of a wrong scene or of missing propagation effects.
 
-If the twin lacks diffraction, scattering or buildings, its error depends on what stands between the ends of a link and
-on how its paths get around it, rather than on where the link is.
+If the twin lacks diffraction, scattering or buildings, its error depends on the obstruction of a link and on how its
+paths bypass it, rather than on the position of the link.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from calibray.fitting.problem import Problem
 from calibray.paths import Paths
 
 OBSTRUCTION: Final = ("out_of_sight", "walls_crossed", "obstruction_m", "knife_edge_db")
-"""Columns of the links' table that a scene gives; lengths and numbers count by their logarithms."""
+"""Columns of the links' table that follow from a scene; lengths and numbers enter by their logarithms."""
 
 
 def link_features(problem: Problem) -> NDArray[np.float64]:
-    """Standardized features of the links that have a weight, of these the ones that differ between links [L, k].
+    """Standardized features of the links with weight, limited to features that differ between links [L, k].
 
-    They are the logarithm of the distance, what stands between the ends, and interactions and mean cosine of incidence
-    of the path with the fewest interactions. Their mean square over all links and features is one over the number of
-    features, so that the distance of two links is about the square root of two.
+    The features are the logarithm of the distance, the obstruction, and the number of interactions and mean cosine of
+    incidence of the path with the fewest interactions. Their mean square over all links and features is one over the
+    number of features, so that the distance of two links is about the square root of two.
     """
     setup = problem.setup.with_obstruction()
     table, links = setup.links.table, setup.links

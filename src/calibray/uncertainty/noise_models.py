@@ -2,10 +2,10 @@
 
 Errors may be independent and Gaussian, correlated between neighbours, structured, or heavy-tailed, and an offset may be
 undeclared. Structured errors are a discrepancy of the twin (M. C. Kennedy and A. O'Hagan, J. Royal Statistical Society
-B 63, 2001): links share errors that are alike in distance, obstruction, depth and angle (`link_features.py`), wherever
-they are. The right model is unknown, and choosing the best-fitting one ignores others that fit nearly as well. Every
-model therefore gets a prior weight, and results are averages over all models (Bayesian model averaging). A discrepancy
-that the data do not need thus has next to no weight, and does not absorb what the parameters explain.
+B 63, 2001): links with similar distance, obstruction, depth and angle share errors (`link_features.py`), wherever they
+are. The right model is unknown, and choosing the best-fitting one ignores others that fit nearly as well. Every model
+therefore gets a prior weight, and results are averages over all models (Bayesian model averaging). A discrepancy that
+the data do not need thus has almost no weight, and does not absorb what the parameters explain.
 
 The noise level has the prior 1/level, and nuisances have their own priors, flat unless declared. For Gaussian noise
 with covariance C times an unknown variance, both integrals are closed (D. A. Harville, Biometrika 61, 1974): with
@@ -13,7 +13,7 @@ whitened errors y and design Z, ridge R, A = Z'Z + R'R and S = y'y - y'Z A^-1 Z'
 
     p = (2 pi)^(-f/2) Gamma(f/2) / 2 (S/2)^(-f/2) |C|^(-1/2) |A|^(-1/2) |R|,
 
-where f is the number of links minus the number of columns with a flat prior. For heavy tails both integrals use
+where f is the number of links minus the number of columns with a flat prior. For heavy tails, both integrals use
 Laplace's approximation (`heavy_tails.py`).
 """
 
@@ -32,7 +32,7 @@ from calibray.uncertainty.heavy_tails import evidence, gross, regular, student
 from calibray.uncertainty.whitening import EXACT, Whitener, nearest_earlier, pairwise, whitener
 
 OFFSET_DB: Final = 6.0
-"""Prior standard deviation of an undeclared offset, as from a cable or an antenna gain [dB]."""
+"""Prior standard deviation of an undeclared offset, for example from a cable or an antenna gain [dB]."""
 
 NO_OFFSET: Final = 1e3
 """Inverse prior standard deviation that keeps an offset at 0 [1/dB]."""
@@ -44,19 +44,19 @@ RANGES: Final = 4
 """Number of correlation ranges tried, from the distance of neighbours to a third of the campaign."""
 
 SAME_PLACE: Final = 0.01
-"""Range, relative to the distance of neighbours, of errors that only links of one position share."""
+"""Range, relative to the distance of neighbours, of errors that only links at one position share."""
 
 FREEDOMS: Final = (2.0, 4.0)
 """Degrees of freedom of Student's t that are tried."""
 
 DEPARTURE: Final = 2.0
 """Prior weight of an offset, of correlated and of heavy-tailed errors, relative to independent Gaussian ones: measured
-errors rarely are. Structured errors count once: where the truth has diffraction and refraction, development districts
-favour them by factors from 20 to 10^9, and a larger weight widens intervals where nothing is missing."""
+errors rarely are. Structured errors have weight one: where the truth has diffraction and refraction, development
+districts favour them by factors from 20 to 10^9, and a larger weight widens intervals where nothing is missing."""
 
 IMPROBABLE: Final = 50.0
-"""Log odds at the optimum against a model that is left out for many links. Its own optimum can be better by some units
-for each parameter, far less than this."""
+"""Log odds at the optimum above which a model is left out for many links. The optimum of that model can be better by
+some units for each parameter, which is far less than this."""
 
 FEATURE_RANGES: Final = (1.0, 4.0)
 """Correlation ranges of structured errors that are tried, in standard deviations of the links' features."""
@@ -65,7 +65,7 @@ FEATURE_RANGES: Final = (1.0, 4.0)
 GAUSSIAN, CORRELATED, STRUCTURED, HEAVY = "gaussian", "correlated", "structured", "student-t"
 
 DIFFERING: Final = "heterogeneous"
-"""Buildings that differ, which has a weight like the kinds of noise."""
+"""Buildings that differ, which have a weight like the kinds of noise."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def noise_models(
 def _ranges(position: NDArray[np.float64]) -> tuple[float, ...]:
     """Correlation ranges to try; none for fewer than three positions.
 
-    Where several links have one position, errors that only these share are tried as well.
+    If several links have one position, errors that only these links share are tried as well.
     """
     places = np.unique(position, axis=0)
     distance = pairwise(places)
@@ -164,7 +164,7 @@ class Marginal:
     Attributes:
         design: Columns of the nuisance, times the square roots of the weights [m, q].
         ridge: Noise level over the standard deviations of the coefficients' priors [q]; 0 for a flat prior.
-        column: The column of an undeclared offset, scaled likewise [m].
+        column: The column of an undeclared offset, scaled in the same way [m].
         noise_db: Approximate noise level, which scales priors [dB].
         models: The noise models.
         whiteners: Whitener of each correlated or structured model, by kind, range and share.
@@ -214,7 +214,7 @@ class Marginal:
         return cls(design * scale[:, None], ridge, scale, noise_db, tuple(models), whiteners, censored)
 
     def without_improbable(self, gap: NDArray[np.float64]) -> Marginal:
-        """The density without models that explain gaps at the optimum [1, m] far worse than the best one."""
+        """The density without models that explain the gaps at the optimum [1, m] much worse than the best one."""
         density = self.densities(gap)[0]
         kept = np.flatnonzero(density > density.max() - IMPROBABLE)
         return replace(self, models=tuple(self.models[k] for k in kept)) if len(kept) else self
@@ -282,7 +282,7 @@ class Marginal:
         return log_evidence(gap, self.censored, design, ridge / self.noise_db, model.freedom)
 
     def _with_offset(self, offset: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Design and ridge, with an undeclared offset as the last column if asked for."""
+        """Design and ridge, with an undeclared offset as the last column if requested."""
         if not offset:
             return self.design, self.ridge
         return np.column_stack([self.design, self.column]), np.append(self.ridge, self.noise_db / OFFSET_DB)
@@ -297,7 +297,7 @@ def _constant(freedom: int, ridge: NDArray[np.float64]) -> float:
 def _plain(
     gap: NDArray[np.float64], design: NDArray[np.float64], ridge: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Log density p of whitened Gaussian errors, see the module [n]; |C| is left to the caller."""
+    """Log density p of whitened Gaussian errors, see the module [n]; the caller adds |C|."""
     freedom = gap.shape[1] - int((ridge == 0).sum())
     square, log_root = np.sum(gap**2, axis=1), 0.0
     if design.shape[1]:

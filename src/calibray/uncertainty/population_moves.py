@@ -3,12 +3,13 @@
 - One or more parameters move along the difference of two other members (C. J. F. ter Braak, Statistics and Computing
   16, 2006).
 - One parameter is redrawn from the population's values of it, smoothed. Reflections inside walls give a permittivity
-  several narrow ranges, and members of one range reach the others at once.
+  several narrow ranges, and members of one range reach the others in one move.
 - One, two or all buildings are redrawn around their values (S. L. Cotter, G. O. Roberts, A. M. Stuart and D. White,
   Statistical Science 28, 2013).
-- The between-building spread is redrawn from its prior, together with all buildings: buildings become equal or differ.
-- Means and spread are redrawn given the buildings' constants. The constants, and with them path loss, stay the same,
-  so nothing is replayed (interweaving: Y. Yu and X.-L. Meng, J. Computational and Graphical Statistics 20, 2011).
+- The between-building spread is redrawn from its prior, together with all buildings: buildings become equal or
+  different.
+- Means and spread are redrawn given the buildings' constants. The constants, and with them path loss, stay the same, so
+  no replay is needed (interweaving: Y. Yu and X.-L. Meng, J. Computational and Graphical Statistics 20, 2011).
 - The noise model is redrawn given the errors.
 """
 
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from calibray.uncertainty.joint_model import MEAN_SPREAD, SPREAD_BOUNDS, JointModel
 
 SPREAD_GRID: Final = 64
-"""Points of the logarithmic grid that the spread is drawn from."""
+"""Number of points of the logarithmic grid from which the spread is drawn."""
 
 ACCEPTANCE: Final = 0.25
 """Target share of accepted moves, which sets their lengths; near the optimal 0.234 of random walks (G. O. Roberts, A.
@@ -69,7 +70,7 @@ class Population:
         return Population(*(part[index] for part in self.parts()))
 
     def updated(self, accepted: NDArray[np.bool_], proposal: Population) -> Population:
-        """The proposal's members where accepted [n], else the present ones."""
+        """The members of the proposal if accepted [n], otherwise the present ones."""
         return Population(
             *(
                 np.where(accepted.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
@@ -289,7 +290,7 @@ def _redraw_spread(population: Population, random: np.random.Generator) -> Popul
 
 
 def _adapted(length: float, accepted: NDArray[np.bool_], longest: float) -> float:
-    """The length of moves after some were accepted or not."""
+    """The length of moves, adapted to their acceptance."""
     if not len(accepted):
         return length
     return float(np.clip(length * np.exp(0.5 * (accepted.mean() - ACCEPTANCE)), 0.02, longest))

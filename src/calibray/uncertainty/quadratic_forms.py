@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from calibray.uncertainty.noise_models import HEAVY, Marginal
 
 MAX_LINKS: Final = 300
-"""Links up to which the matrices are stored; those of 26 Gaussian models then take 19 MB."""
+"""Number of links up to which the matrices are stored; those of 26 Gaussian models then need 19 MB."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,10 +21,10 @@ from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, H
 
 LIKELY: Final = 0.75
 """Odds of three to one against independent Gaussian errors, or against equal buildings, at which a departure is
-reported. Beforehand, buildings differ with a probability of one half."""
+reported. A priori, buildings differ with a probability of one half."""
 
 NOTABLE: Final = 0.25
-"""Least posterior weight of a kind of noise that is reported; several kinds can share the weight."""
+"""Smallest posterior weight of a kind of noise that is reported; several kinds can share the weight."""
 
 SLACK: Final = 0.02
 """Distance of a value from its interval, as a share of the range, above which it is reported."""
@@ -33,10 +33,10 @@ MISSED_DB: Final = 0.01
 """Improvement of the objective by a draw above which the method is reported to have missed the optimum [dB]."""
 
 BEST_DRAWS: Final = 16
-"""Draws of highest density that are checked for a missed optimum."""
+"""Number of draws of highest density that are checked for a missed optimum."""
 
 STARTS: Final = 16
-"""Local searches with a free offset, in addition to those from the minima without it."""
+"""Number of local searches with a free offset, in addition to those from the minima without it."""
 
 OFFSET_DB: Final = 0.1
 """Smallest undeclared offset that is reported [dB]."""

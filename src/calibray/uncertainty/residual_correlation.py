@@ -1,8 +1,8 @@
 """Spatial correlation of the residuals: restricted-likelihood fit, test and variogram.
 
-A link's error has a correlated and an uncorrelated part. Receivers near each other share the correlated part, for
-example because clutter that the scene lacks shades them all. Its covariance falls off exponentially with distance.
-Range and size maximise the restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971), so that fitted
+A link's error has a correlated and an uncorrelated part. Nearby receivers share the correlated part, for example
+because clutter that the scene lacks shadows all of them. Its covariance falls off exponentially with distance. Range
+and size maximise the restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971), so that fitted
 parameters do not bias the noise low. The fit is exact with one Cholesky factor per trial, for up to some thousand
 links.
 """
@@ -22,13 +22,13 @@ from calibray.errors import EngineError, InputError
 from calibray.support.memory import single_blas_thread
 
 SHARES: Final = (0.001, 0.999)
-"""Bounds of the correlated share of the variance; at 1 the covariance of near links is singular."""
+"""Bounds of the correlated share of the variance; at 1 the covariance of nearby links is singular."""
 
 FEWEST_LINKS: Final = 10
-"""Links below which no correlation is reported; fewer cannot show one."""
+"""Number of links below which no correlation is reported; fewer links cannot show one."""
 
 MOST_LINKS: Final = 500
-"""Links used for correlation and variogram; of more, an evenly spaced subset."""
+"""Number of links used for correlation and variogram; if there are more, an evenly spaced subset."""
 
 SIGNIFICANT: Final = 3.0
 """Gain in log likelihood above which correlation is reported: about the 95 % quantile for two further parameters."""
@@ -68,14 +68,14 @@ def fit_correlation(
     Args:
         errors: Errors at the best fit [m], [dB].
         position: Positions of the receivers, or of both ends [m, k], [m].
-        design: Columns that were fitted to the same links, of full rank [m, q]: nuisances, and derivatives by the
-            parameters.
+        design: Columns that were fitted to the same links, of full rank [m, q]: nuisances, and derivatives with respect
+            to the parameters.
 
     Returns:
         The correlation.
 
     Raises:
-        InputError: There are fewer than three links more than columns, or all receivers have one position.
+        InputError: The number of links exceeds that of columns by fewer than three, or all receivers have one position.
         EngineError: The errors are all zero.
     """
     count = len(errors)

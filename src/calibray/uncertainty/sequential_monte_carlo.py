@@ -4,8 +4,8 @@ A population drawn from the prior follows the prior times a power of the likelih
 Moral, A. Doucet and A. Jasra, J. Royal Statistical Society B 68, 2006). Each step raises the power until half of the
 population is effective, resamples the population, and moves its members (`population_moves.py`).
 
-Two populations are independent. While the halves of all disagree, as many more are drawn, as far as the budget allows.
-All populations count by their estimates of the evidence, which are unbiased.
+Two populations are independent. While the halves of all populations disagree, their number is doubled, as far as the
+budget allows. All populations are weighted by their estimates of the evidence, which are unbiased.
 """
 
 from __future__ import annotations
@@ -22,34 +22,34 @@ from calibray.uncertainty.joint_model import JointModel
 from calibray.uncertainty.population_moves import TINY, Lengths, Moves, Population, evaluated
 
 SIZE: Final = (64, 256)
-"""Fewest and most members of a population."""
+"""Smallest and largest number of members of a population."""
 
 BUDGET: Final = 1_000_000_000
 """Interactions that all populations may evaluate together."""
 
 EVALUATIONS: Final = 100
-"""Evaluations that a member takes, about: steps times moves."""
+"""Approximate number of evaluations per member: steps times moves."""
 
 POPULATIONS: Final = (2, 4, 8)
-"""Independent populations, more as long as the halves of them disagree. Where the slabs' fringes fit, means of one
-population of 256 scatter by 0.2 posterior standard deviations; in three development districts the draws of two or four
-populations agreed for half of the truths."""
+"""Number of independent populations; more as long as the halves of them disagree. If the slabs' fringes fit, means of
+one population of 256 scatter by 0.2 posterior standard deviations; in three development districts, the draws of two or
+four populations agreed for half of the truths."""
 
 SWEEPS: Final = 4
-"""Sweeps per step; a sweep moves every member in each way. The share of one of two distant ranges in five dimensions
-then scatters by 0.03 between seeds; with 2 sweeps by 0.08."""
+"""Number of sweeps per step; a sweep moves every member in each way. The share of one of two distant ranges in five
+dimensions then scatters by 0.03 between seeds; with 2 sweeps by 0.08."""
 
 LAST_SWEEPS: Final = 8
 """Further sweeps at power 1."""
 
 KEPT: Final = 2
-"""Sweeps at power 1 between members that are kept as draws."""
+"""Number of sweeps at power 1 between members that are kept as draws."""
 
 EFFECTIVE: Final = 0.5
 """Effective share of the population after each step."""
 
 MAX_STEPS: Final = 60
-"""Steps after which the population is given up as it stands; most posteriors take 8 to 20."""
+"""Number of steps after which the population is used as it is; most posteriors need 8 to 20."""
 
 APART: Final = 0.2
 """Largest distance between the distribution functions of a parameter in independent populations that agree. Two sets of
@@ -94,7 +94,7 @@ def joined(posteriors: Sequence[Posterior]) -> Posterior:
 
 
 def population_size(interactions: int, budget: int = BUDGET, models: int = 1) -> int:
-    """Members of each of two populations within a budget, from the interactions of one evaluation.
+    """Number of members of each of two populations within a budget, from the interactions of one evaluation.
 
     Draws of several models with equal weight are pooled, so that each needs fewer.
 
@@ -244,7 +244,7 @@ def _anneal(
 
 
 def _next_power(log_likelihood: NDArray[np.float64], power: float) -> float:
-    """The largest power that leaves the share `EFFECTIVE` of the members effective, by bisection."""
+    """The largest power with which the share `EFFECTIVE` of the members stays effective, by bisection."""
 
     def effective_share(other: float) -> float:
         weight = _weights((other - power) * log_likelihood)

@@ -15,7 +15,7 @@ from calibray.uncertainty.credible_sets import credible_sets
 from calibray.uncertainty.draws import Draws, systematic_resampling
 
 JUDGED: Final = 0.9
-"""Level of the credible sets behind the verdicts. The last few per cent of a 95 % interval can lie far out, under a
+"""Level of the credible sets behind the verdicts. The last few per cent of a 95 % interval can lie far away, under a
 noise model of small weight."""
 
 IDENTIFIED: Final = 0.25
@@ -28,8 +28,8 @@ NO_EFFECT_DB: Final = 1.0
 """Change of path loss over the range below which no link depends on the parameter [dB]."""
 
 END: Final = 0.1
-"""Distance of an interval's end from the bound, as a share of the range, that is chance if no link depends on the
-parameter."""
+"""Largest distance of an interval's end from the bound, as a share of the range, that counts as chance if no link
+depends on the parameter."""
 
 TRADE_OFF: Final = 0.5
 """Rank correlation above which another parameter compensates."""
@@ -38,10 +38,10 @@ LARGE_EFFECT: Final = 3.0
 """Change of path loss, in standard deviations of the errors, above which single links would determine the parameter."""
 
 RANKED: Final = 400
-"""Draws of equal weight that rank correlations are computed from."""
+"""Number of draws of equal weight from which rank correlations are computed."""
 
 LINE: Final = 25
-"""Values over the range of a parameter at which its effect is computed."""
+"""Number of values over the range of a parameter at which its effect is computed."""
 
 
 Modelled = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -57,8 +57,8 @@ class Axes:
         lower: Lower bounds [d].
         upper: Upper bounds [d].
         value: Maps the index of a parameter and a search coordinate to the value that reasons state.
-        customary: Customary widths of the parameters' ranges [d]; widths of the bounds if None. Shares refer to the
-            smaller width, so that wider bounds do not improve a verdict.
+        customary: Usual widths of the parameters' ranges [d]; widths of the bounds if None. Shares refer to the smaller
+            width, so that wider bounds do not improve a verdict.
     """
 
     names: Sequence[str]
@@ -68,20 +68,20 @@ class Axes:
     customary: NDArray[np.float64] | None = None
 
     def extent(self, index: int) -> float:
-        """Width of the range that shares refer to."""
+        """Width of the range to which shares refer."""
         width = float(self.upper[index] - self.lower[index])
         return width if self.customary is None else min(width, float(self.customary[index]))
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the data say about one parameter.
+    """What the data show about one parameter.
 
     Attributes:
         pieces: Lower and upper end of every piece of the credible set, ascending, within the bounds.
         name: The verdict.
         reason: Its reason.
-        seen: The pieces for the measured buildings; the same where these are not distinguished.
+        seen: The pieces for the measured buildings; the same if these are not distinguished.
     """
 
     pieces: tuple[tuple[float, float], ...]
@@ -245,7 +245,7 @@ def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, 
 
 
 def consistent(interval: Interval, value: float) -> Interval:
-    """The interval; ambiguous if it was identified, but does not contain the value of least RMSE."""
+    """The interval; ambiguous if it was identified but does not contain the value with the lowest RMSE."""
     identified = interval.verdict in (VerdictName.IDENTIFIED, VerdictName.WEAKLY_IDENTIFIED)
     if not identified or interval.contains(value, 1e-9 * abs(value)):
         return interval

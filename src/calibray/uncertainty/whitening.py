@@ -1,8 +1,8 @@
 """Whitening of spatially correlated errors: exact, or with the nearest neighbours of each link.
 
 The covariance is (1 - share) for each link plus share x exp(-distance / range) between links. For some hundred links we
-factor it. For more, each error is its conditional mean given its nearest neighbours among the earlier links, plus an
-independent rest (A. V. Vecchia, J. R. Stat. Soc. B 50, 1988). The cost is then proportional to the number of links.
+factor it. For more links, each error is its conditional mean given its nearest neighbours among the earlier links, plus
+an independent rest (A. V. Vecchia, J. R. Stat. Soc. B 50, 1988). The time is then proportional to the number of links.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.spatial.distance import cdist
 
 EXACT: Final = 600
-"""Links up to which the covariance is factored exactly."""
+"""Number of links up to which the covariance is factored exactly."""
 
 NEAREST: Final = 20
 """Neighbours in Vecchia's approximation."""
 
 CHUNK: Final = 500
-"""Links whose neighbourhoods are solved together."""
+"""Number of links whose neighbourhoods are solved together."""
 
 Neighbours = tuple[NDArray[np.int64], NDArray[np.int64]]
-"""An order of links [m], and the places of each one's nearest earlier links, -1 for none [m, NEAREST]."""
+"""An order of links [m], and the positions of each one's nearest earlier links in it, -1 for none [m, NEAREST]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +64,10 @@ def whitener(
 
     Args:
         position: Positions of the links' ends [m, k], [m].
-        scale: Factors that the errors were multiplied by so that the uncorrelated part has unit size [m].
+        scale: Factors by which the errors were multiplied so that the uncorrelated part has unit size [m].
         range_m: Distance at which the correlated part has fallen to 1/e [m].
         share: Correlated share of the variance, from 0 to below 1.
-        exact: Links up to which the covariance is factored exactly.
+        exact: Number of links up to which the covariance is factored exactly.
         neighbours: The links' nearest earlier neighbours, if they are known.
 
     Returns:
@@ -83,7 +83,7 @@ def whitener(
 
 
 def nearest_earlier(position: NDArray[np.float64]) -> Neighbours:
-    """A random order of links at positions [m, k], so that some earlier ones are near, some far; and the nearest."""
+    """A random order of links at positions [m, k], with earlier ones both near and far; and the nearest ones."""
     order = np.random.default_rng(0).permutation(len(position))
     shuffled, near = position[order], np.full((len(order), NEAREST), -1)
     for index in range(1, len(order)):

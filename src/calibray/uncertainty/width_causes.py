@@ -1,8 +1,8 @@
-"""What makes an interval wide: the share of its width that is left where one cause is ruled out.
+"""What makes an interval wide: the share of its width that remains if one cause is ruled out.
 
-Draws without a cause, as those whose buildings are equal, follow the posterior of a study that rules it out. Constants
-that the scene fixes are ruled out by a linear regression of the parameter on them, which leaves too much where the
-parameter does not depend linearly on them: that share is an upper bound.
+Draws without a cause, for example those with equal buildings, follow the posterior of a study that rules it out.
+Constants that the scene fixes are ruled out by a linear regression of the parameter on them. The remaining share is an
+upper bound, because the parameter may not depend linearly on them.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from calibray.uncertainty.noise_models import CORRELATED, HEAVY, STRUCTURED
 from calibray.uncertainty.sequential_monte_carlo import Posterior
 
 FEWEST: Final = 30
-"""Effective draws below which a standard deviation, then uncertain by 13 %, is not compared."""
+"""Number of effective draws below which a standard deviation, then uncertain by 13 %, is not compared."""
 
 NOTABLE: Final = 0.85
 """Largest share that is reported: the uncertainty of a standard deviation from `FEWEST` draws."""
 
 
 def remaining_widths(model: JointModel, posterior: Posterior) -> list[dict[Cause, float]]:
-    """By parameter of the study, the shares of its interval's width that are left without each cause.
+    """By parameter of the study, the shares of its interval's width that remain without each cause.
 
-    Only causes that make it notably wide are listed, the smallest share first.
+    Only causes that make it noticeably wide are listed, with the smallest share first.
     """
     draws, width = posterior.means, len(model.study)
     models = [model.marginal.models[index] for index in posterior.model]

@@ -1,1 +1,1 @@
-"""Validation: accuracy of models on links that they were not fitted to."""
+"""Validation: accuracy of models on links to which they were not fitted."""

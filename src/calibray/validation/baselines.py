@@ -1,4 +1,4 @@
-"""Baselines without paths: the log-distance model, also with what blocks the direct line, and kriging."""
+"""Baselines without paths: the log-distance model, also with the obstruction of the direct line, and kriging."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from calibray.uncertainty.residual_correlation import fit_correlation
 
 OUT_OF_SIGHT_DB: Final = (10.0, 10.0)
 """Mean and standard deviation of the prior of the loss out of sight [dB]: 3GPP TR 38.901 (UMi) gives 10 dB at 20 m and
-20 dB at 100 m. Without a prior, links in sight alone would say nothing of those out of sight."""
+20 dB at 100 m. Without a prior, links in sight alone would contain no information about those out of sight."""
 
 WALL_DB: Final = 2.0
-"""Standard deviation of the prior of the loss per wall crossed, around zero [dB]. Indoors, walls dominate whatever the
-prior. Outdoors, waves go around buildings; with 5 dB, one cluster of Boulder kept apart was missed by 17 dB."""
+"""Standard deviation of the prior of the loss per wall crossed, around zero [dB]. Indoors, walls dominate with any
+prior. Outdoors, waves go around buildings; with 5 dB, the error on one cluster of Boulder kept apart was 17 dB."""
 
 ROUNDS: Final = 4
-"""Rounds in which the errors and the losses that their priors leave are fitted; more change 0.01 dB."""
+"""Number of rounds in which the errors and the losses under their priors are fitted; more rounds change 0.01 dB."""
 
 LEAST_NOISE_DB: Final = 1.0
-"""Smallest error of the log-distance model that priors are weighed against [dB]."""
+"""Smallest error of the log-distance model against which priors are weighed [dB]."""
 
 MOST_KRIGED: Final = 1000
-"""Most links to krige from: fitting the correlation factors their covariance some hundred times."""
+"""Largest number of links for kriging: fitting the correlation factors their covariance some hundred times."""
 
 
 def without_scene(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
-    """What a model without a scene knows of path loss: the free-space rise over carriers, minus the antennas' gain.
+    """The part of path loss that needs no scene: the free-space increase over carriers, minus the antennas' gain.
 
     Path loss rises by 20 log10(f / f0) from the study's carrier f0. The gain is that of the stated antennas along the
     straight line.
@@ -63,12 +63,12 @@ def log_distance(
 ) -> NDArray[np.float64]:
     """Path loss of a log-distance model with the study's nuisances, fitted to the calibration links.
 
-    Where the study has an offset per group, this model has an intercept per group. A group without calibration links
-    gets the mean intercept of the others.
+    If the study has an offset per group, this model has an intercept per group. A group without calibration links gets
+    the mean intercept of the others.
 
     Args:
         links: All links.
-        objective: The study's objective; its weights say which links are fitted.
+        objective: The study's objective; its weights select the fitted links.
         known_db: Known part of their path loss [links], [dB]; see `without_scene`.
 
     Returns:
@@ -111,18 +111,18 @@ def log_distance_objective(
 
 
 def has_obstruction(links: Measurements) -> bool:
-    """Whether the links have the columns that a scene gives, and the lines of some are blocked."""
+    """Whether the links have the columns that follow from a scene, and the lines of some are blocked."""
     return OUT_OF_SIGHT in links.frame and bool(links.table.numbers(OUT_OF_SIGHT).any())
 
 
 def obstructed(
     links: Measurements, objective: Objective, known_db: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Path loss of the log-distance model with a loss out of sight and a loss per wall, fitted likewise.
+    """Path loss of the log-distance model with a loss out of sight and a loss per wall, fitted in the same way.
 
     Args:
-        links: All links, with the columns that the scene gives.
-        objective: The study's objective; its weights say which links are fitted.
+        links: All links, with the columns that follow from the scene.
+        objective: The study's objective; its weights select the fitted links.
         known_db: Known part of their path loss [links], [dB]; see `without_scene`.
 
     Returns:
@@ -141,10 +141,11 @@ def obstructed_objective(
 ) -> tuple[Objective, NDArray[np.float64]]:
     """The log-distance model with obstruction as an objective, like `log_distance_objective`.
 
-    The loss out of sight has a prior around a mean. The mean is part of the known path loss, the rest a coefficient.
+    The loss out of sight has a prior around a mean. The mean is part of the known path loss, and the rest is a
+    coefficient.
 
     Args:
-        links: All links, with the columns that the scene gives.
+        links: All links, with the columns that follow from the scene.
         objective: The study's objective.
         known_db: Known part of their path loss [links], [dB]; see `without_scene`.
 
@@ -181,7 +182,7 @@ def kriging(links: Measurements, objective: Objective, trend_db: NDArray[np.floa
 
     Args:
         links: All links.
-        objective: The study's objective; its weights say which links are kriged from.
+        objective: The study's objective; its weights select the links for kriging.
         trend_db: Path loss of the model, fitted to these links [links], [dB].
 
     Returns:

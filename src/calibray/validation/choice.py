@@ -37,22 +37,22 @@ from calibray.validation.variants import (
 )
 
 SEARCHES: Final = 16
-"""Local searches for the model's optimum, in addition to the one from the calibrated optimum."""
+"""Number of local searches for the model's optimum, in addition to the one from the calibrated optimum."""
 
 MOST_ERRORS: Final = 400
-"""Most absolute errors that are stored with the model; of more, quantiles are stored."""
+"""Largest number of absolute errors that are stored with the model; if there are more, quantiles are stored."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOutResiduals:
-    """The residuals that the intervals of predictions are computed from.
+    """The residuals from which the intervals of predictions are computed.
 
     Attributes:
         rms_db: Their root mean square [dB]; None if there are too few links.
-        basis: The links that they are of.
-        links: Number of these links, or degrees of freedom where they are calibration links.
-        errors_db: The residuals on held-out links [n], [dB]; empty if they are of calibration links.
-        blocks: The same in two levels; None where no blocks were held out.
+        basis: Description of the links to which they belong.
+        links: Number of these links, or degrees of freedom if they are calibration links.
+        errors_db: The residuals on held-out links [n], [dB]; empty if they belong to calibration links.
+        blocks: The same in two levels; None if no blocks were held out.
     """
 
     rms_db: float | None
@@ -145,7 +145,7 @@ def fit_prediction_model(
 def with_prior_mean(terms: tuple[FittedTerm, ...], study: StudyModel) -> tuple[FittedTerm, ...]:
     """The terms of the log-distance model with obstruction, the loss out of sight with the mean of its prior.
 
-    The fit takes that mean as known. A nuisance of the study by the same column has no such prior.
+    The fit treats that mean as known. A nuisance of the study by the same column has no such prior.
     """
     return tuple(
         replace(
@@ -158,13 +158,13 @@ def with_prior_mean(terms: tuple[FittedTerm, ...], study: StudyModel) -> tuple[F
 
 
 def quantiles(absolute_errors: NDArray[np.float64]) -> tuple[float, ...]:
-    """Absolute errors as they are stored with a model.
+    """Absolute errors in the form in which they are stored with a model.
 
     Args:
         absolute_errors: The errors, ascending [n], [dB].
 
     Returns:
-        All of them, or `MOST_ERRORS` quantiles of them where there are more, ascending.
+        All of them, or `MOST_ERRORS` quantiles of them if there are more, ascending.
     """
     if len(absolute_errors) > MOST_ERRORS:
         absolute_errors = np.quantile(absolute_errors, (np.arange(MOST_ERRORS) + 0.5) / MOST_ERRORS)

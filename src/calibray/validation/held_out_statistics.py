@@ -3,12 +3,12 @@
 The interval is conformal: among n + 1 exchangeable errors, a new one has any rank with the same probability. It
 therefore lies within the ((n + 1) p)-th smallest of the n observed absolute errors with probability p, whatever their
 distribution (V. Vovk, A. Gammerman, G. Shafer, Algorithmic Learning in a Random World, 2005; R. J. Barber et al., Ann.
-Statist. 49, 2021, for held-out links). Errors of links have heavier tails than a Gaussian, so that an interval from
-their root mean square would be too wide at 90 %. With few errors the largest ones are too uncertain, and Student's t
-is used instead.
+Statist. 49, 2021, for held-out links). Errors of links have heavier tails than a Gaussian, so an interval from their
+root mean square would be too wide at 90 %. With few errors the largest ones are too uncertain, and Student's t is used
+instead.
 
 The law of distance is linear in the distance for times of flight, and linear in its logarithm for all others. Models
-and rivals have the same biases of devices, which the other links determine.
+and baselines have the same biases of devices, which the other links determine.
 """
 
 from __future__ import annotations
@@ -39,25 +39,26 @@ Errors = Mapping[Any, NDArray[np.float64]]
 """Residuals by model, a `Model` or its name [n], [dB]."""
 
 CLUSTER_LINKS: Final = 4
-"""Neighbouring links that are resampled together, since they share part of their noise."""
+"""Number of neighbouring links that are resampled together, because they share part of their noise."""
 
 MOST_CLUSTERS: Final = 1000
-"""Most clusters; with more links, clusters are larger."""
+"""Largest number of clusters; with more links, clusters are larger."""
 
 RESAMPLES: Final = 2000
 
 LEAST_GAIN: Final = 0.05
-"""Least decrease of the RMSE, as a share, that makes another model the choice. Smaller ones came from one block of
-Boulder's, and the fitted model lost up to 3 dB in clusters kept apart; on planted misfits none was this small."""
+"""Smallest decrease of the RMSE, as a share, with which another model is chosen. Smaller decreases came from one block
+of Boulder's, and the fitted model lost up to 3 dB in clusters kept apart; on planted misfits, none was this small."""
 
 REACHED: Final = 0.9
 """Share of the held-out links that lie within the reach of the others."""
 
 AVERAGE_LINKS: Final = 8
-"""Links with the mean square error of all, counted with those out of sight, whose errors a few links say little of."""
+"""Number of links with the mean square error of all links that are added to those out of sight, because a few links
+contain little information about errors."""
 
 FEWEST_FOR_RANKS: Final = 40
-"""Errors from which an interval is read off their ranks; with fewer, Student's t is assumed."""
+"""Number of errors from which an interval is read off their ranks; with fewer, Student's t is assumed."""
 
 
 def spatial_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]:
@@ -131,7 +132,7 @@ def choose(errors: Errors, position: NDArray[np.float64]) -> str:
     """Choose the model for predictions by held-out errors.
 
     The initial materials are kept until another model is better by more than the bootstrap error of the difference, and
-    by more than `LEAST_GAIN`. Kriging is never chosen: it knows nothing away from the measured links.
+    by more than `LEAST_GAIN`. Kriging is never chosen, because it predicts well only near the measured links.
 
     Args:
         errors: Held-out residuals by model [n], [dB]; those of `Model.INITIAL` among them.
@@ -151,7 +152,7 @@ def choose(errors: Errors, position: NDArray[np.float64]) -> str:
 
 
 def least(errors: Errors, names: tuple[str, ...]) -> str:
-    """The model of least RMSE among some.
+    """The model with the lowest RMSE among some models.
 
     Args:
         errors: Held-out residuals by model [n], [dB].
@@ -168,7 +169,7 @@ def two_levels(
 ) -> BlockErrors | None:
     """Variance of held-out errors within and between blocks (analysis of variance of random effects).
 
-    A new street has an error of its own, so a few blocks say less than their many links.
+    A new street has its own error, so a few blocks contain less information than their many links.
 
     Args:
         errors: Residuals on held-out links [n], [dB].
@@ -207,7 +208,7 @@ def out_of_sight_ratio(errors: NDArray[np.float64], blocked: NDArray[np.bool_]) 
         blocked: Which of them are out of sight [n].
 
     Returns:
-        The ratio; at least 1, so that links in sight keep the interval of all.
+        The ratio; at least 1, so that links in sight keep the interval of all links.
 
     Example:
         >>> errors, blocked = np.array([1.0, -1, 1, 5, -5, 5, 5, -5, 5, -5, 5]), np.arange(11) > 2
@@ -245,7 +246,7 @@ def interval_half_width(absolute_errors: NDArray[np.float64], level: float) -> f
 
 
 MODELS: Final = ("calibrated", "mean", "law of distance")
-"""What is compared on held-out links."""
+"""The models that are compared on held-out links."""
 
 
 def held_out_gaps(
@@ -259,7 +260,7 @@ def held_out_gaps(
         held_out: Which links are held out [L].
 
     Returns:
-        Gaps of `MODELS` by name of the observable [3, L], in its unit; NaN where a link is not judged.
+        Gaps of `MODELS` by name of the observable [3, L], in its unit; NaN if a link is not judged.
     """
     if not problem.observed:
         return {}

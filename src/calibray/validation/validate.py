@@ -30,13 +30,13 @@ from calibray.validation.validation import Validation
 from calibray.validation.variants import NO_MINIMA, add_nuisance, fit_variants
 
 DEFAULT_BLOCKS: Final = 4
-"""Number of spatial blocks where the study gives none."""
+"""Number of spatial blocks if the study states none."""
 
 MOST_BLOCKS: Final = 100
 """Largest number of spatial blocks, as in a study."""
 
 TX: Final = "tx"
-"""Name of the transmitter's position as a label, where the table has no such column."""
+"""Name of the transmitter's position as a label, if the table has no such column."""
 
 
 def validate(
@@ -52,11 +52,11 @@ def validate(
 
     Args:
         study: The study, opened or not; on the engine "replay".
-        blocks: Number of spatial blocks, each held out in turn; if None and `by` is None, the study's, or 4.
+        blocks: Number of spatial blocks, each held out in turn; if None and `by` is None, the study's number, or 4.
         by: Column whose labels are held out in turn; "tx" for the position of the transmitter.
         workers: Workers that trace and replay chunks of links (`engines.open_workers`); this process if None.
         progress: Called with the stages "tracing" and "validating".
-        tracer: Opens the scene in a ray tracer; an opened study brings its own.
+        tracer: Opens the scene in a ray tracer; an opened study has its own.
 
     Returns:
         Held-out errors of every model, with a table and a conclusion.
@@ -70,7 +70,7 @@ def validate(
         raise InputError("validate: give blocks or by, not both")
     if blocks is not None and not 2 <= blocks <= MOST_BLOCKS:
         raise InputError(
-            f"validate: blocks = {blocks}; must be 2 to {MOST_BLOCKS}, since each takes a calibration"
+            f"validate: blocks = {blocks}; must be 2 to {MOST_BLOCKS}, because each needs a calibration"
         )
     # Links that the study holds out are held out in turn like all others.
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
@@ -109,10 +109,10 @@ def validate_problem(
 
     Args:
         problem: The problem.
-        blocks: Number of spatial blocks; the study's if None and `by` is None.
+        blocks: Number of spatial blocks; the study's number if None and `by` is None.
         by: Column whose labels are held out in turn.
         progress: Called with the stage "validating".
-        known_minima: Minima of the study's own model over all links, under its name [k, d]; searched for if absent.
+        known_minima: Minima of the study's own model over all links, under its name [k, d]; searched if absent.
 
     Returns:
         Held-out errors of every model.
@@ -177,14 +177,14 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
 def fit_models(
     part: Problem, fits: Mapping[Model, tuple[Problem, NDArray[np.float64]]]
 ) -> dict[str, NDArray[np.float64]]:
-    """Fit every model to the links that have a weight, and predict all links.
+    """Fit every model to the links with weight, and predict all links.
 
     Args:
         part: The problem; held-out links have weight 0.
         fits: The fitted variants that use the scene, from `fit_variants`.
 
     Returns:
-        Path loss at all links by name of the model [links], [dB]; NaN where kriging is impossible.
+        Path loss at all links by name of the model [links], [dB]; NaN if kriging is impossible.
     """
     setup, objective = part.setup, part.objective
     path_loss_db: dict[str, NDArray[np.float64]] = {

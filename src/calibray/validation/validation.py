@@ -3,7 +3,7 @@
 Predictions use the initial materials with fitted offsets until another model is better by more than the bootstrap error
 of the difference (the one-standard-error rule, L. Breiman et al., Classification and Regression Trees, 1984) and by 5 %
 of the RMSE. The best calibrated model is tried first, then the log-distance model, which uses no scene. A few blocks
-hardly distinguish models of similar accuracy, and a fitted model loses more where its fit does not transfer.
+hardly distinguish models of similar accuracy, and a fitted model loses more if its fit does not apply elsewhere.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def observables_table(observables: Mapping[str, ObservableErrors]) -> Table:
 @final
 @dataclass(frozen=True, eq=False, repr=False)
 class Validation(HeldOutErrors):
-    """Held-out errors of several models on the same links, and what follows from them.
+    """Held-out errors of several models on the same links, and the conclusions from them.
 
     The error expected in a block is estimated on the other blocks, so that no block judges itself.
     """
@@ -87,12 +87,12 @@ class Validation(HeldOutErrors):
 
     @property
     def best(self) -> str:
-        """The model with the least held-out RMSE."""
+        """The model with the lowest held-out RMSE."""
         return str(self.table["rmse_db"].idxmin())
 
     @cached_property
     def chosen(self) -> str:
-        """The prediction model; never kriging or the residual field, which only help near measured links."""
+        """The prediction model; never kriging or the residual field, which help only near measured links."""
         return self._choose(self.judged)
 
     @cached_property
@@ -111,12 +111,12 @@ class Validation(HeldOutErrors):
 
     @property
     def sentence(self) -> str:
-        """Whether calibration helped on held-out blocks, over which baseline, by how much, and how certain that is."""
+        """Whether calibration helped on held-out blocks, over which baseline, by how much, and how certain this is."""
         return judgement_text(self.judgement)
 
     @property
     def choice(self) -> str:
-        """Which model predictions use, and why."""
+        """Which model predictions use, with the reason."""
         return choice_text(
             self.chosen, least(self._on(self.judged), (Model.INITIAL, *FITTED, *WITHOUT_MATERIALS))
         )

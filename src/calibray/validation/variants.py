@@ -1,8 +1,8 @@
 """Variants of a study's model that use the scene, each fitted to the calibration links.
 
 The variants are the study's own model, its initial materials, priors around the initial values, a slope over distance,
-and an offset per transmitter: what an engineer would try by hand. Which one predicts best differs between campaigns, so
-that held-out links decide (`validate.py`).
+and an offset per transmitter: what an engineer would try by hand. The best variant differs between campaigns, so
+held-out links decide (`validate.py`).
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ PRIOR_SPREAD: Final = 0.3
 """Standard deviation of a parameter's logarithm around its initial value, in the variants with priors."""
 
 OUT_OF_SIGHT_PRIOR_DB: Final = 10.0
-"""Standard deviation of the prior of an offset of links out of sight, around zero [dB]; in downtown Boulder such links
-lack 11.7 dB."""
+"""Standard deviation of the prior of an offset of links out of sight, around zero [dB]; in downtown Boulder, these
+links lack 11.7 dB."""
 
 MOST_STARTS: Final = 4
-"""Known minima that a search starts from."""
+"""Number of known minima from which a search starts."""
 
 NEW_STARTS: Final = 4
-"""Additional starting points, where minima are known."""
+"""Number of additional starting points, if minima are known."""
 
 MOST_NEW_STARTS: Final = 128
-"""Most starting points where no minimum is known."""
+"""Largest number of starting points if no minimum is known."""
 
 TOLERANCE: Final = 1e-6
 """Relative decrease of the mean square below which a search has converged; predictions change by less."""
@@ -56,12 +56,12 @@ TX_OFFSET: Final = "offset of the transmitter"
 def fit_variants(
     part: Problem, known_minima: Mapping[Model, NDArray[np.float64]] = NO_MINIMA
 ) -> dict[Model, tuple[Problem, NDArray[np.float64]]]:
-    """Fit every variant to the links that have a weight.
+    """Fit every variant to the links with weight.
 
     Args:
         part: The problem; held-out links have weight 0.
-        known_minima: Minima over more links by variant [k, d], to start from. Without those of the study's own model,
-            its whole ranges are searched.
+        known_minima: Minima over more links by variant [k, d], as starting points. Without the minima of the study's
+            own model, its whole ranges are searched.
 
     Returns:
         Each variant's problem and its minima, the best first [k, d], by name.
@@ -87,10 +87,10 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
 
     Args:
         part: The problem; held-out links have weight 0.
-        best: Its optimum [d]; the residuals there give the noise that priors are weighed against.
+        best: Its optimum [d]; the residuals there give the noise that scales the priors.
 
     Returns:
-        The problems by name. For `Model.INITIAL` only the nuisance is fitted.
+        The problems by name. For `Model.INITIAL`, only the nuisance is fitted.
     """
     setup, objective = part.setup, part.objective
     noise_db = float(part.squares(best[None]).rmse_db[0]) * np.sqrt(
@@ -152,7 +152,7 @@ def _global_starts(problem: Problem) -> int:
 
 
 def add_nuisance(objective: Objective, path_loss_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Add the nuisance fitted to the links that have a weight; a group without such links gets the mean.
+    """Add the nuisance fitted to the links with weight; a group without such links gets the mean.
 
     Args:
         objective: The objective.
@@ -172,7 +172,7 @@ def initial_objective(objective: Objective, setup: Setup) -> Objective:
 
 
 def _with_offset_per_transmitter(objective: Objective, setup: Setup) -> Objective | None:
-    """The objective with an offset per transmitter; None with one transmitter, or where a term has groups already."""
+    """The objective with an offset per transmitter; None with one transmitter, or if a term already has groups."""
     labels = transmitters(setup.links)
     if len(np.unique(labels)) < 2 or any(len(term.labels) > 1 for term in objective.nuisance.terms):
         return None

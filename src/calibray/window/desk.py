@@ -1,7 +1,7 @@
-"""What the steps of the window share: the folder, its commands, and what was chosen on the map.
+"""Data that the steps of the window share: the folder, its commands, and selections on the map.
 
-Lengths are scaled so that the scene fits into a sphere of `RADIUS` around the origin: the camera of the page sees from
-0.1 to 1000 units.
+Lengths are scaled so that the scene fits into a sphere of `RADIUS` around the origin: the camera of the page covers 0.1
+to 1000 units.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Solid:
 
 
 def solid(folder: StudyFolder, scene: str | None) -> Solid | None:
-    """The scene of a study, or a chosen one as long as there is no study; None without either.
+    """The scene of a study, or a chosen one if there is no study; None without either.
 
     Raises:
         InputError: The scene or the links cannot be read.
@@ -71,7 +71,7 @@ def solid(folder: StudyFolder, scene: str | None) -> Solid | None:
 
 @dataclass
 class Desk:
-    """The state of the page; one user, so one for all its tabs.
+    """The state of the page; there is one user, so all tabs share it.
 
     Attributes:
         folder: The study's folder.
@@ -97,7 +97,7 @@ class Desk:
         self.jobs = Jobs(self.folder.path)
 
     def start(self, words: Sequence[object]) -> None:
-        """Start a command and say so, or say why not."""
+        """Start a command and report this, or the reason why not."""
         with self.messages():
             job = self.jobs.start([str(word) for word in words])
             ui.notify(f"Started: {job.command}", type="info", color="primary")

@@ -20,7 +20,7 @@ TABLES: Final = (".csv", ".xlsx", ".parquet")
 MESHES: Final = (".ply", ".obj")
 PARTS: Final = (".shx", ".dbf", ".prj", ".cpg", ".tif", ".tiff", ".gpx", ".xml", ".json", ".msi")
 LARGEST: Final = 2**30
-"""Bytes of an uploaded file at most; larger ones are better put into the folder."""
+"""Largest size of an uploaded file [bytes]; put larger files into the folder."""
 
 _NAME: Final = re.compile(r"[\w][\w .()+-]{0,119}")
 
@@ -41,12 +41,12 @@ class StudyFolder:
         return self.path / STUDY
 
     def files(self, endings: tuple[str, ...]) -> list[str]:
-        """Names of the folder's files with one of the endings."""
+        """Names of the folder's files with one of the extensions."""
         candidates = (file for file in self.path.iterdir() if file.name.lower().endswith(endings))
         return sorted(file.name for file in candidates if file.is_file() and not file.name.startswith("."))
 
     def scenes(self) -> list[str]:
-        """The scenes of the folder and of its folders, apart from those of results."""
+        """The scenes of the folder and of its subfolders, except those of results."""
         files = [*self.path.glob("*.xml"), *self.path.glob("*/*.xml")]
         names = (file.relative_to(self.path).as_posix() for file in files if file.name != "result-scene.xml")
         return sorted(name for name in names if not name.startswith("."))
@@ -59,7 +59,7 @@ class StudyFolder:
         """The record of a result.
 
         Raises:
-            InputError: There is no such result, or it cannot be read.
+            InputError: The result does not exist, or cannot be read.
         """
         if name not in self.results():
             raise InputError(f"{shortened(name)}: no such result")
@@ -87,7 +87,7 @@ class StudyFolder:
             )
         target = (self.path / "meshes" if ending in MESHES else self.path) / name
         if target.exists() or target.is_symlink():
-            raise InputError(f"{shown}: exists already; rename one of them")
+            raise InputError(f"{shown}: already exists; rename one of them")
         return target
 
     def content(self) -> dict[str, Any]:
@@ -105,13 +105,13 @@ class StudyFolder:
             return ""
 
     def reasons(self) -> dict[str, str]:
-        """Reasons by the dotted name of a section or key: the comments that a draft has."""
+        """Reasons by the dotted name of a section or key, from the comments of a draft."""
         from calibray.study.toml_file import reasons_in
 
         return reasons_in(self.text())
 
     def save(self, content: Mapping[str, Any]) -> None:
-        """Write the study file, with the reasons that it has.
+        """Write the study file, with its reasons as comments.
 
         Raises:
             InputError: The content is not a study; the file is unchanged.

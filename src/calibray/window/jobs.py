@@ -1,7 +1,8 @@
-"""Commands that the window started in a study's folder, and runs that a terminal started there.
+"""Commands that the window started in a study's folder, and runs that were started there from a terminal.
 
-Each is a process of its own with three files in `.calibray-window`: `0001.json` says what runs, `0001.log` is what it
-printed, `0001.exit` its exit status. A command without exit status and without process died; the same command resumes.
+Each is a separate process with three files in `.calibray-window`: `0001.json` describes the command, `0001.log`
+contains its output, and `0001.exit` its exit status. A command without exit status and without process died; the same
+command resumes.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from calibray.support.output_files import write_text
 
 FOLDER: Final = ".calibray-window"
 TAIL: Final = 16_384
-"""Bytes of a log that are shown: some screens full."""
+"""Number of bytes of a log that are shown: some screens full."""
 
 
 _LINE: Final = re.compile(
@@ -43,11 +44,11 @@ class Job:
     """A command and its state.
 
     Attributes:
-        number: Its number in the folder; 0 for one that a terminal started.
+        number: Its number in the folder; 0 if it was started from a terminal.
         words: Its arguments.
         state: "running", "done", "failed", "stopped" or "died".
         pid: Its process.
-        log: The end of what it printed.
+        log: The end of its output.
     """
 
     number: int
@@ -58,7 +59,7 @@ class Job:
 
     @property
     def command(self) -> str:
-        """The command as a terminal takes it."""
+        """The command in the form for a terminal."""
         return shlex.join(["calibray", *self.words])
 
 
@@ -73,7 +74,7 @@ class Jobs:
         """Start a command.
 
         Raises:
-            InputError: Another command runs, or the folder cannot be written.
+            InputError: Another command is running, or the folder cannot be written to.
         """
         if running := self.running():
             raise InputError(f"{running.command}: is running; wait for its end, or stop it")
@@ -108,11 +109,11 @@ class Jobs:
         return [job for job in map(_read, files) if job is not None]
 
     def running(self) -> Job | None:
-        """The command that runs now, if any."""
+        """The command that is running now, if any."""
         return next((job for job in self.list() if job.state == "running"), None)
 
     def elsewhere(self) -> list[Job]:
-        """Commands that run in the folder and were started in a terminal."""
+        """Commands that are running in the folder and were started from a terminal."""
         own = {job.pid for job in self.list() if job.state == "running"}
         commands = []
         for process in psutil.process_iter(["pid", "ppid", "cmdline", "cwd"]):
@@ -124,7 +125,7 @@ class Jobs:
         return commands
 
     def stop(self, job: Job) -> None:
-        """Interrupt a command as Ctrl-C does; what it has finished is kept."""
+        """Interrupt a command like Ctrl-C; finished work is kept."""
         with suppress(ProcessLookupError, PermissionError):
             if job.number:
                 os.killpg(job.pid, signal.SIGINT)
@@ -180,10 +181,10 @@ class Stage:
 
     Attributes:
         name: Its name.
-        share: How much of it is done, 0 to 1; None if unknown.
+        share: Share that is done, 0 to 1; None if unknown.
         seconds: How long it has taken [s].
-        left: How long it takes yet [s]; None if unknown.
-        best: The best value so far, as "best RMSE 3.10 dB"; empty if it says nothing.
+        left: Remaining time [s]; None if unknown.
+        best: The best value so far, as "best RMSE 3.10 dB"; empty if the log has none.
     """
 
     name: str
@@ -194,7 +195,7 @@ class Stage:
 
 
 def stages(log: str) -> list[Stage]:
-    r"""The stages that a log shows, in their order; stages of less than some seconds print no line.
+    r"""The stages that a log shows, in order; stages of less than some seconds print no line.
 
     Example:
         >>> stages("tracing 3/4, 75 %, 1/s, 3 s, about 1 s left\nWritten to result")

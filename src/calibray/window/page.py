@@ -113,7 +113,7 @@ def heading(text: str, level: int) -> None:
 
 @ui.refreshable
 def activity(desk: Desk) -> None:
-    """What runs now, or ran last, with the end of its output."""
+    """The command that is running, or ran last, with the end of its output."""
     jobs = desk.jobs.list()
     if not jobs:
         return
@@ -129,7 +129,7 @@ def activity(desk: Desk) -> None:
 
 
 def progress(shown: list[Stage]) -> None:
-    """The stages of a running command: those of before, how much of the last is done, and the best value so far."""
+    """The stages of a running command: the earlier ones, the progress of the last one, and the best value so far."""
     for stage in shown[:-1]:
         ui.label(" · ".join(filter(None, (stage.name, f"{stage.seconds} s", stage.best)))).classes("quiet")
     last = shown[-1] if shown else None

@@ -1,4 +1,4 @@
-"""What the map of the window shows: outlines of the scene, and links with their values and suspicions."""
+"""The content of the window's map: outlines of the scene, and links with their values and suspicions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from calibray.window.folder import StudyFolder
 
 
 def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
-    """The map of a study, or of a scene as long as there is no study.
+    """The map of a study, or of a scene if there is no study.
 
     Args:
         folder: The study's folder.
@@ -52,7 +52,7 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
 
 
 def opened(folder: StudyFolder, scene: str | None) -> tuple[str | None, Study | None]:
-    """The scene of a folder and its study: the study's scene, or the chosen one as long as there is no study.
+    """The scene of a folder and its study: the study's scene, or the chosen one if there is no study.
 
     Raises:
         InputError: The study cannot be read.
@@ -66,7 +66,7 @@ def opened(folder: StudyFolder, scene: str | None) -> tuple[str | None, Study | 
 
 
 def findings(folder: StudyFolder) -> list[str]:
-    """What looks wrong with the links of a study, as sentences; none without a study.
+    """Suspicions about the links of a study, as sentences; none without a study.
 
     Raises:
         InputError: The scene or the links cannot be read.

@@ -1,6 +1,6 @@
-"""Run one command of Calibray apart from the window, and note how it ended: `python -m calibray.window.runner`.
+"""Run one command of Calibray apart from the window, and record how it ended: `python -m calibray.window.runner`.
 
-It leads a session of its own, so it outlives the server. Ctrl-C is for the command, which keeps what is finished.
+It has its own session, so it outlives the server. Ctrl-C is passed to the command, which keeps finished work.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from calibray.support.output_files import write_text
 
 
 def main() -> None:
-    """Run the words after the file that gets the exit status."""
+    """Run the command given after the file for the exit status."""
     # A handler, unlike SIG_IGN, is not inherited by the command.
     signal.signal(signal.SIGINT, lambda *_: None)
     _, status_file, *words = sys.argv

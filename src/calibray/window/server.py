@@ -1,4 +1,4 @@
-"""The server of the window: on this machine only, behind the guard."""
+"""The server of the window: reachable from this machine only, behind the guard."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def serve(folder: Path, port: int, opened: Callable[[str], None]) -> None:
     Args:
         folder: The folder.
         port: The port; 0 for a free one.
-        opened: Is called with the address when the port is open.
+        opened: It is called with the address when the port is open.
 
     Raises:
         InputError: The port is in use.
@@ -163,7 +163,7 @@ class Guard:
             await self._app(scope, receive, _with_headers(send))
 
     def _fault(self, scope: Any, headers: dict[bytes, bytes]) -> str | None:
-        """What is wrong with a request whoever sent it; None if nothing is."""
+        """The reason to refuse a request from any sender; None if there is none."""
         path = scope["path"]
         if ".." in path.split("/") or "\\" in path or not path.isprintable():
             return "the path leads out of the window"
@@ -211,7 +211,7 @@ async def _answer(send: Any, status: int, body: bytes, headers: tuple[tuple[byte
 
 
 def _with_headers(send: Any) -> Any:
-    """Add the headers of the window to answers, which may bring a stricter policy of their own."""
+    """Add the headers of the window to responses, which may have a stricter policy of their own."""
 
     async def sending(message: Any) -> None:
         if message["type"] == "http.response.start":

@@ -12,7 +12,7 @@ from nicegui import run, ui
 from calibray.window.desk import RADIUS, Desk, Solid, solid
 
 COLORS: Final = ("#8f9aa3", "#56b4e9", "#e69f00", "#009e73", "#cc79a7", "#f0e442", "#0072b2", "#d55e00")
-"""Grey, then those of Okabe and Ito, which colour-blind people can distinguish (jfly.uni-koeln.de/color)."""
+"""Grey, then the colours of Okabe and Ito, which colour-blind people can distinguish (jfly.uni-koeln.de/color)."""
 
 
 @dataclass
@@ -22,7 +22,7 @@ class Camera:
     Attributes:
         azimuth: From the east, anticlockwise [rad].
         elevation: Above the horizon [rad].
-        distance: From the middle of the scene.
+        distance: Distance from the centre of the scene.
     """
 
     azimuth: float = -2.0
@@ -30,7 +30,7 @@ class Camera:
     distance: float = 1.9 * RADIUS
 
     def move(self, turn: float = 0.0, rise: float = 0.0, factor: float = 1.0) -> None:
-        """Turn, rise and come closer; straight down, the direction up would be lost."""
+        """Turn, raise and approach the camera; straight down, the direction up would be undefined."""
         self.azimuth += turn
         self.elevation = float(np.clip(self.elevation + rise, 0.05, 1.5))
         self.distance = float(np.clip(self.distance * factor, 0.1 * RADIUS, 10 * RADIUS))

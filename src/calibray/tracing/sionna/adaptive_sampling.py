@@ -1,9 +1,9 @@
 """Rays are added in rounds until path loss converges (`trace.samples = "auto"`).
 
-Each round sends out as many rays as all rounds before it, in other directions. The interaction sequences that they
-find belong to the source; new ones are tried for every receiver by the method of images (`image_method`). Two rounds in
-a row that change the path loss of no link by more than `CONVERGED_DB` end the search. The last round is the same check
-as a second trace with twice the rays (`calibray.tracing.convergence`).
+Each round launches as many rays as all earlier rounds, in other directions. The interaction sequences that they find
+belong to the source; new sequences are tried for every receiver by the method of images (`image_method`). The search
+ends after two successive rounds that change the path loss of no link by more than `CONVERGED_DB`. The last round is
+equivalent to a second trace with twice the rays (`calibray.tracing.convergence`).
 """
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
@@ -38,17 +38,17 @@ from calibray.tracing.sionna.solver import Rays, Solver
 from calibray.tracing.trace_plan import Launch, TracePlan, lattice_directions, launch_seed
 
 CONVERGED_DB: Final = 0.05
-"""Change of a link's path loss with twice the rays that counts as converged [dB]."""
+"""Largest change of a link's path loss with twice the rays that counts as converged [dB]."""
 QUIET_ROUNDS: Final = 2
-"""Consecutive rounds without a larger change that end the search."""
+"""Number of consecutive rounds without a larger change after which the search ends."""
 MAX_LAUNCHES: Final = 256
-"""Launches of a source after which the search ends in any case: 64 million rays."""
+"""Number of launches of a source after which the search ends in any case: 64 million rays."""
 CACHED_SOURCES: Final = 4
-"""Sources whose sequences are kept for the next links."""
+"""Number of sources whose sequences are kept for the next links."""
 SEQUENCE_BUFFER: Final = 100_000
-"""Sequences that the buffer of a launch holds at first."""
+"""Initial number of sequences in the buffer of a launch."""
 GEOMETRY_BATCH: Final = 500_000
-"""Sequences x receivers whose geometry is computed together; bounds the memory."""
+"""Largest number of sequences x receivers whose geometry is computed together; it limits the memory."""
 
 _LOG: Final = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ _LOG: Final = logging.getLogger(__name__)
 class SequenceCache:
     """Interaction sequences of the sources traced last.
 
-    Sequences serve all receivers, so rays are sent out once for all chunks of links that are traced on one worker.
+    Sequences apply to all receivers, so rays are launched once for all chunks of links that are traced on one worker.
     """
 
     def __init__(self) -> None:
@@ -72,7 +72,7 @@ class SequenceCache:
     def of_source(
         self, solver: Solver, source: NDArray[np.float64], materials: Mapping[str, Material]
     ) -> SourceSequences:
-        """The sequences of a source [3], [m], found with the same materials, which decide how rays continue."""
+        """The sequences of a source [3], [m], found with the same materials, which determine how rays continue."""
         key = source.tobytes(), solver.settings, tuple(materials.items())
         if key not in self._sequences:
             while len(self._sequences) >= CACHED_SOURCES:
@@ -96,7 +96,7 @@ class SourceSequences:
         self._new_by_launch: list[PathsBuffer | None] = []
 
     def new_in_launch(self, number: int, max_paths: int) -> PathsBuffer | None:
-        """The sequences that launch `number` finds and no earlier one did, None if there are none; run if need be."""
+        """The sequences that launch `number` is the first to find, None if there are none; run the launch if needed."""
         while len(self._new_by_launch) <= number:
             sequences = self._launch(len(self._new_by_launch), max_paths)
             self._keys, new = _merge(self._keys, sequence_keys(sequences, self.meshes))
@@ -106,7 +106,7 @@ class SourceSequences:
         return self._new_by_launch[number]
 
     def _launch(self, number: int, max_paths: int) -> PathsBuffer:
-        """Send out the rays of one launch."""
+        """Launch the rays of one launch."""
         seed = self._solver.settings.seed
         # Each launch after the first shifts the lattice at random, modulo the unit square.
         shift = np.random.default_rng([seed, number]).random((2, 1)) * (number > 0)
@@ -151,7 +151,7 @@ class AdaptiveSearch:
         `progress` is called before the first source and after each.
 
         Raises:
-            EngineError: There are more paths than fit into memory.
+            EngineError: The paths do not fit into memory.
         """
         done = 0
         if progress is not None:
@@ -286,6 +286,6 @@ class _SourceSearch:
 def _merge(
     known: NDArray[np.int64], candidates: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Merge the keys of sequences; returns all keys [n, k] and the candidates that are new [m]."""
+    """Merge the keys of sequences; return all keys [n, k] and the candidates that are new [m]."""
     merged, first = np.unique(np.vstack([known, candidates]), axis=0, return_index=True)
     return merged, np.sort(first[first >= len(known)] - len(known))

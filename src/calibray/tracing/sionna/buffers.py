@@ -1,4 +1,4 @@
-"""Sionna's path buffers, cleaned of empty entries and duplicates, and reversed; arrays between NumPy and Dr.Jit."""
+"""Sionna's path buffers, without empty entries and duplicates, and reversed; arrays between NumPy and Dr.Jit."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from calibray.tracing.trace_plan import find_repeats
 def aligned(values: NDArray[Any], dtype: type) -> NDArray[Any]:
     """Copy numbers [n] to memory that starts at a multiple of 64 bytes, converted to a type.
 
-    Dr.Jit takes over NumPy's memory without copying it and compiles a separate kernel for each alignment. With random
-    alignment its kernel cache rarely hits, and every process compiles for seconds.
+    Dr.Jit uses NumPy's memory without copying it and compiles a separate kernel for each alignment. With random
+    alignment, its kernel cache rarely hits, and every process compiles for seconds.
     """
     memory = np.empty(values.size * np.dtype(dtype).itemsize + 64, dtype=np.uint8)
     start = -memory.ctypes.data % 64
@@ -86,8 +86,8 @@ class TracedBuffer:
 def drop_empty_entries(buffer: PathsBuffer) -> PathsBuffer:
     """Remove the entries that Sionna RT 2.2 counts but does not fill; refraction produces some.
 
-    An empty entry has no interaction and refers to the first source and target. The geometry stage would turn each into
-    another direct path between these two.
+    An empty entry has no interaction and refers to the first source and target. The geometry stage would convert each
+    into another direct path between these two.
     """
     if not buffer.buffer_size:
         return buffer
@@ -97,9 +97,9 @@ def drop_empty_entries(buffer: PathsBuffer) -> PathsBuffer:
 
 
 def drop_repeats(traced: list[TracedBuffer]) -> list[TracedBuffer]:
-    """Remove paths that several launches to the same receivers found; random samples of diffuse reflection stay.
+    """Remove paths that several launches to the same receivers found; keep random samples of diffuse reflection.
 
-    The buffers of the launches, in order, lose the paths that an earlier one holds.
+    The buffers of the launches, in order, lose the paths that an earlier buffer contains.
     """
     if len(traced) == 1:
         return traced
@@ -128,10 +128,9 @@ def reverse(buffer: PathsBuffer, sources: mi.Point3f) -> PathsBuffer:
     """Reverse candidate paths, so that those found from the receivers start at the transmitters.
 
     Mirror images, straight lines through walls and the shortest path over an edge are the same in both directions, so
-    candidates of one direction are candidates of the other. They are reversed before their geometry is computed, which
-    makes the paths equal digit by digit whichever end they were found from. Three things depend on the direction: the
-    order of the interactions, the two ends, and the faces of an edge, where Sionna calls the one that the source
-    illuminates the 0-face.
+    candidates of one direction are candidates of the other. They are reversed before their geometry is computed, so
+    that the paths are equal digit by digit for both ends. Three things depend on the direction: the order of the
+    interactions, the two ends, and the faces of an edge, because Sionna calls the illuminated face the 0-face.
     """
     if not buffer.buffer_size:
         return buffer

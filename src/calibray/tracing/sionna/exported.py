@@ -25,10 +25,10 @@ from calibray.tracing.sionna.solver import SCALAR_CONSTANTS
 from calibray.tracing.sionna.tracer import Tracer
 
 LARGEST_DIFFERENCE_DB: Final = 0.01
-"""Difference of path loss up to which two traces of one scene agree [dB]: constants are rounded in the file."""
+"""Largest difference of path loss at which two traces of one scene agree [dB]: constants are rounded in the file."""
 
 SAMPLES: Final = 20_000
-"""Rays of the comparison; both scenes get the same ones."""
+"""Number of rays of the comparison; both scenes use the same rays."""
 
 _LOG: Final = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ def verify_export(
 ) -> None:
     """Load an exported scene into plain Sionna RT; compare materials, surfaces and the path loss of some links.
 
-    Fewer rays are used than the settings say. `names` are those of the materials in the exported scene.
+    The comparison uses fewer rays than the settings state. `names` are those of the materials in the exported scene.
 
     Raises:
         InputError: Sionna RT cannot load the exported scene, or it is another one.

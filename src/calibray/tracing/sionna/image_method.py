@@ -1,14 +1,14 @@
 """The method of images for all receivers of one source.
 
-Sionna keeps an interaction sequence (what a path meets in turn) only where a receiver sees the point that a ray hit, so
-it compares every hit of every ray with every receiver. Here rays are sent in a scene where nothing hides a receiver
-(`Unobstructed`), so the sequences depend on the source alone and serve all receivers.
+Sionna keeps an interaction sequence (the objects that a path meets in order) only if a receiver sees the point that a
+ray hit, so it compares every hit of every ray with every receiver. Here rays are launched in a scene where nothing
+hides a receiver (`Unobstructed`), so the sequences depend only on the source and apply to all receivers.
 
-Unfolding a sequence gives the points that its paths must aim at. By the method of images a path through mirrors is a
+Unfolding a sequence gives the points at which its paths must aim. By the method of images, a path through mirrors is a
 straight line to the image of the source (ITU-R P.1411). An edge is mirrored in the planes that follow it; the
 diffracting point makes the unfolded path shortest (Keller, J. Opt. Soc. Am. 52(2), 1962). Most pairs of sequence and
-receiver can be excluded at once, because the line would meet a plane where the scene has no surface. Sionna's own image
-method computes the paths of the rest.
+receiver can be excluded immediately, because the line would meet a plane where the scene has no surface. Sionna's own
+image method computes the paths of the rest.
 """
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
@@ -34,19 +34,19 @@ from calibray.tracing.sionna.buffers import aligned, per_interaction
 from calibray.tracing.sionna.scene import shape_ids
 
 SAME_PLANE: Final = 2e-3
-"""Planes are one if their offsets differ by less than this [m] and their normals by less than a fiftieth of it."""
+"""Planes are equal if their offsets differ by less than this [m] and their normals by less than a fiftieth of it."""
 CONFUSABLE_PLANE: Final = 0.05
-"""The same for planes that the tracer may take for each other in single precision."""
+"""The same for planes that the tracer may confuse in single precision."""
 MARGIN: Final = 0.1
-"""How far a point may lie outside a surface, for single precision and rounded corners [m]."""
+"""Largest distance of a point outside a surface, for single precision and rounded corners [m]."""
 NEAR_PLANE: Final = 0.01
-"""A point nearer to a plane than this may lie on either side of it [m]."""
+"""A point nearer to a plane than this may be on either side of it [m]."""
 PAIRS_PER_BATCH: Final = 8_000_000
-"""Sequences x receivers that are tested together; bounds the memory."""
+"""Largest number of sequences x receivers that are tested together; it limits the memory."""
 
 
 class Surfaces:
-    """Triangles of a scene, grouped by the planes that they lie in.
+    """Triangles of a scene, grouped by their planes.
 
     Args:
         corner: Corners of the triangles [T, 3, 3], [m].
@@ -71,9 +71,9 @@ class Surfaces:
         self._tree = KDTree(np.vstack([self._feature, -self._feature])) if len(grid) else None
 
     def bounding_boxes(self, plane: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Least and largest coordinates [n, 3], [m], of boxes around all surfaces in or very near to planes [n].
+        """Smallest and largest coordinates [n, 3], [m], of boxes around all surfaces in or very near to planes [n].
 
-        The tracer may confuse surfaces that are so near.
+        The tracer may confuse surfaces that are this close.
         """
         if self._tree is None:
             return np.zeros((0, 3)), np.zeros((0, 3))
@@ -113,7 +113,7 @@ class Unfolded:
         kind: Kinds of interaction, 0 beyond the last one [C, D].
         normal: Normals of the planes [C, D, 3].
         offset: Distances of the planes from the origin of coordinates [C, D], [m].
-        low: Least coordinates of the surfaces in the planes [C, D, 3], [m].
+        low: Smallest coordinates of the surfaces in the planes [C, D, 3], [m].
         high: Largest coordinates of the surfaces in the planes [C, D, 3], [m].
         aim: Image of the source, or of the edge's origin after the edge [C, D, 3], [m].
         slide: Image of the edge's direction after the edge, 0 before it [C, D, 3].
@@ -141,7 +141,7 @@ def unfold(
 ) -> Unfolded:
     """Unfold the interaction sequences of a source at `source` [3], [m].
 
-    Kinds of interaction [C, D] are 0 beyond the last one; `triangle` [C, D] is any number where none is met.
+    Kinds of interaction [C, D] are 0 beyond the last one; `triangle` [C, D] is any number if none is met.
     """
     mirrors = kind == Kind.SPECULAR
     met = np.where(mirrors, triangle, 0)
@@ -225,7 +225,7 @@ class Meshes:
         return np.where(first >= 0, first + primitive, 0)
 
     def triangles_of(self, sequences: PathsBuffer) -> NDArray[np.int64]:
-        """Numbers within the scene of the triangles that sequences meet [C, D]; 0 where none is met."""
+        """Numbers within the scene of the triangles that sequences meet [C, D]; 0 if none is met."""
         return self.triangles(per_interaction(sequences, "shapes"), per_interaction(sequences, "primitives"))
 
 
@@ -233,7 +233,7 @@ def sequence_keys(sequences: PathsBuffer, meshes: Meshes) -> NDArray[np.int64]:
     """Describe interaction sequences by whole numbers [C, k] that are equal for equal sequences.
 
     The numbers are the kinds of interaction, the planes that mirror and the faces of the edge. Walls that a ray passes
-    through do not count: the path runs straight on whichever they are.
+    through do not count: the path is straight whichever they are.
     """
     kind = per_interaction(sequences, "interaction_types")
     plane = np.where(kind == Kind.SPECULAR, meshes.surfaces.plane[meshes.triangles_of(sequences)], 0)
@@ -269,7 +269,7 @@ def possible_pairs(
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Find the sequences that may lead to each receiver [R, 3], [m].
 
-    Yields numbers of sequences and of receivers, pair by pair [n] each; pairs that are left out have no path.
+    Yields numbers of sequences and of receivers, pair by pair [n] each; omitted pairs have no path.
     """
     count, depth = unfolded.kind.shape
     kinds = mi.UInt(aligned(unfolded.kind.reshape(-1), np.uint32))

@@ -1,4 +1,4 @@
-"""A Sionna RT scene in memory, as in a notebook: read into plain data, and given calibrated materials."""
+"""A Sionna RT scene in memory, as in a notebook: converted to plain data, and assigned calibrated materials."""
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false
@@ -29,7 +29,7 @@ from calibray.tracing.sionna.scene import scattering_pattern
 from calibray.tracing.sionna.solver import SCALAR_CONSTANTS
 
 DIRECTIONS: Final = 64
-"""Directions in which a pattern is compared with the known ones."""
+"""Number of directions in which a pattern is compared with the known ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class LiveScene:
 
     Attributes:
         frequency: Carrier frequency [Hz].
-        objects: The meshes; surfaces that are not connected are objects of their own, because Sionna merges objects.
+        objects: The meshes; surfaces that are not connected are separate objects, because Sionna merges objects.
         materials: The materials that objects use, by name.
         antennas: Transmit and receive antenna.
         tx: Positions by name of the transmitters [3], [m].
@@ -59,7 +59,7 @@ class LiveScene:
         """Read a scene with its transmitters, receivers and arrays.
 
         Raises:
-            InputError: It is not a scene of Sionna RT, or has something that a study cannot state.
+            InputError: It is not a scene of Sionna RT, or has a property that a study cannot state.
         """
         live = _checked(scene)
         if not (live.transmitters and live.receivers and live.tx_array and live.rx_array):

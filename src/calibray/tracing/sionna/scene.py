@@ -1,4 +1,4 @@
-"""Scenes, materials and antenna patterns in the form that Sionna RT takes."""
+"""Scenes, materials and antenna patterns in the form that Sionna RT needs."""
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false
@@ -37,7 +37,7 @@ def load_scene(scene: Scene) -> rt.Scene:
     """Load a scene into Sionna RT, in its local frame; its mesh files are found relative to the scene file.
 
     Raises:
-        InputError: Sionna cannot load it, or holds another surface than its files.
+        InputError: Sionna cannot load the scene, or has another surface than its files.
     """
     if has_copied_meshes(scene):
         with _temporary_folder(scene.path) as folder:
@@ -79,7 +79,7 @@ def _load(xml: str, path: Path) -> rt.Scene:
 def _check_surfaces(mitsuba_scene: Any, scene: Scene) -> None:
     """Refuse a scene whose bounds or areas in Mitsuba's memory differ from those of its files.
 
-    Mitsuba reads mesh files itself; a type or layout that it misreads would lose reflections without a message. It
+    Mitsuba reads mesh files itself; a type or layout that it misreads would remove reflections without a message. It
     merges the objects of a material into one mesh, so the comparison is by material.
 
     Raises:
@@ -121,7 +121,7 @@ def _size(shape: Any) -> SurfaceSize:
 
 
 def surfaces_agree(traced: list[SurfaceSize], stored: list[SurfaceSize], origin: NDArray[np.float64]) -> bool:
-    """Whether a surface in the local frame is, within single precision, that of objects in the scene frame."""
+    """Whether a surface in the local frame equals, within single precision, that of objects in the scene frame."""
     if not traced:
         return False
     low, high = np.min([size.low for size in stored], axis=0), np.max([size.high for size in stored], axis=0)
@@ -149,7 +149,7 @@ def shape_ids(mitsuba_scene: Any) -> dict[int, Any]:
 
 
 def scattering_pattern(material: Material) -> rt.ScatteringPattern:
-    """Make a material's scattering pattern, its exponents rounded to integers as Sionna requires."""
+    """Make a material's scattering pattern, with its exponents rounded to integers as Sionna requires."""
     constants = {
         "lambertian": {},
         "directive": {"alpha_r": round(material.alpha_r)},

@@ -1,7 +1,7 @@
 """Sionna RT's solver, stage by stage: candidate paths by rays, exact geometry by the method of images, fields.
 
 The first two stages do not depend on the materials' constants beyond the choice of the ray's next interaction, so their
-result is kept and compiled into a path program. The field stage serves as the reference that replay is tested against.
+result is kept and compiled into a path program. The field stage is the reference against which replay is tested.
 """
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
@@ -48,11 +48,12 @@ from calibray.tracing.sionna.buffers import (
 from calibray.tracing.sionna.scene import antenna_patterns, load_scene, scattering_pattern, shape_ids
 
 HASHES: Final = (16_777_213, 67_108_859)
-"""Entries of Sionna's table of hashes in small and in large launches. It drops candidates whose hashes collide: of
-31,430 of a launch to 25 receivers 1,067 with its own million entries, 36 with 16 million, 4 with 67 million, which take
-0.5 GB and 0.3 s of a launch. Primes, because the lowest bits of its hashes vary least."""
+"""Number of entries of Sionna's table of hashes in small and in large launches. Sionna drops candidates whose hashes
+collide. Of 31,430 candidates of a launch to 25 receivers, it drops 1,067 with its own million entries, 36 with 16
+million, and 4 with 67 million, which take 0.5 GB and 0.3 s per launch. The numbers are primes, because the lowest bits
+of its hashes vary least."""
 SMALL_LAUNCH: Final = 5_000_000
-"""Lanes of a small launch, which find some thousand candidates at most."""
+"""Largest number of lanes of a small launch, which finds some thousand candidates at most."""
 
 SCALAR_CONSTANTS: Final = (
     "relative_permittivity",
@@ -61,19 +62,19 @@ SCALAR_CONSTANTS: Final = (
     "scattering_coefficient",
     "xpd_coefficient",
 )
-"""Constants that Sionna's radio materials hold as single-precision numbers."""
+"""Constants that Sionna's radio materials store as single-precision numbers."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays to send out, and how much room there is for the candidate paths that they find.
+    """The rays to launch, and the size of the buffer for the candidate paths that they find.
 
     Attributes:
-        count: Number of rays; with 0 only direct paths are looked for.
+        count: Number of rays; with 0, only direct paths are searched.
         seed: Seed of the random numbers.
         directions: Directions as points of the unit square [2, count]; Sionna's own lattice if None.
-        direct: Whether direct paths are looked for as well.
-        buffer_size: Candidates that the buffer holds at first; a full one is replaced by a larger one.
+        direct: Whether direct paths are searched as well.
+        buffer_size: Initial number of candidates in the buffer; a full buffer is replaced by a larger one.
         max_paths: Candidates that fit into memory.
     """
 
@@ -116,7 +117,7 @@ class Solver:
 
     @property
     def mitsuba_scene(self) -> Any:
-        """The scene that Mitsuba holds; neither Sionna nor Mitsuba types it."""
+        """The scene in Mitsuba; neither Sionna nor Mitsuba provides types for it."""
         return self._scene.mi_scene
 
     def with_settings(self, settings: TraceSettings) -> Solver:
@@ -126,7 +127,7 @@ class Solver:
         return other
 
     def set_materials(self, materials: Mapping[str, Material]) -> dict[str, Material]:
-        """Set the constants of Sionna's materials: the scene's, except those given by name; returns all of them."""
+        """Set the constants of Sionna's materials: the scene's, except those given by name; return all of them."""
         for name in materials:
             check_material_name(name, self.scene.materials, "materials")
         constants = {**self.scene.materials, **materials}
@@ -141,12 +142,12 @@ class Solver:
     def find_candidates(
         self, mitsuba_scene: Any, source: mi.Point3f, targets: mi.Point3f, rays: Rays
     ) -> PathsBuffer:
-        """Send out rays from the sources and collect candidate paths to the targets.
+        """Launch rays from the sources and collect candidate paths to the targets.
 
         The scene is Mitsuba's, or an object with its ray queries.
 
         Raises:
-            EngineError: There are more than fit into memory.
+            EngineError: The candidates do not fit into memory.
         """
         settings, size = self.settings, rays.buffer_size
         num_targets = dr.width(targets)
@@ -185,7 +186,7 @@ class Solver:
         return drop_empty_entries(buffer)
 
     def compute_geometry(self, buffer: PathsBuffer, source: mi.Point3f, target: mi.Point3f) -> None:
-        """Compute the exact geometry of candidates by the method of images, in place; drop those that are no paths."""
+        """Compute the exact geometry of candidates by the method of images, in place; drop those that are not paths."""
         if not buffer.buffer_size:
             return
         self._apply_image_method(
@@ -292,7 +293,7 @@ def _hash_table(entries: int) -> Iterator[None]:
 
 @contextmanager
 def _ray_directions(directions: NDArray[np.float64] | None) -> Iterator[None]:
-    """Make Sionna send its rays into directions, points of the unit square [2, rays]; its own lattice if None."""
+    """Make Sionna launch its rays into directions, points of the unit square [2, rays]; its own lattice if None."""
     # Sionna has no argument for them, so the function that makes its lattice is replaced.
     sionna_lattice = sb_deterministic.fibonacci_lattice
     if directions is not None:

@@ -1,8 +1,8 @@
 """Sionna RT as a `Tracer`: finds the paths of links and compiles them.
 
-Receivers, and rays if need be, are split over launches (`calibray.tracing.trace_plan`): Sionna's path buffer is shared
-by all receivers of a source, and its memory grows with samples x depth x receivers (NVlabs/sionna#1172). A launch that
-fills its buffer is repeated with a larger one.
+Receivers, and rays if needed, are split over launches (`calibray.tracing.trace_plan`): all receivers of a source share
+Sionna's path buffer, whose memory grows with samples x depth x receivers (NVlabs/sionna#1172). A launch that fills its
+buffer is repeated with a larger one.
 """
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
@@ -41,11 +41,11 @@ from calibray.tracing.trace_plan import (
 )
 
 LANES: Final = 20_000_000
-"""Rays x interactions x receivers of one launch."""
+"""Largest product of rays, interactions and receivers of one launch."""
 BUFFER: Final = 1_000_000
-"""Paths that the buffer of one launch holds at first."""
+"""Initial number of paths in the buffer of one launch."""
 MAX_CROSSINGS: Final = 64
-"""Surfaces that a ray crosses at most when enclosed points are looked for."""
+"""Largest number of surfaces that a ray crosses in the search for enclosed points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +54,11 @@ class Trace:
 
     Attributes:
         solver: The solver that found them.
-        materials: The constants that they were found with, by name.
+        materials: The constants with which they were found, by name.
         tx: Transmitter of every link [L, 3], [m].
         rx: Receiver of every link [L, 3], [m].
         buffers: The paths.
-        record: Entries for the settings of the path program: rays sent out and convergence of an adaptive search.
+        record: Entries for the settings of the path program: launched rays and convergence of an adaptive search.
     """
 
     solver: Solver
@@ -234,7 +234,8 @@ class Tracer:
         """Whether points [n, 3], [m], lie inside closed bodies of the scene, such as buildings [n].
 
         A ray from inside a closed body crosses its surface an odd number of times. Rays in several directions vote,
-        because scenes have gaps. All of them rise, because buildings often lack a floor. A room is a body as well.
+        because scenes have gaps. All of them point upwards, because buildings often lack a floor. A room is a body as
+        well.
         """
         azimuth, elevation = np.meshgrid(np.linspace(0.1, 2 * np.pi, 6), np.radians([25.0, 50.0, 75.0]))
         directions = np.stack(

@@ -16,7 +16,7 @@ from calibray.window.folder import STUDY, TABLES
 from calibray.window.steps.scene import upload
 
 SECTIONS = ("scene", "links", "antennas", "trace", "offset")
-"""Sections with assumptions that this step shows; parameters have a step of their own."""
+"""Sections with assumptions that this step shows; parameters have their own step."""
 
 
 @ui.refreshable
@@ -57,7 +57,7 @@ def show(desk: Desk) -> None:
 
 @ui.refreshable
 def findings(desk: Desk) -> None:
-    """What looks wrong with the links; they are orange on the map."""
+    """Suspicions about the links, which are orange on the map."""
     for finding in desk.findings:
         ui.label(finding).classes("warning").props("role=note")
 
@@ -124,7 +124,7 @@ def _control(key: str, value: Any, columns: list[str]) -> Callable[[], Any]:
 
 
 def _toml(value: Any) -> str:
-    """A value as the study file has it."""
+    """A value in the form of the study file."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{json.dumps(key)} = {_toml(part)}" for key, part in value.items()) + " }"
     if isinstance(value, list):
@@ -143,7 +143,7 @@ def _columns(desk: Desk, content: dict[str, Any]) -> list[str]:
 
 
 def _likely(tables: list[str]) -> str:
-    """The table that is most likely the links'."""
+    """The table that most likely contains the links."""
     return min(tables, key=lambda name: (_is_sites(name), "plan" in name.lower(), Path(name).suffix))
 
 

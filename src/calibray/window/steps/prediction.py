@@ -16,7 +16,7 @@ from calibray.window.desk import Desk
 PLACE, PREDICTED = "place.csv", "place-predicted.csv"
 CANDIDATES, SUGGESTED = "candidates.csv", "suggested.csv"
 MOST_CANDIDATES: Final = 2000
-"""Candidate places at most; each is traced."""
+"""Largest number of candidate places; each is traced."""
 
 
 @ui.refreshable

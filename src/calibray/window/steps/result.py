@@ -42,13 +42,13 @@ def show(desk: Desk) -> None:
         ui.button("Write the report again", on_click=lambda: desk.start(["report", chosen.value])).props(
             "outline"
         ).tooltip("After a validation: with the errors of the held-out blocks")
-    link = ui.link("Open the report in a tab of its own", "#", new_tab=True)
+    link = ui.link("Open the report in its own tab", "#", new_tab=True)
     chosen.on_value_change(point)
     point()
 
 
 def _table(desk: Desk, names: list[str]) -> None:
-    """Values and errors, one column a result."""
+    """Values and errors, with one column per result."""
     columns = {name: _facts(desk, name) for name in names}
     rows = dict.fromkeys(key for column in columns.values() for key in column)
     _facts_table(
@@ -57,7 +57,7 @@ def _table(desk: Desk, names: list[str]) -> None:
 
 
 def _facts_table(names: list[str], rows: dict[str, dict[str, str]]) -> None:
-    """Rows of texts, one column a result; what differs from the first result is bold."""
+    """Rows of texts, with one column per result; differences from the first result are bold."""
     with ui.element("div").classes("scrolled").props("tabindex=0"), ui.element("table").classes("facts"):
         with ui.element("tr"):
             for text in ("", *names):
@@ -92,7 +92,7 @@ def _facts(desk: Desk, name: str) -> dict[str, str]:
 
 
 def _comparison(desk: Desk, names: list[str]) -> None:
-    """What differs between the studies, and which result predicts better."""
+    """The differences between the studies, and which result predicts better."""
     changed = changes([desk.folder.result(name).get("study") or {} for name in names])
     ui.label("Differences between the studies").classes("title")
     if changed:
@@ -149,7 +149,7 @@ def settings(study: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def changes(studies: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Settings that differ between studies: by dotted name, the value of each; None where a study lacks it."""
+    """Settings that differ between studies: by dotted name, the value of each; None if a study lacks it."""
     tables = [settings(study) for study in studies]
     rows = {name: [table.get(name) for table in tables] for table in tables for name in table}
     return {name: values for name, values in rows.items() if any(value != values[0] for value in values)}
@@ -167,7 +167,7 @@ def predictive_errors(folder: Path) -> tuple[str, HeldOutErrors] | None:
 
 
 def better(first: str, second: str, folder: Path) -> str:
-    """Which of two results of a folder predicts held-out blocks better, and how certainly, as a sentence.
+    """Which of two results of a folder predicts held-out blocks better, with what certainty, as a sentence.
 
     Raises:
         InputError: A result or its validation cannot be read.
@@ -181,7 +181,7 @@ def better(first: str, second: str, folder: Path) -> str:
         return f"{first} and {second} were validated on other links, so nothing shows which predicts better."
     judged = (one.block >= 0) & (other.block >= 0)
     if not judged.any():
-        return f"{first} and {second} have no held-out link in common. Validate both by the same blocks."
+        return f"{first} and {second} have no held-out link in common. Validate both with the same blocks."
     errors = {first: one.errors[model][judged], second: other.errors[other_model][judged]}
     best, worst = sorted(errors, key=lambda name: float(np.mean(errors[name] ** 2)))
     judgement = compare(errors[best], {worst: errors[worst]}, one.position[judged])

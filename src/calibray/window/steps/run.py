@@ -1,4 +1,4 @@
-"""The fourth step: calibrate, validate, and everything that ran or runs in the folder."""
+"""The fourth step: calibrate, validate, and everything that has run or is running in the folder."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _row(desk: Desk, job: Job) -> None:
     ui.label(job.command).classes("command")
     if job.state in {"died", "stopped", "failed"}:
         ui.button("Resume", on_click=lambda: desk.start(job.words)).props(
-            'outline dense aria-label="Start this command again; what is finished is not computed again"'
+            'outline dense aria-label="Start this command again; finished work is not repeated"'
         )
     if job.log:
         with ui.expansion("Output").classes("wide"):

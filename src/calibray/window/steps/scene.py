@@ -13,7 +13,7 @@ from calibray.window.folder import LARGEST, MAPS
 
 ITU: Final = [name for name in ITU_MATERIALS[DEFAULT_REVISION] if name != "vacuum"]
 COMMANDS: Final = {".osm": "osm", ".pbf": "osm", ".csv": "plan", ".dxf": "plan"}
-"""How files are made into scenes; those of other kinds may be footprints or plans."""
+"""How files are converted to scenes; files of other kinds may be footprints or plans."""
 
 
 def upload(desk: Desk, label: str) -> None:
@@ -84,7 +84,7 @@ def show(desk: Desk) -> None:
 
 
 def _likely(sources: list[str]) -> str:
-    """The file that is most likely a map: tables are seldom plans."""
+    """The file that is most likely a map; tables are seldom plans."""
     ranked = sorted(sources, key=lambda name: (name.endswith(".csv"), "plan" not in name.lower()))
     return ranked[0]
 
