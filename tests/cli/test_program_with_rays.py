@@ -132,7 +132,7 @@ def test_predictions_and_the_page_show_the_rays_of_the_program(
 
 
 def test_a_program_of_other_physics_is_not_understood(tmp_path: Path) -> None:
-    method = {"name": "auto", "options": {"budget": 9}}
+    method = {"name": "auto", "options": {"budget": 5}}
     study = write_study(tmp_path / "study", RIPPLE, {"tx": ISOTROPIC, "rx": ISOTROPIC}, method=method)
     ran = run("run", study, "--out", tmp_path / "out")
     (remark,) = (
