@@ -10,8 +10,6 @@ from collections import Counter
 from pathlib import Path
 from threading import Timer
 
-import pytest
-
 import programs
 from commands import write_study
 
@@ -85,25 +83,18 @@ def redirected(folder: Path, slow: list[str], *words: object) -> tuple[int, dict
     return status, {step: count * every for step, count in lines.items()}, "".join(printed)
 
 
-@pytest.mark.parametrize(
-    "slow",
-    [
-        [],
-        [
-            "calibray.study.link_checks.examine", "calibray.calibration.calibrate.search",
-            "calibray.reporting.page.report",
-        ],
-    ],
-    ids=["a program's call", "the steps before and after"],
-)  # fmt: skip
-def test_a_calibration_whose_steps_last(tmp_path, slow):
-    """One silent call of an external program, the checks before it, the search, and the report after it."""
+def test_a_calibration_whose_steps_last(tmp_path):
+    """The checks before it, the search, one silent call of an external program in it, and the report after it."""
+    slow = [
+        "calibray.study.link_checks.examine", "calibray.calibration.calibrate.search",
+        "calibray.reporting.page.report",
+    ]  # fmt: skip
     method = {"name": "random", "options": {"budget": 6}}
-    before = "" if slow else f"{SLOW}\nlast('program')"
-    write_study(tmp_path, programs.content(tmp_path, before, timeout=DEADLINE) | {"method": method})
+    content = programs.content(tmp_path, f"{SLOW}\nlast('program')", timeout=DEADLINE)
+    write_study(tmp_path, content | {"method": method})
     status, durations, printed = redirected(tmp_path, slow, "run", "study.toml", "--out", "out")
     assert status == 0, printed
-    assert set(durations) == set(slow or ["program"])
+    assert set(durations) == {*slow, "program"}
     assert min(durations.values()) >= LASTS
 
 
