@@ -178,7 +178,7 @@ ONE = [[1.0, 1.0]]
         ((ONE, [1.0, 2.0]), "x has 1 rows, y 2"),
         ((np.empty((0, 2)), []), "x has 0 rows"),
         (([[NAN, 1.0]], [1.0]), r"x\[0, 0\] = nan"),
-        (([[1.0, 2.5]], [1.0]), r"x\[0, 1\] = 2.5 lies outside its bounds \[-2, 2\]; leave .* or widen"),
+        (([[1.0, 2.5]], [1.0]), r"x\[0, 1\] = 2.5 lies outside its bounds \[-2, 2\]; remove .* or widen"),
         ((ONE, [NAN]), r"y\[0\] = nan; it must be a number, \+inf for a failed"),
         ((ONE, [-INF]), r"y\[0\] = -inf"),
         ((ONE, [1.0], [[NAN]]), r"residuals\[0, 0\] = nan; .* tell y = \+inf"),
@@ -220,7 +220,7 @@ def test_repeated_points_are_merged_with_the_mean_of_their_values():
 
 
 def test_there_is_no_best_before_the_first_evaluation():
-    with pytest.raises(InputError, match=r"0 evaluations told, at least 1 is needed; call tell\(\)"):
+    with pytest.raises(InputError, match=r"there are no evaluations yet; call tell\(\)"):
         _ = make(GWO).best
 
 

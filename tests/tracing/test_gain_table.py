@@ -216,7 +216,7 @@ def replaced(index: int, line: str | None) -> list[str]:
         ([line for line in rows() if int(line.split(",")[0]) <= 90], r"azimuth_deg runs from -180 to 90 in steps"),
         ([line for line in rows() if ",0,0" in line], r"column 'elevation_deg' contains 0 only; give a grid"),
         ([line for line in rows() if ",0,0" in line or line[:2] == "0,"], r"no row for .*principal cuts alone"),
-        ([line.replace(",0\n", ",12\n") for line in rows()], r"would radiate 15\.8 times the power it takes"),
+        ([line.replace(",0\n", ",12\n") for line in rows()], r"would radiate 15\.8 times the power that it accepts"),
         (
             [f"{a:g},{e:g},0\n" for a, e in product(range(-180, 181, 30), range(-90, 91, 30))],
             r"elevation_deg has steps of 30, must be at most 15; give a finer grid",

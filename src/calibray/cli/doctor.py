@@ -88,7 +88,7 @@ def cache(
 ) -> None:
     """Show where traces and compiled programs are kept between runs, or remove them.
 
-    The environment variable CALIBRAY_CACHE sets the folder. If it is set but empty, Calibray keeps nothing.
+    The environment variable CALIBRAY_CACHE sets the folder. If it is set but empty, Calibray caches nothing.
     """
     from calibray.support.cache_folder import cache_folder, compiled_programs
     from calibray.tables import Column, Table, numbers

@@ -15,7 +15,7 @@ CLOCK_TOLERANCE: Final = 2.0
 """Largest difference of two readings of one process's start time [s]: if it is counted from 1970, the system's clock
 may be corrected between them.
 
-The system does not reuse a process number within such a short time, because it first uses all others.
+The system does not reuse a process number within this time, because it first uses all others.
 """
 
 
@@ -91,7 +91,8 @@ def _start_time(pid: int) -> float:
     """Start time of a process [s]. On Linux it counts from the machine's start, so setting the clock does no harm.
 
     Raises:
-        FileNotFoundError: The process does not exist; likewise `ProcessLookupError`, `psutil.NoSuchProcess`.
+        FileNotFoundError: The process does not exist; the same applies to `ProcessLookupError` and
+            `psutil.NoSuchProcess`.
     """
     if not _boot():
         return psutil.Process(pid).create_time()

@@ -7,7 +7,7 @@ depend on the materials, so it is computed once. Each pair of material and mode 
 
 Nodes are evenly spaced in a root of the cosine: the square root, or the sixth root for metals, whose Brewster angle is
 within a thousandth of grazing incidence. A sheet of plasterboard at 2 GHz needs about a hundred intervals, and a thick
-slab at 60 GHz needs thousands. `table_intervals` chooses their number from candidates that represent all others.
+slab at 60 GHz needs thousands. `table_intervals` chooses the number of intervals from a few representative candidates.
 `table_error` then bounds the error for every candidate, also at Brewster angles, grazing incidence and slab resonances.
 """
 
@@ -113,7 +113,7 @@ def coefficient_arguments(
 
 
 def spacing_roots(table: NDArray[np.float64], wavelength: float) -> NDArray[np.int64]:
-    """The root of the cosine, 6 for metals and else 2 [M], in which each material's nodes are evenly spaced."""
+    """The root of the cosine, 6 for metals and otherwise 2 [M], in which each material's nodes are evenly spaced."""
     loss = loss_term(jnp.asarray(table[:, FIELD_COLUMN["conductivity"]]), jnp.asarray(wavelength))
     return np.where(np.asarray(loss) > _METAL_LOSS, 6, 2)
 
@@ -218,7 +218,7 @@ def table_intervals(paths: Paths, tables: NDArray[np.float64], tolerance: float)
     """Number of intervals by material and mode [M, 3] for coefficients with an error within `tolerance` [1].
 
     They are powers of two up to `FINEST`; 0 if there is no such row. The constants `tables` [n, M, 8] belong to
-    candidates that represent all others.
+    representative candidates.
     """
     material, mode, _ = coefficient_arguments(paths)
     needed = np.zeros((tables.shape[1], len(Mode)), dtype=np.int64)

@@ -4,7 +4,7 @@ Each is a power-weighted statistic of the paths of a link that a receiver resolv
 resolves taps instead of paths: samples of its power delay profile, in which the pulse of each path is spread over a few
 taps. It detects neither taps far below the strongest tap nor taps below its noise floor. A logistic function of the
 level in dB, `SOFT_DB` wide, replaces that hard limit, so that derivatives are exact. It changes the weight of taps
-within some 2 dB of the limit. `docs/measurements/observables.md` shows the error of the smooth limit.
+within about 2 dB of the limit. `docs/measurements/observables.md` shows the error of the smooth limit.
 """
 
 from __future__ import annotations

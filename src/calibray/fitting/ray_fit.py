@@ -89,7 +89,7 @@ def understand(
 
     Args:
         parameters: The study's parameters.
-        calls: The calls, of which the last one is modelled.
+        calls: The calls; the last one is modelled.
         known: Whether the program's antennas are those of the engine.
         before: The explanation of the calls before the last one, if any.
     """

@@ -1,6 +1,6 @@
 """Average samples to one row per area or place, in linear power.
 
-Along a street, the power fades by several dB within a wavelength. Ray tracing from one point does not predict that
+Along a street, the power fades by several dB within a wavelength. Ray tracing from one point does not predict this
 fading; it predicts the mean power over some tens of wavelengths (W. C. Y. Lee, "Estimate of local average power of a
 mobile radio signal", IEEE Trans. Veh. Technol. 34(1), 1985: 40 wavelengths, 36 to 50 samples). The mean is taken of
 powers, not of decibels: for Rayleigh fading, the mean of the decibels is 2.5 dB too low.

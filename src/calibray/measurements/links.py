@@ -21,7 +21,7 @@ FREQUENCIES: Final = (1e6, 1e12)
 """Range of carriers [Hz]; a value outside was probably stated in MHz or GHz."""
 
 MAX_CARRIERS: Final = 32
-"""Largest number of carriers; a column with more values probably holds another quantity."""
+"""Largest number of carriers; a column with more values probably contains another quantity."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -19,7 +19,7 @@ POWERS: Final = (-30.0, 100.0)
 def find_angles(frame: pd.DataFrame, of_transmitters: bool) -> dict[str, str]:
     """Find the columns of azimuth, mechanical and electrical downtilt by the key of ``[links.tx_antenna]``.
 
-    A downtilt without a kind in its name is mechanical, unless its name says that it is the sum of both.
+    A downtilt whose name states no kind is mechanical, unless the name states that it is the sum of both.
 
     Args:
         frame: The table.

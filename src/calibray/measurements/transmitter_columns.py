@@ -145,7 +145,7 @@ def find_transmitter_names(transmitters: pd.DataFrame) -> str:
     """Find the column of names in a table of transmitters with one row each.
 
     Raises:
-        InputError: No column with such a name distinguishes the transmitters.
+        InputError: No column with a name of this kind distinguishes the transmitters.
     """
     for name in transmitters:
         is_named_so = matches(name, "name of a transmitter", "transmitter")

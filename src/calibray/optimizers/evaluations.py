@@ -126,7 +126,7 @@ class Archive:
             InputError: Nothing has been told yet.
         """
         if self._leading is None:
-            raise InputError("no best point: 0 evaluations told, at least 1 is needed; call tell() first")
+            raise InputError("no best point: there are no evaluations yet; call tell() first")
         return self._leading
 
     def all(self) -> Evaluations:

@@ -37,7 +37,7 @@ class Session:
     Args:
         box: The box searched.
         uses: Parts of an evaluation that the algorithm uses: "value", "residuals", "jacobian".
-        search: Starts the algorithm on the archive; nothing of it runs before the first `ask`.
+        search: Starts the algorithm on the archive; no part of it runs before the first `ask`.
         objective: Converts residuals to the value, if residuals are used.
 
     Attributes:
@@ -72,7 +72,7 @@ class Session:
         """See `Optimizer.ask`."""
         self._advance()
         if self._asked is None:
-            raise InputError(f"done after {len(self.archive)} evaluations; start a new optimizer to go on")
+            raise InputError(f"done after {len(self.archive)} evaluations; start a new optimizer to continue")
         return self._asked[self._open()]
 
     def tell(
@@ -144,8 +144,8 @@ AS_GIVEN: Final = Schedule(_as_given)
 class Optimizer(ABC):
     """Minimises a value over a box; the caller owns the loop.
 
-    `while not opt.done: x = opt.ask(); opt.tell(x, *evaluate(x))` is a complete run. A final class takes its settings
-    in the constructor, passes its algorithm to a `Session`, sets the attributes below, and overrides nothing.
+    `while not opt.done: x = opt.ask(); opt.tell(x, *evaluate(x))` is a complete run. A final class receives its
+    settings in the constructor, passes its algorithm to a `Session`, sets the attributes below, and overrides nothing.
 
     The value may be any number, such as an error or a negative log likelihood. A method that uses residuals minimises
     their mean square, so the value must rise and fall with it. For a likelihood, pass deviance residuals sign(r) sqrt(2

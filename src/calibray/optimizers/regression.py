@@ -7,8 +7,8 @@ a cheap model at x, if there is one. v_0 therefore allows an offset, v_1 a chang
 All residuals share K, so one factorization serves any number of residuals. With a linear trend, the coefficients of 1
 and x are unknown without a prior (universal kriging).
 
-One derivation covers both cases. C [n, f] holds orthonormal combinations of the points on which the trend vanishes;
-without a trend C is the identity. C^T y has covariance A = C^T K C, and P = C A^-1 C^T takes the place of K^-1.
+One derivation covers both cases. C [n, f] contains orthonormal combinations of the points on which the trend vanishes;
+without a trend, C is the identity. C^T y has covariance A = C^T K C, and P = C A^-1 C^T takes the place of K^-1.
 
 C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, MIT Press 2006, eqs. 2.25, 2.26, 2.41,
 2.42, 4.17, 5.9 and sec. 9.9; leave-one-out in closed form after S. Rippa, Adv. Comput. Math. 11 (1999) 193.

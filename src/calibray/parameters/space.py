@@ -30,7 +30,7 @@ MAX_PARAMETERS: Final = 10_000
 
 
 class _Law(NamedTuple):
-    """A law s f^e of which s, e or both are parameters."""
+    """A law s f^e with s, e or both as parameters."""
 
     material: str
     constant: str

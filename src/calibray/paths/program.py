@@ -330,7 +330,7 @@ except InputError as error:
 """
 
 _known_here: Final[set[str]] = set()
-"""Checksums that this process knows, with or without a cache folder."""
+"""Checksums of files that this process has already accepted, with or without a cache folder."""
 
 
 def remember(digest: str) -> None:

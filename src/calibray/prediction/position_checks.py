@@ -20,7 +20,7 @@ CLEARANCE: Final = 0.05
 """Height above an antenna beyond which a surface counts as above it [m]."""
 
 PAIRS: Final = 5_000_000
-"""Number of triangles times points that are compared at a time; each pair needs some 100 bytes."""
+"""Number of triangle-point pairs that are compared at a time; each pair needs about 100 bytes."""
 
 POSITION_COLUMNS: Final = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
 """Columns of a table of links with the positions of both ends [m]."""

@@ -27,7 +27,7 @@ NEAREST: Final = 50
 """Number of nearest measured links used at each new link."""
 
 TOGETHER: Final = 500
-"""Number of new links whose neighbours are solved for together; each needs some 150 kB."""
+"""Number of new links whose neighbours are solved for together; each needs about 150 kB."""
 
 
 def krige_residuals(

@@ -221,7 +221,7 @@ class Value:
         before: Its value before calibration.
         after: Its calibrated value.
         interval: Its 95 % interval; empty if unknown.
-        verdict: The verdict of the links on it.
+        verdict: The verdict on the parameter.
         bounds: Its bounds, lower and upper.
         scale: "linear" or "log".
         positions: Positions of the values "before" and "after" on the bar, 0 to 1.

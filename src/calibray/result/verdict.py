@@ -72,7 +72,7 @@ class Interval:
         standard_error: From the curvature of the sum of squares at the optimum, in the parameter's unit.
         lower: Lower end of the 95 % interval, within the bounds; if there are several pieces, of the lowest.
         upper: Upper end of the interval; if there are several pieces, of the highest.
-        verdict: The verdict of the links on the parameter.
+        verdict: The verdict on the parameter.
         pieces: Lower and upper end of every piece, ascending, if the interval was computed from draws.
         reason: The reason for the verdict.
         approximate: Whether an emulator replaced an engine that gives no derivatives.

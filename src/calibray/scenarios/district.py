@@ -24,9 +24,9 @@ from calibray.scenes import Mesh, MeshObject, join_meshes
 SEED: Final = 2026
 EXTENT: Final = (2100.0, 1700.0)  # [m], east-west and north-south
 AVENUES: Final = (-905.0, -650.0, -385.0, -120.0, 150.0, 420.0, 665.0, 915.0)
-"""Centre lines of the streets that run north, x [m]."""
+"""x coordinates of the centre lines of north-south streets [m]."""
 STREETS: Final = (-690.0, -455.0, -215.0, 30.0, 265.0, 500.0, 735.0)
-"""Centre lines of the streets that run east, y [m]; the first is the coast road."""
+"""y coordinates of the centre lines of east-west streets [m]; the first is the coast road."""
 STREET_HALF_WIDTH: Final = 17.0  # [m], from the centre line to the building line
 ROADWAY_HALF_WIDTH: Final = (
     7.0  # [m], from the centre line to the kerb; the ground between kerb and building is soil
@@ -46,8 +46,8 @@ class Layout:
     """Streets and building heights of a district; the defaults are those of the paper's area.
 
     Attributes:
-        avenues: Centre lines of the streets that run north, x, ascending [m].
-        streets: Centre lines of the streets that run east, y, ascending [m].
+        avenues: x coordinates of the centre lines of north-south streets, ascending [m].
+        streets: y coordinates of the centre lines of east-west streets, ascending [m].
         extent: East-west and north-south [m].
         parks: Blocks without buildings, column and row.
         heights: Lowest and highest building [m].

@@ -73,7 +73,7 @@ def export_scene(
 def exported_names(names: Iterable[str]) -> dict[str, str]:
     """The names of materials in an exported scene: letters, digits, `_` and `-`, and no name twice.
 
-    Sionna RT refuses a plain `radio-material` with an ITU name, so such a name becomes `calibrated-NAME`. Mitsuba
+    Sionna RT refuses a plain `radio-material` with an ITU name, so this name becomes `calibrated-NAME`. Mitsuba
     misreads names with dots, quotes or line breaks.
 
     Example:
@@ -90,7 +90,7 @@ def _plain(name: str) -> str:
 
 
 def _unique(names: Iterable[str], taken: set[str], kind: str) -> list[str]:
-    """Plain names, each different from the others and from those taken, as `NAME-2`, or `NAME-KIND` if taken."""
+    """Plain names without duplicates, also of names already in use: `NAME-2`, or `NAME-KIND` if that is in use."""
     unique: list[str] = []
     used = set(taken)
     for name in names:

@@ -101,8 +101,8 @@ def read_scene(
         overrides: Constants that replace the file's, by material name: a `Material`, or a mapping with any of its
             fields, or with `itu` (and `revision`) naming an ITU-R P.2040 material.
         split: Separate materials for some objects: by name of the new material, a pattern of object names in which `*`
-            stands for any text. If the name ends in `*`, each object gets its own material, with `*` replaced by
-            the object's name.
+            matches any text. If the name ends in `*`, each object gets its own material, with `*` replaced by the
+            object's name.
 
     Returns:
         The scene.

@@ -109,7 +109,8 @@ class ParameterSection(Section):
             frequency: The carrier [Hz].
 
         Raises:
-            InputError: There is no prior, ITU-R P.2040 gives no such value, or a bound or the value is not positive.
+            InputError: There is no prior, ITU-R P.2040 gives no value of this kind, or a bound or the value is not
+                positive.
         """
         if self.prior is None:
             raise InputError(f"{name}: has no prior")

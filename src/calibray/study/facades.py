@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 NEAR: Final = 0.5
-"""Distance from a polygon up to which a wall belongs to it [m]: walls stand on the outlines of buildings."""
+"""Largest distance of a wall from the polygon to which it belongs [m]: walls are on the outlines of buildings."""
 
 BESIDE: Final = 0.1
 """Distance from a wall at which its sides are distinguished [m]."""

@@ -31,7 +31,7 @@ FAR: Final = 10.0
 """Distance from the scene, in scene sizes, at which links cannot belong to it."""
 
 MIN_LINKS: Final = 8
-"""Number of links below which shares of links show nothing."""
+"""Number of links below which shares of links are not meaningful."""
 
 CELL_SHARE: Final = 0.05
 """Largest width of the areas over which samples are averaged, as a share of the scene's shorter side."""

@@ -266,7 +266,7 @@ class StudyModel(StudyContent, ABC):
         return parameters
 
     def _effect_parameter(self, name: str, materials: Collection[str]) -> Parameter:
-        """The parameter of a region, rough surface or transmit antenna, whose stated pose is the start value 0."""
+        """The parameter of a region, rough surface or transmit antenna; for an antenna, 0 is the stated pose."""
         entry = self.parameters[name]
         if name.endswith(f".{ROUGHNESS}"):
             check_material(name, materials)

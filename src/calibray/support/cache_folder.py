@@ -25,8 +25,8 @@ _NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | g
 _DIGEST_BYTES: Final = 32
 """Bytes of the SHA-256 at the start of each entry."""
 _PRUNED_AT: Final = 16
-"""One entry in so many is followed by a look at the size of all: with 7,000 entries it takes 0.08 s, as long as the
-compilation of a small program."""
+"""The size of all entries is checked once per this number of written entries: with 7,000 entries it takes 0.08 s, as
+long as the compilation of a small program."""
 
 
 def cache_folder() -> Path | None:

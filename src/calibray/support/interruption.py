@@ -1,4 +1,4 @@
-"""Ctrl-C during compiled code, where libraries convert it to an error of their own or drop it."""
+"""Ctrl-C during compiled code, where libraries convert it to their own error or drop it."""
 
 from __future__ import annotations
 

@@ -245,7 +245,7 @@ def file_digest(file: Path) -> str:
 def replacing(path: Path, signed: bool = True) -> Iterator[Path]:
     """Write a file under a temporary name; it is signed and moved into place once it is complete.
 
-    Files with a seal of their own need not be signed. Yields the temporary file in the same folder, which exists and is
+    Files with their own seal need not be signed. Yields the temporary file in the same folder, which exists and is
     empty; it is removed if writing fails.
 
     Raises:

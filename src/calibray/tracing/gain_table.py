@@ -141,8 +141,8 @@ def read_gain_table(path: str | Path) -> GainTable:
     gain_table = GainTable(first, gains)
     if gain_table.efficiency > LARGEST_EFFICIENCY:
         raise InputError(
-            f"{path}: an antenna with these gains would radiate {gain_table.efficiency:.3g} times the power it takes, "
-            f"must be at most {LARGEST_EFFICIENCY:g}; give absolute gains [dBi], not levels relative to another"
+            f"{path}: an antenna with these gains would radiate {gain_table.efficiency:.3g} times the power that it "
+            f"accepts, must be at most {LARGEST_EFFICIENCY:g}; give absolute gains [dBi], not relative levels"
         )
     return gain_table
 

@@ -197,7 +197,7 @@ def cuda_device_count() -> int:
 
 
 def mitsuba_variant() -> str:
-    """The Mitsuba variant to trace with: CUDA if there is a GPU, as Sionna RT chooses, else LLVM."""
+    """The Mitsuba variant for tracing: CUDA if there is a GPU, as in Sionna RT, otherwise LLVM."""
     return "cuda_ad_mono_polarized" if cuda_device_count() else "llvm_ad_mono_polarized"
 
 

@@ -165,7 +165,7 @@ class Antenna:
 
     @property
     def ports(self) -> int:
-        """Number of ports: 2 for a dual-polarized antenna, else 1."""
+        """Number of ports: 2 for a dual-polarized antenna, otherwise 1."""
         return 2 if self.polarization in ("VH", "cross") else 1
 
     @property

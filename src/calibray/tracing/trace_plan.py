@@ -4,7 +4,7 @@ A launch sends rays from one transmitter and searches paths to some receivers, o
 (`starts_at_receivers`); *transmitter* below means the end that sends. The tracer stores some numbers for every
 combination of ray, interaction and receiver, a *lane*. The receivers of a transmitter are therefore split over
 launches; if one receiver is already too much, so are the rays. Sionna's rays form a lattice of directions that no seed
-changes: each launch takes a share of the lattice, so that all launches together send the same rays as a single one.
+changes: each launch gets a share of the lattice, so that all launches together send the same rays as a single one.
 """
 
 from __future__ import annotations

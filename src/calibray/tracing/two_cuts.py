@@ -63,7 +63,7 @@ def read_two_cuts(path: str | Path) -> TwoCuts:
 
     Each cut states its number of lines, each with an angle [deg] and an attenuation [dB], in any order, around a full
     turn in steps of at most 15 degrees. Blanks, tabs or semicolons are separators; decimal commas are accepted. GAIN is
-    in dBd unless its line says dBi, as the format defines.
+    in dBd unless its line contains dBi, as the format defines.
 
     Raises:
         InputError: The file cannot be read, lacks the gain or a cut, or a line is malformed; the message names the

@@ -1,7 +1,7 @@
 """Replay with constants that the study does not vary: those of single buildings, and those that the scene fixes.
 
 The building of every interaction follows from its position and the scene's meshes (`scenes/buildings.py`). Each pair of
-building and material becomes a material of its own.
+building and material becomes a separate material.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Whitening of spatially correlated errors: exact, or with the nearest neighbours of each link.
 
-The covariance is (1 - share) for each link plus share x exp(-distance / range) between links. For some hundred links we
-factor it. For more links, each error is its conditional mean given its nearest neighbours among the earlier links, plus
-an independent rest (A. V. Vecchia, J. R. Stat. Soc. B 50, 1988). The time is then proportional to the number of links.
+The covariance is (1 - share) for each link plus share x exp(-distance / range) between links. For up to some hundred
+links, we factor it. For more links, each error is its conditional mean given its nearest neighbours among the earlier
+links, plus an independent rest (A. V. Vecchia, J. R. Stat. Soc. B 50, 1988). The time is then proportional to the
+number of links.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ CHUNK_LINKS: Final = 1000
 """Links per chunk if there are workers and the study states no number."""
 
 MOST_CHUNKS: Final = 64
-"""Largest number of chunks of such a study: each compiles a program and returns its own sums."""
+"""Largest number of chunks of this study: each compiles a program and returns its own sums."""
 
 _SHARED: WeakValueDictionary[bytes, Shared[Any]] = WeakValueDictionary()
 

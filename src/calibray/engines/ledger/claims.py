@@ -55,7 +55,7 @@ def _is_valid(claimed: tuple[str, bytes, str], owner: object, expires: object, n
     """Whether a claim of another run is still valid.
 
     A claim is invalid if its process has ended, or has not renewed it for `EXPIRY`. `expires` and `now` are times [s
-    since 1970] by the clocks of its machine and of this one.
+    since 1970], by the clock of the claim's machine and of this machine.
     """
     if not isinstance(expires, float) or not abs(expires - now) <= SKEW + EXPIRY:
         return False

@@ -117,7 +117,7 @@ _COLUMNS: Final = {
 
 
 def check_own_file(path: Path) -> None:
-    """Refuse a ledger whose path leads to another file: SQLite would follow it, and write there.
+    """Refuse a ledger whose path leads to another file, because SQLite would write to that file.
 
     Args:
         path: The SQLite file, which need not exist.

@@ -38,7 +38,7 @@ FREE_SPACE_DB: Final = 1.0
 pattern differ by tenths, while transmitted power or watts instead of decibels cause tens."""
 
 DIRECT_GAIN_DB: Final = 60.0
-"""Gain of both antennas together that no direct path exceeds [dB]: two dishes of 30 dBi."""
+"""Largest total gain of both antennas of a direct path [dB]: two dishes of 30 dBi."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
 """Paths of Sionna RT in memory, as returned by its `PathSolver`.
 
-Vertices and interactions are [D, R, T, P] with synthetic arrays, else [D, R, Ra, T, Ta, P] for the antennas of the
+Vertices and interactions are [D, R, T, P] with synthetic arrays, otherwise [D, R, Ra, T, Ta, P] for the antennas of the
 arrays. Gains `a` are real and imaginary part [R, Ra, T, Ta, P].
 """
 

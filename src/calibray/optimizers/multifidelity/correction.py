@@ -1,7 +1,7 @@
 """Corrects a cheap model until it agrees with the engine: first its constants, then the remaining discrepancy.
 
 *Input mapping*: the constants of the cheap model are set to the values that explain the engine's answers best. Errors
-are weighted by the covariance of the discrepancy, most of which is a common offset. An offset of a link therefore does
+are weighted by the covariance of the discrepancy, which is mostly a common offset. An offset of a link therefore does
 not distort a constant. The constants have a prior around their assumed values. Slabs resonate, so there are many
 minima: the search starts from the likeliest of many draws from that prior. This is implicit space mapping (J. W.
 Bandler, Q. S. Cheng, N. K. Nikolova, M. A. Ismail, IEEE Trans. Microw. Theory Tech. 52 (2004) 378). *Output mapping*:

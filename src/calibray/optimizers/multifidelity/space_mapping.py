@@ -111,7 +111,7 @@ MISLED: Final = 2.0
 """Ratio above which later checks doubt it; points are then so close together that any process predicts them."""
 
 DOUBTS: Final = 2
-"""Number of successive doubts after which the cheap model is dropped, and number of the first checks."""
+"""Number of successive failed checks after which the cheap model is dropped, and number of the first checks."""
 
 
 @final

@@ -67,7 +67,7 @@ def make_scene(
         per_building: One mesh per building and material, named `BUILDING-MATERIAL`, instead of one per material.
             Calibray can then give some buildings a separate material. Tracing many meshes takes longer.
         overwrite: Replace files that Calibray did not write.
-        trees: Trees, of which those over the ground are written next to the scene as `TREES_FILE`; this needs a frame.
+        trees: Trees; those over the ground are written next to the scene as `TREES_FILE`, which needs a frame.
 
     Returns:
         The scene.

@@ -4,10 +4,10 @@ In each cell, every building that covers it occurs once, between its bottom and 
 taller one is used. Where parts of a building are mapped, they replace the building's outline. Neighbouring cells have
 the same corners along their common border, so walls and roofs that meet share their vertices.
 
-A wall stands at each height where one side of a border is built and the other is not: between neighbours of different
-heights it begins at the lower one's roof, and between equals there is none. A column of corners is at each end of a
-border. All walls that meet there use the same corners, so the surface is closed and its wedges are connected. Lengths
-are whole millimetres, so that corners are either equal or different.
+A wall exists at each height where one side of a border is built and the other is not. Between neighbours of different
+heights it begins at the lower roof, and between neighbours of equal height there is no wall. A column of corners is at
+each end of a border. All walls that meet there use the same corners, so the surface is closed and its wedges are
+connected. Lengths are whole millimetres, so that corners are either equal or different.
 """
 
 from __future__ import annotations
@@ -312,7 +312,7 @@ def _lids(
     strips: Strips,
     ground: Sequence[int] | None,
 ) -> Shell:
-    """Roofs, and undersides of the bodies that do not stand on the ground."""
+    """Roofs, and undersides of the bodies that are above the ground."""
     shapely = library("shapely", "scenes")
     rings = [[_with_strips(ring, strips) for ring in cell_rings] for cell_rings in outlines]
     polygons = np.array([shapely.Polygon(outer, holes) for outer, *holes in rings], dtype=object)

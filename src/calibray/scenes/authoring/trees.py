@@ -39,7 +39,7 @@ CROWN: Final = 6.0
 """Assumed diameter of a crown [m]."""
 
 CLEARANCE: Final = 2.5
-"""Height at which crowns of single trees and rows begin [m], because people walk below them; woods begin at the
+"""Height at which crowns of single trees and rows begin [m], high enough for people to pass; woods begin at the
 ground."""
 
 TALLEST: Final = 120.0

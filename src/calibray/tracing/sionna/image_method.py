@@ -267,7 +267,7 @@ def unfold_sequences(sequences: PathsBuffer, source: NDArray[np.float64], meshes
 def possible_pairs(
     unfolded: Unfolded, targets: NDArray[np.float64]
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Find the sequences that may lead to each receiver [R, 3], [m].
+    """Find the sequences that may connect the source to each receiver [R, 3], [m].
 
     Yields numbers of sequences and of receivers, pair by pair [n] each; omitted pairs have no path.
     """
