@@ -1,9 +1,9 @@
-"""Inputs that ask for more than a machine has: the memory each takes, and how soon it ends or says what it will cost.
+"""Inputs that request more than a machine has: the memory of each, and how soon it ends or announces its cost.
 
 Run with: python benchmarks/bombs.py [--only WORD]
 
-Each is a small study with one thing made huge, given to the command line in a process of its own, which is stopped
-once it has said what it will cost. Memory is the largest of any process that the command started.
+Each is a small study with one huge item, passed to the command line in a separate process, which is stopped once it has
+announced its cost. Memory is the largest of any process that the command started.
 """
 
 from __future__ import annotations

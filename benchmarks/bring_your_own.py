@@ -1,14 +1,14 @@
-"""How often what was planted lies in its 95 % interval, over seeds of the logs of the three example walks.
+"""How often the planted values lie in their 95 % intervals, over seeds of the logs of the three example walks.
 
     python benchmarks/bring_your_own.py [--walks town flat hill] [--seeds 30] [--first 1000] [--keep-faint] [--biased]
         [--out intervals.jsonl]
 
 Every seed is another walk through the places of `examples/bring_your_own`: other errors of position, other fading. The
-study is the one that `calibray init` writes for the example, the scene the one that `calibray scene` makes, and what is
-chosen, fitted and profiled is what `calibray run` does. So that all is traced once and no program compiled twice,
-positions are drawn from some for each stop of the town, and the track of the hill is one of a few. --keep-faint fits
-all averages above the noise floor, --biased leaves the logarithm of their means as it is; both concern the town, where
-there is a noise floor. Seeds that stand in --out are not run again.
+study is the one that `calibray init` writes for the example, the scene is the one that `calibray scene` makes, and the
+calibration is that of `calibray run`. Positions are drawn from a few for each stop of the town, and the track of the
+hill is one of a few, so that everything is traced and compiled only once. --keep-faint fits all averages above the
+noise floor, --biased leaves the logarithm of their means as it is; both concern the town, where there is a noise floor.
+Seeds that --out already contains are not run again.
 """
 
 from __future__ import annotations

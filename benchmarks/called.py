@@ -1,12 +1,12 @@
-"""Intervals on engines that can only be called, compared with those that their derivatives would give.
+"""Intervals for engines that can only be called, compared with intervals from their derivatives.
 
     python benchmarks/called.py --repetitions 30 --districts demo,development --out called.jsonl
 
 The engine is the replay of a district whose fixed constants (thickness, conductivity) are off by random factors and
 whose every link is off by 0.5 dB, so that the study's own replay is a cheap model with wrong constants. Truths are
-drawn evenly from their ranges, errors have 1 and 3 dB. Twice the engine is only called: by space mapping with the
-study's replay, 10 calls a parameter, and by the vector surrogate without, 20 calls a parameter; the third time its
-derivatives are used. A row says how often 90 % and 95 % intervals cover the truth, and how wide they are compared
+drawn evenly from their ranges, and errors have 1 and 3 dB. Two methods only call the engine: space mapping with the
+study's replay, with 10 calls per parameter, and the vector surrogate without it, with 20 calls per parameter. The third
+method uses derivatives. A row says how often 90 % and 95 % intervals cover the truth, and how wide they are compared
 with the third's on the same data.
 """
 

@@ -1,9 +1,9 @@
-"""Whether the measured campaigns read as their descriptions say.
+"""Check that the measured campaigns agree with their descriptions.
 
     CALIBRAY_DATA=FOLDER python benchmarks/campaigns.py
 
-Measured data is no part of the repository, so this is none of the tests. Prints what was compared; the exit status is 1
-if something differs.
+The measured data are not part of the repository, so this check is not a test. It prints the comparisons; the exit
+status is 1 if something differs.
 """
 
 from __future__ import annotations

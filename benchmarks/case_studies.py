@@ -1,4 +1,4 @@
-"""Downtown Boulder: what path loss and delay spread say of the walls' scattering coefficient.
+"""Downtown Boulder: what path loss and delay spread show about the walls' scattering coefficient.
 
     CALIBRAY_DATA=FOLDER python benchmarks/case_studies.py --samples 60000
 
@@ -6,7 +6,7 @@ The links are traced once with diffuse reflection. For each scattering coefficie
 replayed: the RMSE of path loss with an offset for links in sight and one for those out of sight, and the RMS delay
 spread in sight, from the power delay profile in bins of 1 ns, those above 132 dB of path loss or 30 dB below the
 strongest left out, as the sounder left them out. The measured one (delay.csv) is printed
-next to it. Without the campaign nothing is measured.
+next to it. The script needs the data of the campaign.
 """
 
 from __future__ import annotations

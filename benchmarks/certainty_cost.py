@@ -1,4 +1,4 @@
-"""What certainty costs: draws, validation and choice, as a ratio to the calibration itself, in one run.
+"""Time of posterior draws, validation and choice, as a ratio to that of the calibration itself, in one run.
 
     python benchmarks/certainty_cost.py
     python benchmarks/certainty_cost.py STUDY ...

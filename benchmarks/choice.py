@@ -1,4 +1,4 @@
-"""Whether the model chosen by held-out blocks is the right one where nothing was fitted or chosen.
+"""Whether the model chosen by held-out blocks is the right one on links that were not used for fitting or choice.
 
     CALIBRAY_DATA=FOLDER python benchmarks/choice.py examples/nist_boulder.toml examples/auckland_tower.toml
     CALIBRAY_DATA=FOLDER python benchmarks/choice.py examples/nist_boulder.toml --blocks 5 --uneven 22
@@ -6,21 +6,21 @@
     python benchmarks/choice.py --planted 40
     python benchmarks/choice.py --chance 100 --workers 2 --out chance.jsonl
 
-Nested: each block is held out in turn; all models are validated on blocks of the rest, the one that is best there is
-fitted to the rest, and judged by the block, which had no say. Beside its pooled RMSE stands what the model of the least
-RMSE on the inner blocks comes to, whether it earned its place or not, every model's own, and how often the block's
-links lie in the 90 % interval that the chosen model's errors on the inner blocks give. Blocks are even, or with
-`--uneven` clusters of receivers (k-means from that seed).
+The validation is nested: each block is held out in turn, and all models are validated on blocks of the remaining links.
+The best model there is fitted to the remaining links and judged on the block. The output has its pooled RMSE, that of
+the model with the lowest RMSE on the inner blocks, those of all models, and how often the block's links lie in the 90 %
+interval from the chosen model's errors on the inner blocks. Blocks are even, or with `--uneven` clusters of receivers
+(k-means from that seed).
 
 With `--rule`, the same over planted truths in districts: at the study's start, near it, and anywhere, with an offset of
 3 dB and 3 dB of noise, one of four blocks left out each time.
 
-With `--planted`, how often the links of a block of the demo district lie in the interval of a prediction that knew the
-other blocks alone: planted truths, 3 dB of noise.
+With `--planted`, the output is how often the links of a block of the demo district lie in the interval of a prediction
+from the other blocks: planted truths, 3 dB of noise.
 
-With `--chance`, the twin without a chance: measurements from a log-distance law with noise, in the demo district. The
-sentence must say that calibration did not help; the script fails where it does so in fewer than 95 of 100. Each
-repetition is a line of the file `--out`; a run that was stopped goes on where it stood.
+With `--chance`, the scene contains no information: measurements follow a log-distance law with noise, in the demo
+district. The result must state that calibration did not help; the script fails if it does so in fewer than 95 of 100
+repetitions. Each repetition is a line of the file `--out`; an interrupted run continues where it stopped.
 """
 
 from __future__ import annotations

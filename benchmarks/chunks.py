@@ -1,4 +1,4 @@
-"""Links in chunks: speed-up by a second worker, bytes that come back, and memory and time against the number of links.
+"""Links in chunks: speed-up by a second worker, bytes returned, and memory and time over the number of links.
 
     python benchmarks/chunks.py speed-up            # tracing and search in Munich, 2 workers of one thread against 1
     python benchmarks/chunks.py validate            # the same of a validation by two blocks held out
@@ -6,8 +6,8 @@
     python benchmarks/chunks.py links               # memory and time of a step, chunks repeated up to a million links
     python benchmarks/chunks.py city --links 100000 # a campaign in Munich end to end, in one process
 
-Each has processes and a cache of its own. Measured values are a law of the distance with noise of 6 dB: how well they
-fit is no matter here.
+Each mode has its own processes and cache. Measured values follow a law of distance with noise of 6 dB, because the fit
+does not matter here.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How often intervals hold the truth: planted values, replayed paths of several districts, several worlds of errors.
+"""How often intervals cover the truth: planted values, replayed paths of several districts, several worlds of errors.
 
     python benchmarks/coverage.py --repetitions 200 --workers 2 --out coverage.jsonl
     python benchmarks/coverage.py --districts demo --worlds random,offset --repetitions 20
@@ -9,14 +9,13 @@ Every repetition draws a truth for each parameter evenly from its search range, 
 of its world, and calibrates as `calibray run` does, from fewer starting points. The study does not state the world:
 all settings are defaults. A row says how often the interval covered the truth, over all repetitions and where the
 verdict was "identified" or "weakly identified", and how often the verdict was "not identifiable". For comparison, the
-same draws are weighted with the true noise. That posterior covers its share of truths by definition: what it covers is
-the luck of the repetitions, and its width is the narrowest that may be claimed. Where buildings differ there is no such
-posterior.
+same draws are weighted with the true noise. That posterior covers its share of truths by definition, apart from the
+chance of the repetitions, and its width is the narrowest possible. If buildings differ, this posterior does not exist.
 
-Each repetition is a line of the file `--out`; a run that was stopped goes on where it stood, and `--repetitions 0`
-prints the tables of what is there. The last rows are the negative control, the same posterior with the noise
-understated by two, which must cover too seldom: the script fails if it does not. It fails as well where a parameter
-is called not identifiable whose posterior with the noise known is narrower than a tenth of its range.
+Each repetition is a line of the file `--out`; an interrupted run continues where it stopped, and `--repetitions 0`
+prints the tables of the stored repetitions. The last rows are the negative control, the same posterior with the noise
+understated by two, which must cover too seldom: the script fails if it does not. It fails as well where a parameter is
+called not identifiable whose posterior with the noise known is narrower than a tenth of its range.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
     python benchmarks/coverage_map.py [--cells 64 | --whole] [--samples auto] [--solver]
 
-The demo district, one of its transmitters, an area of cells around it of 5 m, the values planted in its world. The map
-is timed against the same trace alone, both without the cache and each after a first run that compiles. With --solver,
+The map has cells of 5 m around one transmitter of the demo district, with the values planted in its world. The map is
+timed against the same trace alone, both without the cache and each after a first run that compiles. With --solver,
 Sionna's radio map of the same cells is compared with the map: it counts the rays that cross a cell, so it averages over
 the cell and is noisy, where the map is a sum of paths to the cell's middle.
 """

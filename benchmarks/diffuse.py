@@ -2,9 +2,9 @@
 
     CALIBRAY_DATA=../shared/data python benchmarks/diffuse.py
 
-Needs the measured campaign that examples/README.md tells how to get; without it, nothing is measured. One run times the
-rival (Sionna RT finding the paths and evaluating the fields anew), replay of all paths, and replay of the compressed
-program, with the agreement next to the times.
+The script needs the measured campaign (examples/README.md). One run times the rival (Sionna RT finding the paths and
+evaluating the fields anew), replay of all paths, and replay of the compressed program, with the agreement next to the
+times.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Districts made from seeds: streets, buildings, materials, carriers and links that no part of the package knows.
+"""Districts made from seeds: streets, buildings, materials, carriers and links that no part of the package contains.
 
-Seeds 100 to 109 are to develop on (the odd ones were judged by before); those to judge by are run once, at the end.
-Buildings are boxes with windows, so that the building an interaction belongs to follows from where it happens.
+Seeds 100 to 109 are for development (the odd ones were used for judging earlier); those for judging are run once, at
+the end. Buildings are boxes with windows, so that the building an interaction belongs to follows from where it happens.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
     python benchmarks/family.py --seeds 1000:1020 --workers 2    # judging: run once, reported whatever it says
 
 needs `pip install "calibray[optimizers,scenes]"` and a tracer. Every finished run is kept under out/family at once; a
-killed benchmark goes on where it stopped, and one with more seeds, methods or `--repeats` makes what is missing alone.
+killed benchmark continues where it stopped, and one with more seeds, methods or `--repeats` runs only what is missing.
 Problems that cannot be made and runs that fail are named below the tables. Excesses can be compared between machines;
 seconds cannot.
 """

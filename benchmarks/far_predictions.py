@@ -12,8 +12,8 @@ hold all links of an offset's group are left out. A second table has the RMSE of
 and of the model that was chosen without them.
 
 With `--worlds`, the truth differs from each district's study (`misfit_worlds.py`). One of four blocks is kept apart;
-the regret is the RMSE there of the chosen model minus that of the best. Each run is a line of the file `--out`; a run
-that was stopped goes on where it stood.
+the regret is the RMSE there of the chosen model minus that of the best. Each run is a line of the file `--out`; an
+interrupted benchmark continues where it stopped.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Hostile input of every kind, thousands of cases from a seed; says what came of each kind, and what must not.
+"""Hostile input of every kind, thousands of cases from a seed; lists the outcomes of each kind, and forbidden ones.
 
 Run with: python benchmarks/fuzz.py [--cases N] [--seed S] [--workers W] [--kinds NAME ...], or, to see one case again,
 python benchmarks/fuzz.py --seed S --case N [--keep DIR]

@@ -1,4 +1,4 @@
-"""What an interaction costs: nanoseconds and bytes over program sizes from 1e4 to 1e7 interactions.
+"""Time and memory per interaction, for program sizes from 1e4 to 1e7 interactions.
 
     python benchmarks/interactions.py
 

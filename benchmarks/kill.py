@@ -1,4 +1,4 @@
-"""Studies that are killed, interrupted, or robbed of their disk at random moments and started again each time.
+"""Studies that are killed, interrupted, or lose their disk at random moments, and are started again each time.
 
 Run with: python benchmarks/kill.py [--kills N] [--seed S] [--studies NAMES]
 

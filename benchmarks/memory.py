@@ -1,10 +1,10 @@
-"""What memory tracing takes, and that sharing receivers out over launches does not change the result.
+"""Memory of tracing, and a check that splitting receivers over launches does not change the result.
 
     python benchmarks/memory.py             # 2,000 receivers and 2 transmitters in Munich
     python benchmarks/memory.py --lanes     # bytes of a lane, for calibray.tracing.trace_plan.LANE_BYTES
     python benchmarks/memory.py --paths     # bytes of a path, for calibray.tracing.trace_plan.PATH_BYTES
 
-Each run has a process of its own, whose peak resident memory is what is printed.
+Each run has its own process, whose peak resident memory is printed.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
     python benchmarks/methods.py --seeds 25 --workers 2
 
 needs `pip install 'calibray[optimizers]'`, and for the two real campaigns their data (see examples/README.md). Finished
-runs are kept under out/methods, so that a killed benchmark goes on where it stopped; delete the folder to measure
-anew. Excesses can be compared between machines; seconds cannot.
+runs are kept under out/methods, so that a killed benchmark continues where it stopped; delete the folder to measure
+again. Excesses can be compared between machines; seconds cannot.
 """
 
 # ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)

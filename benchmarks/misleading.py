@@ -1,4 +1,4 @@
-"""What a cheap model that is pure noise costs space mapping, on planted problems.
+"""The calls that a misleading cheap model costs space mapping, on planted problems.
 
     python benchmarks/misleading.py --seeds 0:5
 

@@ -2,10 +2,10 @@
 
     python benchmarks/ray_mapping.py --first 3000 --districts 20 --offices 10 --seeds 3 --out rays.jsonl
 
-The engine is the replay of a district or an office with antennas, constants and physics of its own; it answers with the
-power of every path. The study knows neither. Truths are drawn evenly within the bounds, errors have 3 dB. The excess of
-a call is the RMSE of its candidate on the engine, minus that of the engine's optimum. A call counts as the first one
-whose excess is at most 0.01 dB.
+The engine is the replay of a district or an office with its own antennas, constants and physics, which the study does
+not state; it answers with the power of every path. Truths are drawn evenly within the bounds, errors have 3 dB. The
+excess of a call is the RMSE of its candidate on the engine, minus that of the engine's optimum. A call counts as the
+first one whose excess is at most 0.01 dB.
 """
 
 from __future__ import annotations

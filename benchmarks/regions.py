@@ -1,4 +1,4 @@
-"""A planted belt of trees: is its attenuation found, does validation prefer the model with it, does the report see it?
+"""A planted belt of trees: its estimated attenuation, the model that validation prefers, and the hint in the report.
 
     python benchmarks/regions.py --districts 20 --repetitions 5
     python benchmarks/regions.py --lines --districts 20 --repetitions 5

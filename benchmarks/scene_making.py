@@ -1,4 +1,4 @@
-"""What a scene of 5,000 buildings takes to make and to trace, compared with reading the map alone.
+"""Time to make and to trace a scene of 5,000 buildings, compared with reading the map alone.
 
     python benchmarks/scene_making.py [--buildings 5000] [--windows 0.3] [--trace]
 

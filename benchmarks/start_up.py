@@ -2,7 +2,7 @@
 
     python benchmarks/start_up.py [--repeats 9]
 
-Processor time of whole processes, the least of some, so that other work on the machine hardly counts.
+The smallest processor time of several whole processes is used, so that other work on the machine hardly affects it.
 """
 
 from __future__ import annotations

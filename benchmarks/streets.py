@@ -1,4 +1,4 @@
-"""Planted differences between streets: do intervals of predictions hold links of streets that were never measured?
+"""Planted differences between streets: do prediction intervals cover links of streets that were never measured?
 
     python benchmarks/streets.py --districts development --repetitions 2
     python benchmarks/streets.py --districts judging --repetitions 5 --stated

@@ -1,4 +1,4 @@
-"""Does a study that uses none of the newer features give the same numbers, as fast, as an earlier commit?
+"""Does a study without the newer features give the same numbers as an earlier commit, in the same time?
 
     git worktree add --detach BEFORE COMMIT
     python benchmarks/unused_features.py BEFORE --rounds 3

@@ -1,4 +1,4 @@
-"""From raw files to a page by commands alone: the three example walks and both campaigns, in one table.
+"""From raw files to a report by commands alone: the three example walks and both campaigns, in one table.
 
     python benchmarks/walks.py [--walks town flat hill boulder auckland] [--folder FOLDER] [--samples N]
 

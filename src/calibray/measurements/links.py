@@ -189,7 +189,7 @@ class Measurements:
         return self.table.where(expression)
 
     def held_out(self, holdout: str) -> NDArray[np.bool_]:
-        """The mask [links] of the links that a filter holds out, true and false for at least one link each.
+        """The mask [links] of the links that a filter holds out; at least one link is held out and one is not.
 
         Raises:
             InputError: The filter is not valid, or one of the parts would be empty.

@@ -228,7 +228,7 @@ def _refuse_signature_file(path: Path, fault: str) -> NoReturn:
 
 
 def _signature(file: Path, name: str) -> str:
-    """The line of a file, in which a name with line breaks is escaped."""
+    """The signature line of a file; line breaks in its name are escaped."""
     return f"{file_digest(file)}  {name if name.isprintable() else ascii(name)}"
 
 

@@ -151,7 +151,7 @@ def variogram(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Empirical variogram: half the mean squared difference of errors over the distance between links.
 
-    A rising variogram indicates correlated errors, a level one independent errors.
+    A rising variogram indicates correlated errors, and a flat one indicates independent errors.
 
     Args:
         errors: Errors [m], [dB].

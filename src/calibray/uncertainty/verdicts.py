@@ -56,7 +56,7 @@ class Axes:
         names: Names of the parameters.
         lower: Lower bounds [d].
         upper: Upper bounds [d].
-        value: Maps the index of a parameter and a search coordinate to the value that reasons state.
+        value: Maps the index of a parameter and a search coordinate to the value that is stated in reasons.
         customary: Usual widths of the parameters' ranges [d]; widths of the bounds if None. Shares refer to the smaller
             width, so that wider bounds do not improve a verdict.
     """
