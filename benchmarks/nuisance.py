@@ -2,9 +2,8 @@
 
     python benchmarks/nuisance.py
 
-The rival is how the package did it before nuisances were designs: a mask over all links for every group and every
-parameter. Both are timed in the same run on the same numbers and must agree; the designs that the rival could not
-express stand below without one.
+The baseline is an earlier implementation: a mask over all links for every group and every parameter. Both are timed in
+the same run on the same numbers and must agree; designs that the baseline cannot express are listed below without it.
 """
 
 from __future__ import annotations

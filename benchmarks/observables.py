@@ -6,12 +6,12 @@
 Every district of antenna_pose.py gets diffuse walls and 40 links in sight along two streets. A repetition draws the
 permittivity and the scattering coefficient S of the walls, computes path loss and RMS delay spread, adds noise of 3 dB
 and 3 ns, and calibrates on path loss alone and on both, with an unknown offset of path loss. The table says how often S
-is identified, and how often the 90 % intervals of the draws hold the truth. A third run takes the delay spreads of the
-next district: how often is a conflict reported there, and how often without one?
+is identified, and how often the 90 % intervals of the draws cover the truth. A third run uses the delay spreads of the
+next district: how often is a conflict reported there, and how often with the right ones?
 
 Every office has five access points whose round-trip times have an unknown bias each. A repetition draws two
 permittivities and the biases, and calibrates on path loss and round-trip times (80 MHz, 8 ns of noise). The table says
-how often the 90 % interval of a bias holds it.
+how often the 90 % interval of a bias covers it.
 """
 
 from __future__ import annotations

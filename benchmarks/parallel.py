@@ -2,7 +2,7 @@
 
     python benchmarks/parallel.py
 
-The rival in the same run is the same batch, one call after the other.
+The baseline in the same run is the same batch, one call after the other.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ def test_a_phones_log_becomes_a_study_that_reads(scene, tmp_path):
     assert json.loads((tmp_path / "study.schema.json").read_text())["title"] == "Calibray study"
     # Never overwritten.
     status, _, err = typed(*words, "-o", file)
-    assert (status, "exists already" in err, file.read_text()) == (2, True, text)
+    assert (status, "already exists" in err, file.read_text()) == (2, True, text)
 
 
 def test_metres_and_a_distance_tell_where_the_transmitter_stands(scene, tmp_path):

@@ -49,7 +49,7 @@ def test_an_upload_replaces_nothing_and_follows_no_link(folder, tmp_path):
     (tmp_path / "there.csv").write_text("")
     (tmp_path / "link.csv").symlink_to(tmp_path / "nowhere")
     for name in ("there.csv", "link.csv"):
-        with pytest.raises(InputError, match="exists already"):
+        with pytest.raises(InputError, match="already exists"):
             folder.check_upload(name)
 
 
