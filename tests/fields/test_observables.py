@@ -118,7 +118,9 @@ def test_paths_below_the_floor_are_no_first_paths(replay):
             (found,) = observed(replay, Statistic("time_of_flight", "first", floor_db=floor_db))
             assert found[link] == pytest.approx(paths.delay[mine][level_db[mine] > floor_db].min())
             tested += 1
-    assert tested
+        if tested == 3:  # every floor is compiled
+            break
+    assert tested == 3
 
 
 @pytest.mark.parametrize("path", ["first", "strongest"])
@@ -179,12 +181,12 @@ def test_derivatives_of_every_observable_agree_with_finite_differences():
     engine, wanted = every_constant(), (*ALL, *LIMITED, *BANDED, *RESOLVED)
     value = engine.parameters.start[None]
     answer = engine.respond(value, wanted, derivatives=True)
-    assert answer.observed == pytest.approx(engine.respond(value, wanted).observed, rel=1e-12, nan_ok=True)
     slopes = [answer.loss_slope[:, None], answer.observed_slope]
     for index, parameter in enumerate(engine.parameters):
         step = 1e-4 * max(parameter.start, 0.01)
-        at = [value + factor * step * np.eye(value.shape[1])[index] for factor in (2, 1, -1, -2)]
+        at = [value + factor * step * np.eye(value.shape[1])[index] for factor in (2, 1, -1, -2, 0)]
         response = engine.respond(np.vstack(at), wanted)
+        assert answer.observed[0] == pytest.approx(response.observed[4], rel=1e-12, nan_ok=True)
         for slope, values in zip(slopes, (response.path_loss[:, None], response.observed), strict=True):
             # Five-point stencil
             numeric = (-values[0] + 8 * values[1] - 8 * values[2] + values[3]) / (12 * step)
