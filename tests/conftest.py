@@ -45,9 +45,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 LONGEST = (
-    "test_browser", "test_report_browser", "test_ledger", "test_derivatives", "test_ctrl_c", "test_dask",
-    "test_command", "test_octave", "test_program_with_rays", "test_emulator", "test_calibrate", "test_notebooks",
-    "test_compression",
+    "test_browser", "test_ledger", "test_dask", "test_observables", "test_calibrate", "test_notebooks", "test_pose",
+    "test_demo", "test_compression", "test_comparison", "test_program_with_rays", "test_coefficient_tables",
+    "test_derivatives", "test_unreached_links", "test_cli_run", "test_jax_context", "test_command",
+    "test_report_browser",
 )  # fmt: skip
 """Files that take longest. They run first, so that no worker is left with one of them at the end."""
 
