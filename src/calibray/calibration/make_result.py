@@ -1,4 +1,4 @@
-"""Make the result of a finished run: accuracy next to baselines, intervals, and a row for every link."""
+"""Make the result of a finished run: accuracy compared with baselines, intervals, and a row for every link."""
 
 from __future__ import annotations
 

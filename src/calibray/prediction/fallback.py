@@ -23,7 +23,7 @@ def fill_missing(
     level: float | None = None,
     least_db: NDArray[np.float64] | float = 0.0,
 ) -> pd.DataFrame:
-    """Predict the links without a path by the fallback.
+    """Use the fallback to predict the links without a path.
 
     Args:
         prediction: The prediction model and its fallback.

@@ -71,8 +71,8 @@ def trace(
         frequency: Carrier frequency [Hz].
         tx_antenna: Transmit antenna, as `Antenna` or a mapping with its attributes.
         rx_antenna: Receive antenna.
-        materials: Constants in place of the scene's, by material name; with a study, each a `Material`, in place of
-            the start values.
+        materials: Constants by material name, which replace the scene's; with a study, each is a `Material` that
+            replaces the start values.
         progress: Called with ("tracing", receivers traced, receivers in all) after every launch.
         **settings: The attributes of `TraceSettings`.
 

@@ -34,7 +34,7 @@ JITTER: Final = 1e-4
 """Random addition to moves along differences, so that every point can be reached."""
 
 NEIGHBOURHOOD: Final = 32
-"""A kernel is as wide as this part of the population on either side of it."""
+"""Width of a kernel, as the share of the population on either side of its centre."""
 
 TINY: Final = 1e-30
 """Replaces a constant of 0 under the logarithm; its factors have no effect."""
