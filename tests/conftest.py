@@ -1,23 +1,14 @@
 """What all tests share: reproducible property tests, one cache of compiled code, no lines of progress."""
 
-# ruff: noqa: E402  (what NumPy and XLA read has to be set before they are imported)
+# ruff: noqa: E402  (what NumPy reads has to be set before it is imported)
 
 import os
 from collections.abc import Iterator
-from importlib.metadata import version
-from pathlib import Path
 
 # Matrices of the tests are small, and BLAS threads that wait for each other cost more than they gain. NumPy and SciPy
 # read these when they are imported; subprocesses inherit them.
 for _library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
-
-# XLA compiles the small programs of the tests for longer than they run, and for half as long without its emitters of
-# fused loops. It ends the process at a flag that it does not know, so versions other than the locked one compile as
-# they do for users, and so do the benchmarks and the demo.
-LOCK = Path(__file__).parents[1] / "requirements.lock"
-if f"jaxlib=={version('jaxlib')}" in LOCK.read_text(encoding="utf-8").split():
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 import pytest
 from hypothesis import settings
