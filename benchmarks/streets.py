@@ -26,6 +26,7 @@ import pandas as pd
 import calibray as cb
 import districts
 import misfit_worlds
+from calibray.errors import InputError
 from calibray.fitting.problem import Problem
 from calibray.study import Study
 from calibray.validation.baselines import obstructed, without_scene
@@ -104,7 +105,11 @@ def main() -> None:
         for name in misfit_worlds.named(given.districts):
             district = districts.make(name, Path(folder))
             for seed in range(given.repetitions):
-                found = repetition(district, seed, studies)
+                try:
+                    found = repetition(district, seed, studies)
+                except InputError as error:  # too few links for the unknowns
+                    print(f"{name}, {seed}: left out: {error}", file=sys.stderr)
+                    continue
                 rows += found
                 for each in found:
                     inside, blocked = np.asarray(each["inside"]), each["blocked"]
