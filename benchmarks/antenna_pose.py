@@ -190,28 +190,36 @@ def named(result: cb.Result) -> set[str]:
     return {name for remark in remarks for name in remark.values["transmitters"]}
 
 
-def repeated(description: str, repetition: Repetition, stream: int) -> pd.DataFrame:
-    """The rows of all repetitions in all districts, as many as the command line asks for; `stream` seeds them."""
-    parser = argparse.ArgumentParser(description=description)
+def arguments(description: str | None) -> argparse.ArgumentParser:
+    """The options that benchmarks on these districts share."""
+    parser = argparse.ArgumentParser(description=(description or "").partition("\n")[0])
     parser.add_argument("--first", type=int, default=0, help="seed of the first district")
     parser.add_argument("--districts", type=int, default=20)
     parser.add_argument("--repetitions", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=np.inf, help="start no repetition after this time")
-    options = parser.parse_args()
-    started, rows = time.perf_counter(), []
+    return parser
+
+
+def repeated(options: argparse.Namespace, repetition: Repetition, stream: int) -> pd.DataFrame:
+    """The rows of all repetitions in all districts, which are printed as each ends; `stream` seeds them."""
+    started, tables = time.perf_counter(), []
     with tempfile.TemporaryDirectory() as root:
         seeds = range(options.first, options.first + options.districts)
         links = {seed: district(Path(root) / str(seed), seed) for seed in seeds}
         for number in range(options.repetitions):
             for seed in seeds:
                 if time.perf_counter() - started < options.seconds:
-                    rows += repetition(Path(root) / str(seed), links[seed], [seed, number, stream])
-    return pd.DataFrame(rows)
+                    rows = repetition(Path(root) / str(seed), links[seed], [seed, number, stream])
+                    tables.append(pd.DataFrame(rows).assign(seed=seed, number=number))
+                    print(
+                        tables[-1].round(2).to_csv(index=False, header=len(tables) == 1), end="", flush=True
+                    )
+    return pd.concat(tables, ignore_index=True)
 
 
 def main() -> None:
     """Run the repetitions and print the table."""
-    table = repeated(__doc__.splitlines()[0] if __doc__ else "", repetition, 270)
+    table = repeated(arguments(__doc__).parse_args(), repetition, 270)
     summary = table.groupby(["posed", "parameter"]).agg(
         count=("covered", "size"), coverage=("covered", "mean"), identified=("identified", "mean"),
         median_error=("error", "median"), median_width=("width", "median"),

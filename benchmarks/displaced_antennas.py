@@ -1,4 +1,4 @@
-"""Planted heights of masts and a shifted track: does calibration find them, and the materials beside them?
+"""Planted heights of masts and a shifted track: do intervals contain them, and those of materials the truth?
 
     python benchmarks/displaced_antennas.py one --first 100 --districts 20 --repetitions 1
     python benchmarks/displaced_antennas.py all --first 100 --districts 20 --repetitions 1
@@ -13,9 +13,8 @@ tracer sends 20,000 rays, which give the same path loss as the 100,000 of antenn
 
 from __future__ import annotations
 
-import argparse
-import tempfile
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,14 +22,16 @@ import numpy as np
 import pandas as pd
 
 import calibray as cb
-from antenna_pose import SECTORS, district, planted, study
+from antenna_pose import SECTORS, arguments, planted, repeated, study
 from calibray.study import Study
 
 OFF_M: Final = 5.0
 RAYS: Final = 20_000
 
 
-def repetition(folder: Path, links: pd.DataFrame, every: bool, blind: bool, seed: list[int]) -> pd.DataFrame:
+def repetition(
+    folder: Path, links: pd.DataFrame, seed: list[int], every: bool, blind: bool
+) -> list[dict[str, Any]]:
     """Calibrate one draw of the truth: a row for every parameter."""
     random = np.random.default_rng(seed)
     truth, reached, stated = planted(folder, links, random, RAYS)
@@ -60,7 +61,6 @@ def repetition(folder: Path, links: pd.DataFrame, every: bool, blind: bool, seed
             kind = "wrong height" if truth[name] else "right height"
             rows.append(
                 {
-                    "seed": seed[0],
                     "known": known,
                     "parameter": kind if name.endswith("height") else name,
                     "truth": truth[name],
@@ -74,30 +74,17 @@ def repetition(folder: Path, links: pd.DataFrame, every: bool, blind: bool, seed
                     "seconds": seconds,
                 }
             )
-    return pd.DataFrame(rows)
+    return rows
 
 
 def main() -> None:
-    """Run the repetitions, print the rows of each as it ends, and then the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    """Run the repetitions and print the table."""
+    parser = arguments(__doc__)
+    parser.set_defaults(repetitions=1)
     parser.add_argument("case", choices=["one", "all"])
-    parser.add_argument("--first", type=int, default=0, help="seed of the first district")
-    parser.add_argument("--districts", type=int, default=20)
-    parser.add_argument("--repetitions", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=np.inf, help="start no repetition after this time")
     parser.add_argument("--blind", action="store_true", help="calibrate without heights and shifts as well")
     options = parser.parse_args()
-    started, tables = time.perf_counter(), []
-    with tempfile.TemporaryDirectory() as root:
-        for number in range(options.repetitions):
-            for seed in range(options.first, options.first + options.districts):
-                if time.perf_counter() - started < options.seconds:
-                    folder = Path(root) / f"{seed}-{number}"
-                    links, every = district(folder, seed), options.case == "all"
-                    table = repetition(folder, links, every, options.blind, [seed, number, 272])
-                    print(table.round(2).to_csv(index=False, header=not tables), end="", flush=True)
-                    tables.append(table)
-    table = pd.concat(tables)
+    table = repeated(options, partial(repetition, every=options.case == "all", blind=options.blind), 272)
     summary = table.groupby(["known", "parameter"]).agg(
         count=("covered", "size"), covered=("covered", "sum"), median_error=("error", "median"),
         median_width=("width", "median"),

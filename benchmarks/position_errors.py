@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 import calibray as cb
-from antenna_pose import NOISE_DB, planted, repeated, study
+from antenna_pose import NOISE_DB, arguments, planted, repeated, study
 from calibray.study import Study
 
 ERROR_M = 5.0
@@ -47,7 +47,7 @@ def repetition(folder: Path, links: pd.DataFrame, seed: list[int]) -> list[dict[
 
 def main() -> None:
     """Run the repetitions and print the table."""
-    table = repeated(__doc__.splitlines()[0] if __doc__ else "", repetition, 271)
+    table = repeated(arguments(__doc__).parse_args(), repetition, 271)
     summary = table.groupby(["key", "parameter"]).agg(
         count=("covered", "size"), coverage=("covered", "mean"), median_error=("error", "median"),
         median_width=("width", "median"),

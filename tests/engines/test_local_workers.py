@@ -9,6 +9,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+import distributed
 import numpy as np
 import pandas as pd
 import pytest
@@ -98,7 +99,6 @@ def test_nobody_else_can_reach_the_workers():
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_the_check_of_sockets_sees_a_scheduler_of_dask():
     """What local workers were before: a scheduler on loopback, to which any local user can connect."""
-    distributed = pytest.importorskip("distributed")
     before = listening_sockets()
     with distributed.LocalCluster(n_workers=1, processes=False, protocol="tcp", dashboard_address=None):
         assert listening_sockets() != before

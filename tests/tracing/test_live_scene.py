@@ -23,9 +23,6 @@ def street() -> rt.Scene:
     """The bundled street with two transmitters of one antenna, and receivers along it."""
     scene = rt.load_scene(rt.scene.simple_street_canyon)
     scene.frequency = 3.5e9
-    # The marble has 0.018 S/m, which hardly damp its slab: where it is half a wavelength thick, little is reflected
-    # and the single precision of Sionna RT errs by 6e-4 in power.
-    scene.radio_materials["marble"].conductivity = 0.3
     scene.tx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="tr38901", polarization="V")
     scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="dipole", polarization="cross")
     for number, x in enumerate((-35.0, 0.0)):
@@ -65,7 +62,7 @@ def study(measured: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> cb.
 def test_sionna_and_the_study_agree_and_materials_are_set(study: cb.Study, measured: np.ndarray) -> None:
     """`examples/notebooks/4-sionna-notebook.ipynb` calibrates; here the materials are the planted ones."""
     scene, paths = street(), cb.trace(study)
-    assert np.abs(path_loss_db(scene) - measured).max() > 0.3
+    assert np.abs(path_loss_db(scene) - measured).max() > 0.5
     planted = {
         name: replace(paths.materials[name], relative_permittivity=value) for name, value in PLANTED.items()
     }
@@ -77,7 +74,12 @@ def test_sionna_and_the_study_agree_and_materials_are_set(study: cb.Study, measu
 
 
 def test_observables_equal_those_of_sionnas_impulse_responses(study: cb.Study) -> None:
-    scene, engine = street(), engines.make(study, "replay")
+    # The marble has 0.018 S/m, which hardly damp its slab: where it is half a wavelength thick, little is reflected
+    # and the single precision of Sionna RT errs by 6e-4 in power.
+    scene, lossy = street(), study.content()
+    scene.radio_materials["marble"].conductivity = 0.3
+    lossy["materials"] = {"marble": {"conductivity": 0.3}}
+    engine = engines.make(cb.Study.from_content(lossy, study.path), "replay")
     for name, value in PLANTED.items():
         scene.radio_materials[name].relative_permittivity = value
     paths = rt.PathSolver()(scene, max_depth=2, samples_per_src=50_000, refraction=False)
