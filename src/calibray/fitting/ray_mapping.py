@@ -134,8 +134,9 @@ def _objective(problem: Problem, call: Call) -> float:
 
 def _gap(replay: Replay, call: Call) -> float:
     """Root mean square over the links of the answered minus the predicted path loss [dB]."""
-    change = call.export.path_loss_db - replay.path_loss(call.candidate[None])[0]
-    return float(np.sqrt(np.mean(change[np.isfinite(change)] ** 2)))
+    answered, predicted = call.export.path_loss_db, replay.path_loss(call.candidate[None])[0]
+    both = np.isfinite(answered) & np.isfinite(predicted)
+    return float(np.sqrt(np.mean((answered[both] - predicted[both]) ** 2)))
 
 
 def _most_informative(problem: Problem, call: Call, random: np.random.Generator) -> NDArray[np.float64]:
