@@ -182,7 +182,7 @@ def test_weak_paths_are_left_out_of_large_programs(problem, monkeypatch):
     assert (fewer - whole).max() < 3.0
 
 
-def test_structured_errors_are_tried_unless_errors_are_declared_independent(problem):
+def test_errors_out_of_sight_are_tried_unless_errors_are_declared_independent(problem):
     best = problem.parameters.to_search(np.array(list(planted.TRUTH.values())))
 
     def kinds(**noise):
@@ -191,5 +191,5 @@ def test_structured_errors_are_tried_unless_errors_are_declared_independent(prob
         model = joint_model(Problem.of(setup, problem.engine), best, 0.3**2, problem.freedom)
         return {each.kind for each in model.marginal.models}
 
-    assert kinds(heterogeneity=0, constants_spread=0) == {"gaussian", "correlated", "structured", "student-t"}
+    assert kinds(heterogeneity=0, constants_spread=0) == {"gaussian", "correlated", "shadowed", "student-t"}
     assert kinds(heterogeneity=0, constants_spread=0, range_m=0) == {"gaussian", "student-t"}

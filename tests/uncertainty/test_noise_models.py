@@ -15,12 +15,11 @@ import planted
 from calibray.engines import Replay
 from calibray.fitting.problem import Problem
 from calibray.measurements import links_from_frame
-from calibray.paths import take
 from calibray.study import Setup, Study
 from calibray.uncertainty import heavy_tails as tails
-from calibray.uncertainty.link_features import link_features
+from calibray.uncertainty.missing_paths import excess_db, missing_db
 from calibray.uncertainty.noise_models import IMPROBABLE, OFFSET_DB, Marginal, NoiseModel, noise_models
-from calibray.uncertainty.whitening import whitener
+from calibray.uncertainty.whitening import EXACT, shared, whitener
 
 RANDOM = np.random.default_rng(1)
 COUNT = 6
@@ -28,10 +27,10 @@ POSITION = RANDOM.uniform(0, 100, (COUNT, 3))
 GAP = RANDOM.normal(0, 2, COUNT)
 
 
-def marginal(models, design=None, ridge=None, position=POSITION, noise_db=2.0, features=None) -> Marginal:
+def marginal(models, design=None, ridge=None, position=POSITION, noise_db=2.0, excess=None) -> Marginal:
     design = np.zeros((len(position), 0)) if design is None else design
     ridge = np.zeros(design.shape[1]) if ridge is None else ridge
-    return Marginal.of(design, ridge, np.ones(len(position)), position, noise_db, models, None, features)
+    return Marginal.of(design, ridge, np.ones(len(position)), position, noise_db, models, None, excess)
 
 
 def integral(log_density) -> float:
@@ -159,23 +158,25 @@ def test_nearest_neighbours_approximate_the_exact_whitener():
     )
 
 
-@pytest.mark.parametrize("kind", ["gaussian", "correlated", "structured", "student-t"])
+@pytest.mark.parametrize("kind", ["gaussian", "correlated", "shadowed", "student-t"])
 def test_planted_errors_favour_their_kind(kind):
     """For 150 links, the planted kind gets the largest weight; a planted offset is recognised."""
-    random = np.random.default_rng(7)
-    position, features = random.uniform(0, 600, (150, 2)), random.normal(0, 0.6, (150, 3))
+    random = np.random.default_rng(8)
+    position, excess = random.uniform(0, 600, (150, 2)), random.normal(15, 8, 150)
+    excess[::2] = -np.inf  # in sight
     errors = {
         "gaussian": 3 * random.standard_normal(150),
         "correlated": 3
         * np.linalg.cholesky(np.exp(-cdist(position, position) / 60) + 1e-6 * np.eye(150))
         @ random.standard_normal(150),
-        "structured": 3 * features.sum(axis=1) + random.standard_normal(150),
+        # Missing power some 15 dB below that in sight, differing by 6 dB.
+        "shadowed": -missing_db(excess + 6 * random.standard_normal(150), 15.0) + random.standard_normal(150),
         "student-t": 3 * random.standard_t(2.5, 150),
     }[kind]
-    models = noise_models(position, structured=True)
+    models = noise_models(position, shadowed=True)
     assert sum(model.weight for model in models) == pytest.approx(1.0)
     assert sum(model.weight for model in models if model.offset) == pytest.approx(2 / 3)
-    density = marginal(models, position=position, noise_db=2.0, features=features)
+    density = marginal(models, position=position, noise_db=2.0, excess=excess)
 
     def weights(gap):
         found = density.densities(gap[None])[0]
@@ -221,25 +222,35 @@ def test_links_of_one_position_share_errors():
     assert models[int(np.argmax(log[0]))].kind == "gaussian"
 
 
-def test_links_with_like_obstruction_and_paths_have_like_features():
+def test_weak_links_out_of_sight_have_excess_loss():
+    out_of_sight = np.arange(planted.LINKS) % 2
     study = Study.from_content(planted.content("links.csv", noise=None))
-    problem = Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
-    # Every second link without its simple paths, so that links differ in depth.
+    table = planted.links().assign(out_of_sight=out_of_sight)
+    problem = Problem.of(Setup.open(study, links=links_from_frame(table)), planted.engine())
+    excess = excess_db(problem)
+    assert np.isneginf(excess[::2]).all()
+    # With a tenth of the power, a link has 10 dB more loss.
     paths = problem.engine.paths
-    blocked = (np.diff(paths.first) == 1) & (paths.link % 2 == 0)
-    paths = take(paths, np.flatnonzero(~blocked))
-    features = link_features(replace(problem, engine=Replay(paths, problem.parameters)))
-    assert np.mean(features**2) * features.shape[1] == pytest.approx(1.0)
-    depth = features[:, -2]
-    fewest = np.full(paths.num_links, np.inf)
-    np.minimum.at(fewest, paths.link, np.diff(paths.first))
-    assert np.corrcoef(depth, fewest)[0, 1] == pytest.approx(1.0)
-    # An error that grows with depth is structured, whatever the position of the links.
-    gap = 6.0 * depth / depth.std() + 0.5 * np.random.default_rng(0).standard_normal(len(depth))
-    place = np.random.default_rng(1).uniform(0, 300, (len(depth), 3))
-    models = noise_models(place, structured=True)
-    density = marginal(models, position=place, features=features).densities(gap[None])[0]
-    assert models[int(np.argmax(density))].kind == "structured"
+    spreading = np.where(paths.link == 1, np.sqrt(0.1), 1.0) * paths.spreading
+    weaker = excess_db(
+        replace(problem, engine=Replay(replace(paths, spreading=spreading), problem.parameters))
+    )
+    assert weaker[1::2] - excess[1::2] == pytest.approx(10.0 * (np.arange(1, planted.LINKS, 2) == 1))
+    # Equal powers add 3 dB; in sight nothing is missing.
+    assert missing_db(np.array([-np.inf, 15.0, 45.0]), 15.0) == pytest.approx([0.0, 3.01, 30.0], abs=0.01)
+
+
+def test_errors_of_missing_paths_are_shared():
+    """The exact whitener is that of the covariance; beyond its number of links, the parts are independent."""
+    error = np.random.default_rng(3).uniform(0, 4, 5)
+    filter_ = shared(error, 0.5)
+    covariance = np.eye(5) + 0.5 * np.diag(error**2) + 0.5 * np.outer(error, error)
+    assert filter_.factor @ covariance @ filter_.factor.T == pytest.approx(np.eye(5))
+    assert filter_.log_determinant == pytest.approx(np.linalg.slogdet(covariance)[1])
+    many = np.resize(error, EXACT + 1)
+    filter_ = shared(many, 0.5)
+    assert filter_.apply(many) == pytest.approx(many / np.sqrt(1 + many**2))
+    assert filter_.log_determinant == pytest.approx(np.log(1 + many**2).sum())
 
 
 def test_models_far_less_probable_are_left_out():

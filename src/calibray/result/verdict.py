@@ -43,7 +43,7 @@ class Cause(StrEnum):
 
     BUILDINGS = "buildings that differ"
     CORRELATION = "correlated errors"
-    STRUCTURE = "errors that depend on obstruction, distance or angles"
+    MISSING_PATHS = "larger errors out of sight"
     HEAVY_TAILS = "heavy-tailed errors"
     OFFSET = "undeclared offset"
     CONSTANTS = "constants that the scene fixes"
@@ -115,7 +115,7 @@ class RemarkKind(StrEnum):
 
     CORRELATED_NOISE = "correlated noise"  # weight, gaussian_weight
     HEAVY_TAILS = "heavy tails"  # weight, gaussian_weight
-    STRUCTURED_NOISE = "structured noise"  # weight, gaussian_weight
+    SHADOWED_ERRORS = "shadowed errors"  # weight, gaussian_weight
     # observables, names, path_loss, further, standard_errors; slope and slope_error of measured over modelled values
     CONFLICT = "conflict"
     HETEROGENEITY = "heterogeneity"  # weight, gaussian_weight

@@ -63,7 +63,7 @@ def explanation_text(interval: Interval) -> str:
 _STATEMENTS: Final = {
     Cause.BUILDINGS: "if all buildings were known to be equal (noise.heterogeneity = 0),",
     Cause.CORRELATION: "if errors of neighbouring links were known to be independent (noise.range_m = 0),",
-    Cause.STRUCTURE: "if errors were known not to depend on obstruction, distance and angles (noise.range_m = 0),",
+    Cause.MISSING_PATHS: "if errors were known not to be larger out of sight (noise.range_m = 0),",
     Cause.HEAVY_TAILS: "if errors were known to be Gaussian (noise.kind = 'gaussian'),",
     Cause.OFFSET: "if there were known to be no offset ([offset] with narrow bounds),",
     Cause.CONSTANTS: "if the scene's other constants were exact (noise.constants_spread = 0), at most",
@@ -145,7 +145,7 @@ def _noise_remark(finding: str) -> Callable[[dict[str, Any]], str]:
 
 _CAUSES: Final = {
     "correlated": "neighbouring links share part of their noise, so that many links count as few",
-    "structured": "links with similar obstruction, distance and angles share errors, so that many count as few",
+    "shadowed": "weak links out of sight count less if the twin lacks paths to them",
     "student-t": "outliers count less if noise has heavy tails",
     "heterogeneous": "links that depend on single buildings count less if buildings differ",
     "gaussian": "their noise model differs from the one that RMSE assumes",
@@ -264,9 +264,9 @@ def _ray_mapping(values: dict[str, Any]) -> str:
 _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.CORRELATED_NOISE: _noise_remark("Neighbouring links share part of their noise"),
     RemarkKind.HEAVY_TAILS: _noise_remark("The noise has heavy tails, as with outliers"),
-    RemarkKind.STRUCTURED_NOISE: _noise_remark(
-        "Errors depend on the obstruction of links, on distance or on angles, as if the scene lacked objects or the "
-        "traced paths lacked a mechanism such as diffraction"
+    RemarkKind.SHADOWED_ERRORS: _noise_remark(
+        "Errors of weak links out of sight are larger than those of the others, as if the twin lacked paths to them. "
+        "Trace with refraction and diffraction"
     ),
     RemarkKind.HETEROGENEITY: _noise_remark(
         "The noise is larger where materials matter more, as if buildings of one material differed"

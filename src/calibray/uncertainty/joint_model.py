@@ -25,7 +25,7 @@ from calibray.fitting.nuisance import CONSTANT
 from calibray.fitting.problem import Problem
 from calibray.parameters import LogNormal, Parameter, Parameters, fixed_constant, split_name
 from calibray.uncertainty.buildings import can_split, split_replay
-from calibray.uncertainty.link_features import link_features
+from calibray.uncertainty.missing_paths import excess_db
 from calibray.uncertainty.noise_models import Marginal, noise_models
 from calibray.uncertainty.quadratic_forms import MAX_LINKS, QuadraticForms
 
@@ -190,18 +190,18 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
     few = len(counted) < FEWEST
     # With correlated errors, the probability of censoring is an integral over all censored links.
     uncorrelated = few or bool(censored.any())
-    structured = not uncorrelated and section.range_m == "auto"
+    shadowed = not uncorrelated and section.range_m == "auto"
     models = noise_models(
         position,
         kind="gaussian" if few else None if section.kind == "auto" else section.kind,
         range_m=0.0 if uncorrelated else None if section.range_m == "auto" else float(section.range_m),
         offset=not has_offset(problem),
         censored=bool(censored.any()),
-        structured=structured,
+        shadowed=shadowed,
     )
-    features = link_features(problem)[counted] if structured else None
+    excess = excess_db(problem)[counted] if shadowed else None
     ridge = objective.noise_db / nuisance.prior[used] if nuisance.terms else np.zeros(0)
-    marginal = Marginal.of(design[:, used], ridge, scale, position, noise_db, models, censored, features)
+    marginal = Marginal.of(design[:, used], ridge, scale, position, noise_db, models, censored, excess)
     measured = objective.measured[counted] - design[:, at_bound] @ coefficients[at_bound]
 
     def gap(loss: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -77,10 +77,25 @@ def whitener(
     count = len(position)
     if count <= exact:
         common = np.exp(-cdist(position, position) / range_m) * np.outer(scale, scale)
-        factor = cholesky(share * common + (1 - share) * np.eye(count), lower=True)
-        inverse = solve_triangular(factor, np.eye(count), lower=True)
-        return Whitener(inverse, 2.0 * float(np.log(np.diag(factor)).sum()))
+        return _exact(share * common + (1 - share) * np.eye(count))
     return _vecchia(position, scale, range_m, share, neighbours or nearest_earlier(position))
+
+
+def shared(error: NDArray[np.float64], share: float) -> Whitener:
+    """The whitener of errors of unit variance plus further ones with these standard deviations [m].
+
+    All links have a share of the further variance in common; beyond `EXACT` links, all errors are independent.
+    """
+    if len(error) > EXACT:
+        variance = 1.0 + error**2
+        return Whitener(sparse.diags_array(1.0 / np.sqrt(variance)).tocsr(), float(np.log(variance).sum()))
+    return _exact(np.diag(1.0 + (1 - share) * error**2) + share * np.outer(error, error))
+
+
+def _exact(covariance: NDArray[np.float64]) -> Whitener:
+    factor = cholesky(covariance, lower=True)
+    inverse = solve_triangular(factor, np.eye(len(covariance)), lower=True)
+    return Whitener(inverse, 2.0 * float(np.log(np.diag(factor)).sum()))
 
 
 def nearest_earlier(position: NDArray[np.float64]) -> Neighbours:
