@@ -51,15 +51,19 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", default=list(METHODS))
     parser.add_argument("--budget", type=int, default=225)
     parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument(
+        "--constants", choices=("right", "wrong"), help="only problems whose cheap model has such constants"
+    )
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--runs", type=Path, default=ROOT / "out/family", help="folder that keeps the runs")
     chosen = parser.parse_args()
+    wrong_constants = None if chosen.constants is None else chosen.constants == "wrong"
     finished = []
     for kind in chosen.families:
         with progress_bars(log()) as progress:
             part = compare_family(
                 kind, seed_range(chosen.seeds), chosen.methods, budget=chosen.budget, repeats=chosen.repeats,
-                out=chosen.runs, workers=chosen.workers, progress=progress,
+                out=chosen.runs, workers=chosen.workers, progress=progress, wrong_constants=wrong_constants,
             )  # fmt: skip
         finished.append(part)
     together = FamilyComparison.joined(finished)
@@ -101,7 +105,7 @@ def shown(comparison: FamilyComparison) -> Table:
             ("right", ~comparison.wrong_constants, 15),
             ("wrong", comparison.wrong_constants, 30),
         ):
-            if chosen.any():
+            if chosen.any() and calls <= by_method["space-mapping"].budget:
                 share = comparison.part(chosen).solved(by_method["space-mapping"].name, calls, 0.02)
                 what = (
                     f"space mapping, cheap model with {constants} constants, share within 0.02 dB at {calls}"

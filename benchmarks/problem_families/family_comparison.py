@@ -212,6 +212,7 @@ def compare_family(
     out: str | Path,
     workers: int = 1,
     progress: Progress | None = None,
+    wrong_constants: bool | None = None,
 ) -> FamilyComparison:
     """Run methods on every problem of a family at equal budgets of RT calls.
 
@@ -227,6 +228,7 @@ def compare_family(
         out: Folder that keeps the runs.
         workers: Number of processes.
         progress: Called after every problem made and every run.
+        wrong_constants: Compare only problems whose cheap model has wrong constants, or only the others; None for all.
 
     Returns:
         The comparison.
@@ -258,10 +260,17 @@ def compare_family(
             pool, _prepare, [(kind, seed) for seed in seeds], "problems", progress
         ):
             prepared[seed] = answer
-        ready = {seed: answer for seed in seeds if isinstance(answer := prepared[seed], _Prepared)}
+        made = {seed: answer for seed in seeds if isinstance(answer := prepared[seed], _Prepared)}
         failed = tuple((seed, answer) for seed in seeds if isinstance(answer := prepared[seed], str))
-        if not ready:
+        if not made:
             raise InputError(f"no problem of the family can be made: {failed[0][1]}")
+        ready = {
+            seed: answer for seed, answer in made.items() if wrong_constants in (None, answer.wrong_constants)
+        }
+        if not ready:
+            raise InputError(
+                "no problem of these seeds has a cheap model with such constants; use other seeds"
+            )
         files = {
             (seed, method.method): RunFile(path, f"{problem.fingerprint}-{code_fingerprint(method.method)}")
             for seed, problem in ready.items()

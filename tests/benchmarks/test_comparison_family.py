@@ -63,6 +63,22 @@ def test_parts_and_joins_keep_problems_and_runs_together():
     assert both.wrong_constants.tolist() == [False, False, True]
 
 
+def test_only_problems_whose_cheap_model_has_such_constants_are_run(streets, tmp_path, monkeypatch):
+    landscape = module.planted_problem
+    monkeypatch.setattr(
+        module,
+        "planted_problem",
+        lambda kind, seed: replace(landscape(kind, seed), wrong_constants=seed == 3),
+    )
+    for wanted, seeds in ((True, (3,)), (False, (2, 4)), (None, (2, 3, 4))):
+        chosen = compare_family(
+            "district", (2, 3, 4), ["random"], budget=8, out=tmp_path, wrong_constants=wanted
+        )
+        assert chosen.seeds == seeds
+    with pytest.raises(InputError, match="no problem of these seeds"):
+        compare_family("district", (2, 4), ["random"], budget=8, out=tmp_path, wrong_constants=True)
+
+
 def test_a_problem_that_cannot_be_made_is_reported_and_the_others_are_run(streets, tmp_path, monkeypatch):
     landscape = module.planted_problem
 
