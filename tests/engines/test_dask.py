@@ -6,8 +6,6 @@ import os
 import signal
 import threading
 import time
-from contextlib import suppress
-from pathlib import Path
 
 import distributed
 import numpy as np
@@ -20,8 +18,9 @@ import two_ray
 from calibray import calibrate, coverage_map, engines
 from calibray.engines.cluster.chunks import for_each_chunk
 from calibray.errors import InputError
-from calibray.measurements import Measurements, links_from_frame
+from calibray.measurements import links_from_frame
 from calibray.study import Setup
+from worker_tasks import doubled
 
 pytestmark = pytest.mark.filterwarnings("default")  # Dask closes sockets late
 
@@ -95,17 +94,6 @@ def test_maps_of_workers_are_those_of_one_process(tmp_path, cluster):
     assert np.isfinite(alone.path_loss_db).all()
     for name, values in alone.layers.items():
         assert together.layers[name] == pytest.approx(values, rel=1e-9)
-
-
-def doubled(folder: Path, links: Measurements) -> tuple[int, list[float]]:
-    """Work on a block, which the first process that comes to the third block does not survive."""
-    with (folder / "begun.txt").open("a") as file:
-        file.write(f"{os.getpid()} {links.row[0]}\n")
-    if 6 in links.row:
-        with suppress(FileExistsError):
-            (folder / "fatal").open("x").close()
-            os.kill(os.getpid(), signal.SIGKILL)
-    return os.getpid(), (2 * links.rx[:, 0]).tolist()
 
 
 def test_a_block_that_is_killed_is_done_again_and_what_is_shared_is_sent(tmp_path, cluster):

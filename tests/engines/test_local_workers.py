@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -16,37 +15,11 @@ import pytest
 
 import two_ray
 from calibray import calibrate, engines
-from calibray.engines.cluster.chunks import for_each_chunk, identity
+from calibray.engines.cluster.chunks import for_each_chunk
 from calibray.errors import EngineError, InputError
-from calibray.measurements import Measurements, links_from_frame
+from calibray.measurements import links_from_frame
 from calibray.study import Setup
-
-
-def made(name: str) -> tuple[str, int]:
-    return name, os.getpid()
-
-
-def kept_process(kept: tuple[str, int], text: str) -> tuple[str, int, int]:
-    """The object with a text added, the process that made it, and this process."""
-    name, process = kept
-    return name + text, process, os.getpid()
-
-
-def fail(name: str) -> None:
-    raise InputError(f"{name} cannot be used")
-
-
-def die(name: str) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def work_or_die_once(folder: Path, links: Measurements) -> tuple[int, list[float]]:
-    """Work on a chunk; the first process that comes to the third chunk is killed."""
-    if 6 in links.row:
-        with suppress(FileExistsError):
-            (folder / "fatal").open("x").close()
-            os.kill(os.getpid(), signal.SIGKILL)
-    return os.getpid(), (2 * links.rx[:, 0]).tolist()
+from worker_tasks import die, doubled, fail, kept_process, made, unchanged
 
 
 def listening_sockets() -> list[str]:
@@ -92,7 +65,7 @@ def test_nobody_else_can_reach_the_workers():
     before = listening_sockets()
     with engines.open_workers(2) as workers:
         kept = workers.keep(made, ["a", "b"])
-        assert len(workers.ask(identity, [kept])) == 2
+        assert len(workers.ask(unchanged, [kept])) == 2
         assert listening_sockets() == before
 
 
@@ -107,8 +80,8 @@ def test_the_check_of_sockets_sees_a_scheduler_of_dask():
 def test_an_error_reaches_the_caller_and_workers_go_on():
     with engines.open_workers(1) as workers:
         with pytest.raises(InputError, match="b cannot be used"):
-            workers.ask(identity, [workers.keep(fail, ["b"])])
-        assert workers.ask(identity, [workers.keep(made, ["c"])])[0][0] == "c"
+            workers.ask(unchanged, [workers.keep(fail, ["b"])])
+        assert workers.ask(unchanged, [workers.keep(made, ["c"])])[0][0] == "c"
 
 
 def test_a_chunk_that_kills_its_workers_ends_the_run(caplog, monkeypatch):
@@ -118,7 +91,7 @@ def test_a_chunk_that_kills_its_workers_ends_the_run(caplog, monkeypatch):
         engines.open_workers(1) as workers,
         pytest.raises(EngineError, match=r"chunk 1: 2 workers died with it; give workers more memory"),
     ):
-        workers.ask(identity, [workers.keep(die, ["b"])])
+        workers.ask(unchanged, [workers.keep(die, ["b"])])
     assert caplog.text.count("is being replaced") == 2
 
 
@@ -128,16 +101,14 @@ def test_a_chunk_whose_worker_dies_is_done_again(tmp_path):
     with engines.open_workers(2) as workers:
         parts = for_each_chunk(
             workers,
-            work_or_die_once,
+            doubled,
             tmp_path,
             links_from_frame(table),
             2,
             lambda stage, count, total: done.append(count),
         )
-    doubled = {
-        int(row): value for rows, (_, values) in parts for row, value in zip(rows, values, strict=True)
-    }
-    assert doubled == {row: 2.0 * (row + 1) for row in range(12)}
+    values = {int(row): value for rows, (_, values) in parts for row, value in zip(rows, values, strict=True)}
+    assert values == {row: 2.0 * (row + 1) for row in range(12)}
     assert done == [2, 4, 6, 8, 10, 12]
     assert (tmp_path / "fatal").exists()
 
@@ -157,4 +128,4 @@ def test_chunks_on_workers_give_the_result_of_one_process(tmp_path, monkeypatch)
 def test_more_processes_than_cores_are_refused(monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     with engines.open_workers(9) as workers, pytest.raises(InputError, match="must be at most 8"):
-        workers.ask(identity, [workers.keep(made, ["a"])])
+        workers.ask(unchanged, [workers.keep(made, ["a"])])

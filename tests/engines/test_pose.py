@@ -102,6 +102,7 @@ def test_derivatives_of_further_observables_agree_with_finite_differences(engine
     # Fields combine coherently to path loss, powers to all other observables.
     assert answer.path_loss == pytest.approx(engine.path_loss(value))
     assert answer.loss_slope == pytest.approx(engine.path_loss_and_jacobian(value)[1])
+    assert answer.observed == pytest.approx(engine.respond(value, wanted).observed, rel=1e-12)
     for index, name in enumerate(engine.parameters.names):
         step = 1e-4 * np.eye(value.shape[1])[index]
         above, below = engine.respond(np.vstack([value + step, value - step]), wanted).observed

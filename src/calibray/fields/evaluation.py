@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial, reduce
 from operator import add
-from typing import Final, cast
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ from calibray.fields import coefficient_tables
 from calibray.fields.arithmetic import Pair, materialize, segment_sums
 from calibray.fields.coefficient_tables import CoefficientTables, TableLayout
 from calibray.fields.combining import POWER, Combining, decibel, link_power, path_power
+from calibray.fields.compiled import WIDE, compiled
 from calibray.fields.effects import (
     AntennaFields,
     Effects,
@@ -47,10 +48,6 @@ from calibray.fields.program import FormulaArguments, GroupedProgram, layout
 from calibray.fields.propagation import path_fields
 from calibray.materials import Material
 from calibray.paths import Paths
-
-WIDE: Final = {"xla_cpu_prefer_vector_width": 512}
-"""Compile for vectors of 512 bits. XLA prefers 256 even on processors with wider instructions; on others the option has
-no effect. The numbers are the same."""
 
 
 @jax_settings()
@@ -330,7 +327,7 @@ def _link_power(program: GroupedProgram, response: MaterialResponse, combining: 
     return _power(program, split_by_step(program, response), combining)
 
 
-@partial(jax.jit, compiler_options=WIDE)
+@compiled
 def _losses_by_formula(
     program: GroupedProgram, tables: jax.Array, count: int, combining: Combining
 ) -> jax.Array:
@@ -343,7 +340,7 @@ def _losses_by_formula(
     return jax.lax.fori_loop(0, count, evaluate, jnp.zeros((len(tables), program.num_links), tables.dtype))
 
 
-@partial(jax.jit, static_argnums=3, compiler_options=WIDE)
+@compiled(static_argnums=3)
 def _slopes_by_formula(
     program: GroupedProgram, tables: jax.Array, count: int, columns: tuple[int, ...], combining: Combining
 ) -> tuple[jax.Array, jax.Array]:
@@ -365,7 +362,7 @@ def _slopes_by_formula(
     return jax.lax.fori_loop(0, count, evaluate, (losses, slopes))
 
 
-@partial(jax.jit, compiler_options=WIDE)
+@compiled
 def _losses_with_effects(
     program: GroupedProgram,
     tables: jax.Array,
@@ -383,7 +380,7 @@ def _losses_with_effects(
     return jax.lax.fori_loop(0, count, evaluate, jnp.zeros((len(tables), program.num_links), tables.dtype))
 
 
-@partial(jax.jit, static_argnums=5, compiler_options=WIDE)
+@compiled(static_argnums=5)
 def _slopes_with_effects(
     program: GroupedProgram,
     tables: jax.Array,

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from calibray.fields.arithmetic import materialize
 from calibray.fields.channel import angular_spread, delay_spread, k_factor_db, link_mean
 from calibray.fields.combining import decibel, path_power
+from calibray.fields.compiled import compiled
 from calibray.fields.effects import Effects, apply_effects
-from calibray.fields.evaluation import WIDE
 from calibray.fields.jax_context import jax_settings
 from calibray.fields.material_response import material_response, split_by_step
 from calibray.fields.program import GroupedProgram
@@ -177,7 +177,7 @@ def link_responses_and_slopes(
     return tuple(np.asarray(answer)[:count] for answer in answers)
 
 
-@partial(jax.jit, compiler_options=WIDE)
+@compiled
 def _responses(channel: Channel, values: jax.Array, count: int) -> tuple[jax.Array, ...]:
     def evaluate(index: jax.Array, every: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         answers = _response(channel, values[index])
@@ -186,7 +186,7 @@ def _responses(channel: Channel, values: jax.Array, count: int) -> tuple[jax.Arr
     return jax.lax.fori_loop(0, count, evaluate, _blank(channel, len(values)))
 
 
-@partial(jax.jit, compiler_options=WIDE)
+@compiled
 def _responses_and_slopes(channel: Channel, values: jax.Array, count: int) -> tuple[jax.Array, ...]:
     directions = jnp.eye(values.shape[1])
 
