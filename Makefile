@@ -6,7 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
 
-QUICK := tests/measurements tests/optimizers tests/parameters tests/result tests/tables tests/test_public_api.py tests/comparison/test_comparison.py
+QUICK := tests/measurements tests/optimizers tests/parameters tests/result tests/test_tables.py tests/test_public_api.py tests/comparison/test_comparison.py
 
 .PHONY: setup demo test quick lint package lowest newest bench docs site
 

@@ -32,8 +32,7 @@ from calibray.fitting.cheap_replay import ProblemRows, ReplayedModel, with_const
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares, SpaceMapping, VectorSurrogate
-from calibray.tables import Column, Table, numbers
-from calibray.tables.text import render
+from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.credible_sets import credible
 

@@ -16,8 +16,7 @@ import numpy as np
 from scipy.constants import speed_of_light
 
 from calibray.measurements import read_measurements
-from calibray.tables import Column, Table
-from calibray.tables.text import render
+from calibray.tables import Column, Table, render
 
 
 def boulder(folder: Path) -> dict[str, bool]:

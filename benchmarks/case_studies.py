@@ -22,8 +22,7 @@ import pandas as pd
 from calibray.fields import path_loss
 from calibray.fields.channel import power_delay_profile
 from calibray.study import Study
-from calibray.tables import Table, numbers
-from calibray.tables.text import render
+from calibray.tables import Table, numbers, render
 
 STUDY = Path(__file__).parents[1] / "examples" / "nist_boulder.toml"
 WALLS, TRACED = "walls", 0.4

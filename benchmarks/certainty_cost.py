@@ -28,8 +28,7 @@ from calibray.fitting.search import search
 from calibray.result.held_out import Model
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
-from calibray.tables import Column, Table, numbers
-from calibray.tables.text import render
+from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.credible_sets import credible
 from calibray.uncertainty.draws import Draws

@@ -47,8 +47,7 @@ from calibray.fitting.problem import Problem
 from calibray.result.held_out import FITTED, WITHOUT_MATERIALS, BlockErrors, Model
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
-from calibray.tables import Column, Table, numbers
-from calibray.tables.text import render
+from calibray.tables import Column, Table, numbers, render
 from calibray.validation.held_out_statistics import spatial_blocks
 from calibray.validation.validate import fit_models, validate_problem
 from calibray.validation.variants import fit_variants

@@ -43,8 +43,7 @@ import districts
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, search
 from calibray.optimizers import LeastSquares
-from calibray.tables import Column, Table, numbers
-from calibray.tables.text import render, render_markdown
+from calibray.tables import Column, Table, numbers, render, render_markdown
 from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.credible_sets import credible, credible_sets
 from calibray.uncertainty.draws import Draws

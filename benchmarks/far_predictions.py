@@ -34,8 +34,7 @@ from calibray.errors import InputError
 from calibray.fitting.problem import Problem
 from calibray.result.held_out import FITTED, WITHOUT_MATERIALS, Model
 from calibray.scenes.obstruction import OUT_OF_SIGHT
-from calibray.tables import Column, Table, numbers
-from calibray.tables.text import render
+from calibray.tables import Column, Table, numbers, render
 from calibray.validation.held_out_statistics import (
     interval_half_width,
     out_of_sight_ratio,

@@ -29,8 +29,7 @@ from calibray.calibration.link_diagnostics import directions_remark
 from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares
 from calibray.result.held_out import Model
-from calibray.tables import Column, Table, numbers
-from calibray.tables.text import render
+from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.credible_sets import credible
 from calibray.validation.validate import fit_models, validate_problem

@@ -24,8 +24,7 @@ from calibray.paths import Paths, take
 from calibray.paths.interactions import Kind
 from calibray.paths.selection import concatenate
 from calibray.study import Study
-from calibray.tables import Column, Table, numbers
-from calibray.tables.text import render
+from calibray.tables import Column, Table, numbers, render
 from districts import District
 
 NOTHING = "nothing more"

@@ -23,8 +23,7 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares
 from calibray.study import Study
-from calibray.tables import Column, Table, numbers
-from calibray.tables.text import render
+from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.credible_sets import credible
 

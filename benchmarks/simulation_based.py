@@ -37,8 +37,7 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares
 from calibray.study import Setup, Study
-from calibray.tables import Column, Table, numbers
-from calibray.tables.text import render
+from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.credible_sets import credible
 from calibray.uncertainty.joint_model import JointModel, joint_model
 from calibray.uncertainty.sequential_monte_carlo import BUDGET, draw_posterior

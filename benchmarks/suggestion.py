@@ -40,8 +40,7 @@ from calibray.scenarios import demo_study_path
 from calibray.scenarios.district import AVENUES, STREETS, district, scene_objects
 from calibray.scenes import write_scene
 from calibray.study import Study
-from calibray.tables import Column, Table, numbers
-from calibray.tables.text import render
+from calibray.tables import Column, Table, numbers, render
 
 NOISE_DB = 3.0
 MEASURED, MORE = 20, 5

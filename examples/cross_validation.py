@@ -12,8 +12,7 @@ import sys
 from pathlib import Path
 
 import calibray as cb
-from calibray.tables import Column, Table, numbers
-from calibray.tables.text import render
+from calibray.tables import Column, Table, numbers, render
 
 BLOCKS = {
     "nist_boulder": {  # along the street in sight from west to east, and along the other from near to far

@@ -21,7 +21,7 @@ from calibray.optimizers import METHODS
 from calibray.parameters import Parameter, Parameters
 from calibray.reporting.result_tables import nuisances
 from calibray.study import Setup
-from calibray.tables.text import render
+from calibray.tables import render
 
 PAPER_CALLS = {"gwo": 600, "sgwo-im": 225}
 METHOD_NAMES = ("auto", *METHODS)

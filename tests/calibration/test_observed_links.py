@@ -20,7 +20,7 @@ from calibray.result import wording
 from calibray.result.held_out import Model
 from calibray.result.verdict import RemarkKind
 from calibray.study import Setup, Study
-from calibray.tables.text import render
+from calibray.tables import render
 from calibray.uncertainty.conflict import conflict
 from calibray.validation.validate import validate_problem
 

@@ -15,7 +15,7 @@ from calibray import doctor as diagnosis
 from calibray.cli import main
 from calibray.cli.app import Commands, app
 from calibray.errors import EngineError, InputError
-from calibray.tables.text import render
+from calibray.tables import render
 
 HEAVY = (
     "numpy",

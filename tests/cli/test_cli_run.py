@@ -20,7 +20,7 @@ from calibray.paths import Paths
 from calibray.reporting import result_tables
 from calibray.result import FILES
 from calibray.support.output_files import SIGNATURES
-from calibray.tables.text import render
+from calibray.tables import render
 from calibray.tracing.protocol import EnclosedAntennas
 from changed import changed
 from commands import run, write_study

@@ -18,7 +18,7 @@ from calibray.cli.scene import scene
 from calibray.reporting import scene_tables as report
 from calibray.scenes import read_frame, read_scene
 from calibray.scenes.checks import check_scene
-from calibray.tables.text import render
+from calibray.tables import render
 from planted_maps import FRAME, write_extract
 
 SQUARE = [(0, 0), (20, 0), (20, 20), (0, 20)]

@@ -10,7 +10,7 @@ import pytest
 
 from calibray import doctor as diagnosis
 from calibray.doctor import Check, Diagnosis
-from calibray.tables.text import render
+from calibray.tables import render
 from calibray.tracing import llvm
 
 OLD = llvm.Llvm("/usr/lib/libLLVM-15.so.1", (15,), "LLVM 15 is too old")

@@ -2,7 +2,7 @@
 
 import shown
 from calibray.cli.ledger import calls_table
-from calibray.tables.text import render
+from calibray.tables import render
 
 
 def test_the_table_has_one_row_per_call():

@@ -25,7 +25,7 @@ from calibray.parameters import Parameter, Parameters
 from calibray.paths import take
 from calibray.reporting.result_tables import costs
 from calibray.study import Setup, Study
-from calibray.tables.text import render
+from calibray.tables import render
 
 PRIOR = {"prior": {"value": 4.0, "spread": 0.3}}
 

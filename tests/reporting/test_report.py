@@ -11,7 +11,7 @@ import shown
 from calibray.comparison import comparison
 from calibray.reporting import result_tables
 from calibray.reporting import scene_tables as trace
-from calibray.tables.text import render, render_markdown
+from calibray.tables import render, render_markdown
 from calibray.tracing.protocol import EnclosedAntennas
 from changed import changed
 

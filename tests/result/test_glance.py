@@ -10,7 +10,7 @@ import pytest
 import shown
 from calibray.measurements import Measurements
 from calibray.study import Study
-from calibray.tables import display as glance
+from calibray.tables import SENTENCE, named
 from changed import changed
 from html_cells import Cells
 
@@ -58,7 +58,7 @@ RECORDS = large_records()
 def test_it_fits_a_screen(kind):
     lines = repr(RECORDS[kind]).splitlines()
     assert len(lines) <= LINES
-    assert max(map(len, lines)) <= CHARACTERS + glance.SENTENCE * (kind == "links")
+    assert max(map(len, lines)) <= CHARACTERS + SENTENCE * (kind == "links")
     assert str(RECORDS[kind]) == repr(RECORDS[kind])
 
 
@@ -108,4 +108,4 @@ def test_links_tell_their_number_groups_and_ranges():
 
 
 def test_names_are_counted_where_they_are_many():
-    assert glance.named(f"mast {k}" for k in range(500)).endswith("mast 3 and 496 more")
+    assert named(f"mast {k}" for k in range(500)).endswith("mast 3 and 496 more")

@@ -22,7 +22,7 @@ from calibray.result.verdict import Interval, ReasonKind, Verdict
 from calibray.result.wording import reason_text
 from calibray.scenes import read_scene
 from calibray.scenes.export import exported_names
-from calibray.tables.text import render
+from calibray.tables import render
 from calibray.uncertainty.verdicts import consistent
 
 NAME = next(name for name in shown.result().parameters if name.endswith(".relative_permittivity"))

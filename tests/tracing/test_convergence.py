@@ -13,7 +13,7 @@ from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.reporting import scene_tables as report
 from calibray.scenes import read_scene
-from calibray.tables.text import render
+from calibray.tables import render
 from calibray.tracing.convergence import Convergence, check, compare
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer

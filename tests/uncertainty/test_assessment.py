@@ -22,7 +22,7 @@ from calibray.reporting import result_tables as tables
 from calibray.result.held_out import Model
 from calibray.result.wording import NOT_JUDGED, reason_text
 from calibray.study import Setup, Study
-from calibray.tables.text import render
+from calibray.tables import render
 from calibray.uncertainty.assessment import certainty
 from calibray.validation import variants
 from calibray.validation.validate import validate_problem

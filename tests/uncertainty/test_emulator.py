@@ -17,7 +17,7 @@ from calibray.optimizers import LeastSquares, VectorSurrogate
 from calibray.reporting import result_tables as tables
 from calibray.result.wording import reason_text
 from calibray.study import Setup, Study
-from calibray.tables.text import render
+from calibray.tables import render
 from calibray.uncertainty.assessment import certainty
 
 NOISE_DB = 0.3

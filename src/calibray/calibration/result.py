@@ -17,7 +17,7 @@ from calibray.reporting import diagnostics, result_tables
 from calibray.result import files, wording
 from calibray.result.record import Record
 from calibray.support.progress import Progress
-from calibray.tables import display
+from calibray.tables import short_html, short_text
 from calibray.validation.validation import Validation
 
 if TYPE_CHECKING:
@@ -33,10 +33,10 @@ class Result(Record):
     """A finished calibration; `Record` lists its sections."""
 
     def __repr__(self) -> str:
-        return display.text(*result_tables.summary(self))
+        return short_text(*result_tables.summary(self))
 
     def _repr_html_(self) -> str:
-        return display.html(*result_tables.summary(self))
+        return short_html(*result_tables.summary(self))
 
     @classmethod
     def load(cls, folder: str | Path, *, allow_changed_inputs: bool = False) -> Result:

@@ -49,7 +49,7 @@ def compare(
     from calibray.comparison.method_runs import study_problem
     from calibray.study import Study
     from calibray.support.output_files import check_outputs
-    from calibray.tables.text import render
+    from calibray.tables import render
 
     names = [name.strip() for name in methods.split(",") if name.strip()]
     check_outputs(out, FILES, Study.load(study_file).files(), overwrite)

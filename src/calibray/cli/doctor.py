@@ -42,7 +42,7 @@ def _machine() -> None:
     """Check the machine."""
     from calibray.cli.progress_bars import progress_bars
     from calibray.doctor import examine
-    from calibray.tables.text import render
+    from calibray.tables import render
 
     with progress_bars(log()) as progress:
         progress("checking Dr.Jit, Sionna RT and JAX", 0, None)
@@ -60,7 +60,7 @@ def _scene(subject: str, plot: Path | None, overwrite: bool) -> None:
         from calibray.reporting import scene_tables
         from calibray.scenes.checks import check_scene
         from calibray.study import Study
-        from calibray.tables.text import render
+        from calibray.tables import render
 
         study = Study.load(subject) if subject.lower().endswith(".toml") else None
         if plot is not None and study is None:
@@ -91,8 +91,7 @@ def cache(
     The environment variable CALIBRAY_CACHE sets the folder. If it is set but empty, Calibray caches nothing.
     """
     from calibray.support.cache_folder import cache_folder, compiled_programs
-    from calibray.tables import Column, Table, numbers
-    from calibray.tables.text import render
+    from calibray.tables import Column, Table, numbers, render
     from calibray.tracing.cache import stored_traces
 
     folder, programs = cache_folder(), compiled_programs()

@@ -64,7 +64,7 @@ def init(
         from calibray.study.draft import schema_text
         from calibray.study.link_checks import count_unknowns
         from calibray.study.toml_file import SCHEMA_FILE
-        from calibray.tables.text import render
+        from calibray.tables import render
 
         progress("reading scene and links", 0, None)
         draft = draft_study(

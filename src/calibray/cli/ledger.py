@@ -36,7 +36,7 @@ def ledger(
 
     from calibray.engines import open_ledger
     from calibray.support.output_tables import check_table, write_table
-    from calibray.tables.text import render
+    from calibray.tables import render
 
     if out is not None:
         check_table(out, (), overwrite)

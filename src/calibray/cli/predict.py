@@ -146,7 +146,7 @@ def _collect_warnings(
 
 
 def _warn(warning: str, rows: Sequence[int], count: int) -> None:
-    from calibray.tables.text import rows_text
+    from calibray.tables import rows_text
 
     if rows:
         echo(f"Warning: {warning} {len(rows)} of {count} links, {rows_text(rows)}", err=True)
@@ -196,7 +196,7 @@ def suggest(
         from calibray.prediction.predict import as_links
         from calibray.prediction.suggestion import suggest as suggest_links
         from calibray.support.output_tables import check_table, write_table
-        from calibray.tables.text import render
+        from calibray.tables import render
 
         print_costs()
         result = Result.load(folder, allow_changed_inputs=allow_changed_inputs)

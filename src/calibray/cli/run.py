@@ -63,7 +63,7 @@ def run(
             from calibray.result import FILES
             from calibray.study import Study
             from calibray.support.output_files import check_outputs
-            from calibray.tables.text import render
+            from calibray.tables import render
 
             study = Study.load(study_file).replace(method, seed, engine)
             check_method(study.method.name)
@@ -144,7 +144,7 @@ def demo(
     with progress_bars(log()) as progress:
         from calibray.comparison.demo import FILES, run_demo, write_demo
         from calibray.support.output_files import check_outputs
-        from calibray.tables.text import render
+        from calibray.tables import render
 
         check_outputs(out, FILES, (), overwrite)
         finished = run_demo(engine, seed, progress)

@@ -207,7 +207,7 @@ def plan(
 def _print(made: MadeScene) -> None:
     """Print the contents of the scene."""
     from calibray.reporting.scene_tables import contents
-    from calibray.tables.text import render
+    from calibray.tables import render
 
     echo(render(contents(made)))
 

@@ -44,7 +44,7 @@ def trace(
         from calibray.reporting import scene_tables
         from calibray.study import Study
         from calibray.support.output_files import check_file
-        from calibray.tables.text import render
+        from calibray.tables import render
 
         study = Study.load(study_file)
         if out is None and not check:

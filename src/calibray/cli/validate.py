@@ -51,7 +51,7 @@ def validate(
         from calibray.result.files import VALIDATION_FILE, write_validation
         from calibray.study import Study
         from calibray.support.output_files import check_outputs
-        from calibray.tables.text import render
+        from calibray.tables import render
         from calibray.validation.validate import validate as run_validation
 
         study = Study.load(study_file)

@@ -20,7 +20,7 @@ from calibray.optimizers import METHODS, label
 from calibray.support.figure_style import COLORS, PALETTE, logarithmic, plain_figure, styled
 from calibray.support.figure_style import write as write_figure
 from calibray.support.output_tables import write_table
-from calibray.tables import Column, Table, display, numbers
+from calibray.tables import Column, Table, numbers, short_html, short_text
 
 CALLS: Final = (30, 60, 225)
 """Numbers of RT calls for which the excess is tabulated, in addition to the end."""
@@ -106,10 +106,10 @@ class Comparison:
         return pd.concat(parts, ignore_index=True)
 
     def __repr__(self) -> str:
-        return display.text(*_summary(self))
+        return short_text(*_summary(self))
 
     def _repr_html_(self) -> str:
-        return display.html(*_summary(self))
+        return short_html(*_summary(self))
 
     def _row(self, method: BudgetedMethod) -> dict[str, Any]:
         runs = self.runs[method.name]

@@ -23,7 +23,7 @@ from calibray.study import Setup, Study
 from calibray.support import figure_style as style
 from calibray.support.output_files import write_text
 from calibray.support.progress import Progress, with_stage
-from calibray.tables import Column, Table, display, numbers
+from calibray.tables import Column, Table, numbers, short_html, short_text
 
 RECORD: Final = "result.json"
 FIGURES: Final = ("cumulative-cost.png", "convergence.png", "path-loss.png")
@@ -150,10 +150,10 @@ class Demo:
     trace_seconds: float
 
     def __repr__(self) -> str:
-        return display.text(self._heading, permittivity(self), accuracy(self))
+        return short_text(self._heading, permittivity(self), accuracy(self))
 
     def _repr_html_(self) -> str:
-        return display.html(self._heading, permittivity(self), accuracy(self))
+        return short_html(self._heading, permittivity(self), accuracy(self))
 
     @property
     def _heading(self) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from calibray.errors import InputError
 from calibray.measurements.source_table import SourceTable
 from calibray.support.messages import shortened
-from calibray.tables import Column, Table, display
+from calibray.tables import Column, Table, hertz, named, short_html, short_text
 
 MIN_DISTANCE: Final = 1e-3
 """Distance [m] between transmitter and receiver below which they coincide, so that no path loss is defined."""
@@ -97,11 +97,11 @@ class Measurements:
 
     def __repr__(self) -> str:
         kind = "measured" if self.measured else "unmeasured"
-        groups = "" if self.group is None else f" in groups {display.named(self.group_names)}"
-        return display.text(f"<{len(self)} {kind} links{groups} from {self.source}>")
+        groups = "" if self.group is None else f" in groups {named(self.group_names)}"
+        return short_text(f"<{len(self)} {kind} links{groups} from {self.source}>")
 
     def _repr_html_(self) -> str:
-        return display.html(_summary(self))
+        return short_html(_summary(self))
 
     @property
     def frame(self) -> pd.DataFrame:
@@ -249,9 +249,9 @@ def _summary(links: Measurements) -> Table:
     if links.measured:
         rows.append(("path loss", _range(links.path_loss_db, "dB")))
     if links.group is not None:
-        rows.append(("groups", display.named(links.group_names)))
+        rows.append(("groups", named(links.group_names)))
     if links.carriers:
-        rows.append(("carriers", display.named(display.hertz(frequency) for frequency, _ in links.carriers)))
+        rows.append(("carriers", named(hertz(frequency) for frequency, _ in links.carriers)))
     return Table(f"Links from {links.source}", (Column(), Column()), tuple(rows))
 
 

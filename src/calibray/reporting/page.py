@@ -39,9 +39,7 @@ from calibray.scenes import Scene, Triangles, read_scene, read_triangles
 from calibray.support import figure_style as style
 from calibray.support.output_files import check_file, check_outputs, write_text
 from calibray.support.progress import Progress
-from calibray.tables import Column, Table, numbers
-from calibray.tables.display import hertz
-from calibray.tables.text import decibels
+from calibray.tables import Column, Table, decibels, hertz, numbers
 from calibray.validation.validation import Validation, observables_table
 
 FILE: Final = "report.html"

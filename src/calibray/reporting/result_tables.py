@@ -14,8 +14,7 @@ from calibray.result import wording
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict
 from calibray.result.wording import explanation_text, interval_text
-from calibray.tables import Column, Table, numbers
-from calibray.tables.text import decibels, rows_text
+from calibray.tables import Column, Table, decibels, numbers, rows_text
 from calibray.tracing.protocol import EnclosedAntennas
 from calibray.validation.validation import Validation, observables_table
 

@@ -13,8 +13,7 @@ from calibray.reporting.result_tables import suspicious_rows
 from calibray.scenes.authoring import MadeScene
 from calibray.scenes.checks import Finding, SceneCheck
 from calibray.study.draft import Draft
-from calibray.tables import Column, Table, numbers
-from calibray.tables.text import rows_text
+from calibray.tables import Column, Table, numbers, rows_text
 from calibray.tracing.convergence import Convergence
 from calibray.tracing.protocol import EnclosedAntennas
 

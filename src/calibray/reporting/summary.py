@@ -12,8 +12,7 @@ from calibray.reporting.wording import block_sentence, prediction_text, scene_al
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict
 from calibray.result.wording import NOT_JUDGED, judgement_text
-from calibray.tables.display import hertz, named
-from calibray.tables.text import rows_text
+from calibray.tables import hertz, named, rows_text
 from calibray.validation.validation import Validation
 
 Kind = Literal["plain", "good", "caution"]

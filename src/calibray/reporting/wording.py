@@ -11,8 +11,7 @@ from calibray.reporting.diagnostics import FEWEST, calibration_links, diagnostic
 from calibray.result.held_out import HeldOutErrors, Model
 from calibray.result.record import Record
 from calibray.support.messages import percent
-from calibray.tables import Column, Table
-from calibray.tables.text import rows_text
+from calibray.tables import Column, Table, rows_text
 
 SCENE_ALONE_DB: Final = 0.05
 """Largest difference between the exported scene and the predictions that is not reported."""

@@ -24,8 +24,7 @@ from calibray.study.content import OFFSET
 from calibray.study.model import StudyModel
 from calibray.study.row_steps import position_steps, row_track, study_links
 from calibray.study.setup import Setup
-from calibray.tables import Column, Table, display, numbers
-from calibray.tables.display import hertz
+from calibray.tables import Column, Table, hertz, numbers, short_html, short_text
 
 
 @final
@@ -82,12 +81,12 @@ class Study(StudyModel):
         return study
 
     def __repr__(self) -> str:
-        return display.text(*summary(self))
+        return short_text(*summary(self))
 
     __str__ = __repr__
 
     def _repr_html_(self) -> str:
-        return display.html(*summary(self))
+        return short_html(*summary(self))
 
     def measurements(self) -> Measurements:
         """All links of the study, including held-out links, with the groups of the offset.

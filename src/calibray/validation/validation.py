@@ -30,7 +30,7 @@ from calibray.result.held_out import (
 )
 from calibray.result.wording import choice_text, judgement_text
 from calibray.support.messages import percent
-from calibray.tables import Column, Table, display, numbers
+from calibray.tables import Column, Table, numbers, short_html, short_text
 from calibray.validation.held_out_statistics import choose, compare, interval_half_width, least, two_levels
 
 
@@ -70,10 +70,10 @@ class Validation(HeldOutErrors):
         )  # fmt: skip
 
     def __repr__(self) -> str:
-        return display.text(*self.summary())
+        return short_text(*self.summary())
 
     def _repr_html_(self) -> str:
-        return display.html(*self.summary())
+        return short_html(*self.summary())
 
     @cached_property
     def judged(self) -> NDArray[np.bool_]:

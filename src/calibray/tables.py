@@ -1,0 +1,269 @@
+"""Tables as data, and their rendering, with sentences, as plain text, HTML and Markdown.
+
+Control characters and markup are escaped, because names come from files. Short forms are for the Python prompt and
+notebooks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from html import escape
+from io import StringIO
+from typing import Final, Literal
+
+from calibray.support.messages import printable
+
+LISTED: Final = 12
+"""Largest number of rows of a file that are listed; the others are only counted."""
+
+WIDEST: Final = 100_000
+"""Characters per line: many, so that no cell is cut; output also goes to files and pipes."""
+
+ROWS: Final = 10
+"""Largest number of rows of a table at the prompt; the others are only counted."""
+
+CHARACTERS: Final = 60
+"""Largest number of characters of a cell or a name; longer ones are cut."""
+
+SENTENCE: Final = 200
+"""Largest number of characters of a sentence; longer ones are cut."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table.
+
+    Attributes:
+        name: Meaning of its cells; empty for the column that names the rows.
+        unit: Unit of all its cells; empty if they have no unit or different ones.
+        align: "left" for text, "right" for numbers.
+
+    Example:
+        >>> Column("time", "s").heading
+        'time [s]'
+    """
+
+    name: str = ""
+    unit: str = ""
+    align: Literal["left", "right"] = "left"
+
+    @property
+    def heading(self) -> str:
+        """The name with the unit in brackets."""
+        return " ".join(part for part in (self.name, self.unit and f"[{self.unit}]") if part)
+
+
+def numbers(name: str = "", unit: str = "") -> Column:
+    """A column of numbers, aligned to the right."""
+    return Column(name, unit, "right")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with cells of text.
+
+    Attributes:
+        title: Its title; may be empty.
+        columns: Its columns.
+        rows: The cells of every row, one per column.
+
+    Raises:
+        ValueError: A row has more or fewer cells than there are columns.
+
+    Example:
+        >>> table = Table("Cost", (Column(), numbers("time", "s")), (("tracing", "0.3"),))
+        >>> table.titled, table.headed
+        (False, True)
+    """
+
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.columns):
+                raise ValueError(
+                    f"table {self.title!r}: a row has {len(row)} cells, must be {len(self.columns)}: {row}"
+                )
+
+    @property
+    def titled(self) -> bool:
+        """Whether the title is above the table; otherwise it is the heading of the first column."""
+        return bool(self.title) and bool(self.columns[0].heading)
+
+    @property
+    def headed(self) -> bool:
+        """Whether the table has a row of headings."""
+        return bool(self.title) or any(column.heading for column in self.columns)
+
+    @property
+    def headings(self) -> tuple[str, ...]:
+        """The heading of each column."""
+        first = self.columns[0].heading or self.title
+        return (first, *(column.heading for column in self.columns[1:]))
+
+    def head(self, count: int) -> Table:
+        """The first rows, and a last row with the number of rows that are left out, if any.
+
+        Example:
+            >>> Table("", (Column("link"),), (("a",), ("b",), ("c",))).head(1).rows
+            (('a',), ('... and 2 more',))
+        """
+        if len(self.rows) <= count:
+            return self
+        left_out = (f"... and {len(self.rows) - count:,} more", *("" for _ in self.columns[1:]))
+        return replace(self, rows=(*self.rows[:count], left_out))
+
+
+def render(*parts: Table | str) -> str:
+    """Render tables and sentences as plain text, with an empty line between them; empty strings are omitted.
+
+    Example:
+        >>> print(render("study.toml", Table("Cost", (Column(), numbers()), (("tracing", "0.3 s"),))))
+        study.toml
+        <BLANKLINE>
+        Cost
+        ───────────────
+        tracing   0.3 s
+    """
+    return "\n\n".join(
+        printable(part, "\n") if isinstance(part, str) else _lines(part) for part in parts if part
+    )
+
+
+def render_html(*parts: Table | str) -> str:
+    """Render tables and sentences as HTML: elements `p` and `table`, without scripts and links.
+
+    Example:
+        >>> render_html("a < b")
+        '<p>a &lt; b</p>'
+    """
+    return "\n".join(
+        f"<p>{escape(part)}</p>" if isinstance(part, str) else _html_table(part) for part in parts if part
+    )
+
+
+def render_markdown(table: Table) -> str:
+    """Render a table in Markdown, without a title above it and without a final line break."""
+    rules = ["---" if column.align == "left" else "---:" for column in table.columns]
+    return "\n".join(_markdown_line(line) for line in [table.headings, rules, *table.rows])
+
+
+def rows_text(rows: Sequence[int]) -> str:
+    """List rows of a file; if there are many, only the first ones; empty without rows.
+
+    Example:
+        >>> rows_text([3, 4, 9])
+        'rows 3, 4, 9'
+        >>> rows_text(range(2, 40))
+        'rows 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13 and 26 more'
+    """
+    if not rows:
+        return ""
+    first = ", ".join(map(str, rows[:LISTED]))
+    more = f" and {len(rows) - LISTED} more" if len(rows) > LISTED else ""
+    return f"row{'s' if len(rows) > 1 else ''} {first}{more}"
+
+
+def decibels(value: float | None) -> str:
+    """Format a value [dB] for tables with two decimals; a dash if unknown."""
+    return "-" if value is None else f"{value:.2f}"
+
+
+def short_text(*parts: Table | str) -> str:
+    """Plain text for `__repr__`, with long tables and cells cut, and control characters escaped."""
+    return render(*_fitted(parts))
+
+
+def short_html(*parts: Table | str) -> str:
+    """HTML for `_repr_html_`, with long tables and cells cut, and all text escaped."""
+    return render_html(*_fitted(parts))
+
+
+def named(names: Iterable[str], count: int = 4) -> str:
+    """List names with commas between them; if there are many, only the first ones.
+
+    Example:
+        >>> named(["east", "west"])
+        'east, west'
+        >>> named(f"mast {k}" for k in range(500))
+        'mast 0, mast 1, mast 2, mast 3 and 496 more'
+    """
+    short = [_short(name, CHARACTERS) for name in names]
+    more = f" and {len(short) - count:,} more" if len(short) > count else ""
+    return ", ".join(short[:count]) + more
+
+
+def hertz(frequency: float) -> str:
+    """Format a frequency [Hz] in GHz or MHz.
+
+    Example:
+        >>> hertz(28.5e9)
+        '28.5 GHz'
+    """
+    return f"{frequency / 1e9:.6g} GHz" if frequency >= 1e9 else f"{frequency / 1e6:.6g} MHz"
+
+
+def _lines(table: Table) -> str:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table as Grid
+    from rich.text import Text
+
+    grid = Grid(
+        box=box.SIMPLE_HEAD if table.headed else None,
+        show_header=table.headed, pad_edge=False, show_edge=False,
+    )  # fmt: skip
+    for column, heading in zip(table.columns, table.headings, strict=True):
+        grid.add_column(Text(printable(heading)), justify=column.align, no_wrap=True)
+    for row in table.rows:
+        grid.add_row(*(Text(printable(cell)) for cell in row))
+    console = Console(file=StringIO(), width=WIDEST, color_system=None)
+    with console.capture() as shown:
+        console.print(grid)
+    lines = [line.rstrip() for line in shown.get().splitlines()]
+    return "\n".join([printable(table.title), *lines] if table.titled else lines)
+
+
+def _html_table(table: Table) -> str:
+    caption = f"<caption>{escape(table.title)}</caption>" if table.title else ""
+    headings = [column.heading for column in table.columns]
+    head = f"<thead>{_html_row(table, 'th', headings)}</thead>" if any(headings) else ""
+    body = "".join(_html_row(table, "td", row) for row in table.rows)
+    return f"<table>{caption}{head}<tbody>{body}</tbody></table>"
+
+
+def _html_row(table: Table, tag: str, cells: list[str] | tuple[str, ...]) -> str:
+    return "<tr>{}</tr>".format(
+        "".join(
+            f'<{tag} style="text-align: {column.align}">{escape(cell)}</{tag}>'
+            for column, cell in zip(table.columns, cells, strict=True)
+        )
+    )
+
+
+def _markdown_line(cells: Iterable[str]) -> str:
+    escaped = (printable(cell).replace("|", r"\|") for cell in cells)
+    return f"| {' | '.join(escaped)} |"
+
+
+def _fitted(parts: Iterable[Table | str]) -> Iterator[Table | str]:
+    for part in parts:
+        if isinstance(part, str):
+            yield _short(part, SENTENCE)
+        else:
+            table = part.head(ROWS)
+            yield replace(
+                table,
+                columns=tuple(
+                    replace(column, name=_short(column.name, CHARACTERS)) for column in table.columns
+                ),
+                rows=tuple(tuple(_short(cell, CHARACTERS) for cell in row) for row in table.rows),
+            )
+
+
+def _short(text: str, length: int) -> str:
+    """Text on one line of limited length, with line breaks and control characters escaped."""
+    return printable(text if len(text) <= length else f"{text[: length - 3]}...")
