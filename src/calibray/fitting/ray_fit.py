@@ -2,8 +2,8 @@
 
 Materials are added one after the other. Each is scanned (`ray_scan.py`) on paths that meet no material that is added
 later. The best points, with several polarizations, are refined together with the values so far, by least squares with
-exact derivatives on all these paths. The best few go on. If a misfit remains at the end, each material is scanned again
-on all its paths.
+exact derivatives on all these paths. The best few go on. If a misfit remains at the end, linear polarizations are
+searched with the materials fixed (`ray_antennas.py`), and then each material is scanned again on all its paths.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 from calibray.engines.rays.compile import powers
 from calibray.engines.rays.surfaces import TOLERANCE
 from calibray.engines.replay import Replay
-from calibray.fitting import ray_scan
+from calibray.fitting import ray_antennas, ray_scan
 from calibray.fitting.ray_model import Call, Ends, RayModel
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take
@@ -121,6 +121,9 @@ def _search(
         if part:
             fits = _best([refined(fit, part, last, EVALUATIONS[0]) for fit in [*fits, *new]])
     fits = _best([refined(fit, ratios, last, EVALUATIONS[1]) for fit in fits] + ([before] if before else []))
+    if fits[0].misfit_db > EXACT_DB and all(fits[0].linear) and not fits[0].model.known:
+        new = _turned(fits[0], ratios, last)
+        fits = _best([*fits, *(refined(fit, ratios, last, EVALUATIONS[1]) for fit in new)])
     for material in order:
         if fits[0].misfit_db <= EXACT_DB:
             break
@@ -189,6 +192,21 @@ def _scanned(
         found = scan(fit, replace(paths, materials=model.paths.materials), True)
         new += [moved(fit, constants) for constants in found.lowest(0)]
     return new
+
+
+def _turned(fit: Understanding, ratios: list[Ratio], last: Call) -> list[Understanding]:
+    """Explanations with other angles of the antennas, and the same materials."""
+    model, count = fit.model, len(fit.model.assumed)
+    gains = model.gains(last.candidate, fit.values)
+    parts = [
+        ray_antennas.Gains(
+            gains[each.here], model.gains(each.call.candidate, fit.values)[each.here],
+            (model.bases[0][each.here], model.bases[1][each.here]), each.weight, each.observed,
+        )
+        for each in ratios
+    ]  # fmt: skip
+    found = ray_antennas.antennas(parts, fit.values[count:])
+    return [replace(fit, values=np.concatenate([fit.values[:count], angles])) for angles in found]
 
 
 def _polarized(fit: Understanding, slants: tuple[float | None, float | None]) -> Understanding:

@@ -116,12 +116,19 @@ class RayModel:
             self.paths.material_table(self.materials(candidate)),
             np.array([names.index(name) for name, _ in self.assumed], dtype=np.int64),
             np.array([FIELDS.index(field) for _, field in self.assumed], dtype=np.int64),
-            *self._bases,
+            *(basis[[] if self.known else self._layout.order] for basis in self.bases),
             np.array([0.0 if end else 1.0 for end in linear]),
         )
         with jax_settings():
             level, slope = _level_and_slope(self._layout.program, frame, values)
             return np.asarray(level)[self._order], np.asarray(slope)[self._order]
+
+    def gains(self, candidate: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Gain of every path between the ports [P, R, T], with the constants of values [k]."""
+        with jax_settings():
+            table = self.paths.material_table(self.materials(candidate, values))
+            real, imaginary = map(np.asarray, program_gains(self._layout.program, table))
+        return (real + 1j * imaginary).transpose(2, 0, 1)[self._order]
 
     def materials(
         self, candidate: NDArray[np.float64], values: NDArray[np.float64] | None = None
@@ -140,8 +147,8 @@ class RayModel:
         angles = values[len(self.assumed) :].reshape(-1, ANGLES)
         with jax_settings():
             for end in np.flatnonzero(linear).tolist() if not self.known else []:
-                weights = np.asarray(_ports(jnp.asarray(self._bases[end]), jnp.asarray(angles[end])))[:, 0]
-                fields[end] = np.einsum("pt,ptc->pc", weights[self._order], fields[end])[:, None]
+                weights = np.asarray(_ports(jnp.asarray(self.bases[end]), jnp.asarray(angles[end])))[:, 0]
+                fields[end] = np.einsum("pt,ptc->pc", weights, fields[end])[:, None]
         materials = self.materials(candidate, values)
         return replace(self.paths, materials=materials, tx_field=fields[0], rx_field=fields[1])
 
@@ -152,10 +159,9 @@ class RayModel:
                 yield f"{name}.{field}", value
 
     @cached_property
-    def _bases(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Axes theta and phi of the fields at both ends [P, 2, 3], in the order of the program; empty if known."""
-        order = [] if self.known else self._layout.order
-        return _basis(self.paths.departure[order]), _basis(self.paths.arrival[order])
+    def bases(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Axes theta and phi of the fields at both ends [P, 2, 3]."""
+        return _basis(self.paths.departure), _basis(self.paths.arrival)
 
     @cached_property
     def _layout(self) -> Layout:
