@@ -41,6 +41,7 @@ from problem_families.sites import office_site
 
 NOISE_DB: Final = 3.0
 REACHED_DB: Final = 0.01
+FAILED: Final = 99  # calls of a repetition that does not reach it, or fails
 SEARCHES: Final = 128  # local searches for an engine's optimum
 DIFFUSE: Final = 3  # diffuse paths of a link
 LEAST_POWER: Final = 1e-25  # of a path at the start values; the engines trace no weaker ones
@@ -164,7 +165,9 @@ def with_diffuse(place: Place) -> Place:
     power = powers(mixed)[diffuse]
     order = diffuse[np.lexsort((-power, mixed.link[diffuse]))]
     rank = np.arange(len(order)) - np.searchsorted(mixed.link[order], mixed.link[order])
-    both = concatenate([place.paths, take(mixed, np.sort(order[rank < DIFFUSE]))])
+    both = concatenate(
+        [replace(place.paths, materials=mixed.materials), take(mixed, np.sort(order[rank < DIFFUSE]))]
+    )
     setup = Study.from_content(content | {"materials": materials}, file).opened()
     return replace(place, setup=setup, paths=both)
 
@@ -210,10 +213,22 @@ def repetition(place: Place, name: str, seed: int) -> dict[str, Any]:
     excess = problem.squares(points).value - optimum
     return {
         "place": place.name, "engine": name, "seed": seed, "paths": foreign.paths.num_paths,
-        "calls": next((k + 1 for k, value in enumerate(excess.tolist()) if value <= REACHED_DB), 99),
+        "calls": next((k + 1 for k, value in enumerate(excess.tolist()) if value <= REACHED_DB), FAILED),
         "made": len(excess), "excess_db": excess.round(6).tolist(), "misfit_db": mapped.understanding.misfit_db,
         "gap_db": mapped.gap_db, "understood": mapped.understood, "seconds": time.process_time() - started,
     }  # fmt: skip
+
+
+def _attempt(place: Place, name: str, seed: int) -> dict[str, Any]:
+    """A repetition; one that fails counts as not solved and states the error."""
+    started = time.process_time()
+    try:
+        return repetition(place, name, seed)
+    except Exception as error:
+        return {
+            "place": place.name, "engine": name, "seed": seed, "calls": FAILED, "made": 0, "excess_db": [],
+            "understood": False, "seconds": time.process_time() - started, "error": f"{type(error).__name__}: {error}",
+        }  # fmt: skip
 
 
 def main() -> None:
@@ -249,7 +264,7 @@ def main() -> None:
                     continue
                 if (place := made.get(make, number, name == "scattering")) is None:
                     continue
-                rows.append(repetition(place, name, seed))
+                rows.append(_attempt(place, name, seed))
                 print(json.dumps(rows[-1]), flush=True)
                 if options.out is not None:
                     with options.out.open("a") as file:
@@ -297,13 +312,16 @@ class Places:
 def _summary(rows: list[dict[str, Any]]) -> str:
     calls = np.array([row["calls"] for row in rows])
     understood = np.array([row["understood"] for row in rows])
-    excess = np.array([min(row["excess_db"]) for row in rows])  # of the best call, which is the result
+    excess = np.array(
+        [min(row["excess_db"], default=np.inf) for row in rows]
+    )  # of the best call, which is the result
     right = (excess > 0.02)[~understood]
     return (
         f"{len(rows)} runs: calls median {np.median(calls):g}, 90th percentile {np.quantile(calls, 0.9):g}; "
         f"{understood.sum()} understood, {(excess[understood] > 0.05).sum()} of them above 0.05 dB "
         f"(largest {excess[understood].max(initial=0.0):.4f} dB); {len(right)} not understood, {right.sum()} of them "
-        f"above 0.02 dB; {np.mean([row['seconds'] for row in rows]):.1f} s of CPU each"
+        f"above 0.02 dB; {np.mean([row['seconds'] for row in rows]):.1f} s of CPU each; "
+        f"{sum('error' in row for row in rows)} ended with an error"
     )
 
 

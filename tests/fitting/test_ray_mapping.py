@@ -6,19 +6,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 import two_ray
 from calibray.engines import Replay
 from calibray.engines.rays.compile import RaySetting, compile_rays, powers, rays_of
 from calibray.engines.rays.export import Export
 from calibray.engines.rays.table import RayTable
-from calibray.fitting import ray_fit
+from calibray.fitting import ray_antennas, ray_fit
 from calibray.fitting.problem import Problem
+from calibray.fitting.ray_antennas import Gains
 from calibray.fitting.ray_fit import understand
 from calibray.fitting.ray_mapping import RayMap, map_rays
 from calibray.fitting.ray_model import ANGLES, HALF_SPACE, Call, RayModel
 from calibray.materials import Material
 from calibray.paths import Paths
+from calibray.paths.chains import spherical_basis
 from calibray.study import Setup
 from calibray.tracing.settings import Antenna
 
@@ -106,6 +109,43 @@ def test_values_that_no_ratio_shows_stay(foreign: Foreign) -> None:
     refined = ray_fit.refined(fit, ray_fit.ratios_of(calls), calls[-1], 12)
     np.testing.assert_array_equal(refined.values[slants], 0.3)
     assert not np.array_equal(refined.values, start)
+
+
+def test_a_ray_of_power_zero_is_absent(foreign: Foreign) -> None:
+    table = foreign.rays(np.array([4.0]))
+    power = table.power.copy()
+    power[0] = 0.0
+    setting = RaySetting.of(foreign.problem.setup)
+    export = Export.of_table(replace(table, power=power), setting)
+    rest = Export.of_table(table.take(np.arange(1, len(power))), setting)
+    np.testing.assert_array_equal(export.level_db, rest.level_db)
+    np.testing.assert_array_equal(export.paths.link, rest.paths.link)
+
+
+@pytest.mark.parametrize(("slant", "cross"), [(np.pi / 2, 0.2), (3 * np.pi / 4, 0.05), (0.0, 0.2)])
+def test_tilted_antennas_are_found_among_the_minima_near_their_nulls(slant: float, cross: float) -> None:
+    """A local search from upright antennas ends in a wrong minimum; the scan reaches the truth."""
+    random, count = np.random.default_rng(0), 60
+    bases = []
+    for _ in range(2):
+        direction = random.standard_normal((count, 3)) * [1.0, 1.0, 0.15]
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        theta = spherical_basis(direction)
+        bases.append(np.stack([theta, np.cross(direction, theta)], axis=1))
+    shape, coupling = (count, 2, 2), np.array([[1.0, cross], [cross, 1.0]])
+    last, earlier = (
+        np.exp(2j * np.pi * random.random(shape)) * random.random(shape) * coupling for _ in range(2)
+    )
+    part = Gains(last, earlier, (bases[0], bases[1]), np.full(count, 1 / count), np.zeros(count))
+    truth = np.array([np.pi / 2, 0.08, -0.06, slant, 0.0, 0.0])
+    parts = [part._replace(observed=ray_antennas.errors([part], truth))]
+    upright = np.array([np.pi / 2, 0.0, 0.0, slant, 0.0, 0.0])
+    local = least_squares(lambda angles: ray_antennas.errors(parts, angles), upright, loss="soft_l1").x
+    assert np.linalg.norm(ray_antennas.errors(parts, local)) > 1.0
+    difference = ray_antennas.antennas(parts, local)[0] - truth
+    slants = [0, ANGLES]
+    difference[slants] -= np.pi * np.round(difference[slants] / np.pi)
+    np.testing.assert_allclose(difference, 0.0, atol=1e-6)
 
 
 def test_an_engine_of_other_physics_is_not_understood(foreign: Foreign) -> None:

@@ -64,7 +64,7 @@ def antennas(parts: list[Gains], angles: NDArray[np.float64]) -> list[NDArray[np
     for start in starts:
         # The soft loss counts paths near a null less, as in the search for all values.
         fit = least_squares(
-            lambda angles: _errors(parts, angles), np.clip(start, 1e-9 - bound, bound - 1e-9), bounds=(-bound, bound),
+            lambda angles: errors(parts, angles), np.clip(start, 1e-9 - bound, bound - 1e-9), bounds=(-bound, bound),
             loss="soft_l1", f_scale=ROBUST_DB, x_scale=0.05, max_nfev=30,
         )  # fmt: skip
         found.append((fit.cost, fit.x))
@@ -76,7 +76,7 @@ def antennas(parts: list[Gains], angles: NDArray[np.float64]) -> list[NDArray[np
     return lowest
 
 
-def _errors(parts: list[Gains], angles: NDArray[np.float64]) -> NDArray[np.float64]:
+def errors(parts: list[Gains], angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Errors of the ratios [m], [dB], with weights of mean 1."""
     errors, weights = [], np.concatenate([part.weight for part in parts])
     for part in parts:
