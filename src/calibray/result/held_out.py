@@ -21,10 +21,8 @@ class Model(StrEnum):
     CALIBRATED = "calibrated"
     PRIOR = "calibrated with prior"
     SLOPE = "calibrated with slope"
-    PER_TRANSMITTER = "calibrated, offset per transmitter"
-    PRIOR_PER_TRANSMITTER = "calibrated with prior, offset per transmitter"
-    OUT_OF_SIGHT = "calibrated, offset out of sight"
-    PRIOR_OUT_OF_SIGHT = "calibrated with prior, offset out of sight"
+    OFFSETS = "calibrated with offsets"
+    PRIOR_OFFSETS = "calibrated with prior and offsets"
     RESIDUAL_FIELD = "calibrated with residual field"
     LOG_DISTANCE = "log-distance"
     OBSTRUCTION = "log-distance with obstruction"
@@ -41,10 +39,8 @@ FITTED: Final = (
     Model.CALIBRATED,
     Model.PRIOR,
     Model.SLOPE,
-    Model.PER_TRANSMITTER,
-    Model.PRIOR_PER_TRANSMITTER,
-    Model.OUT_OF_SIGHT,
-    Model.PRIOR_OUT_OF_SIGHT,
+    Model.OFFSETS,
+    Model.PRIOR_OFFSETS,
 )
 """Models that calibrate materials and can make predictions anywhere."""
 

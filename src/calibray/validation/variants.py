@@ -1,8 +1,10 @@
 """Variants of a study's model that use the scene, each fitted to the calibration links.
 
 The variants are the study's own model, its initial materials, priors around the initial values, a slope over distance,
-and an offset per transmitter: what an engineer would try by hand. The best variant differs between campaigns, so
-held-out links decide (`validate.py`).
+and offsets per transmitter and out of sight: what an engineer would try by hand. The best variant differs between
+campaigns, so held-out links decide (`validate.py`). Both offsets have a prior around zero, which keeps them small where
+the links do not need them. One variant therefore has both, instead of one variant for each
+(docs/measurements/predictions.md).
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE, Nuisance, make_ter
 from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import rounds
+from calibray.measurements import Measurements
 from calibray.optimizers import LeastSquares
 from calibray.optimizers.least_squares import CATCH_UP, NEARER
 from calibray.parameters import LogNormal
@@ -31,9 +34,9 @@ from calibray.validation.baselines import has_obstruction
 PRIOR_SPREAD: Final = 0.3
 """Standard deviation of a parameter's logarithm around its initial value, in the variants with priors."""
 
-OUT_OF_SIGHT_PRIOR_DB: Final = 10.0
-"""Standard deviation of the prior of an offset of links out of sight, around zero [dB]; in downtown Boulder, these
-links lack 11.7 dB."""
+OFFSET_PRIOR_DB: Final = 10.0
+"""Standard deviation of the prior, around zero, of a transmitter's offset from that of all links, and of the offset of
+links out of sight [dB]; in downtown Boulder, links out of sight lack 11.7 dB."""
 
 MOST_STARTS: Final = 4
 """Number of known minima from which a search starts."""
@@ -103,20 +106,13 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
         Model.INITIAL: replace(part, objective=initial_objective(objective, setup)),
         Model.CALIBRATED: part,
         Model.PRIOR: with_prior,
-        Model.SLOPE: replace(part, objective=_with_term(objective, LOG_DISTANCE, setup)),
+        Model.SLOPE: replace(part, objective=_with_term(objective, LOG_DISTANCE, setup.links)),
     }
-    if has_obstruction(setup.links):
-        out_of_sight = replace(
-            _with_term(objective, OUT_OF_SIGHT, setup, OUT_OF_SIGHT_PRIOR_DB), noise_db=noise_db
-        )
-        problems[Model.OUT_OF_SIGHT] = replace(part, objective=out_of_sight)
-        problems[Model.PRIOR_OUT_OF_SIGHT] = replace(with_prior, objective=out_of_sight)
-    per_transmitter = _with_offset_per_transmitter(objective, setup)
-    if per_transmitter is not None:
-        problems[Model.PER_TRANSMITTER] = replace(part, objective=per_transmitter)
-        problems[Model.PRIOR_PER_TRANSMITTER] = replace(
-            with_prior, objective=replace(per_transmitter, noise_db=noise_db)
-        )
+    with_both = with_offsets(objective, setup.links)
+    if with_both is not None:
+        with_both = replace(with_both, noise_db=noise_db)
+        problems[Model.OFFSETS] = replace(part, objective=with_both)
+        problems[Model.PRIOR_OFFSETS] = replace(with_prior, objective=with_both)
     return problems
 
 
@@ -168,27 +164,33 @@ def add_nuisance(objective: Objective, path_loss_db: NDArray[np.float64]) -> NDA
 
 def initial_objective(objective: Objective, setup: Setup) -> Objective:
     """The objective of the initial materials: with an offset of all links, unless the study declares one."""
-    return _with_term(objective, CONSTANT, setup)
+    return _with_term(objective, CONSTANT, setup.links)
 
 
-def _with_offset_per_transmitter(objective: Objective, setup: Setup) -> Objective | None:
-    """The objective with an offset per transmitter; None with one transmitter, or if a term already has groups."""
-    labels = transmitters(setup.links)
-    if len(np.unique(labels)) < 2 or any(len(term.labels) > 1 for term in objective.nuisance.terms):
-        return None
-    offset = make_term(setup.links, TX_OFFSET, labels=labels)
-    # The offsets per transmitter replace the offset of all links.
-    kept = [term for term in objective.nuisance.terms if term.by != CONSTANT]
-    return replace(objective, nuisance=Nuisance(len(setup.links), (*kept, offset)))
+def with_offsets(objective: Objective, links: Measurements) -> Objective | None:
+    """The objective with offsets per transmitter and out of sight that have a prior; None if neither is possible.
+
+    There are no offsets per transmitter with one transmitter, or if a term already has groups.
+    """
+    changed, labels = objective, transmitters(links)
+    if len(np.unique(labels)) > 1 and all(len(term.labels) == 1 for term in objective.nuisance.terms):
+        changed = _with_term(changed, CONSTANT, links)
+        deviation = make_term(links, TX_OFFSET, labels=labels, prior=OFFSET_PRIOR_DB)
+        changed = replace(changed, nuisance=Nuisance(len(links), (*changed.nuisance.terms, deviation)))
+    if has_obstruction(links):
+        changed = _with_term(changed, OUT_OF_SIGHT, links, OFFSET_PRIOR_DB)
+    return None if changed is objective else changed
 
 
-def _with_term(objective: Objective, by: str, setup: Setup, prior_db: float | None = None) -> Objective:
+def _with_term(
+    objective: Objective, by: str, links: Measurements, prior_db: float | None = None
+) -> Objective:
     """The objective with one coefficient of a kind for all links, unless it has a term of that kind."""
     if any(term.by == by for term in objective.nuisance.terms):
         return objective
-    term = make_term(setup.links, f"{by} of all links", by, prior=prior_db)
+    term = make_term(links, f"{by} of all links", by, prior=prior_db)
     terms = (*objective.nuisance.terms, term)
-    return replace(objective, nuisance=Nuisance(len(setup.links), terms))
+    return replace(objective, nuisance=Nuisance(len(links), terms))
 
 
 def _priors_around_start(problem: Problem) -> LogNormal:
