@@ -74,12 +74,15 @@ APART = (0.0, 0.3, 1.0)
 """How far truths lie from the study's start, of the way to anywhere."""
 
 
-def left_out(problem: Problem, here: np.ndarray) -> tuple[str, dict[str, np.ndarray], list[bool]]:
+def left_out(
+    problem: Problem, here: np.ndarray, inner_blocks: int | None = None
+) -> tuple[str, dict[str, np.ndarray], list[bool]]:
     """Choose and fit without some links, and judge by them.
 
     Args:
         problem: The problem.
         here: Which links are left out [L].
+        inner_blocks: Number of blocks of the others that choose the model; the study's number if None.
 
     Returns:
         The model that the others speak for, every model's errors at the links left out, with those of the one of the
@@ -89,7 +92,7 @@ def left_out(problem: Problem, here: np.ndarray) -> tuple[str, dict[str, np.ndar
     part = replace(problem, objective=replace(objective, weight=np.where(here, 0.0, objective.weight)))
     part = replace(part, setup=part.setup.with_obstruction())
     fits = fit_variants(part)
-    inner = validate_problem(part, known_minima={Model.CALIBRATED: fits[Model.CALIBRATED][1]})
+    inner = validate_problem(part, inner_blocks, known_minima={Model.CALIBRATED: fits[Model.CALIBRATED][1]})
     found = fit_models(part, fits)
     errors = {name: (model - objective.measured)[here] for name, model in found.items()}
     least = inner.table["rmse_db"].reindex([Model.INITIAL, *FITTED, *WITHOUT_MATERIALS]).idxmin()
@@ -109,7 +112,7 @@ def half_widths(levels: BlockErrors, links: int) -> tuple[float, float]:
     return within * levels.within_db, between * levels.between_db
 
 
-def nested(problem: Problem, count: int, uneven: int | None) -> tuple[Table, str]:
+def nested(problem: Problem, count: int, uneven: int | None, inner_blocks: int | None) -> tuple[Table, str]:
     """Leave one block out, and choose without it."""
     links, objective = problem.setup.links, problem.objective
     block = blocks_of(problem, count, uneven)
@@ -117,7 +120,7 @@ def nested(problem: Problem, count: int, uneven: int | None) -> tuple[Table, str
     mine = np.full(len(links), np.nan)
     for number in range(count):
         here = block == number
-        best, found, held = left_out(problem, here)
+        best, found, held = left_out(problem, here, inner_blocks)
         for name, each in found.items():
             errors.setdefault(name, np.full(len(links), np.nan))[here] = each
         chosen.append(best)
@@ -230,6 +233,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("studies", nargs="*", help="study files")
     parser.add_argument("--blocks", type=int, default=4)
+    parser.add_argument("--inner", type=int, help="number of blocks that choose the model; 4 if not given")
     parser.add_argument("--uneven", type=int, help="seed of clusters of receivers in place of even blocks")
     parser.add_argument("--rule", type=int, default=0, help="planted truths in each district")
     parser.add_argument("--districts", default="demo,district-101,district-103,district-105,district-107")
@@ -239,7 +243,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="file of the repetitions")
     given = parser.parse_args()
     for file in given.studies:
-        table, chosen = nested(opened(file), given.blocks, given.uneven)
+        table, chosen = nested(opened(file), given.blocks, given.uneven, given.inner)
         print(render(table, f"Chosen for each block: {chosen}."))
     if given.rule:
         print(render(rules(given.districts.split(","), given.rule)))
