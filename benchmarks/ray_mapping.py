@@ -69,7 +69,10 @@ ENGINES: Final[dict[str, tuple[Any, Any]]] = {
     ),
     "ITU law": (
         OTHER,
-        lambda m, f: replace(m, conductivity=itu_material("concrete", f).conductivity, thickness=0.25),
+        lambda m, f: replace(
+            m, conductivity=itu_material("concrete", max(f, 1e9)).conductivity, thickness=0.25
+        ),
+        # The law starts at 1 GHz.
     ),
 }
 """Antennas, and materials from the study's at a carrier [Hz]; calibrated constants are those of the candidate."""
