@@ -25,8 +25,7 @@ for library in (
 
 from calibray.cli.console import log
 from calibray.cli.progress_bars import progress_bars
-from calibray.comparison.compare import compare
-from calibray.comparison.comparison import figure, table
+from calibray.comparison.comparison import compare, figure, table
 from calibray.comparison.method_runs import ComparisonProblem, study_problem
 from calibray.scenarios import demo_study_path
 from calibray.support.figure_style import write

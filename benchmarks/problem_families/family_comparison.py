@@ -19,8 +19,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from calibray.comparison.compare import parse_methods
-from calibray.comparison.comparison import quantile
+from calibray.comparison.comparison import parse_methods, quantile
 from calibray.comparison.method_runs import (
     LIMITS,
     BudgetedMethod,

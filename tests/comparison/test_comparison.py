@@ -12,9 +12,8 @@ from typer.testing import CliRunner
 import planted
 from calibray.calibration.calibrate import calibrate
 from calibray.cli.app import app
-from calibray.comparison import compare as module
-from calibray.comparison.compare import compare
-from calibray.comparison.comparison import FILES, FLOOR_DB, Comparison, figure
+from calibray.comparison import comparison as module
+from calibray.comparison.comparison import FILES, FLOOR_DB, Comparison, compare, figure
 from calibray.comparison.comparison import table as render_table
 from calibray.comparison.method_runs import BudgetedMethod, MethodRun, RunFile, run_optimizer, study_problem
 from calibray.errors import InputError

@@ -15,8 +15,7 @@ from scipy.io import savemat
 
 import calibray as cb
 from calibray.engines.rays.compile import powers
-from calibray.engines.rays.polylines import Polyline, rows_of
-from calibray.engines.rays.sionna_paths import read_sionna_paths
+from calibray.engines.rays.other_programs import Polyline, read_sionna_paths, rows_of
 from calibray.errors import InputError
 from calibray.paths import Paths
 

@@ -43,9 +43,8 @@ def compare(
     from functools import partial
 
     from calibray.cli.progress_bars import progress_bars
-    from calibray.comparison.compare import compare as run_comparison
-    from calibray.comparison.compare import parse_methods
-    from calibray.comparison.comparison import FILES, optimum_text, table, write
+    from calibray.comparison.comparison import FILES, optimum_text, parse_methods, table, write
+    from calibray.comparison.comparison import compare as run_comparison
     from calibray.comparison.method_runs import study_problem
     from calibray.study import Study
     from calibray.support.output_files import check_outputs

@@ -29,7 +29,6 @@ from calibray.result.record import (
 from calibray.result.rows import COLUMNS, read_rows
 from calibray.scenes import export_scene, read_scene
 from calibray.study import Study
-from calibray.study.validation_errors import explain
 from calibray.support.messages import shortened
 from calibray.support.output_files import (
     check_outputs,
@@ -40,7 +39,7 @@ from calibray.support.output_files import (
     write_text,
 )
 from calibray.support.output_tables import csv_text
-from calibray.support.strict_models import Section
+from calibray.support.strict_models import Section, explain
 
 VERSION: Final = 1
 """The version of `result.json` that is written and read."""

@@ -29,9 +29,8 @@ from calibray.study.link_obstruction import REGION
 from calibray.study.observables import ObservableSection, by_column
 from calibray.study.regions import PREFIX, RegionSection
 from calibray.study.sections import AntennasSection, LinksSection, MaterialSection, SceneSection, TraceSection
-from calibray.study.validation_errors import dotted
 from calibray.support.messages import did_you_mean
-from calibray.support.strict_models import Section, Text
+from calibray.support.strict_models import Section, Text, dotted
 from calibray.tracing.mounting import EVERY, POSE, turns
 
 VERSION: Final = 1

@@ -27,9 +27,9 @@ from calibray.study.link_obstruction import CLUTTER
 from calibray.study.link_obstruction import COLUMNS as OBSTRUCTION
 from calibray.study.regions import PREFIX
 from calibray.study.toml_file import expand, read_content, refuse_unquoted_names, split_engine_keys
-from calibray.study.validation_errors import explain
 from calibray.support.messages import shortened
 from calibray.support.output_files import exists
+from calibray.support.strict_models import explain
 from calibray.tracing.settings import Antenna
 
 

@@ -17,10 +17,9 @@ from tomlkit.items import Item, Table
 from calibray.engines.kinds import DEFAULT, KINDS
 from calibray.errors import InputError
 from calibray.study.calibration_sections import ParameterSection
-from calibray.study.validation_errors import describe_fault
 from calibray.support.messages import printable, shortened
 from calibray.support.output_files import exists
-from calibray.support.strict_models import CLOSED
+from calibray.support.strict_models import CLOSED, describe_fault
 
 SCHEMA_FILE: Final = "study.schema.json"
 HEADING: Final = (

@@ -8,16 +8,13 @@ from typing import Any, overload
 
 import pandas as pd
 
-from calibray.engines.rays.aodt import FILES, read_aodt
 from calibray.engines.rays.compile import RaySetting, compile_rays, rays_of
-from calibray.engines.rays.deepmimo import is_deepmimo, read_deepmimo
-from calibray.engines.rays.files import read_ray_file, write_ray_file
-from calibray.engines.rays.insite import read_insite
-from calibray.engines.rays.sionna_paths import is_sionna_paths, read_sionna_paths
+from calibray.engines.rays.files import write_ray_file
+from calibray.engines.rays.other_programs import ray_rows
 from calibray.engines.rays.table import RayTable
 from calibray.errors import InputError
 from calibray.materials import Material
-from calibray.measurements import Measurements, SourceTable
+from calibray.measurements import Measurements
 from calibray.paths import Paths
 from calibray.scenes import Scene, read_scene
 from calibray.study.setup import Setup
@@ -157,7 +154,7 @@ def read_rays(
         >>> study = Study.load(demo_study_path())
         >>> read_rays("rays.csv", study)  # doctest: +SKIP
     """
-    rows = _rows(rays, tx_power_dbm)
+    rows = ray_rows(rays, tx_power_dbm)
     if isinstance(scene, Study | Setup):
         if frequency is not None:
             raise InputError("read_rays: the study states the frequency; change it there")
@@ -169,26 +166,6 @@ def read_rays(
         scene = scene if isinstance(scene, Scene) else read_scene(scene, frequency)
         setting = RaySetting(scene, frequency, antennas)
     return compile_rays(RayTable.of(rows, axes), setting)
-
-
-def _rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
-    """The rows of a table, or of the paths of another program."""
-    if isinstance(rays, pd.DataFrame):
-        return SourceTable(rays)
-    if is_sionna_paths(rays):
-        return read_sionna_paths(rays)
-    path = Path(rays)
-    if path.suffix.lower() == ".p2m" and path.is_file():
-        return read_insite(path, tx_power_dbm)
-    if not path.is_dir():
-        return read_ray_file(path)
-    if is_deepmimo(path):
-        return read_deepmimo(path)
-    if (path / FILES[0]).is_file():
-        return read_aodt(path)
-    raise InputError(
-        f"{path}: a folder must have {' and '.join(FILES)} (AODT) or power_t*.mat (DeepMIMO); otherwise name a file"
-    )
 
 
 def write_rays(paths: Paths, file: str | Path, *, overwrite: bool = False) -> None:

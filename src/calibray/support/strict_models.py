@@ -1,10 +1,16 @@
-"""Strict models of file contents: unknown keys and wrong types are refused instead of ignored."""
+"""Strict models of file contents, which refuse unknown keys and wrong types, and messages about what they refuse."""
 
 from __future__ import annotations
 
-from typing import Annotated, Final
+import types
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Annotated, Any, Final, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from calibray.errors import InputError
+from calibray.support.messages import did_you_mean, shortened
 
 CLOSED: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 """No unknown keys, no type conversions, only finite numbers."""
@@ -16,3 +22,140 @@ class Section(BaseModel):
     """A table of a file: strict and immutable."""
 
     model_config = CLOSED | ConfigDict(frozen=True)
+
+
+MOST_ERRORS: Final = 20
+"""Number of errors that are listed; further errors are only counted."""
+
+_UNKNOWN: Final = ("extra_forbidden", "unexpected_keyword_argument")
+
+_WORDS: Final[Mapping[str, str]] = {
+    "missing": "is required",
+    "greater_than_equal": "must be at least {ge:g}",
+    "greater_than": "must be greater than {gt:g}",
+    "less_than_equal": "must be at most {le:g}",
+    "literal_error": "must be one of {expected}",
+    "union_tag_invalid": "must be one of {expected_tags}",
+    "int_type": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "float_type": "must be a number",
+    "finite_number": "must be a finite number",
+    "bool_type": "must be true or false",
+    "string_type": "must be text in quotes",
+    "string_too_short": "must not be empty",
+    "tuple_type": "must be a list",
+    "too_short": "must not be empty",
+    "too_long": "must have {max_length} entries, has {actual_length}",
+    "model_type": "must be a table",
+    "dict_type": "must be a table",
+    "dataclass_type": "must be a table",
+}
+
+
+def explain(
+    error: ValidationError,
+    model: type[BaseModel],
+    content: Mapping[str, Any],
+    source: str,
+    tagged: Sequence[str] = (),
+) -> InputError:
+    """One message for all errors, with one line each: file, dotted key, value, bound.
+
+    For misspelled keys, it suggests keys of the model. `tagged` are tables of which there are several kinds,
+    distinguished by their `name`.
+    """
+    lines: dict[str, str] = {}
+    for fault in error.errors():
+        location = fault["loc"]
+        if location[:1] and location[0] in tagged:
+            # Pydantic puts the kind after the table's name, but it is not a key of the file.
+            location = (location[0], "name") if "tag" in fault["type"] else (location[0], *location[2:])
+        path = _path(location, content, fault["type"] == "missing")
+        key = dotted(path)
+        if fault["type"] in _UNKNOWN:
+            line = f"{key}: unknown key; {did_you_mean(str(path[-1]), _keys(model, path[:-1]))}"
+        elif fault["type"] == "missing":
+            line = f"{key}: {_WORDS['missing']}"
+        else:
+            text = describe_fault(fault)
+            # A message about a whole table names the key itself.
+            line = text if text.startswith(key) else f"{key}{_shown(path, content)}: {text}"
+        # A value that matches none of several types has one error per type; the first is enough.
+        lines.setdefault(key, line)
+    listed = list(lines.values())[:MOST_ERRORS]
+    if len(lines) > len(listed):
+        listed.append(f"and {len(lines) - len(listed)} more errors of this kind; correct these first")
+    return InputError("\n".join(f"{source}: {line}" for line in listed))
+
+
+def describe_fault(fault: Mapping[str, Any]) -> str:
+    """The message of one of Pydantic's errors, without the value."""
+    context = fault.get("ctx") or {}
+    if isinstance(cause := context.get("error"), InputError):
+        return str(cause)
+    template = _WORDS.get(fault["type"])
+    return fault["msg"] if template is None else template.format(**context)
+
+
+def dotted(path: Sequence[str | int]) -> str:
+    """A key in the form of TOML, for instance ``parameters."walls.thickness".bounds[1]``."""
+    text = ""
+    for part in path:
+        if isinstance(part, int):
+            text += f"[{part}]"
+        else:
+            name = shortened(f'"{part}"' if "." in part else part)
+            text += f".{name}" if text else name
+    return text
+
+
+def _path(location: Sequence[str | int], content: Any, missing: bool) -> tuple[str | int, ...]:
+    """Pydantic's location without the parts that name a type; only the last key may be missing from the content."""
+    path: list[str | int] = []
+    for index, part in enumerate(location):
+        last = index == len(location) - 1
+        if isinstance(content, Mapping):
+            if part not in content and not (missing and last):
+                break
+            content = content.get(part)
+        elif isinstance(content, list) and isinstance(part, int):
+            content = content[part] if part < len(content) else None
+        else:
+            break
+        path.append(part)
+    return tuple(path)
+
+
+def _shown(path: Sequence[str | int], content: Any) -> str:
+    """The value at a path, if it is short enough to help."""
+    for part in path:
+        content = content[part]
+    return "" if isinstance(content, Mapping) else f" = {shortened(repr(content))}"
+
+
+def _keys(model: Any, path: Sequence[str | int]) -> list[str]:
+    """The keys of a model at a path, of all kinds of tables that are possible there."""
+    models = [model]
+    for part in path:
+        models = [table for known in models for table in _tables(_annotation(known, str(part)))]
+    return list(dict.fromkeys(key for known in models for key in _annotations(known)))
+
+
+def _annotation(model: Any, key: str) -> Any:
+    """The type of a key of a model, or of any key of a mapping; None if it is neither."""
+    if annotations := _annotations(model):
+        return annotations.get(key)
+    arguments = get_args(model)
+    return arguments[1] if len(arguments) > 1 else None
+
+
+def _annotations(model: Any) -> dict[str, Any]:
+    if isinstance(model, type) and issubclass(model, BaseModel):
+        return {name: field.annotation for name, field in model.model_fields.items()}
+    return {field.name: field.type for field in fields(model)} if is_dataclass(model) else {}
+
+
+def _tables(annotation: Any) -> list[Any]:
+    """The types that a key may have, except None."""
+    options = get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
+    return [option for option in options if option is not type(None)]

@@ -1,0 +1,393 @@
+"""Paths of other programs as rows of a ray table: Wireless InSite, AODT, DeepMIMO and Sionna RT."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+from zipfile import BadZipFile, ZipFile
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.io import loadmat, whosmat
+from scipy.io.matlab import MatReadError
+
+from calibray.engines.rays.files import read_ray_file
+from calibray.engines.rays.table import ENDS, TYPES
+from calibray.errors import InputError
+from calibray.measurements import SourceTable, read_table
+from calibray.support.messages import did_you_mean, first_line, shortened
+
+
+class Polyline(NamedTuple):
+    """One path.
+
+    Attributes:
+        points: Points from the transmitter to the receiver [n, 3], [m].
+        types: Types of the n - 2 interactions, as in the column `type`.
+        power_db: Path gain [dB].
+        delay: Propagation delay [s]; NaN if not stated.
+    """
+
+    points: NDArray[np.floating]
+    types: Sequence[str]
+    power_db: float
+    delay: float = np.nan
+
+
+def rows_of(paths: Iterable[Polyline], source: str) -> SourceTable:
+    """The ray table of paths, in their order.
+
+    Raises:
+        InputError: The list is empty, or the numbers of points, interactions and ends of a path do not match.
+    """
+    paths = list(paths)
+    if not paths:
+        raise InputError(f"{source}: contains no path; export the rays of at least one link")
+    for number, path in enumerate(paths):
+        if len(path.points) != len(path.types) + 2:
+            raise InputError(
+                f"{source}: path {number} has {len(path.points)} points and {len(path.types)} interactions; it needs "
+                "two points more than interactions, its transmitter and its receiver"
+            )
+    count = [len(path.points) for path in paths]
+    per_path = {
+        "path": np.arange(len(paths)),
+        "power_db": [path.power_db for path in paths],
+        "delay": [path.delay for path in paths],
+    }
+    frame = pd.DataFrame({name: np.repeat(values, count) for name, values in per_path.items()})
+    frame["point"] = np.concatenate([np.arange(number) for number in count])
+    frame["type"] = [name for path in paths for name in (ENDS[0], *path.types, ENDS[1])]
+    frame[["x", "y", "z"]] = np.concatenate([np.asarray(path.points, dtype=float) for path in paths])
+    return SourceTable(frame.dropna(axis=1, how="all"), source=source)
+
+
+def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
+    """The rows of a ray table, a file of one, or the paths of another program.
+
+    Raises:
+        InputError: The file or folder is malformed or not of a known kind.
+    """
+    if isinstance(rays, pd.DataFrame):
+        return SourceTable(rays)
+    if is_sionna_paths(rays):
+        return read_sionna_paths(rays)
+    path = Path(rays)
+    if path.suffix.lower() == ".p2m" and path.is_file():
+        return read_insite(path, tx_power_dbm)
+    if not path.is_dir():
+        return read_ray_file(path)
+    if is_deepmimo(path):
+        return read_deepmimo(path)
+    if (path / AODT_FILES[0]).is_file():
+        return read_aodt(path)
+    raise InputError(
+        f"{path}: a folder must have {' and '.join(AODT_FILES)} (AODT) or power_t*.mat (DeepMIMO); "
+        "otherwise name a file"
+    )
+
+
+INSITE_TYPES: Final = {"R": "reflection", "D": "diffraction", "DS": "diffuse", "T": "transmission"}
+"""Interactions by their letters; foliage (F, X) is not a surface with a material."""
+
+
+def read_insite(file: Path, tx_power_dbm: float | None) -> SourceTable:
+    """Read the paths of one transmitter from a text file `*.paths.*.p2m` of Remcom Wireless InSite.
+
+    Lines that begin with # are comments. The first line is the number of receivers. For each receiver, its number and
+    its number of paths follow and, if there are any paths, a line of sums. A path has a line of nine numbers (number,
+    number of interactions, received power [dBm], phase [deg], time of arrival [s], four angles [deg]), a line such as
+    Tx-R-D-Rx, and a line for each point.
+
+    Raises:
+        InputError: The transmitted power is missing, the file is malformed, or a path crosses foliage.
+    """
+    if tx_power_dbm is None:
+        raise InputError(
+            f"{file}: states received power in dBm; give tx_power_dbm, the transmitted power of the project"
+        )
+    lines = [
+        (number, line.strip())
+        for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), 1)
+        if line.strip() and not line.startswith("#")
+    ]
+    rest = iter(lines)
+    try:
+        return rows_of(_insite_paths(file, rest, tx_power_dbm), str(file))
+    except StopIteration:
+        raise InputError(
+            f"{file}: ends within a path; export it again, or check that it is a paths file"
+        ) from None
+
+
+def _insite_paths(file: Path, rest: Iterator[tuple[int, str]], tx_power_dbm: float) -> list[Polyline]:
+    paths = []
+    (receivers,) = _insite_numbers(file, next(rest), 1)
+    for _ in range(int(receivers)):
+        _, count = _insite_numbers(file, next(rest), 2)
+        if count:
+            next(rest)
+        for _ in range(int(count)):
+            _, depth, power, _, delay, *_ = _insite_numbers(file, next(rest), 9)
+            number, text = next(rest)
+            names = text.split("-")[1:-1]
+            if unknown := [name for name in names if name not in INSITE_TYPES]:
+                raise InputError(
+                    f"{file}, line {number}: {shortened(text)!r} has the interaction {shortened(unknown[0])!r}; "
+                    f"Calibray knows {', '.join(INSITE_TYPES)}, so export without foliage"
+                )
+            points = np.array([_insite_numbers(file, next(rest), 3) for _ in range(int(depth) + 2)])
+            paths.append(
+                Polyline(points, [INSITE_TYPES[name] for name in names], power - tx_power_dbm, delay)
+            )
+    return paths
+
+
+def _insite_numbers(file: Path, line: tuple[int, str], count: int) -> list[float]:
+    number, text = line
+    try:
+        values = [float(word) for word in text.split()]
+    except ValueError:
+        values = []
+    if len(values) != count or not np.isfinite(values).all():
+        raise InputError(
+            f"{file}, line {number}: {shortened(text)!r}, must be {count} numbers; this is not a paths file of "
+            f"Wireless InSite (project.paths.t001_01.r002.p2m)"
+        )
+    return values
+
+
+AODT_FILES: Final = ("raypaths.parquet", "cirs.parquet")
+AODT_PAIR: Final = ["ru_id", "ue_id"]
+AODT_ELEMENTS: Final = ["ru_ant_el", "ue_ant_el"]
+AODT_TYPES: Final = {
+    "reflection": "reflection", "diffraction": "diffraction", "transmission": "transmission", "diffuse": "diffuse",
+    "scattering": "diffuse",
+}  # fmt: skip
+
+
+def read_aodt(folder: Path, metres_per_unit: float = 0.01) -> SourceTable:
+    """Read the first time step of NVIDIA's Aerial Omniverse Digital Twin, a folder with two tables.
+
+    Both name the time, the radio unit and the user equipment. `raypaths` has a row for each path, with its points in
+    units of the scene (centimetres unless stated) and its types of interaction. `cirs` has a row for each pair of
+    antenna elements, with lists of complex gains and delays [s] in the order of the paths.
+
+    Powers are summed over the antenna elements of the user equipment and averaged over those of the radio unit.
+
+    Raises:
+        InputError: A table or column is missing or malformed, or the numbers of gains and paths of a pair differ.
+    """
+    rays, gains = (read_table(folder / name) for name in AODT_FILES)
+    for table, names in ((rays, ["points", "interaction_types"]), (gains, ["cir_re", "cir_im", "cir_delay"])):
+        for name in (*AODT_PAIR, *names):
+            table.column(name)
+    frames = []
+    for table in (rays, gains):
+        time = table.frame["time_idx"].to_numpy() if "time_idx" in table.frame else np.zeros(len(table))
+        frames.append(table.frame[time == time.min()])
+    responses = {key: rows for key, rows in frames[1].groupby(AODT_PAIR, sort=False)}
+    paths = []
+    for pair, rows in frames[0].groupby(AODT_PAIR, sort=False):
+        if pair not in responses:
+            raise InputError(
+                f"{gains.source}: has no gains of ru_id, ue_id = {pair}, which have {len(rows)} paths"
+            )
+        power, delay = _aodt_response(gains.source, pair, responses[pair], len(rows))
+        for number, (points, types) in enumerate(zip(rows["points"], rows["interaction_types"], strict=True)):
+            if power[number] > 0:
+                level = 10 * np.log10(power[number])
+                paths.append(
+                    Polyline(
+                        metres_per_unit * _aodt_points(points), _aodt_types(rays, types), level, delay[number]
+                    )
+                )
+    return rows_of(paths, str(folder))
+
+
+def _aodt_response(
+    source: str, pair: Any, rows: Any, count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Power and delay of every path of a pair."""
+    lists = [
+        [np.asarray(value, dtype=float) for value in rows[name]] for name in ("cir_re", "cir_im", "cir_delay")
+    ]
+    if wrong := [len(values) for column in lists for values in column if len(values) != count]:
+        raise InputError(
+            f"{source}: {wrong[0]} gains of ru_id, ue_id = {pair}, but raypaths has {count} paths of them; export both "
+            "tables of the same run"
+        )
+    real, imaginary, delay = (np.array(column) for column in lists)
+    transmitting = len(np.unique(rows[AODT_ELEMENTS[0]])) if AODT_ELEMENTS[0] in rows else 1
+    return (real**2 + imaginary**2).sum(axis=0) / transmitting, delay[0]
+
+
+def _aodt_points(points: Any) -> NDArray[np.float64]:
+    """Points [n, 3] of a list of triples, or of dictionaries with the keys 1, 2 and 3."""
+    try:
+        return np.array(
+            [list(item.values()) if isinstance(item, dict) else np.asarray(item) for item in points],
+            dtype=float,
+        ).reshape(-1, 3)
+    except (TypeError, ValueError):
+        raise InputError(
+            "raypaths.parquet: points must be triples of numbers; export the table again"
+        ) from None
+
+
+def _aodt_types(table: SourceTable, types: Any) -> list[str]:
+    names = [str(item).lower() for item in types][1:-1]
+    if unknown := [name for name in names if name not in AODT_TYPES]:
+        raise InputError(
+            f"{table.source}: interaction_types has {unknown[0]!r}; {did_you_mean(unknown[0], AODT_TYPES)}"
+        )
+    return [AODT_TYPES[name] for name in names]
+
+
+DEEPMIMO_TYPES: Final = {"1": "reflection", "2": "diffraction", "3": "diffuse", "4": "transmission"}
+DEEPMIMO_OLD_NAMES: Final = {"delay": "toa", "inter_pos": "inter_loc", "tx_pos": "tx_loc", "rx_pos": "rx_loc"}
+"""Matrices and their names in earlier versions."""
+
+LARGEST_MATRIX: Final = 2**30
+"""Largest size of a matrix in memory [bytes]."""
+
+
+def is_deepmimo(folder: Path) -> bool:
+    """Whether a folder contains matrices of a scenario."""
+    return any(_deepmimo_files(folder))
+
+
+def read_deepmimo(folder: Path) -> SourceTable:
+    """Read the paths of all transmitters of a DeepMIMO scenario (version 4), `NAME_tSET_txTX_rSET.mat` or `.npz`.
+
+    For each transmitter and set of N receivers: `power` [N, P], path gain [dB]; `delay` [N, P], [s]; `inter` [N, P],
+    one digit for each interaction; `inter_pos` [N, P, I, 3], `tx_pos` [3] and `rx_pos` [N, 3], [m]. Missing paths are
+    NaN.
+
+    Raises:
+        InputError: A matrix is missing, malformed or too large, or its shape does not match the others.
+    """
+    paths = [path for file in _deepmimo_files(folder) for path in _deepmimo_paths(file)]
+    return rows_of(paths, str(folder))
+
+
+def _deepmimo_files(folder: Path) -> Iterator[Path]:
+    """The matrices of powers."""
+    for ending in ("mat", "npz"):
+        yield from sorted(folder.glob(f"power_t*.{ending}"))
+
+
+def _deepmimo_paths(file: Path) -> Iterator[Polyline]:
+    code = file.name.removeprefix("power")
+    matrices = {"power": _matrix(file)}
+    for name in ("delay", "inter", "inter_pos", "tx_pos", "rx_pos"):
+        other = file.with_name(DEEPMIMO_OLD_NAMES.get(name, name) + code)
+        matrices[name] = _matrix(other if other.exists() else file.with_name(name + code))
+    power, delay, inter = (np.atleast_2d(matrices[name]) for name in ("power", "delay", "inter"))
+    tx, rx = matrices["tx_pos"].reshape(-1, 3), matrices["rx_pos"].reshape(-1, 3)
+    place = matrices["inter_pos"]
+    if place.ndim == 3:  # one interaction at most
+        place = place[:, :, None]
+    if (
+        not (power.shape == delay.shape == inter.shape == place.shape[:2])
+        or len(rx) != len(power)
+        or len(tx) != 1
+    ):
+        raise InputError(
+            f"{file}: its matrices have the shapes {power.shape}, {delay.shape}, {inter.shape}, {place.shape}, "
+            f"{tx.shape} and {rx.shape}; power, delay and inter must be [N, P], inter_pos [N, P, I, 3], tx_pos [1, 3] "
+            "and rx_pos [N, 3]"
+        )
+    for receiver, path in np.argwhere(np.isfinite(power) & np.isfinite(inter) & (inter >= 0)).tolist():
+        codes = str(int(inter[receiver, path])) if inter[receiver, path] else ""
+        if unknown := set(codes) - set(DEEPMIMO_TYPES):
+            raise InputError(
+                f"{file}: receiver {receiver}, path {path}: interaction {unknown.pop()} of {codes}; the codes are "
+                f"{', '.join(f'{key} {name}' for key, name in DEEPMIMO_TYPES.items())}"
+            )
+        points = np.vstack([tx[0], place[receiver, path, : len(codes)], rx[receiver]])
+        yield Polyline(
+            points, [DEEPMIMO_TYPES[digit] for digit in codes], power[receiver, path], delay[receiver, path]
+        )
+
+
+def _matrix(file: Path) -> NDArray[np.float64]:
+    """The one matrix of a file."""
+    try:
+        if file.suffix == ".npz":
+            with ZipFile(file) as parts:
+                size = sum(part.file_size for part in parts.infolist())
+        else:
+            size = 8 * sum(int(np.prod(shape)) for _, shape, _ in whosmat(file))
+        if size > LARGEST_MATRIX:
+            raise InputError(
+                f"{file}: {size / 2**20:,.0f} MiB, must be at most {LARGEST_MATRIX // 2**20}; export fewer receivers"
+            )
+        if file.suffix == ".npz":
+            with np.load(file, allow_pickle=False) as packed:
+                content = {name: packed[name] for name in packed}
+        else:
+            content = loadmat(file)
+        (matrix,) = (values for name, values in content.items() if not name.startswith("__"))
+        return np.asarray(matrix, dtype=float)
+    except (OSError, ValueError, TypeError, NotImplementedError, BadZipFile, MatReadError) as error:
+        raise InputError(f"{file}: not a matrix of a DeepMIMO scenario ({first_line(error)})") from None
+
+
+SIONNA_PATHS: Final = "the paths of Sionna RT"
+
+
+def is_sionna_paths(value: object) -> bool:
+    """Whether a value is Sionna's `Paths`."""
+    return type(value).__module__.startswith("sionna.rt") and hasattr(value, "interactions")
+
+
+def read_sionna_paths(paths: Any) -> SourceTable:
+    """Read paths of Sionna RT in memory, as returned by its `PathSolver`, between antennas with one position each.
+
+    Vertices and interactions are [D, R, T, P] with synthetic arrays, otherwise [D, R, Ra, T, Ta, P] for the antennas of
+    the arrays. Gains `a` are real and imaginary part [R, Ra, T, Ta, P].
+
+    Powers are summed over the ports of a receiver and averaged over those of a transmitter.
+
+    Raises:
+        InputError: An array has antennas at several positions, or there is no path.
+    """
+    for array in (paths.tx_array, paths.rx_array):
+        if array.array_size != 1:
+            raise InputError(
+                f"{SIONNA_PATHS}: an array has {array.array_size} antennas, whose paths are summed; trace with one "
+                "antenna each"
+            )
+    return rows_of(_sionna_polylines(paths), SIONNA_PATHS)
+
+
+def _sionna_polylines(paths: Any) -> Iterator[Polyline]:
+    real, imaginary = (np.array(part, dtype=float) for part in paths.a)
+    power = (real**2 + imaginary**2).sum(axis=1).mean(axis=2)  # [R, T, P]
+    shape = power.shape
+    kinds, vertices = np.array(paths.interactions), np.array(paths.vertices, dtype=float)
+    if not paths.synthetic_array:  # ports at one place have the same paths
+        kinds, vertices = kinds[:, :, 0, :, 0], vertices[:, :, 0, :, 0]
+    delay = np.array(paths.tau, dtype=float)
+    delay = delay if delay.shape == shape else delay[:, 0, :, 0]
+    sources, targets = (
+        _sionna_positions(ends, count)
+        for ends, count in ((paths.sources, shape[1]), (paths.targets, shape[0]))
+    )
+    names = {int(kind): name for name, kind in TYPES.items()}
+    for rx, tx, path in np.argwhere((power > 0) & (delay >= 0)).tolist():
+        kind = [int(code) for code in kinds[:, rx, tx, path] if code]
+        inner = vertices[: len(kind), rx, tx, path]
+        points = np.vstack([sources[tx], inner, targets[rx]])
+        yield Polyline(
+            points, [names[code] for code in kind], 10 * np.log10(power[rx, tx, path]), delay[rx, tx, path]
+        )
+
+
+def _sionna_positions(ends: Any, count: int) -> NDArray[np.float64]:
+    """Positions of the ends [count, 3]; ports at one position are listed one after the other."""
+    positions = np.array(ends, dtype=float).T
+    return positions[:: len(positions) // count]
