@@ -9,8 +9,7 @@ import pytest
 import scipy.io
 
 from calibray.errors import InputError
-from calibray.measurements.impulse_responses import read_impulse_responses
-from calibray.measurements.multipath import measure, read_multipath
+from calibray.measurements.multipath import measure, read_impulse_responses, read_multipath
 from calibray.measurements.observables import Statistic
 
 TABLE = pd.DataFrame(

@@ -6,8 +6,7 @@ from scipy.stats import norm
 
 from calibray.errors import InputError
 from calibray.scenes import Triangles
-from calibray.scenes.obstruction import obstruction
-from calibray.study.link_obstruction import clutter_loss_db
+from calibray.scenes.obstruction import clutter_loss_db, obstruction
 
 
 def box(low, high, bottom=0.0, top=10.0):

@@ -11,7 +11,7 @@ import shapely
 
 from calibray.coordinates import Frame
 from calibray.errors import InputError
-from calibray.measurements.planner_columns import find_angles, find_antenna_names, find_powers
+from calibray.measurements.transmitter_columns import find_angles, find_antenna_names, find_powers
 from calibray.scenes.authoring import Footprints, make_scene
 from calibray.study import Setup, Study
 from calibray.study.draft import Draft, draft

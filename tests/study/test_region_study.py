@@ -15,8 +15,8 @@ from calibray.measurements import links_from_frame
 from calibray.reporting.wording import scene_alone_text
 from calibray.scenes.authoring import make_scene, read_openstreetmap, read_trees
 from calibray.scenes.checks import SceneSurfaces
+from calibray.scenes.obstruction import clutter_loss_db
 from calibray.study import Setup, Study
-from calibray.study.link_obstruction import clutter_loss_db
 from calibray.study.regions import Place, RegionSection, dense_trees, region_effects
 from planted_maps import FRAME, write_park
 

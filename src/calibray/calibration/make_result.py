@@ -43,10 +43,9 @@ from calibray.result.record import (
     Uncertainty,
 )
 from calibray.result.verdict import Remark, RemarkKind
-from calibray.scenes.obstruction import OUT_OF_SIGHT
+from calibray.scenes.obstruction import OUT_OF_SIGHT, REGION
 from calibray.study import Setup, Study
 from calibray.study.facades import without_facade_materials
-from calibray.study.link_obstruction import REGION
 from calibray.study.model import StudyModel
 from calibray.tracing.protocol import EnclosedAntennas
 from calibray.uncertainty.assessment import Certainty

@@ -18,8 +18,13 @@ from numpy.typing import NDArray
 from calibray.engines.protocol import Engine, Observing
 from calibray.errors import InputError
 from calibray.measurements import Measurements
-from calibray.measurements.impulse_responses import ENDINGS, read_impulse_responses
-from calibray.measurements.multipath import Multipath, measure, read_multipath
+from calibray.measurements.multipath import (
+    ENDINGS,
+    Multipath,
+    measure,
+    read_impulse_responses,
+    read_multipath,
+)
 from calibray.measurements.observables import Statistic
 from calibray.study import Setup
 

@@ -27,8 +27,8 @@ from calibray.prediction.predict import as_links, open_for_links
 from calibray.result.held_out import NO_PATH
 from calibray.result.record import Record
 from calibray.scenes import Triangles, ground_heights, read_triangles
+from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Study
-from calibray.study.link_obstruction import COLUMNS as OBSTRUCTION
 from calibray.study.mounting import mounting_columns
 from calibray.study.row_steps import known_frame
 from calibray.support.progress import Progress, with_total

@@ -24,10 +24,9 @@ from calibray.prediction.position_checks import POSITION_COLUMNS, remarks
 from calibray.prediction.residual_field import calibration_residuals, krige_residuals
 from calibray.result.held_out import Model, PredictionModel
 from calibray.result.record import Record
-from calibray.scenes.obstruction import OUT_OF_SIGHT
+from calibray.scenes.obstruction import CLUSTER, OUT_OF_SIGHT
+from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Setup
-from calibray.study.link_obstruction import CLUSTER
-from calibray.study.link_obstruction import COLUMNS as OBSTRUCTION
 from calibray.support.progress import Progress
 from calibray.validation.baselines import without_scene
 

@@ -1,25 +1,30 @@
-"""The obstruction of links: the straight line through buildings, over roofs and across walls.
+"""The obstruction of links, and the columns of links that follow from scene and positions.
 
-Buildings extend from the ground to their roofs. A line is inside a building if a roof is above it. All lengths follow
-from the crossings of the line with the scene's triangles, in plan for roofs and in space for walls.
+The straight line runs through buildings, over roofs and across walls. Buildings extend from the ground to their roofs.
+A line is inside a building if a roof is above it. All lengths follow from the crossings of the line with the scene's
+triangles, in plan for roofs and in space for walls.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.constants import speed_of_light
 
-from calibray.scenes.regions import united
-from calibray.scenes.triangles import LEVEL, Triangles
+from calibray.errors import InputError
+from calibray.measurements import Measurements
+from calibray.scenes.regions import Region, united
+from calibray.scenes.scene import Scene
+from calibray.scenes.triangles import LEVEL, Triangles, read_triangles
 
 OUT_OF_SIGHT: Final = "out_of_sight"
 WALLS: Final = "walls_crossed"
 
-COLUMNS: Final = (OUT_OF_SIGHT, WALLS, "obstruction_m", "knife_edge_db")
+OBSTACLES: Final = (OUT_OF_SIGHT, WALLS, "obstruction_m", "knife_edge_db")
 """Columns of links that follow from a scene: whether the straight line between the ends is blocked, how many walls it
 crosses, its length inside buildings [m], and the knife-edge loss of the highest roof [dB]."""
 
@@ -48,9 +53,9 @@ class Obstruction:
     clearance: NDArray[np.float64]
 
     def columns(self, wavelength: NDArray[np.float64] | float) -> dict[str, NDArray[np.float64]]:
-        """The values of `COLUMNS` [n] by name, for a wavelength [m] of all links or of each [n]."""
+        """The values of `OBSTACLES` [n] by name, for a wavelength [m] of all links or of each [n]."""
         values = (self.out_of_sight, self.walls, self.length_m, self.knife_edge_db(wavelength))
-        return {name: value.astype(np.float64) for name, value in zip(COLUMNS, values, strict=True)}
+        return {name: value.astype(np.float64) for name, value in zip(OBSTACLES, values, strict=True)}
 
     @property
     def out_of_sight(self) -> NDArray[np.bool_]:
@@ -226,3 +231,97 @@ def _crossing(
         share = (other * normal).sum(axis=1) * inverse
         hit = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (share > 0) & (share < 1)
     return np.where(hit, share * np.linalg.norm(step, axis=1), np.nan)
+
+
+REGION: Final = "region_m"
+"""Column of the length of the straight line inside regions of extra loss [m]."""
+
+CLUTTER: Final = "clutter_db"
+"""Column of the clutter loss of ITU-R P.2108 at one end [dB]."""
+
+CLUSTER: Final = "cluster"
+"""Column of labels of squares in which receivers form groups."""
+
+COLUMNS: Final = (*OBSTACLES, REGION, CLUTTER)
+"""All columns that follow from the scene."""
+
+
+def with_obstruction(
+    links: Measurements,
+    scene: Scene,
+    frequency: float,
+    regions: Mapping[str, Region],
+    *,
+    clutter: bool = False,
+    cluster_m: float | None = None,
+) -> Measurements:
+    """The links with the columns that follow from the scene; columns of these names in their table are kept.
+
+    Args:
+        links: The links.
+        scene: The scene.
+        frequency: Carrier [Hz] of the links that state none.
+        regions: The regions of extra loss by name; if there are none, `REGION` is left out.
+        clutter: Whether `CLUTTER` is wanted.
+        cluster_m: Side of the squares of `CLUSTER`, a lattice through the scene's origin; left out if None.
+
+    Raises:
+        InputError: A carrier is outside the range of the clutter loss.
+    """
+    carrier = frequency if links.frequency is None else links.frequency
+    added: dict[str, NDArray[np.float64] | NDArray[np.str_]] = {}
+    if any(name not in links.frame for name in OBSTACLES):
+        obstacles = obstruction(read_triangles(scene), links.tx, links.rx)
+        added |= obstacles.columns(speed_of_light / np.asarray(carrier))
+    if regions:
+        added[REGION] = np.sum([item.length_inside(links.tx, links.rx) for item in regions.values()], axis=0)
+    if clutter:
+        added[CLUTTER] = clutter_loss_db(links.distance, carrier)
+    if cluster_m is not None:
+        squares = np.floor(links.rx[:, :2] / cluster_m).astype(int)
+        added[CLUSTER] = np.array([f"{column} {row}" for column, row in squares])
+    missing = {name: values for name, values in added.items() if name not in links.frame}
+    return replace(links, table=links.table.assign(**missing)) if missing else links
+
+
+SHORTEST: Final = 250.0
+"""Shortest path that the recommendation covers, with one end in clutter [m]."""
+
+CARRIERS: Final = (0.5e9, 67e9)
+"""Carriers that it covers [Hz]."""
+
+
+def clutter_loss_db(distance: ArrayLike, frequency: ArrayLike) -> NDArray[np.float64]:
+    """Median clutter loss at one end, over locations in urban or suburban clutter [n], [dB].
+
+    Args:
+        distance: Length of the paths [n], [m].
+        frequency: Carrier of all or of each [n], [Hz].
+
+    Returns:
+        The losses; 0 for paths shorter than `SHORTEST`, which the recommendation does not cover.
+
+    Raises:
+        InputError: A carrier is outside `CARRIERS`.
+
+    Example:
+        >>> clutter_loss_db([100.0, 1000.0, 5000.0], 3.5e9).round(2).tolist()
+        [0.0, 30.11, 30.38]
+    """
+    carrier_ghz = np.asarray(frequency, dtype=float) / 1e9
+    low, high = CARRIERS
+    if not ((carrier_ghz * 1e9 >= low) & (carrier_ghz * 1e9 <= high)).all():
+        wrong = carrier_ghz[(carrier_ghz * 1e9 < low) | (carrier_ghz * 1e9 > high)].reshape(-1)[0]
+        raise InputError(
+            f"clutter_db: ITU-R P.2108 section 3.2 covers {low / 1e9:g} to {high / 1e9:g} GHz, not {wrong:g} GHz; "
+            "leave this nuisance out"
+        )
+    length_km = np.asarray(distance, dtype=float) / 1e3
+    # Beyond 2 km the loss is that at 2 km (equation 6).
+    capped_km = np.clip(length_km, SHORTEST / 1e3, 2.0)
+    long_db = -2 * np.log10(10 ** (-5 * np.log10(carrier_ghz) - 12.5) + 10**-16.5)  # equation 4
+    short_db = 32.98 + 23.9 * np.log10(capped_km) + 3 * np.log10(carrier_ghz)  # equation 5
+    median_db = -5 * np.log10(
+        10 ** (-0.2 * long_db) + 10 ** (-0.2 * short_db)
+    )  # equation 3, for 50 % of locations
+    return np.where(length_km < SHORTEST / 1e3, 0.0, median_db)

@@ -12,7 +12,7 @@ from pydantic import Field, field_validator, model_validator
 
 from calibray.errors import InputError
 from calibray.parameters import Scale, itu_start
-from calibray.study.link_obstruction import CLUSTER
+from calibray.scenes.obstruction import CLUSTER
 from calibray.support.messages import did_you_mean, shortened
 from calibray.support.strict_models import Section, Text
 

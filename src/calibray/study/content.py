@@ -13,6 +13,7 @@ from calibray.errors import InputError
 from calibray.materials import DEFAULT_REVISION, itu_material
 from calibray.parameters import Parameter, Parameters, itu_start, split_name
 from calibray.parameters.laws import ROUGHNESS
+from calibray.scenes.obstruction import REGION
 from calibray.study.calibration_sections import (
     FidelitySection,
     HoldoutSection,
@@ -25,7 +26,6 @@ from calibray.study.calibration_sections import (
 )
 from calibray.study.displacement import RECEIVER, displaces
 from calibray.study.facades import FacadeSection
-from calibray.study.link_obstruction import REGION
 from calibray.study.observables import ObservableSection, by_column
 from calibray.study.regions import PREFIX, RegionSection
 from calibray.study.sections import AntennasSection, LinksSection, MaterialSection, SceneSection, TraceSection

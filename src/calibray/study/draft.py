@@ -15,9 +15,9 @@ from typing import Any, Final
 import numpy as np
 
 from calibray.errors import InputError
-from calibray.measurements import planner_columns
+from calibray.measurements import transmitter_columns
 from calibray.measurements.column_names import matches
-from calibray.measurements.planner_columns import plain_name
+from calibray.measurements.transmitter_columns import plain_name
 from calibray.scenes import Scene, read_frame, read_scene
 from calibray.scenes.authoring import TREES_FILE
 from calibray.scenes.checks import count_crossings
@@ -243,8 +243,8 @@ def add_antennas(links: LinksDraft, folder: Path | None) -> dict[str, Any]:
     antennas: dict[str, Any] = {"tx": dict(UNKNOWN), "rx": dict(UNKNOWN)}
     if folder is not None:
         antennas |= _patterns(links, folder, mount)
-    for key, column in planner_columns.find_angles(frame, of_transmitters).items():
-        cause = planner_columns.unusable(frame, key, column)
+    for key, column in transmitter_columns.find_angles(frame, of_transmitters).items():
+        cause = transmitter_columns.unusable(frame, key, column)
         if not cause and folder is not None and key.startswith("electrical") and not _is_additional(column):
             cause = "it is part of the files' vertical cuts"
         if cause:
@@ -256,7 +256,7 @@ def add_antennas(links: LinksDraft, folder: Path | None) -> dict[str, Any]:
         antennas["tx"]["pattern"] = "tr38901"
     if mount:
         links.section["tx_antenna"] = mount
-    name = planner_columns.find_antenna_names(frame) if of_transmitters else None
+    name = transmitter_columns.find_antenna_names(frame) if of_transmitters else None
     if folder is not None:
         reason = f"files of {folder.name}; the receiver's antenna is unknown"
     elif "azimuth_deg" in mount:
@@ -286,7 +286,7 @@ def _patterns(links: LinksDraft, folder: Path, mount: dict[str, str]) -> dict[st
     if not files:
         raise InputError(f"--antennas {folder}: has no file *.msi, *.pln or *.ant; export the antennas there")
     by_name = {plain_name(file.name): file for file in files}
-    column = planner_columns.find_antenna_names(links.transmitter_rows, by_name)
+    column = transmitter_columns.find_antenna_names(links.transmitter_rows, by_name)
     if column is None and len(files) == 1:
         return {"tx": _antenna(links, files[0])}
     if column is None:

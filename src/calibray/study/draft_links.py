@@ -26,8 +26,8 @@ from calibray.measurements import (
     transmitter_columns,
 )
 from calibray.measurements.column_names import PositionColumns, ValueColumn
-from calibray.measurements.planner_columns import find_powers
 from calibray.measurements.selection import comparison, find_codes, without_codes
+from calibray.measurements.transmitter_columns import find_powers
 from calibray.scenes import read_frame
 from calibray.scenes.checks import SceneSurfaces
 from calibray.study.content import BUNDLED, VERSION

@@ -21,10 +21,10 @@ from calibray.measurements import Measurements
 from calibray.parameters import LogNormal, Parameter, Parameters, is_effect, make_parameter, split_name
 from calibray.parameters.laws import ROUGHNESS, frequency_independent_law
 from calibray.parameters.parameter import check_material
+from calibray.scenes.obstruction import CLUTTER
+from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study.calibration_sections import NuisanceTerm
 from calibray.study.content import BUNDLED, OFFSET, StudyContent
-from calibray.study.link_obstruction import CLUTTER
-from calibray.study.link_obstruction import COLUMNS as OBSTRUCTION
 from calibray.study.regions import PREFIX
 from calibray.study.toml_file import expand, read_content, refuse_unquoted_names, split_engine_keys
 from calibray.support.messages import shortened

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from scipy.constants import speed_of_light
 
 from calibray.errors import InputError
-from calibray.measurements.impulse_responses import MARGIN_DB
+from calibray.measurements.multipath import MARGIN_DB
 from calibray.measurements.observables import FLIGHTS, KINDS, PROFILES, SECTORS, Statistic, Wanted
 from calibray.support.strict_models import Section, Text
 

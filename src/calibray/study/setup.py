@@ -21,6 +21,7 @@ from calibray.measurements import Measurements
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take_links
 from calibray.scenes import Scene, check_material_name, read_scene
+from calibray.scenes.obstruction import with_obstruction
 from calibray.scenes.regions import Region
 from calibray.scenes.scene_file import read_content as scene_content
 from calibray.study.displacement import (
@@ -42,7 +43,6 @@ from calibray.study.facades import (
     with_facades,
     without_facade_materials,
 )
-from calibray.study.link_obstruction import with_obstruction
 from calibray.study.model import StudyModel
 from calibray.study.mounting import link_mountings, pose_effects, with_population
 from calibray.study.regions import region_effects
@@ -140,7 +140,7 @@ class Setup:
         return setup.with_obstruction() if self.study.uses_obstruction else setup
 
     def with_obstruction(self) -> Setup:
-        """The same with the columns of the links' table that follow from the scene (`link_obstruction.COLUMNS`)."""
+        """The same with the columns of the links' table that follow from the scene (`obstruction.COLUMNS`)."""
         study = self.study
         links = with_obstruction(
             self.links,
