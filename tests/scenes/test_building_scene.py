@@ -14,7 +14,6 @@ from calibray.prediction.position_checks import locate
 from calibray.scenes import buildings, read_frame, read_scene, read_triangles
 from calibray.scenes.authoring import Palette, SurfaceMaterial, Terrain, Windows, make_scene
 from calibray.scenes.authoring.extrusion import (
-    MILLIMETRE,
     ROOF,
     UNDERSIDE,
     WALL,
@@ -24,7 +23,7 @@ from calibray.scenes.authoring.extrusion import (
     split_overlaps,
 )
 from calibray.scenes.authoring.terrain import make_level_ground
-from calibray.scenes.meshes import weld
+from calibray.scenes.meshes import MILLIMETRE, weld
 from planted_maps import FRAME, L_SHAPE, footprints
 
 BOX = shapely.box
@@ -37,7 +36,7 @@ def shell_of(polygons, tops, windows=None, ground=None, **more) -> Shell:
 
 
 def body(shell: Shell) -> trimesh.Trimesh:
-    mesh = weld(shell.corners, MILLIMETRE)
+    mesh = weld(shell.corners)
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
@@ -183,7 +182,7 @@ def test_terrain_is_interpolated_on_its_triangles():
     np.testing.assert_allclose(terrain.heights(mesh.vertices[:, 0], mesh.vertices[:, 1]), mesh.vertices[:, 2])
     assert (solid.face_normals[:, 2] > 0).all()
     assert terrain.heights([-99.0], [0.0]) == terrain.z[0, 0]
-    assert make_level_ground((0, 0, 4, 2), 3.0).mesh().faces.shape == (2, 3)
+    assert make_level_ground((0, 0, 4, 2)).mesh().faces.shape == (2, 3)
 
 
 # Files

@@ -25,7 +25,6 @@ from calibray.errors import InputError
 from calibray.fields import layout, path_losses, path_powers
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take
-from calibray.support.progress import Progress
 
 TOLERANCE_DB: Final = 0.01
 """Default of the largest error of a link's path loss [dB]."""
@@ -89,26 +88,23 @@ def compress(
     paths: Paths,
     parameters: Parameters,
     tolerance_db: float = TOLERANCE_DB,
-    seed: int = 0,
-    progress: Progress | None = None,
 ) -> Compressed:
     """Compress a program for given parameters within their bounds, for path loss by the sum of powers.
 
-    The largest error of a link's path loss is `tolerance_db` [dB]. `progress` is called with "compressing", links done
-    and all links. Returns the compressed program and its error.
+    The largest error of a link's path loss is `tolerance_db` [dB]. Returns the compressed program and its error.
 
     Raises:
         InputError: The tolerance is not a positive number, or a parameter's material is not in the paths.
     """
     if not (np.isfinite(tolerance_db) and tolerance_db > 0):
         raise InputError(f"tolerance_db = {tolerance_db}: must be a positive number of dB")
-    candidates = _candidate_sets(parameters, seed)
+    candidates = _candidate_sets(parameters)
     intervals = FIRST_INTERVALS
     totals, strength, table_error = _evaluate_all(paths, parameters, candidates, intervals)
     while table_error > TABLE_TOLERANCE and intervals < LAST_INTERVALS:
         intervals *= 2
         totals, strength, table_error = _evaluate_all(paths, parameters, candidates, intervals)
-    pool = _pool(paths, strength, seed)
+    pool = _pool(paths, strength)
     weight, error = np.ones(paths.num_paths), np.zeros(paths.num_links)
     links = np.unique(paths.link[pool])
     ends = np.searchsorted(paths.link[pool], np.arange(paths.num_links + 1))
@@ -121,8 +117,6 @@ def compress(
             if fit is not None:
                 weight[slice(*np.searchsorted(paths.link, [link, link + 1]))] = 0.0
                 weight[pool[ends[link] : ends[link + 1]]], error[link] = fit
-            if progress is not None:
-                progress("compressing", int(link) + 1, paths.num_links)
     kept = np.flatnonzero(weight > 0)
     compressed = take(paths, kept)
     compressed = replace(
@@ -147,12 +141,12 @@ def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
     return take(paths, np.sort(order[weaker > share]))
 
 
-def _candidate_sets(parameters: Parameters, seed: int) -> list[NDArray[np.float64]]:
+def _candidate_sets(parameters: Parameters) -> list[NDArray[np.float64]]:
     """Training candidates with corners of the bounds, and then the candidates of every check [n, d].
 
     A fit fails first where it extrapolates, so half of the candidates of a check are on faces of the bounds.
     """
-    d, random = len(parameters), np.random.default_rng(seed)
+    d, random = len(parameters), np.random.default_rng(0)
     corners = np.full((2 ** min(d, CORNER_PARAMETERS), d), 0.5)
     corners[:, :CORNER_PARAMETERS] = list(product([0.0, 1.0], repeat=min(d, CORNER_PARAMETERS)))
     sets = [np.vstack([corners, qmc.LatinHypercube(d, rng=random).random(TRAINING * (d + 1))])]
@@ -187,9 +181,9 @@ def _evaluate_all(
     return totals, strength, max(errors)
 
 
-def _pool(paths: Paths, strength: NDArray[np.float64], seed: int) -> NDArray[np.int64]:
+def _pool(paths: Paths, strength: NDArray[np.float64]) -> NDArray[np.int64]:
     """Paths that may be kept, ascending: of every link with many paths the strongest and as many random others."""
-    random, pool = np.random.default_rng(seed), []
+    random, pool = np.random.default_rng(0), []
     for of_link in np.split(np.arange(paths.num_paths), np.flatnonzero(np.diff(paths.link)) + 1):
         if len(of_link) > MIN_PATHS:
             order = of_link[np.argsort(-strength[of_link], kind="stable")]

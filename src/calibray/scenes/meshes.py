@@ -24,6 +24,9 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.support.messages import first_line, shortened
 
+MILLIMETRE: Final = 0.001
+"""Unit of corners that are whole numbers [m]."""
+
 LARGEST_COORDINATE: Final = 1e9
 """Largest coordinate of a vertex [m], as of a position in a path file."""
 
@@ -82,23 +85,22 @@ def join_meshes(meshes: Iterable[Mesh]) -> Mesh:
 
 def weld(
     triangles: NDArray[np.int64],
-    scale: float,
     position: Callable[[NDArray[np.int64]], NDArray[np.float64]] | None = None,
 ) -> Mesh:
     """Make a mesh of triangles with integer corners [F, 3, 3]: equal corners become one vertex.
 
-    Triangles are counter-clockwise seen from outside; those with two equal corners are dropped. `scale` is the unit of
-    the corners [m]; `position` gives the position [n, 3], [m], of corners [n, 3] if it is not the corner times `scale`.
+    Triangles are counter-clockwise seen from outside; those with two equal corners are dropped. Corners are
+    in units of `MILLIMETRE`; `position` gives the position [n, 3], [m], of corners [n, 3] if it is another one.
 
     Example:
-        >>> weld(np.array([[[0, 0, 0], [5, 0, 0], [0, 5, 0]], [[5, 0, 0], [5, 5, 0], [0, 5, 0]]]), 0.001).faces
+        >>> weld(np.array([[[0, 0, 0], [5, 0, 0], [0, 5, 0]], [[5, 0, 0], [5, 5, 0], [0, 5, 0]]])).faces
         array([[0, 2, 1],
                [2, 3, 1]])
     """
     corners, faces = np.unique(np.reshape(triangles, (-1, 3)), axis=0, return_inverse=True)
     faces = faces.reshape(-1, 3)
     distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    vertices = corners.astype(np.float64) * scale if position is None else position(corners)
+    vertices = corners.astype(np.float64) * MILLIMETRE if position is None else position(corners)
     return join_meshes([Mesh(vertices, faces[distinct])])
 
 

@@ -117,7 +117,7 @@ def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[n
     crossings = [
         np.column_stack([line, distance])[np.isfinite(distance)]
         for line, face in _pairs(first, last, sides)
-        for distance in (_crossing(first[line], last[line], sides[face]),)
+        for distance in (crossing(first[line], last[line], sides[face]),)
     ]
     crossed = np.concatenate([np.zeros((0, 2)), *crossings])
     crossed = crossed[np.lexsort(crossed.T[::-1])]
@@ -213,24 +213,25 @@ def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
-def _crossing(
+def crossing(
     first: NDArray[np.float64], last: NDArray[np.float64], corners: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Distance from the first end at which each line crosses its triangle [n], [m]; NaN where it does not.
 
-    Moeller and Trumbore, J. Graphics Tools 2(1), 1997.
+    Intersection with the triangle in barycentric coordinates u and v (Moeller and Trumbore, J. Graphics Tools 2(1),
+    1997). A line parallel to the triangle divides by zero and gives NaN, which fails all comparisons.
     """
     step = last - first
-    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    one, other = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
     across = np.cross(step, other)
-    offset = first - corners[:, 0]
+    offset = first - corners[..., 0, :]
     normal = np.cross(offset, one)
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1.0 / (across * one).sum(axis=1)
-        u, v = (offset * across).sum(axis=1) * inverse, (step * normal).sum(axis=1) * inverse
-        share = (other * normal).sum(axis=1) * inverse
+        inverse = 1.0 / (across * one).sum(axis=-1)
+        u, v = (offset * across).sum(axis=-1) * inverse, (step * normal).sum(axis=-1) * inverse
+        share = (other * normal).sum(axis=-1) * inverse
         hit = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (share > 0) & (share < 1)
-    return np.where(hit, share * np.linalg.norm(step, axis=1), np.nan)
+    return np.where(hit, share * np.linalg.norm(step, axis=-1), np.nan)
 
 
 REGION: Final = "region_m"

@@ -160,6 +160,9 @@ def _insite_numbers(file: Path, line: tuple[int, str], count: int) -> list[float
 
 
 AODT_FILES: Final = ("raypaths.parquet", "cirs.parquet")
+AODT_UNIT: Final = 0.01
+"""Unit of lengths [m]."""
+
 AODT_PAIR: Final = ["ru_id", "ue_id"]
 AODT_ELEMENTS: Final = ["ru_ant_el", "ue_ant_el"]
 AODT_TYPES: Final = {
@@ -168,11 +171,11 @@ AODT_TYPES: Final = {
 }  # fmt: skip
 
 
-def read_aodt(folder: Path, metres_per_unit: float = 0.01) -> SourceTable:
+def read_aodt(folder: Path) -> SourceTable:
     """Read the first time step of NVIDIA's Aerial Omniverse Digital Twin, a folder with two tables.
 
     Both name the time, the radio unit and the user equipment. `raypaths` has a row for each path, with its points in
-    units of the scene (centimetres unless stated) and its types of interaction. `cirs` has a row for each pair of
+    units of the scene (centimetres) and its types of interaction. `cirs` has a row for each pair of
     antenna elements, with lists of complex gains and delays [s] in the order of the paths.
 
     Powers are summed over the antenna elements of the user equipment and averaged over those of the radio unit.
@@ -200,9 +203,7 @@ def read_aodt(folder: Path, metres_per_unit: float = 0.01) -> SourceTable:
             if power[number] > 0:
                 level = 10 * np.log10(power[number])
                 paths.append(
-                    Polyline(
-                        metres_per_unit * _aodt_points(points), _aodt_types(rays, types), level, delay[number]
-                    )
+                    Polyline(AODT_UNIT * _aodt_points(points), _aodt_types(rays, types), level, delay[number])
                 )
     return rows_of(paths, str(folder))
 

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from calibray.coordinates import Frame
 from calibray.errors import InputError
 from calibray.scenes.authoring.extrusion import (
-    MILLIMETRE,
     ROOF,
     UNDERSIDE,
     WALL,
@@ -130,7 +129,7 @@ def _objects(shell: Shell, palette: Palette, buildings: Sequence[str] | None) ->
     position = align(shell.corners).positions
     if buildings is None:
         return [
-            MeshObject(f"all-{name}", name, weld(shell.corners[material == name], MILLIMETRE, position))
+            MeshObject(f"all-{name}", name, weld(shell.corners[material == name], position))
             for name in sorted(set(material))
         ]
     order = np.lexsort((material, shell.owner))
@@ -139,7 +138,7 @@ def _objects(shell: Shell, palette: Palette, buildings: Sequence[str] | None) ->
         MeshObject(
             f"{buildings[int(shell.owner[rows[0]])]}-{material[rows[0]]}",
             str(material[rows[0]]),
-            weld(shell.corners[rows], MILLIMETRE, position),
+            weld(shell.corners[rows], position),
         )
         for rows in np.split(order, ends + 1)
     ]

@@ -25,6 +25,7 @@ from scipy.sparse.csgraph import connected_components
 
 from calibray.errors import InputError
 from calibray.scenes.authoring.footprints import GRID, Footprints
+from calibray.scenes.meshes import MILLIMETRE
 from calibray.support.lazy_imports import library
 
 Interval = tuple[float, float, int]
@@ -123,8 +124,6 @@ def subtract(
     parts = [(low, min(high, bottom), owner), (max(low, top), high, owner)]
     return [part for part in parts if part[1] - part[0] > THINNEST]
 
-
-MILLIMETRE: Final = 0.001
 
 WALL, WINDOW, ROOF, UNDERSIDE = range(4)
 """Kinds of surfaces."""

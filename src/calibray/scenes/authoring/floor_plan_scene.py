@@ -12,10 +12,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.coordinates import Frame
 from calibray.errors import InputError
 from calibray.scenes.authoring.extrusion import (
-    MILLIMETRE,
     Point,
     Stand,
     subtract,
@@ -27,7 +25,7 @@ from calibray.scenes.authoring.floor_plan import OPENINGS, Segment
 from calibray.scenes.authoring.made_scene import SCENE_FILES, MadeScene, SurfaceMaterial, write_made_scene
 from calibray.scenes.authoring.wall_alignment import align
 from calibray.scenes.authoring.wall_faces import MergedPlan, merge_faces
-from calibray.scenes.meshes import MeshObject, weld
+from calibray.scenes.meshes import MILLIMETRE, MeshObject, weld
 from calibray.scenes.scene import ITU_NAMES
 from calibray.support.lazy_imports import library
 from calibray.support.messages import did_you_mean
@@ -64,7 +62,6 @@ def make_plan_scene(
     floor: bool = True,
     ceiling: bool = True,
     merge: bool = True,
-    frame: Frame | None = None,
     overwrite: bool = False,
 ) -> MadeScene:
     """Make a scene of a floor plan.
@@ -82,7 +79,6 @@ def make_plan_scene(
         floor: Whether to make a floor: a sheet over the whole area that walls enclose, at the lowest bottom.
         ceiling: Whether to make a ceiling, at the highest top.
         merge: Whether two parallel lines are merged into one wall (`merge_faces`).
-        frame: Position of the scene on the globe, if known.
         overwrite: Replace files that Calibray did not write.
 
     Returns:
@@ -115,14 +111,14 @@ def make_plan_scene(
     for kind, height in lids.items():
         name = types[kind].name
         materials.append(types[kind])
-        objects.append(MeshObject(f"all-{name}", name, weld(_lid(outline, height), MILLIMETRE)))
+        objects.append(MeshObject(f"all-{name}", name, weld(_lid(outline, height))))
     counts = {
         "lines": len(segments),
         "sheets": len(sheets),
         **({"lines merged as faces of one wall": merged.lines} if merged.lines else {}),
     }
     return write_made_scene(
-        folder, objects, materials, frame, counts, walls=merged.report, overwrite=overwrite
+        folder, objects, materials, None, counts, walls=merged.report, overwrite=overwrite
     )
 
 
@@ -227,10 +223,7 @@ def _wall_objects(pieces: Pieces) -> list[MeshObject]:
             )
     sheets = {name: np.array(corners, dtype=np.int64) for name, corners in sorted(triangles.items())}
     position = align(np.concatenate(list(sheets.values())), ROUNDING).positions
-    return [
-        MeshObject(f"all-{name}", name, weld(corners, MILLIMETRE, position))
-        for name, corners in sheets.items()
-    ]
+    return [MeshObject(f"all-{name}", name, weld(corners, position)) for name, corners in sheets.items()]
 
 
 def _enclosed(pieces: Pieces) -> Any:

@@ -18,6 +18,9 @@ from calibray.support.lazy_imports import library
 GRID: Final = 0.01
 """Grid to which the corners of buildings are rounded [m]."""
 
+SMALLEST: Final = 1.0
+"""Smallest area of a building [m^2]."""
+
 HIGHEST: Final = 1000.0
 """Largest height of a building or part of one [m]; the highest building is 828 m high."""
 
@@ -136,10 +139,10 @@ class Footprints:
         return guesses
 
 
-def clean_footprints(raw: Footprints, grid: float = GRID, smallest: float = 1.0) -> Footprints:
+def clean_footprints(raw: Footprints) -> Footprints:
     """Repair outlines so that buildings can be raised on them: on a grid, without self-crossings, not too small.
 
-    Corners are rounded to multiples of `grid` [m]; outlines of less area than `smallest` [m^2] are left out. Repairs
+    Corners are rounded to multiples of `GRID`; outlines of less area than `SMALLEST` are left out. Repairs
     are counted, and names are unique.
 
     Raises:
@@ -149,12 +152,12 @@ def clean_footprints(raw: Footprints, grid: float = GRID, smallest: float = 1.0)
     valid = shapely.is_valid(raw.polygon)
     polygons = raw.polygon.copy()
     polygons[~valid] = shapely.make_valid(polygons[~valid], method="structure", keep_collapsed=False)
-    polygons = shapely.set_precision(polygons, grid)
-    large = shapely.area(polygons) >= smallest
+    polygons = shapely.set_precision(polygons, GRID)
+    large = shapely.area(polygons) >= SMALLEST
     repairs = {
         **raw.repairs,
         "crossing or touching themselves, repaired": int((~valid & large).sum()),
-        f"of less than {smallest:g} m2, left out": int((~large).sum()),
+        f"of less than {SMALLEST:g} m2, left out": int((~large).sum()),
     }
     keep = np.flatnonzero(large)
     _check_heights(raw, keep)

@@ -62,10 +62,10 @@ class Terrain:
         return Mesh(np.column_stack([east.ravel(), north.ravel(), self.z.ravel()]), faces)
 
 
-def make_level_ground(bounds: ArrayLike, height: float = 0.0) -> Terrain:
-    """Make a level rectangle of two triangles within west, south, east and north [4], [m]."""
+def make_level_ground(bounds: ArrayLike) -> Terrain:
+    """Make a level rectangle of two triangles at z = 0 within west, south, east and north [4], [m]."""
     west, south, east, north = np.asarray(bounds, dtype=float)
-    return Terrain(np.array([west, east]), np.array([south, north]), np.full((2, 2), float(height)))
+    return Terrain(np.array([west, east]), np.array([south, north]), np.zeros((2, 2)))
 
 
 def lower_origin(terrain: Terrain, frame: Frame) -> tuple[Terrain, Frame]:

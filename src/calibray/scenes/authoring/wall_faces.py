@@ -42,14 +42,14 @@ class MergedPlan:
     report: Sequence[str] = field(default=())
 
 
-def merge_faces(segments: Sequence[Segment], thickest: float = THICKEST) -> MergedPlan:
+def merge_faces(segments: Sequence[Segment]) -> MergedPlan:
     """Merge the two faces of each wall into one sheet.
 
     Two lines are faces of one wall if they have the same type, bottom and top, are parallel, and are adjacent at the
     distance of a wall's thickness over more than that distance. In addition, no line nearer to one of them may be its
-    other face. The distance is at most `thickest`, and within a fifth or 2 cm of the thickness if that is given. Where
+    other face. The distance is at most `THICKEST`, and within a fifth or 2 cm of the thickness if that is given. Where
     one long face is opposite several short ones, as between the rooms along a corridor, each pair makes a sheet, and
-    gaps between the sheets up to `thickest` are closed. Ends lie midway between the faces' ends, so that corners meet.
+    gaps between the sheets up to `THICKEST` are closed. Ends lie midway between the faces' ends, so that corners meet.
 
     The remaining part of a face that is longer than the other one is kept as a sheet in the same plane. The short lines
     that close the outline of a wall are left out. All walls of a type without a given thickness get the median of the
@@ -58,25 +58,20 @@ def merge_faces(segments: Sequence[Segment], thickest: float = THICKEST) -> Merg
     If less than half the length of a type's lines has another face, that type is drawn as single lines: two of them
     that are close together are two walls, and are kept.
 
-    Args:
-        segments: Lines of a plan.
-        thickest: Largest thickness of a wall [m].
-
-    Returns:
-        The sheets, followed by the lines without another face.
+    Returns the sheets, followed by the lines without another face.
     """
-    pairs = _face_pairs(segments, thickest)
+    pairs = _face_pairs(segments)
     faced = _types_drawn_as_faces(segments, pairs)
     separate = [pair for pair in pairs if segments[pair[0]].kind not in faced]
     pairs = [pair for pair in pairs if segments[pair[0]].kind in faced]
     paired = {index for pair in pairs for index in pair}
-    merged = [_merge_pair(segments[one], segments[other], thickest) for one, other in pairs]
+    merged = [_merge_pair(segments[one], segments[other]) for one, other in pairs]
     distances = [abs(_offset(segments[one], segments[other])) for one, other in pairs]
-    rest = [sheet for index in sorted(paired) for sheet in _left_over(index, pairs, segments, thickest)]
+    rest = [sheet for index in sorted(paired) for sheet in _left_over(index, pairs, segments)]
     single = [index for index in range(len(segments)) if index not in paired]
-    closing = {index for index in single if _closes_wall(segments[index], pairs, segments, thickest)}
+    closing = {index for index in single if _closes_wall(segments[index], pairs, segments)}
     thickness = _thicknesses(merged, distances)
-    sheets = [*_close_gaps([*merged, *rest], thickest), *(segments[k] for k in single if k not in closing)]
+    sheets = [*_close_gaps([*merged, *rest]), *(segments[k] for k in single if k not in closing)]
     report = [
         *_described("merged from two faces", merged, distances),
         *_described("kept of a face that is longer than the other", rest),
@@ -100,15 +95,15 @@ def merge_faces(segments: Sequence[Segment], thickest: float = THICKEST) -> Merg
     )
 
 
-def _face_pairs(segments: Sequence[Segment], thickest: float) -> list[tuple[int, int]]:
+def _face_pairs(segments: Sequence[Segment]) -> list[tuple[int, int]]:
     """Pairs of lines that are the two faces of one wall."""
     shapely = library("shapely", "scenes")
     lines = np.array([shapely.LineString([segment.start, segment.end]) for segment in segments], dtype=object)
-    near = shapely.STRtree(lines).query(lines, predicate="dwithin", distance=thickest)
+    near = shapely.STRtree(lines).query(lines, predicate="dwithin", distance=THICKEST)
     distances: dict[tuple[int, int], float] = {}
     nearest = np.full(len(segments), np.inf)
     for one, other in near.T.tolist():
-        distance = _face_distance(segments[one], segments[other], thickest) if one > other else None
+        distance = _face_distance(segments[one], segments[other]) if one > other else None
         if distance is not None:
             distances[other, one] = distance
             nearest[[one, other]] = np.minimum(nearest[[one, other]], distance)
@@ -130,7 +125,7 @@ def _types_drawn_as_faces(segments: Sequence[Segment], pairs: Sequence[tuple[int
     return {kind for kind in length if faced[kind] >= _FACED * length[kind]}
 
 
-def _face_distance(one: Segment, other: Segment, thickest: float) -> float | None:
+def _face_distance(one: Segment, other: Segment) -> float | None:
     """Distance of two lines that may be faces of one wall [m]; None if they cannot be."""
     if (one.kind, one.bottom, one.top) != (other.kind, other.bottom, other.top):
         return None
@@ -138,7 +133,7 @@ def _face_distance(one: Segment, other: Segment, thickest: float) -> float | Non
         return None
     low, high = _span(one, other)
     distance = abs(_offset(one, other))
-    if not 0.01 < distance <= thickest or high - low < max(0.5 * min(one.length, other.length), distance):
+    if not 0.01 < distance <= THICKEST or high - low < max(0.5 * min(one.length, other.length), distance):
         return None
     for stated in (one.thickness, other.thickness):
         if stated is not None and abs(distance - stated) > max(0.2 * stated, 0.02):
@@ -172,35 +167,31 @@ def _part(segment: Segment, start: float, end: float, offset: float) -> Segment:
     return replace(segment, start=(first[0], first[1]), end=(last[0], last[1]))
 
 
-def _merge_pair(one: Segment, other: Segment, thickest: float) -> Segment:
+def _merge_pair(one: Segment, other: Segment) -> Segment:
     """The sheet between two faces: over their overlap, with its ends midway where both faces end near each other."""
     low, high = sorted(_relative(one, other)[0].tolist())
-    start = low / 2 if abs(low) <= thickest else max(low, 0.0)
-    end = (high + one.length) / 2 if abs(high - one.length) <= thickest else min(high, one.length)
+    start = low / 2 if abs(low) <= THICKEST else max(low, 0.0)
+    end = (high + one.length) / 2 if abs(high - one.length) <= THICKEST else min(high, one.length)
     sheet = _part(one, start, end, _offset(one, other) / 2)
     return replace(sheet, thickness=one.thickness if one.thickness is not None else other.thickness)
 
 
-def _left_over(
-    index: int, pairs: Sequence[tuple[int, int]], segments: Sequence[Segment], thickest: float
-) -> list[Segment]:
-    """The parts of a face without another face, longer than `thickest`, moved into the plane of the nearest sheet."""
+def _left_over(index: int, pairs: Sequence[tuple[int, int]], segments: Sequence[Segment]) -> list[Segment]:
+    """The parts of a face without another face, longer than `THICKEST`, moved into the plane of the nearest sheet."""
     face = segments[index]
     opposite = [segments[sum(pair) - index] for pair in pairs if index in pair]
     spans = sorted((*_span(face, other), _offset(face, other)) for other in opposite)
     parts, covered, offset = [], 0.0, spans[0][2]
     for low, high, offset in [*spans, (face.length, face.length, spans[-1][2])]:
-        if low - covered > thickest:
+        if low - covered > THICKEST:
             parts.append(_part(face, covered, low, offset / 2))
         covered = max(covered, high)
     return parts
 
 
-def _closes_wall(
-    segment: Segment, pairs: Sequence[tuple[int, int]], segments: Sequence[Segment], thickest: float
-) -> bool:
+def _closes_wall(segment: Segment, pairs: Sequence[tuple[int, int]], segments: Sequence[Segment]) -> bool:
     """Whether a line joins ends of the two faces of a wall."""
-    if segment.length > thickest:
+    if segment.length > THICKEST:
         return False
     for one, other in pairs:
         faces = [np.array([segments[index].start, segments[index].end]) for index in (one, other)]
@@ -214,7 +205,7 @@ def _closes_wall(
     return False
 
 
-def _close_gaps(sheets: Sequence[Segment], longest: float) -> list[Segment]:
+def _close_gaps(sheets: Sequence[Segment]) -> list[Segment]:
     """Join sheets of one wall that only a crossing wall separates."""
     joined: list[Segment] = []
     for sheet in sorted(sheets, key=lambda sheet: min(sheet.start, sheet.end)):
@@ -224,8 +215,8 @@ def _close_gaps(sheets: Sequence[Segment], longest: float) -> list[Segment]:
             along, across = _relative(before, sheet)
             if (
                 np.abs(across).max() < _TOUCHING
-                and along.min() <= before.length + longest
-                and along.max() >= -longest
+                and along.min() <= before.length + THICKEST
+                and along.max() >= -THICKEST
             ):
                 reach = min(0.0, float(along.min())), max(before.length, float(along.max()))
                 joined[index] = _part(before, *reach, 0.0)

@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
+from calibray.scenes.obstruction import BATCH, SAME_CROSSING, crossing
 from calibray.scenes.triangles import is_ground, read_meshes
 from calibray.support.lazy_imports import library
+
+KERB: Final = 2.0
+"""Largest height of what covers no ground, above the lowest point of a scene [m]."""
 
 CLEARANCE: Final = 0.05
 """A surface is above an antenna if it is higher by more than this [m]."""
 
-SAME_CROSSING: Final = 1e-3
-"""Crossings closer than this count as one, on an edge that two triangles share [m]."""
-
 _STEEP: Final = 0.1  # a face is a wall if the vertical part of its unit normal is at most this [1]
-_BATCH: Final = 2_000_000  # pairs of a line and a triangle in memory at once
 
 
 def _is_wall(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -134,7 +134,7 @@ class SceneSurfaces:
 
 
 def count_crossings(corners: NDArray[np.float64], start: ArrayLike, end: ArrayLike) -> NDArray[np.int64]:
-    """Count the surfaces that straight lines cross (Moeller and Trumbore, J. Graphics Tools 2(1), 1997).
+    """Count the surfaces that straight lines cross.
 
     Triangles are [F, 3, 3], the ends of the lines [n, 3], [m].
 
@@ -143,46 +143,30 @@ def count_crossings(corners: NDArray[np.float64], start: ArrayLike, end: ArrayLi
         >>> count_crossings(sheet, [[0, 0, 0], [0, 0, 0]], [[2, 0, 0], [0.5, 0, 0]])
         array([1, 0])
     """
-    origin = np.asarray(start, dtype=float).reshape(-1, 3)
-    step = np.asarray(end, dtype=float).reshape(-1, 3) - origin
-    batch = max(1, _BATCH // max(len(corners), 1))
+    first, last = (np.asarray(ends, dtype=float).reshape(-1, 3) for ends in (start, end))
+    batch = max(1, BATCH // max(len(corners), 1))
     counts = [
-        _count_crossings(corners, origin[first : first + batch], step[first : first + batch])
-        for first in range(0, len(origin), batch)
+        _count_crossings(corners, first[number : number + batch], last[number : number + batch])
+        for number in range(0, len(first), batch)
     ]
     return np.concatenate([np.zeros(0, dtype=np.int64), *counts])
 
 
 def _count_crossings(
-    corners: NDArray[np.float64], origin: NDArray[np.float64], step: NDArray[np.float64]
+    corners: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    # Intersection of origin + share * step with each triangle in barycentric coordinates u, v. A line parallel to the
-    # triangle divides by zero and gives NaN, which fails all comparisons.
-    base, one, other = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    across = np.cross(step[:, None], other)
-    volume = (across * one).sum(axis=2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1.0 / volume
-        offset = origin[:, None] - base
-        u = (offset * across).sum(axis=2) * inverse
-        normal = np.cross(offset, one)
-        v = (step[:, None] * normal).sum(axis=2) * inverse
-        share = (other * normal).sum(axis=2) * inverse
-        hit = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (share > 0) & (share < 1)
-    length = np.linalg.norm(step, axis=1)
-    distance = np.sort(np.where(hit, share * length[:, None], np.inf), axis=1)
-    # Misses sort last. The difference of two of them is NaN, which is not a new crossing either.
-    with np.errstate(invalid="ignore"):
-        separate = np.diff(distance, axis=1, prepend=-np.inf) > SAME_CROSSING
-    return (np.isfinite(distance) & separate).sum(axis=1)
+    # Misses are NaN, which sorts last and is no new crossing.
+    distance = np.sort(crossing(start[:, None], end[:, None], corners), axis=1)
+    return (np.diff(distance, axis=1, prepend=-np.inf) > SAME_CROSSING).sum(axis=1)
 
 
-def building_outlines(source: str | Path, height: float = 2.0) -> Any:
+def building_outlines(source: str | Path) -> Any:
     """Find the area that buildings and other bodies of a scene cover in plan.
+
+    Faces less than `KERB` above the scene's lowest point cover nothing: kerbs, floors, the ground.
 
     Args:
         source: Path of a Mitsuba XML file, or `sionna:NAME`.
-        height: Faces less than this above the scene's lowest point cover nothing: kerbs, floors, the ground [m].
 
     Returns:
         A shapely Polygon or MultiPolygon [m], empty if there is no body.
@@ -196,7 +180,7 @@ def building_outlines(source: str | Path, height: float = 2.0) -> Any:
     lowest = min(mesh.vertices[:, 2].min() for mesh in meshes)
     bodies = [mesh.vertices[mesh.faces] for mesh in meshes if not is_ground(mesh, extent)]
     corners = np.concatenate([np.zeros((0, 3, 3)), *bodies])
-    high = corners[:, :, 2].max(axis=1) >= lowest + height
+    high = corners[:, :, 2].max(axis=1) >= lowest + KERB
     return shapely.union_all(shapely.polygons(corners[~_is_wall(corners) & high][:, :, :2]), grid_size=0.001)
 
 
