@@ -36,10 +36,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 LONGEST = (
-    "test_browser", "test_ledger", "test_dask", "test_observables", "test_calibrate", "test_notebooks", "test_pose",
-    "test_demo", "test_compression", "test_comparison", "test_program_with_rays", "test_coefficient_tables",
-    "test_derivatives", "test_unreached_links", "test_cli_run", "test_jax_context", "test_command",
-    "test_report_browser",
+    "test_browser", "test_scenarios", "test_notebooks", "test_walk", "test_fidelity", "test_dask", "test_calibrate",
+    "test_assessment", "test_program_with_rays", "test_tracing", "test_ledger", "test_coefficient_tables",
+    "test_observables", "test_antennas_per_link", "test_unreached_links", "test_suggest", "test_derivatives", "test_demo",
 )  # fmt: skip
 """Files that take longest. They run first, so that no worker is left with one of them at the end."""
 

@@ -23,7 +23,9 @@ def of(kind, **limits):
 
 ALL = tuple(of(kind) for kind in KINDS)
 LIMITS = {"dynamic_range_db": 25.0, "floor_db": -95.0, "window": 9e-8}
-LIMITED = tuple(of(kind, **LIMITS) for kind in KINDS)
+LIMITED = tuple(
+    of(kind, **LIMITS) for kind in ("rms_delay_spread", "mean_excess_delay", "azimuth_spread_arrival")
+)
 BANDWIDTH = 2e8
 BANDED = tuple(of(kind, bandwidth=BANDWIDTH, **LIMITS) for kind in KINDS)
 RESOLVED = tuple(Statistic("round_trip_time", path, 25.0, bandwidth=4e7) for path in ("first", "strongest"))
@@ -223,7 +225,7 @@ def diffuse_paths():
     from calibray.measurements import links_from_frame
     from calibray.study import Setup, Study
 
-    trace = {"max_depth": 2, "samples": 400, "line_of_sight": False, "diffuse_reflection": True}
+    trace = {"max_depth": 1, "samples": 400, "line_of_sight": False, "diffuse_reflection": True}
     content = planted.content("links.csv", trace=trace)
     return engines.make(
         Setup.open(Study.from_content(content), links=links_from_frame(planted.links()))

@@ -150,14 +150,16 @@ def make_segments(segment: NDArray[np.integer], count: int) -> Segments:
     """Order numbers for summation by their segments [n]; the order depends on `segment` only."""
     size = np.bincount(segment, minlength=count)
     if not (size >= BLOCK).any():
-        return Segments(None, jnp.asarray(segment.astype(np.int32)), 0, count)
+        return Segments(None, jax.device_put(segment.astype(np.int32)), 0, count)
     order = np.argsort(segment, kind="stable")
     rank = np.arange(len(segment)) - np.repeat(np.cumsum(size) - size, size)  # within its segment
     in_block = rank < np.repeat(size // BLOCK * BLOCK, size)
     order = np.concatenate([order[in_block], order[~in_block]])
     blocks = int(in_block.sum()) // BLOCK
     owner = np.concatenate([segment[order[: blocks * BLOCK : BLOCK]], segment[order[blocks * BLOCK :]]])
-    return Segments(jnp.asarray(order.astype(np.int32)), jnp.asarray(owner.astype(np.int32)), blocks, count)
+    return Segments(
+        jax.device_put(order.astype(np.int32)), jax.device_put(owner.astype(np.int32)), blocks, count
+    )
 
 
 def segment_sums(segments: Segments, values: jax.Array) -> jax.Array:

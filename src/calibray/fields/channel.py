@@ -63,8 +63,8 @@ def channel_statistics(paths: Paths, materials: Mapping[str, Material] | None = 
     Raises:
         InputError: A material is unknown.
     """
-    plan, table = layout(paths), jnp.asarray(paths.material_table(materials))
-    azimuths = jnp.asarray(paths.departure[plan.order, 1]), jnp.asarray(paths.arrival[plan.order, 1])
+    plan, table = layout(paths), jax.device_put(paths.material_table(materials))
+    azimuths = jax.device_put((paths.departure[plan.order, 1], paths.arrival[plan.order, 1]))
     return jax.tree.map(np.asarray, _statistics(plan.program, table, *azimuths))
 
 

@@ -147,12 +147,12 @@ def table_layout(
     last, material_of_node = cells[row_of_node] + _EXTRA_NODES - 1, (rows // len(Mode))[row_of_node]
     node_cosine = ((rank - 1) / cells[row_of_node]) ** root[material_of_node]
     return TableLayout(
-        cell=tuple(jnp.asarray(cell[step]) for step in steps),
-        fraction=tuple(jnp.asarray(fraction[step]) for step in steps),
-        cosine=jnp.asarray(np.maximum(node_cosine, _GRAZING).astype(dtype)),
-        material=jnp.asarray(material_of_node.astype(np.int32)),
-        mode=jnp.asarray((rows % len(Mode))[row_of_node].astype(np.int32)),
-        inner=jnp.asarray(np.flatnonzero((rank >= _STENCIL) & (rank <= last - _STENCIL)).astype(np.int32)),
+        cell=tuple(jax.device_put(cell[step]) for step in steps),
+        fraction=tuple(jax.device_put(fraction[step]) for step in steps),
+        cosine=jax.device_put(np.maximum(node_cosine, _GRAZING).astype(dtype)),
+        material=jax.device_put(material_of_node.astype(np.int32)),
+        mode=jax.device_put((rows % len(Mode))[row_of_node].astype(np.int32)),
+        inner=jax.device_put(np.flatnonzero((rank >= _STENCIL) & (rank <= last - _STENCIL)).astype(np.int32)),
     )
 
 

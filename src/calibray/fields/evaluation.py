@@ -65,8 +65,7 @@ def path_gains(paths: Paths, materials: Mapping[str, Material] | None = None) ->
         InputError: A material is unknown.
     """
     plan = layout(paths)
-    response = _material_response(plan.program, jnp.asarray(paths.material_table(materials)))
-    real, imaginary = _gains(plan.program, response)
+    real, imaginary = _gains(plan.program, jax.device_put(paths.material_table(materials)))
     gains = np.empty((paths.num_paths, paths.rx_field.shape[1], paths.tx_field.shape[1]), dtype=complex)
     gains[plan.order] = np.moveaxis(np.asarray(real) + 1j * np.asarray(imaginary), -1, 0)
     return gains[:, 0, 0] if gains.shape[1:] == (1, 1) else gains
@@ -143,12 +142,12 @@ def path_losses(
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
-        return np.asarray(_losses_by_formula(program, jnp.asarray(tables), count, combining))[:count], 0.0
+        return np.asarray(_losses_by_formula(program, jax.device_put(tables), count, combining))[:count], 0.0
     # Tables are looked up where coefficients are used, which is fastest if each is used once.
     single_use = all(set(group.signature) <= {COEFFICIENT} for group in program.groups)
     powers, errors = [], []
     for table in tables[:count]:
-        response = _material_response(program, jnp.asarray(table))
+        response = _material_response(program, jax.device_put(table))
         if single_use:
             powers.append(_link_power(program, response, combining))
         else:
@@ -174,11 +173,11 @@ def path_losses_and_slopes(
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
-        loss, slope = _slopes_by_formula(program, jnp.asarray(tables), count, columns, combining)
+        loss, slope = _slopes_by_formula(program, jax.device_put(tables), count, columns, combining)
         return np.asarray(loss)[:count], np.asarray(slope)[:count], 0.0
     powers, slopes, errors = [], [], []
     for table in tables[:count]:
-        response, derivatives = _response_and_derivatives(program, jnp.asarray(table), columns)
+        response, derivatives = _response_and_derivatives(program, jax.device_put(table), columns)
         power, by_step = _power_and_slope(program, _split_by_step_wide(program, response), combining)
         powers.append(power)
         slopes.append(_path_loss_slope(program, power, by_step, derivatives, table.shape[0]))
@@ -197,7 +196,7 @@ def path_losses_with_effects(
 ) -> NDArray[np.floating]:
     """Path loss [count, L], [dB], for material constants [n, M, 8] and effect parameters [n, e]; see `path_losses`."""
     count = len(tables) if count is None else count
-    arrays = jnp.asarray(tables), jnp.asarray(values)
+    arrays = jax.device_put(tables), jax.device_put(values)
     return np.asarray(_losses_with_effects(program, *arrays, effects, count, combining))[:count]
 
 
@@ -213,7 +212,7 @@ def path_losses_and_slopes_with_effects(
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
     """Path loss with effects, and its derivatives by materials [count, L, M, columns] and by effects [count, L, e]."""
     count = len(tables) if count is None else count
-    arrays = jnp.asarray(tables), jnp.asarray(values)
+    arrays = jax.device_put(tables), jax.device_put(values)
     answers = _slopes_with_effects(program, *arrays, effects, count, columns, combining)
     loss, slope, by_effect = (np.asarray(answer)[:count] for answer in answers)
     return loss, slope, by_effect
@@ -309,7 +308,7 @@ _material_response = jax.jit(material_response)
 _split_by_step = jax.jit(split_by_step)
 _split_by_step_wide = jax.jit(split_by_step, compiler_options=WIDE)
 _response_and_derivatives = jax.jit(response_and_derivatives, static_argnums=2)
-_gains = jax.jit(lambda program, response: path_fields(program, split_by_step(program, response)))
+_gains = compiled(program_gains)
 _path_powers = jax.jit(lambda program, responses: path_power(path_fields(program, responses)))
 _link_power_of_steps = jax.jit(_power, compiler_options=WIDE)
 _power_and_slope = jax.jit(_slope, compiler_options=WIDE)

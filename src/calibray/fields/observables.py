@@ -146,7 +146,7 @@ class Channel:
         """The same with other statistics."""
         link, delay = (np.asarray(part) for part in self.program.phases)
         taps = tuple(Taps.of(delay, link, bandwidth) for bandwidth in _bandwidths(wanted))
-        return jax.tree.map(jnp.asarray, replace(self, taps=taps, wanted=wanted))
+        return jax.device_put(replace(self, taps=taps, wanted=wanted))
 
 
 def _bandwidths(wanted: tuple[Statistic, ...]) -> list[float]:
@@ -164,7 +164,7 @@ def link_responses(
         values: Values of the parameters [n, d].
         count: Number of candidates that are evaluated; the function is compiled for n.
     """
-    loss, observed = _responses(channel, jnp.asarray(values), count)
+    loss, observed = _responses(channel, jax.device_put(values), count)
     return np.asarray(loss)[:count], np.asarray(observed)[:count]
 
 
@@ -173,7 +173,7 @@ def link_responses_and_slopes(
     channel: Channel, values: NDArray[np.float64], count: int
 ) -> tuple[NDArray[np.float64], ...]:
     """Path loss, statistics, and their derivatives by the parameters [count, L, d] and [count, K, L, d]."""
-    answers = _responses_and_slopes(channel, jnp.asarray(values), count)
+    answers = _responses_and_slopes(channel, jax.device_put(values), count)
     return tuple(np.asarray(answer)[:count] for answer in answers)
 
 

@@ -15,7 +15,6 @@ from functools import partial
 from typing import Final
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
@@ -224,6 +223,7 @@ def layout(
     incidence; None evaluates the slab formula at every interaction. With `phases`, links and delays of the paths are
     kept. Without them, only sums of powers can be computed.
     """
+    # Arrays are put on the device as they are: jnp.asarray compiles a program for every shape, 15 ms each.
     padded = intervals is None or paths.num_interactions <= PADDED
     path_groups = padded_groups(paths) if padded else exact_groups(paths)
     order = _joined([group.paths for group in path_groups])
@@ -237,9 +237,9 @@ def layout(
     program = GroupedProgram(
         groups=tuple(_group(paths, group, numbering.table_row, dtype) for group in path_groups),
         by_link=make_segments(paths.link[order], paths.num_links),
-        link=jnp.asarray(paths.link[order]) if phases else None,
-        delay=jnp.asarray(paths.delay[order]) if phases else None,
-        wavelength=jnp.asarray(speed_of_light / paths.frequency, dtype=dtype),
+        link=jax.device_put(paths.link[order]) if phases else None,
+        delay=jax.device_put(paths.delay[order]) if phases else None,
+        wavelength=jax.device_put(np.asarray(speed_of_light / paths.frequency, dtype=dtype)),
         coefficients=_coefficients(paths, numbering, dtype, intervals),
         diffuse=_diffuse(paths, numbering.scattered, numbering.table_row[numbering.scattered], dtype),
         by_material=(
@@ -305,11 +305,11 @@ def _coefficients(
         np.append(column, filler)[position] for column, filler in ((material, 0), (mode, 0), (cosine, 1.0))
     )
     return FormulaArguments(
-        material=jnp.asarray(material.astype(np.int32)),
-        cosine=jnp.asarray(cosine.astype(dtype)),
-        transmitted=jnp.asarray(mode == Mode.TRANSMISSION),
-        unreduced=jnp.asarray(mode == Mode.FULL_REFLECTION),
-        blank=jnp.asarray(blank) if blank.any() else None,
+        material=jax.device_put(material.astype(np.int32)),
+        cosine=jax.device_put(cosine.astype(dtype)),
+        transmitted=jax.device_put(mode == Mode.TRANSMISSION),
+        unreduced=jax.device_put(mode == Mode.FULL_REFLECTION),
+        blank=jax.device_put(blank) if blank.any() else None,
         shapes=tuple(step.shape for step in numbering.steps),
         lines=tuple(tuple(len(line) for line in step) for step in lines),
         any_transmitted=bool((mode == Mode.TRANSMISSION).any()),
@@ -328,10 +328,10 @@ def _diffuse(
     lobes = slice(0 if all(pattern == "lambertian" for pattern in patterns) else None)
 
     def column(values: NDArray[np.float64]) -> jax.Array:
-        return jnp.asarray(values.astype(dtype))
+        return jax.device_put(values.astype(dtype))
 
     return DiffuseArguments(
-        material=jnp.asarray(paths.material[interaction].astype(np.min_scalar_type(len(paths.materials)))),
+        material=jax.device_put(paths.material[interaction].astype(np.min_scalar_type(len(paths.materials)))),
         solid_angle=column(table.solid_angle[row]),
         cos_scattered=column(table.cos_scattered[row]),
         cos_incidence=column(paths.cos_incidence[interaction][lobes]),
@@ -346,9 +346,9 @@ def _group(paths: Paths, group: PathGroup, table_row: NDArray[np.int64], dtype: 
     for letter, interaction in group.steps:  # [n] or [k, n]
         row = table_row[interaction]
         cos_sin = np.where((interaction < 0)[..., None], [1.0, 0.0], paths.rotation[interaction])
-        rotation.append(jnp.asarray(np.moveaxis(cos_sin, -1, -2).astype(dtype)))
+        rotation.append(jax.device_put(np.moveaxis(cos_sin, -1, -2).astype(dtype)))
         scatters, diffracts = letter == SCATTERING, letter == DIFFRACTION
-        turn.append(jnp.asarray(paths.diffuse.rotation[row].T.astype(dtype)) if scatters else None)
+        turn.append(jax.device_put(paths.diffuse.rotation[row].T.astype(dtype)) if scatters else None)
         wedge.append(
             _parts(affine_form(paths.diffraction, row, paths.frequency), dtype) if diffracts else None
         )
@@ -375,4 +375,4 @@ def _num_parts(field: NDArray[np.complex128]) -> int:
 
 def _parts(value: NDArray[np.complex128], dtype: type, count: int = 2) -> jax.Array:
     """Real and imaginary part, or only the real part."""
-    return jnp.asarray(np.stack([value.real, value.imag][:count]).astype(dtype))
+    return jax.device_put(np.stack([value.real, value.imag][:count]).astype(dtype))
