@@ -38,7 +38,7 @@ def pytest_configure(config: pytest.Config) -> None:
 LONGEST = (
     "test_browser", "test_scenarios", "test_notebooks", "test_walk", "test_fidelity", "test_dask", "test_calibrate",
     "test_assessment", "test_program_with_rays", "test_tracing", "test_ledger", "test_coefficient_tables",
-    "test_observables", "test_antennas_per_link", "test_unreached_links", "test_suggest", "test_derivatives", "test_demo",
+    "test_observables", "test_antennas_per_link", "test_unreached_links", "test_suggest", "test_demo",
 )  # fmt: skip
 """Files that take longest. They run first, so that no worker is left with one of them at the end."""
 

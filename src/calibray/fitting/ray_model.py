@@ -147,7 +147,7 @@ class RayModel:
         angles = values[len(self.assumed) :].reshape(-1, ANGLES)
         with jax_settings():
             for end in np.flatnonzero(linear).tolist() if not self.known else []:
-                weights = np.asarray(_ports(jnp.asarray(self.bases[end]), jnp.asarray(angles[end])))[:, 0]
+                weights = np.asarray(_ports(*jax.device_put((self.bases[end], angles[end]))))[:, 0]
                 fields[end] = np.einsum("pt,ptc->pc", weights, fields[end])[:, None]
         materials = self.materials(candidate, values)
         return replace(self.paths, materials=materials, tx_field=fields[0], rx_field=fields[1])

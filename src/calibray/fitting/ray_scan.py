@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import epsilon_0, speed_of_light
@@ -222,7 +221,7 @@ def _coefficients(
     cosine, through = np.ones(padded.shape[1]), np.zeros(padded.shape[1], dtype=bool)
     cosine[:size], through[:size] = paths.cos_incidence, paths.kind == Kind.REFRACTION
     with jax_settings():
-        pairs = _slab(*map(jnp.asarray, (cosine, padded, speed_of_light / paths.frequency, through)))
+        pairs = _slab(*jax.device_put((cosine, padded, speed_of_light / paths.frequency, through)))
     te, tm = (
         np.asarray(real)[:count, :size] + 1j * np.asarray(imaginary)[:count, :size]
         for real, imaginary in pairs
