@@ -101,7 +101,7 @@ def test_three_calls_find_the_truth_and_the_result_has_what_replay_gives(finishe
     assert remark.values["misfit_db"] < 0.01
     assert remark.values["half_space"]
     assert remark.values["values"] == [pytest.approx(0.02, rel=0.2)]
-    assert "The assumptions of the program are identified" in " ".join(printed.split())
+    assert "The model represents the program" in " ".join(printed.split())
 
 
 def test_a_second_run_pays_for_no_call(finished: tuple[Path, str]) -> None:
@@ -127,7 +127,7 @@ def test_predictions_and_the_page_show_the_rays_of_the_program(
     np.testing.assert_allclose(predicted, answered, atol=1e-6)
     before = calls(folder)
     assert run("report", folder / "out", "-o", tmp_path / "report.html").exit_code == 0
-    assert "The assumptions of the program are identified" in (tmp_path / "report.html").read_text()
+    assert "The model represents the program" in (tmp_path / "report.html").read_text()
     assert calls(folder) == before
 
 
@@ -140,7 +140,7 @@ def test_a_program_of_other_physics_is_not_understood(tmp_path: Path) -> None:
     )
     assert not remark.values["understood"]
     assert remark.values["misfit_db"] > 0.2
-    assert "The assumptions of the program are not identified" in " ".join(ran.output.split())
+    assert "The model does not represent the program" in " ".join(ran.output.split())
 
 
 def test_rays_that_do_not_fit_the_scene_are_refused_with_the_reason(tmp_path: Path) -> None:

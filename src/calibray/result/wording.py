@@ -246,11 +246,11 @@ def _ray_mapping(values: dict[str, Any]) -> str:
         f"{values['misfit_db']:.3f} dB, and predicted path loss at the last call within {values['gap_db']:.3f} dB"
     )
     if values["understood"]:
-        text = f"The assumptions of the program are identified. {text}. Its surfaces are {surfaces}"
+        text = f"The model represents the program. {text}. Its surfaces are {surfaces}"
         text += f" with {constants}." if constants else "."
     else:
         text = (
-            f"The assumptions of the program are not identified. {text}. A replay that agrees with the program at "
+            f"The model does not represent the program. {text}. A replay that agrees with the program at "
             "the best call replaces it: the optimum may be missed, and intervals are approximate."
         )
     if values["changed"]:
