@@ -1,22 +1,28 @@
 """Time and memory per interaction, for program sizes from 1e4 to 1e7 interactions.
 
     python benchmarks/interactions.py
+    python benchmarks/interactions.py --compiling
 
 Path programs are made up at random (three materials, three interactions a path, three hundred links), in single
 precision as large programs are. The rival in the same run is the slab formula of ITU-R P.2040 evaluated at every
 interaction, which is what replay does without tables; the difference between both is printed next to the times.
+
+With `--compiling`, small programs: the processor time of their compilation and the time of a candidate, in batches of
+32, compiled to run fast and compiled fast.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import time
 
 import numpy as np
 from scipy.constants import speed_of_light
 
 from calibray import Material
 from calibray.engines import Replay
-from calibray.fields import layout
+from calibray.fields import compiled, layout
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Diffuse, Kind, Paths
 from timing import seconds
@@ -94,7 +100,11 @@ def main() -> None:
     """Measure and print the table."""
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--largest", type=float, default=1e7, help="largest number of interactions")
-    largest = options.parse_args().largest
+    options.add_argument("--compiling", action="store_true", help="small programs and their compilation")
+    chosen = options.parse_args()
+    if chosen.compiling:
+        return measure_compiling()
+    largest = chosen.largest
     print(f"{'interactions':>12} {'kind':>9} {'table [ns]':>11} {'formula [ns]':>13} {'Jacobian [ns]':>14} "
           f"{'ratio':>6} {'bytes':>6} {'difference [dB]':>16}")  # fmt: skip
     for diffuse in (False, True):
@@ -103,6 +113,29 @@ def main() -> None:
             paths = program(size, diffuse)
             measure(paths, "diffuse" if diffuse else "specular")
             size *= 10
+
+
+def measure_compiling() -> None:
+    """Measure and print the table of small programs; what was compiled is not kept."""
+    os.environ["CALIBRAY_CACHE"] = ""
+    print(
+        f"{'interactions':>12} {'compiled':>12} {'compiling [s]':>14} {'path loss [us]':>15} {'Jacobian [us]':>14}"
+    )
+    chosen = parameters()
+    unit = np.random.default_rng(1).random((32, len(chosen)))
+    points = chosen.lower + unit * (chosen.upper - chosen.lower)
+    for size in (60, 120, 300, 960):
+        for small, name in ((0, "to run fast"), (size, "fast")):
+            compiled.SMALL = small
+            engine = Replay(program(size, False), chosen, dtype=np.float64)
+            started = time.process_time()
+            engine.path_loss(points), engine.path_loss_and_jacobian(points)
+            compiling = time.process_time() - started
+            value, slope = (
+                1e6 / len(points) * seconds(lambda f=function: f(points), 100)
+                for function in (engine.path_loss, engine.path_loss_and_jacobian)
+            )
+            print(f"{size:12,} {name:>12} {compiling:14.2f} {value:15.1f} {slope:14.1f}", flush=True)
 
 
 def measure(paths: Paths, kind: str) -> None:

@@ -18,8 +18,8 @@ _QUICK: Final = WIDE | {"xla_cpu_use_fusion_emitters": False}
 """The same without XLA's emitters of fused loops. The numbers differ by rounding."""
 
 SMALL: Final = 300
-"""Largest number of coefficients of a small program. Path loss and derivatives of a program with 120 are compiled in
-1.8 s instead of 3.0 s, and a candidate then takes 20 us instead of 18 us; with 960, it takes 96 us instead of 59 us."""
+"""Largest number of coefficients of a small program. With 120, path loss and derivatives are compiled in 2.3 s instead
+of 3.4 s, and a candidate takes up to 20 us longer; with 960, 135 us longer (`docs/measurements/speed.md`)."""
 
 
 def compiled(
