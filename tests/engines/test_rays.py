@@ -13,10 +13,9 @@ import pytest
 
 import calibray as cb
 import two_ray
-from calibray.engines.rays import files
+from calibray.engines.rays import table as ray_table
 from calibray.engines.rays.compile import RaySetting, compile_rays
-from calibray.engines.rays.files import read_ray_file
-from calibray.engines.rays.table import RayTable
+from calibray.engines.rays.table import RayTable, read_ray_file
 from calibray.errors import InputError
 from calibray.fields import path_gains, path_loss
 from calibray.measurements import SourceTable
@@ -244,7 +243,7 @@ def test_files_that_would_fill_the_memory_or_lie_elsewhere_are_refused(
     (tmp_path / "deep.json").write_text("[" * 10**6)
     with pytest.raises(InputError, match="not a ray table"):
         read_ray_file(tmp_path / "deep.json")
-    monkeypatch.setattr(files, "LARGEST_JSON", 100)
+    monkeypatch.setattr(ray_table, "LARGEST_JSON", 100)
     cb.write_rays(traced, tmp_path / "rays.json")
     with pytest.raises(InputError, match="MiB of JSON"):
         read_ray_file(tmp_path / "rays.json")

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from calibray.support.lazy_imports import lazy_attributes
 
 if TYPE_CHECKING:
-    from calibray.engines.cluster.chunked_replay import ChunkedReplay as ChunkedReplay
+    from calibray.engines.cluster.chunks import ChunkedReplay as ChunkedReplay
     from calibray.engines.cluster.workers import InProcess as InProcess
     from calibray.engines.cluster.workers import Workers as Workers
     from calibray.engines.cluster.workers import open_workers as open_workers
@@ -49,7 +49,7 @@ _HOMES = {
     "Answer": "calibray.engines.protocol",
     "Answering": "calibray.engines.protocol",
     "Chunked": "calibray.engines.protocol",
-    "ChunkedReplay": "calibray.engines.cluster.chunked_replay",
+    "ChunkedReplay": "calibray.engines.cluster.chunks",
     "Command": "calibray.engines.external.command",
     "Differentiable": "calibray.engines.protocol",
     "Engine": "calibray.engines.protocol",

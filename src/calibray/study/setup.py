@@ -450,8 +450,7 @@ def _scene_of(study: StudyModel, frequency: float) -> Scene:
 def _paths_of_table(setup: Setup, file: Path, materials: Mapping[str, Material]) -> Paths:
     """The paths of the study's ray table, whose powers apply at the start values."""
     from calibray.engines.rays.compile import RaySetting, compile_rays
-    from calibray.engines.rays.files import read_ray_file
-    from calibray.engines.rays.table import RayTable
+    from calibray.engines.rays.table import RayTable, read_ray_file
 
     paths = compile_rays(RayTable.of(read_ray_file(file)), RaySetting.of(setup))
     return replace(paths, materials={**paths.materials, **materials})

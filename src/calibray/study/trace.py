@@ -9,9 +9,8 @@ from typing import Any, overload
 import pandas as pd
 
 from calibray.engines.rays.compile import RaySetting, compile_rays, rays_of
-from calibray.engines.rays.files import write_ray_file
 from calibray.engines.rays.other_programs import ray_rows
-from calibray.engines.rays.table import RayTable
+from calibray.engines.rays.table import RayTable, write_ray_file
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements

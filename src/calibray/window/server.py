@@ -17,10 +17,9 @@ from fastapi.responses import FileResponse, JSONResponse, Response
 from nicegui import run, ui
 
 from calibray.errors import InputError
-from calibray.window.desk import Desk
+from calibray.window.desk import Desk, findings, plan
 from calibray.window.folder import StudyFolder
 from calibray.window.page import build
-from calibray.window.plan import findings, plan
 
 ASSETS = Path(__file__).parent / "assets"
 SHOWN = ("report.html", "map.png")

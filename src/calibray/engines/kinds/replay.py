@@ -17,7 +17,7 @@ from calibray.support.progress import Progress
 from calibray.support.strict_models import Text
 
 if TYPE_CHECKING:
-    from calibray.engines.cluster.chunked_replay import ChunkedReplay
+    from calibray.engines.cluster.chunks import ChunkedReplay
     from calibray.engines.cluster.workers import Workers
     from calibray.engines.replay import Replay, ReplayCarriers
     from calibray.materials import Material
@@ -74,8 +74,7 @@ class ReplaySection(EngineSection):
     def _chunked(
         self, study: OpenedStudy, progress: Progress | None, workers: Workers | None
     ) -> ChunkedReplay:
-        from calibray.engines.cluster.chunked_replay import ChunkedReplay
-        from calibray.engines.cluster.chunks import chunk_size, cut, seconds_to_trace
+        from calibray.engines.cluster.chunks import ChunkedReplay, chunk_size, cut, seconds_to_trace
         from calibray.engines.cluster.workers import InProcess
         from calibray.tracing.trace_plan import LONG_TRACE_SECONDS
 

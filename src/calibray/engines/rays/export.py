@@ -12,8 +12,7 @@ from calibray.engines.ledger.database import key
 from calibray.engines.ledger.recorded import Recorded
 from calibray.engines.protocol import Answering, check_candidates
 from calibray.engines.rays.compile import RaySetting, compile_rays, powers
-from calibray.engines.rays.files import parse_rays
-from calibray.engines.rays.table import RayTable
+from calibray.engines.rays.table import RayTable, parse_rays
 from calibray.engines.section import OpenedStudy
 from calibray.errors import EngineError, InputError
 from calibray.materials import Material

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from scipy.io import loadmat, whosmat
 from scipy.io.matlab import MatReadError
 
-from calibray.engines.rays.files import read_ray_file
-from calibray.engines.rays.table import ENDS, TYPES
+from calibray.engines.rays.table import ENDS, TYPES, read_ray_file
 from calibray.errors import InputError
 from calibray.measurements import SourceTable, read_table
 from calibray.support.messages import did_you_mean, first_line, shortened
