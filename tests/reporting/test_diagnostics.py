@@ -130,7 +130,10 @@ def test_residuals_by_obstruction_and_by_street(result):
     assert table.out_of_sight.tolist() == [False] + [True] * (len(table) - 1)
     assert table.mean_db.iloc[0] == pytest.approx(0.0, abs=0.1)
     assert (np.diff(table.mean_db) < 0).all()
-    assert "in sight" in finding(shaded, "by obstruction")
+    assert "m below roofs" in finding(shaded, "by obstruction")
+    indoors = planted(result, noise, **columns | {"obstruction_m": np.zeros(60)})
+    assert indoors.diagnostics["obstruction"].out_of_sight.tolist() == [False, True]
+    assert "dB out of sight" in finding(indoors, "by obstruction")
     west = (result.links["rx_x"] < result.links["rx_x"].median()).to_numpy()
     streets = planted(result, noise + 5.0 * west).diagnostics["streets"]
     assert streets.links.sum() == 60

@@ -117,7 +117,9 @@ def _by_obstruction(result: Record) -> pd.DataFrame:
         return pd.DataFrame()
     blocked, length = links[OUT_OF_SIGHT].to_numpy(float) > 0, links["obstruction_m"].to_numpy(float)
     order = np.flatnonzero(blocked)[np.argsort(length[blocked], kind="stable")]
-    classes = [np.flatnonzero(~blocked), *np.array_split(order, max(min(CLASSES, len(order) // FEWEST), 1))]
+    # Indoors nothing lies below a roof, so there is only one class.
+    count = min(CLASSES, len(order) // FEWEST) if length[blocked].max(initial=0.0) >= 1.0 else 1
+    classes = [np.flatnonzero(~blocked), *np.array_split(order, max(count, 1))]
     return pd.DataFrame(
         [
             {

@@ -202,12 +202,12 @@ def _obstruction_text(tables: dict[str, pd.DataFrame]) -> str:
     """Mean residual of links in sight, and of those out of sight by the length of the line below roofs."""
     if "obstruction" not in tables:
         return ""
-    parts = [
-        f"{row.mean_db:+.1f} dB "
-        + (f"with {row.from_m:.0f} to {row.to_m:.0f} m below roofs" if row.out_of_sight else "in sight")
-        + f" ({row.links} links)"
-        for row in tables["obstruction"].itertuples()
-    ]
+    parts = []
+    for row in tables["obstruction"].itertuples():
+        below = (
+            f"with {row.from_m:.0f} to {row.to_m:.0f} m below roofs" if row.to_m >= 1.0 else "out of sight"
+        )
+        parts.append(f"{row.mean_db:+.1f} dB {below if row.out_of_sight else 'in sight'} ({row.links} links)")
     return f"mean residual: {', '.join(parts)}"
 
 
