@@ -112,11 +112,13 @@ class RayModel:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Power of every path [P], [dB], and its derivatives by the values [P, k], for values [k]."""
         names = list(self.paths.materials)
+        order = [] if self.known else self._layout.order
         frame = _Frame(
             self.paths.material_table(self.materials(candidate)),
             np.array([names.index(name) for name, _ in self.assumed], dtype=np.int64),
             np.array([FIELDS.index(field) for _, field in self.assumed], dtype=np.int64),
-            *(basis[[] if self.known else self._layout.order] for basis in self.bases),
+            self.bases[0][order],
+            self.bases[1][order],
             np.array([0.0 if end else 1.0 for end in linear]),
         )
         with jax_settings():
@@ -127,7 +129,7 @@ class RayModel:
         """Gain of every path between the ports [P, R, T], with the constants of values [k]."""
         with jax_settings():
             table = self.paths.material_table(self.materials(candidate, values))
-            real, imaginary = map(np.asarray, program_gains(self._layout.program, table))
+            real, imaginary = map(np.asarray, program_gains(self._layout.program, jnp.asarray(table)))
         return (real + 1j * imaginary).transpose(2, 0, 1)[self._order]
 
     def materials(

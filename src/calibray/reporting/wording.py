@@ -203,11 +203,10 @@ def _obstruction_text(tables: dict[str, pd.DataFrame]) -> str:
     if "obstruction" not in tables:
         return ""
     parts = []
-    for row in tables["obstruction"].itertuples():
-        below = (
-            f"with {row.from_m:.0f} to {row.to_m:.0f} m below roofs" if row.to_m >= 1.0 else "out of sight"
-        )
-        parts.append(f"{row.mean_db:+.1f} dB {below if row.out_of_sight else 'in sight'} ({row.links} links)")
+    for row in tables["obstruction"].to_dict("records"):
+        below = f"with {row['from_m']:.0f} to {row['to_m']:.0f} m below roofs"
+        where = "in sight" if not row["out_of_sight"] else below if row["to_m"] >= 1.0 else "out of sight"
+        parts.append(f"{row['mean_db']:+.1f} dB {where} ({row['links']} links)")
     return f"mean residual: {', '.join(parts)}"
 
 
