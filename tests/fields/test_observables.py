@@ -180,10 +180,12 @@ def test_derivatives_of_every_observable_agree_with_finite_differences():
     # Every kind of constant of a material, with diffuse walls so that scattering has an effect, and a region's.
     engine, wanted = every_constant(), (*ALL, *LIMITED, *BANDED, *RESOLVED)
     value = engine.parameters.start[None]
+    without = engine.respond(value, wanted)
     for index, parameter in enumerate(engine.parameters):
         step = 1e-4 * max(parameter.start, 0.01)
         at = [value + factor * step * np.eye(value.shape[1])[index] for factor in (2, 1, -1, -2, 0)]
         answer = engine.respond(np.vstack(at), wanted, derivatives=True)
+        assert answer.observed[4] == pytest.approx(without.observed[0], rel=1e-12, nan_ok=True)
         slopes = answer.loss_slope[4, None], answer.observed_slope[4]
         for slope, values in zip(slopes, (answer.path_loss[:, None], answer.observed), strict=True):
             # Five-point stencil
