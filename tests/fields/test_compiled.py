@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -30,3 +32,14 @@ def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch: pytest.Monkey
     assert known()
     monkeypatch.setattr(compiled, "_QUICK", {"xla_cpu_no_such_option": True})
     assert not known()
+
+
+def test_only_small_programs_are_compiled_fast(monkeypatch: pytest.MonkeyPatch) -> None:
+    program = layout(synthetic.program(SEQUENCES, seed=8), phases=False).program
+    assert compiled._xla_has_the_option()
+    monkeypatch.setattr(compiled, "_QUICK", {"xla_cpu_no_such_option": True})
+    function = compiled.compiled(lambda program: jnp.zeros(()))
+    with pytest.raises(jax.errors.JaxRuntimeError, match="no_such_option"):
+        function(program)
+    monkeypatch.setattr(compiled, "SMALL", 0)
+    assert function(program) == 0
