@@ -5,7 +5,7 @@ import pytest
 
 from calibray.errors import InputError
 from calibray.optimizers import GWO, RandomSearch
-from calibray.optimizers.gwo import encircle, linear_decay
+from calibray.optimizers.grey_wolf import encircle, linear_decay
 from problem_families.landscapes import tones, within
 
 LOWER, UPPER = np.array([-1.0, 2.0]), np.array([4.0, 9.0])

@@ -11,7 +11,7 @@ from calibray.errors import InputError
 from calibray.optimizers import CMAES, DFOLS, DifferentialEvolution, GaussianProcess, RandomSearch
 from calibray.optimizers.evaluations import Evaluations
 from calibray.optimizers.gaussian_process import log_shape
-from calibray.optimizers.library_adapter import inverted
+from calibray.optimizers.libraries import inverted
 from problem_families.landscapes import rosenbrock, street, tones, within
 
 LARGE = 2.0**31

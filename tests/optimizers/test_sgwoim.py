@@ -6,7 +6,7 @@ from scipy.interpolate import RBFInterpolator
 
 from calibray.errors import InputError
 from calibray.optimizers import GWO, SGWOIM, RandomSearch
-from calibray.optimizers.sgwoim import cosine_decay, memory_weight
+from calibray.optimizers.grey_wolf import cosine_decay, memory_weight
 from problem_families.landscapes import hall, tones, within
 
 LOWER, UPPER = np.array([-1.0, 2.0]), np.array([4.0, 9.0])

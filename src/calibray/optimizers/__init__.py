@@ -5,20 +5,16 @@ Every class is an `Optimizer` and states what it uses, how it keeps to a budget 
 class is constructed.
 """
 
-from calibray.optimizers.cma_es import CMAES
-from calibray.optimizers.dfo_ls import DFOLS
-from calibray.optimizers.differential_evolution import DifferentialEvolution
+from calibray.optimizers.derivative_free import POUNDERS, GaussNewton
 from calibray.optimizers.evaluations import Best
-from calibray.optimizers.gauss_newton import GaussNewton
 from calibray.optimizers.gaussian_process import GaussianProcess
-from calibray.optimizers.gwo import GWO
+from calibray.optimizers.grey_wolf import GWO, SGWOIM
 from calibray.optimizers.least_squares import LeastSquares
+from calibray.optimizers.libraries import CMAES, DFOLS, DifferentialEvolution
 from calibray.optimizers.methods import METHODS, label, make, method
 from calibray.optimizers.multifidelity.space_mapping import SpaceMapping
-from calibray.optimizers.pounders import POUNDERS
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import LatinHypercube, RandomSearch, Sobol
-from calibray.optimizers.sgwoim import SGWOIM
 from calibray.optimizers.vector_surrogate import VectorSurrogate
 
 __all__ = [

@@ -8,7 +8,7 @@ arXiv:2310.20708). A failed evaluation enters the model with the worst successfu
 
 from __future__ import annotations
 
-from typing import ClassVar, final
+from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +18,7 @@ from scipy.stats import norm
 from calibray.optimizers.arguments import Box, whole
 from calibray.optimizers.evaluations import Archive, merge_repeated
 from calibray.optimizers.kriging import Kriging, fit, solve
-from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, Session
+from calibray.optimizers.protocol import Optimizer, Search, Session
 from calibray.optimizers.sampling import distance_to_nearest, draw_around, maximin_design
 
 CANDIDATES = 300
@@ -45,10 +45,6 @@ class GaussianProcess(Optimizer):
     Raises:
         InputError: An argument is out of range.
     """
-
-    uses: ClassVar[frozenset[str]] = frozenset({"value"})
-    schedule: ClassVar[Schedule | None] = AS_GIVEN
-    takes_starts: ClassVar[bool] = False
 
     def __init__(
         self,

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, cast, final
 import numpy as np
 
 from calibray.errors import InputError
-from calibray.optimizers.sgwoim import SGWOIM
+from calibray.optimizers.grey_wolf import SGWOIM
 from calibray.support.lazy_imports import library
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from abc import ABC
 from collections.abc import Callable, Generator
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
@@ -120,6 +121,23 @@ class Session:
             self._asked, self._answers, self._finished = None, [], True
 
 
+def limited(search: Search, budget: int) -> Search:
+    """End a search when it has used its budget, and shorten the last batch; the search must not end earlier."""
+    with closing(search):
+        x = next(search)
+        while True:
+            answers = yield x[:budget]
+            budget -= len(answers)
+            if budget == 0:
+                return
+            x = search.send(answers)
+
+
+def first_start(archive: Archive) -> NDArray[np.float64]:
+    """Where a local search starts in the unit cube [d]: at the best point passed to `tell` before, or in the middle."""
+    return archive.box.to_unit(archive.best.x) if len(archive) else np.full(archive.box.dimension, 0.5)
+
+
 @dataclass(frozen=True)
 class Schedule:
     """How a method keeps to a budget.
@@ -133,11 +151,7 @@ class Schedule:
     least: int = 1
 
 
-def _as_given(budget: int) -> dict[str, int]:
-    return {"budget": budget}
-
-
-AS_GIVEN: Final = Schedule(_as_given)
+AS_GIVEN: Final = Schedule(lambda budget: {"budget": budget})
 """The schedule of a method that accepts any budget as its setting `budget`."""
 
 
@@ -145,7 +159,8 @@ class Optimizer(ABC):
     """Minimises a value over a box; the caller owns the loop.
 
     `while not opt.done: x = opt.ask(); opt.tell(x, *evaluate(x))` is a complete run. A final class receives its
-    settings in the constructor, passes its algorithm to a `Session`, sets the attributes below, and overrides nothing.
+    settings in the constructor, passes its algorithm to a `Session`, sets those of the attributes below whose defaults
+    do not apply, and overrides nothing else.
 
     The value may be any number, such as an error or a negative log likelihood. A method that uses residuals minimises
     their mean square, so the value must rise and fall with it. For a likelihood, pass deviance residuals sign(r) sqrt(2
@@ -162,9 +177,9 @@ class Optimizer(ABC):
             points. In every other method, the best point passed to `tell` before the first `ask` leads the search.
     """
 
-    uses: ClassVar[frozenset[str]]
-    schedule: ClassVar[Schedule | None]
-    takes_starts: ClassVar[bool]
+    uses: ClassVar[frozenset[str]] = frozenset({"value"})
+    schedule: ClassVar[Schedule | None] = AS_GIVEN
+    takes_starts: ClassVar[bool] = False
     _session: Session
     _budget: Any  # int, or None if the method stops by itself
 

@@ -14,7 +14,7 @@ from scipy.stats import qmc
 
 from calibray.optimizers.arguments import Box, whole
 from calibray.optimizers.evaluations import Archive
-from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, Session
+from calibray.optimizers.protocol import Optimizer, Search, Session
 from calibray.support.interruption import defer_interruption
 
 
@@ -75,9 +75,6 @@ class Sampling(Optimizer):
         kind: Name of the design.
     """
 
-    uses: ClassVar[frozenset[str]] = frozenset({"value"})
-    schedule: ClassVar[Schedule | None] = AS_GIVEN
-    takes_starts: ClassVar[bool] = False
     kind: ClassVar[str]
 
     def __init__(self, lower: ArrayLike, upper: ArrayLike, *, seed: int = 0, budget: int = 225) -> None:

@@ -38,7 +38,7 @@ from calibray.optimizers.arguments import Box, real, whole
 from calibray.optimizers.descent import descend_all
 from calibray.optimizers.evaluations import Archive, Objective, merge_repeated, root_mean_square
 from calibray.optimizers.kriging import Kriging, fit, solve
-from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, Session
+from calibray.optimizers.protocol import Optimizer, Search, Session
 from calibray.optimizers.sampling import distance_to_nearest, draw_around, maximin_design
 
 FIRST = 5
@@ -98,8 +98,6 @@ class VectorSurrogate(Optimizer):
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value", "residuals"})
-    schedule: ClassVar[Schedule | None] = AS_GIVEN
-    takes_starts: ClassVar[bool] = False
 
     def __init__(
         self,

@@ -1,19 +1,22 @@
-"""POUNDERS: derivative-free least squares by quadratic models of every residual.
+"""Derivative-free least squares: POUNDERS, and Gauss-Newton with finite differences.
 
-S. M. Wild, "Solving Derivative-Free Nonlinear Least Squares Problems with POUNDERS", in Advances and Trends in
-Optimization with Engineering Applications, SIAM (2017), ch. 40. The authors' package IBCDFO needs a solver (MINQ) that
-no package index provides.
+Both are local methods: they start in the middle of the box (or at the best point passed to `tell` before), and restart
+at random points if they have converged before their budget is used.
 
-Every residual has the quadratic model of least curvature through evaluated points near the best one. The sum of their
-squares, to second order, is minimised in a trust region, a box. Points for which the models are at least fully linear
-come first: they span all directions within the region. If a direction is missing and the step failed, that direction is
-evaluated before the region shrinks. It is a local method: it starts in the middle of the box (or at the best point
-passed to `tell` before), and restarts at random points if it has converged before its budget is used.
+POUNDERS: S. M. Wild, "Solving Derivative-Free Nonlinear Least Squares Problems with POUNDERS", in Advances and Trends
+in Optimization with Engineering Applications, SIAM (2017), ch. 40. The authors' package IBCDFO needs a solver (MINQ)
+that no package index provides. Every residual has the quadratic model of least curvature through evaluated points near
+the best one. The sum of their squares, to second order, is minimised in a trust region, a box. Points for which the
+models are at least fully linear come first: they span all directions within the region. If a direction is missing and
+the step failed, that direction is evaluated before the region shrinks.
+
+Gauss-Newton is the approach of a user with a least squares solver and no derivatives. Every accepted point takes one
+evaluation for each parameter, all in one batch. Steps are those of `descent.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import ClassVar, Final, NamedTuple, final
 
 import numpy as np
@@ -21,9 +24,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
 from calibray.optimizers.arguments import Box, real, whole
+from calibray.optimizers.descent import descend
 from calibray.optimizers.evaluations import Archive, Evaluations, Objective, root_mean_square
-from calibray.optimizers.library_adapter import limited
-from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, Session
+from calibray.optimizers.protocol import Optimizer, Search, Session, first_start, limited
 
 SPANNING: Final = (1.75, 10.0)
 """Distances, in trust regions, within which points may span the directions: for a fully linear model, and at all."""
@@ -56,8 +59,6 @@ class POUNDERS(Optimizer):
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value", "residuals"})
-    schedule: ClassVar[Schedule | None] = AS_GIVEN
-    takes_starts: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -78,18 +79,19 @@ class POUNDERS(Optimizer):
         self._session = Session(
             self.box,
             self.uses,
-            lambda archive: limited(_search(archive, radii, rng), self._budget),
+            lambda archive: limited(_searches(archive, rng, _descend, *radii), self._budget),
             objective,
         )
 
 
-def _search(archive: Archive, radii: tuple[float, float], rng: np.random.Generator) -> Search:
-    """Search from one starting point after the other, without end."""
-    d = archive.box.dimension
-    start = archive.box.to_unit(archive.best.x) if len(archive) else np.full(d, 0.5)
+def _searches(
+    archive: Archive, rng: np.random.Generator, local: Callable[..., Search], *settings: float
+) -> Search:
+    """Run a local search from one starting point of the unit cube after the other, without end."""
+    start = first_start(archive)
     while True:
-        yield from _descend(archive, start, radii)
-        start = rng.random(d)
+        yield from local(archive, start, *settings)
+        start = rng.random(len(start))
 
 
 class _Points(NamedTuple):
@@ -104,9 +106,9 @@ class _Points(NamedTuple):
         return 0.5 * np.sum(self.residuals**2, axis=1)
 
 
-def _descend(archive: Archive, start: NDArray[np.float64], radii: tuple[float, float]) -> Search:
-    """One local search; yields candidates [n, d] of the box."""
-    box, d, radius = archive.box, len(start), radii[0]
+def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: float) -> Search:
+    """One local search in trust regions from `radius` down to `last`; yields candidates [n, d] of the box."""
+    box, d = archive.box, len(start)
 
     def evaluated(
         points: _Points | None, unit: NDArray[np.float64]
@@ -118,13 +120,13 @@ def _descend(archive: Archive, start: NDArray[np.float64], radii: tuple[float, f
 
     side = np.where(start <= 0.5, radius, -radius)
     points = yield from evaluated(None, np.vstack([start, start + np.diag(side)]))
-    while radius > radii[1]:
+    while radius > last:
         best = int(np.argmin(points.value))
         centre = points.unit[best]
         chosen, missing = _spanning(points, best, radius)
         if missing is None or len(chosen) == d:
             step, predicted = _step(points, best, _enriched(points, best, chosen, radius), radius)
-            if predicted > 0 and np.abs(step).max() > 1e-3 * radii[1]:
+            if predicted > 0 and np.abs(step).max() > 1e-3 * last:
                 before = points.value[best]
                 points = yield from evaluated(points, np.clip(centre + step, 0.0, 1.0)[None])
                 ratio = (before - points.value[-1]) / predicted
@@ -230,3 +232,62 @@ def _improving(
         )
     length = np.minimum(room.min(axis=1), radius)
     return np.clip(centre + length.max() * directions[np.argmax(length)], 0.0, 1.0)
+
+
+@final
+class GaussNewton(Optimizer):
+    """Least squares with forward differences. Uses residuals; budget as set.
+
+    Args:
+        seed: Seed of the random points of restarts.
+        budget: Number of evaluations.
+        step: Step of the differences, as a share of the box.
+        tolerance: Relative decrease, or step as a share of the box, at which a search has converged.
+
+    Raises:
+        InputError: An argument is out of range.
+    """
+
+    uses: ClassVar[frozenset[str]] = frozenset({"value", "residuals"})
+
+    def __init__(
+        self,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        *,
+        seed: int = 0,
+        budget: int = 225,
+        step: float = 1e-3,
+        tolerance: float = 1e-4,
+        objective: Objective = root_mean_square,
+    ) -> None:
+        self.box = Box.between(lower, upper)
+        self._budget = whole("budget", budget, at_least=1)
+        self.step = real("step", step, at_least=1e-12, at_most=0.1)
+        self.tolerance = real("tolerance", tolerance, at_least=1e-15, at_most=1.0)
+        rng, settings = np.random.default_rng(whole("seed", seed, at_least=0)), (self.step, self.tolerance)
+        self._session = Session(
+            self.box,
+            self.uses,
+            lambda archive: limited(_searches(archive, rng, _newton, *settings), self._budget),
+            objective,
+        )
+
+
+def _newton(archive: Archive, start: NDArray[np.float64], step: float, tolerance: float) -> Search:
+    """One local search; yields candidates [n, d] of the box."""
+    box, lowest = archive.box, np.inf
+    descent = descend(start[None], 10**6, tolerance)
+    unit = next(descent)
+    while True:
+        residuals = archive.imputed((yield box.from_unit(unit))).errors
+        value, slope = float(np.sum(residuals**2)), np.zeros((*residuals.shape, unit.shape[1]))
+        if value < lowest:  # a rejected step needs no derivatives
+            lowest = value
+            moves = np.where(unit[0] <= 0.5, step, -step)
+            moved = archive.imputed((yield box.from_unit(unit + np.diag(moves)))).errors
+            slope = ((moved - residuals) / moves[:, None]).T[None]
+        try:
+            unit = descent.send((residuals, slope))
+        except StopIteration:
+            return

@@ -1,0 +1,257 @@
+"""Minimisers of other libraries as ask-and-tell searches: CMA-ES, DFO-LS and SciPy's differential evolution.
+
+- CMA-ES, in its author's package `cma`: N. Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772. It
+  starts in the middle of the unit cube with a step of 0.3.
+- DFO-LS, in its authors' package: C. Cartis, J. Fiala, B. Marteau, L. Roberts, "Improving the Flexibility and
+  Robustness of Model-Based Derivative-Free Optimization Solvers", ACM Trans. Math. Softw. 45 (2019) 32. It fits a
+  linear model to every residual in a trust region, one evaluation at a time. It is a local method.
+- Differential evolution: R. Storn, K. Price, J. Global Optim. 11 (1997) 341, one generation per batch, without SciPy's
+  final polish, which would need derivatives.
+
+All start at the best point passed to `tell` before, if any, and restart from a random point or population if they
+converge before their budget is used.
+
+A minimiser that calls its objective runs in a separate thread, and waits inside the objective for the evaluation. Only
+one side runs at a time, so a run is as reproducible as the library. If a search is dropped before its end, the
+objective raises an exception inside the library, which ends the thread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any, ClassVar, final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import differential_evolution
+
+from calibray.optimizers.arguments import Box, real, whole
+from calibray.optimizers.evaluations import Archive, Evaluations, Objective, root_mean_square
+from calibray.optimizers.protocol import Optimizer, Search, Session, first_start, limited
+from calibray.support.lazy_imports import library
+
+Evaluate = Callable[[NDArray[np.float64]], Evaluations]
+"""The function that a minimiser calls: it maps candidates [n, d] to their evaluations."""
+
+
+class _AbandonedError(BaseException):
+    """Ends a minimiser whose search was dropped; not an `Exception`, so that no library catches it."""
+
+
+def inverted(minimise: Callable[[Evaluate], None]) -> Search:
+    """Run a minimiser in a thread and yield the candidates [n, d] that it needs evaluated.
+
+    Raises:
+        Exception: Whatever `minimise` raises.
+    """
+    questions: SimpleQueue[NDArray[np.float64] | BaseException | None] = SimpleQueue()
+    answers: SimpleQueue[Evaluations | None] = SimpleQueue()
+
+    def evaluate(x: NDArray[np.float64]) -> Evaluations:
+        questions.put(x)
+        answer = answers.get()
+        if answer is None:
+            answers.put(None)  # for the next call, should the library have caught the exception
+            raise _AbandonedError
+        return answer
+
+    def work() -> None:
+        try:
+            minimise(evaluate)
+            questions.put(None)
+        except _AbandonedError:
+            pass
+        except BaseException as error:
+            questions.put(error)
+
+    thread = Thread(target=work, name="minimiser", daemon=True)
+    thread.start()
+    try:
+        while (question := questions.get()) is not None:
+            if isinstance(question, BaseException):
+                raise question
+            answers.put((yield question))
+    finally:
+        answers.put(None)
+        thread.join()
+
+
+@final
+class CMAES(Optimizer):
+    """Covariance matrix adaptation. Uses only the value, with the given budget. Needs `calibray[optimizers]`.
+
+    Args:
+        budget: Number of evaluations.
+        population: Candidates per generation; 4 + 3 ln d if None.
+
+    Raises:
+        InputError: An argument is out of range, or `cma` is not installed.
+    """
+
+    def __init__(
+        self,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        *,
+        seed: int = 0,
+        budget: int = 225,
+        population: int | None = None,
+    ) -> None:
+        self.box = Box.between(lower, upper)
+        self._budget = whole("budget", budget, at_least=1)
+        default = 4 + int(3 * np.log(self.box.dimension))
+        self.population = default if population is None else whole("population", population, at_least=4)
+        self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
+        self._cma = library("cma", "optimizers")
+        self._session = Session(self.box, self.uses, self._search)
+
+    def _search(self, archive: Archive) -> Search:
+        return limited(self._generations(archive), self._budget)
+
+    def _generations(self, archive: Archive) -> Search:
+        start = first_start(archive)
+        options = {
+            "bounds": [0.0, 1.0],
+            "popsize": self.population,
+            "randn": lambda *shape: self._rng.standard_normal(shape),
+            "seed": np.nan,  # leaves NumPy's global generator alone
+            "verbose": -9,
+        }
+        if len(start) == 1:
+            options["maxstd_boundrange"] = np.inf  # its limit fails in one dimension, as of cma 4.5
+        while True:
+            strategy = self._cma.CMAEvolutionStrategy(start, 0.3, options)
+            while not strategy.stop():
+                unit = np.array(strategy.ask())
+                answers = yield self.box.from_unit(unit)
+                strategy.tell(list(unit), list(archive.imputed(answers).y))
+            start = self._rng.random(len(start))
+
+
+@final
+class DFOLS(Optimizer):
+    """Derivative-free least squares. Uses residuals; budget as set. Needs `calibray[optimizers]`.
+
+    Args:
+        seed: Seed of the random points of restarts.
+        budget: Number of evaluations.
+        radius: First trust region, as a share of the box.
+        tolerance: Trust region at which a search has converged, as a share of the box.
+
+    Raises:
+        InputError: An argument is out of range, or `DFO-LS` is not installed.
+    """
+
+    uses: ClassVar[frozenset[str]] = frozenset({"value", "residuals"})
+
+    def __init__(
+        self,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        *,
+        seed: int = 0,
+        budget: int = 225,
+        radius: float = 0.2,
+        tolerance: float = 1e-4,
+        objective: Objective = root_mean_square,
+    ) -> None:
+        self.box = Box.between(lower, upper)
+        self._budget = whole("budget", budget, at_least=1)
+        self.radius = real("radius", radius, at_least=1e-6, at_most=0.5)
+        self.tolerance = real("tolerance", tolerance, at_least=1e-12, at_most=self.radius)
+        self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
+        self._dfols = library("dfols", "optimizers")
+        self._session = Session(self.box, self.uses, self._search, objective)
+
+    def _search(self, archive: Archive) -> Search:
+        # The thread holds no reference to this object, so it ends when this object is dropped.
+        solve, radii = self._dfols.solve, (self.radius, self.tolerance)
+        minimise = partial(_minimise_residuals, solve, radii, self._budget, archive, self._rng)
+        return limited(inverted(minimise), self._budget)
+
+
+def _minimise_residuals(
+    solve: Callable[..., Any],
+    radii: tuple[float, float],
+    budget: int,
+    archive: Archive,
+    rng: np.random.Generator,
+    evaluate: Evaluate,
+) -> None:
+    """Minimise from one starting point after the other, without end."""
+    box = archive.box
+    d = box.dimension
+
+    def residuals(unit: NDArray[np.float64]) -> NDArray[np.float64]:
+        return archive.imputed(evaluate(box.from_unit(unit[None]))).errors[0]
+
+    start = first_start(archive)
+    while True:
+        before = len(archive)
+        outcome = solve(
+            residuals,
+            start,
+            bounds=(np.zeros(d), np.ones(d)),
+            rhobeg=radii[0],
+            rhoend=radii[1],
+            maxfun=budget + d + 2,  # `limited` keeps the budget, and DFO-LS warns of a small one
+            do_logging=False,
+            # Coordinate directions: the random ones come from NumPy's global generator.
+            user_params={"init.random_initial_directions": False},
+        )
+        if len(archive) == before:
+            raise RuntimeError(f"DFO-LS ended without an evaluation: {outcome.msg}")
+        start = rng.random(d)
+
+
+@final
+class DifferentialEvolution(Optimizer):
+    """Differential evolution. Uses only the value, with the given budget.
+
+    Args:
+        budget: Number of evaluations.
+        population: Candidates per generation as a multiple of d; SciPy uses at least 5 in total.
+
+    Raises:
+        InputError: An argument is out of range.
+    """
+
+    def __init__(
+        self, lower: ArrayLike, upper: ArrayLike, *, seed: int = 0, budget: int = 225, population: int = 5
+    ) -> None:
+        self.box = Box.between(lower, upper)
+        self._budget = whole("budget", budget, at_least=1)
+        self.population = whole("population", population, at_least=1)
+        self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
+        self._session = Session(self.box, self.uses, self._search)
+
+    def _search(self, archive: Archive) -> Search:
+        # The thread holds no reference to this object, so it ends when this object is dropped.
+        minimise = partial(_evolve, self.population, archive, self._rng)
+        return limited(inverted(minimise), self._budget)
+
+
+def _evolve(population: int, archive: Archive, rng: np.random.Generator, evaluate: Evaluate) -> None:
+    """Minimise with one population after the other, without end."""
+    box = archive.box
+
+    def objective(x: NDArray[np.float64]) -> NDArray[np.float64]:  # [d, n], SciPy's vectorized form
+        return archive.imputed(evaluate(box.clip(x.T))).y
+
+    start = archive.best.x if len(archive) else None
+    while True:
+        differential_evolution(
+            objective,
+            list(zip(box.lower, box.upper, strict=True)),
+            popsize=population,
+            x0=start,
+            tol=0.0,
+            polish=False,
+            vectorized=True,
+            updating="deferred",
+            rng=rng,
+        )
+        start = None
