@@ -159,6 +159,23 @@ def test_the_correction_takes_the_power_of_the_engine(
     np.testing.assert_allclose(ratio, 10**0.7)
 
 
+@pytest.mark.parametrize("form", ["level", "gain"])
+def test_a_path_of_power_zero_is_absent(yard: Tracer, rows: pd.DataFrame, form: str) -> None:
+    weakest = rows.path == rows.path[rows.power_db.idxmin()]
+    if form == "level":
+        silent = rows.assign(power_db=rows.power_db.where(~weakest, -np.inf))
+        silence = rows.assign(power_db=-np.inf)
+    else:
+        gain = 10 ** (rows.power_db / 20)
+        silent = rows.drop(columns="power_db").assign(gain_real=gain.where(~weakest, 0), gain_imag=0.0)
+        silence = silent.assign(gain_real=0.0)
+    paths = read(silent, yard)
+    assert paths.num_paths == rows.path.nunique() - 1
+    np.testing.assert_allclose(path_loss(paths), path_loss(read(rows[~weakest], yard)), rtol=1e-12)
+    with pytest.raises(InputError, match="no path has a power above 0"):
+        read(silence, yard)
+
+
 def test_a_correction_is_stored_and_follows_its_path(
     yard: Tracer, rows: pd.DataFrame, tmp_path: Path
 ) -> None:

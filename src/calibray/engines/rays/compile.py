@@ -64,12 +64,18 @@ class RaySetting:
 
 
 def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
-    """Compile the paths of a table.
+    """Compile the paths of a table; one of power 0 is absent.
 
     Raises:
-        InputError: The table does not agree with the scene, the links or itself.
+        InputError: The table does not agree with the scene, the links or itself, or has neither links nor power.
     """
     scene = setting.scene
+    if table.power is not None:
+        table = table.take(np.flatnonzero(table.power > 0))
+        if not len(table.path) and setting.links is None:
+            raise InputError(
+                f"{table.source}: no path has a power above 0; export the rays of at least one link"
+            )
     tx, rx, link, chosen = _assign_links(table, setting.links)
     order = np.argsort(link, kind="stable")[(link < 0).sum() :]
     table, link = table.take(order), link[order]

@@ -49,14 +49,14 @@ class Export:
 
     @classmethod
     def of_table(cls, table: RayTable, setting: RaySetting) -> Export:
-        """Compile the rays of a call; one of power 0 is absent.
+        """Compile the rays of a call.
 
         Raises:
             InputError: The rays state no power, or do not agree with the scene or the links.
         """
         if table.power is None:
             raise InputError(f"{table.source}: states no power of its paths; add power_db")
-        paths = compile_rays(table.take(np.flatnonzero(table.power > 0)), setting)
+        paths = compile_rays(table, setting)
         return cls(paths, 10 * np.log10(powers(paths)))
 
     @property

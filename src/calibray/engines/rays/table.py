@@ -39,6 +39,9 @@ ENDS: Final = ("transmitter", "receiver")
 MOST_POINTS: Final = 102
 """Largest number of points of a path: `trace.max_depth` allows 100 interactions."""
 
+POWER_ZERO_DB: Final = -10_000.0
+"""Level in place of -inf [dB]: its power is 0 in double precision."""
+
 
 @dataclass(frozen=True, eq=False)
 class RayTable:
@@ -54,7 +57,7 @@ class RayTable:
         kind: Kinds of interaction, 0 beyond the last one [P, D].
         material: Names of materials, empty where not stated [P, D].
         object: Names of objects, empty where not stated [P, D].
-        power: Path gain [P]; None if not stated.
+        power: Path gain [P], 0 for an absent path; None if not stated.
         delay: [P], [s]; None if not stated.
     """
 
@@ -233,7 +236,8 @@ def _power(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray[np.float6
     if "power_db" in table.frame:
         if gains:
             raise InputError(f"{table.source}: has both power_db and {gains[0]}; remove one")
-        level = _per_path(table, "power_db", row_path)
+        finite = table.column("power_db").replace(-np.inf, POWER_ZERO_DB)
+        level = _per_path(table.assign(power_db=finite), "power_db", row_path)
         if (level > 0).any():
             raise InputError(
                 f"{table.source}: power_db = {level.max():g} dB; path gain is negative: give received minus "
@@ -243,9 +247,7 @@ def _power(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray[np.float6
     if not gains:
         return None
     real, imaginary = (_per_path(table, name, row_path) for name in ("gain_real", "gain_imag"))
-    if not ((power := real**2 + imaginary**2) > 0).all():
-        raise InputError(f"{table.source}: a path has the gain 0; remove it")
-    return power
+    return real**2 + imaginary**2
 
 
 LARGEST_JSON: Final = 2**26
