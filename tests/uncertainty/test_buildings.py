@@ -191,5 +191,10 @@ def test_errors_out_of_sight_are_tried_unless_errors_are_declared_independent(pr
         model = joint_model(Problem.of(setup, problem.engine), best, 0.3**2, problem.freedom)
         return {each.kind for each in model.marginal.models}
 
-    assert kinds(heterogeneity=0, constants_spread=0) == {"gaussian", "correlated", "shadowed", "student-t"}
+    assert kinds(heterogeneity=0, constants_spread=0) == {
+        "gaussian",
+        "correlated",
+        "out_of_sight",
+        "student-t",
+    }
     assert kinds(heterogeneity=0, constants_spread=0, range_m=0) == {"gaussian", "student-t"}

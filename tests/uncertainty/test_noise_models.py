@@ -158,7 +158,7 @@ def test_nearest_neighbours_approximate_the_exact_whitener():
     )
 
 
-@pytest.mark.parametrize("kind", ["gaussian", "correlated", "shadowed", "student-t"])
+@pytest.mark.parametrize("kind", ["gaussian", "correlated", "out_of_sight", "student-t"])
 def test_planted_errors_favour_their_kind(kind):
     """For 150 links, the planted kind gets the largest weight; a planted offset is recognised."""
     random = np.random.default_rng(8)
@@ -170,10 +170,11 @@ def test_planted_errors_favour_their_kind(kind):
         * np.linalg.cholesky(np.exp(-cdist(position, position) / 60) + 1e-6 * np.eye(150))
         @ random.standard_normal(150),
         # Missing power some 15 dB below that in sight, differing by 6 dB.
-        "shadowed": -missing_db(excess + 6 * random.standard_normal(150), 15.0) + random.standard_normal(150),
+        "out_of_sight": -missing_db(excess + 6 * random.standard_normal(150), 15.0)
+        + random.standard_normal(150),
         "student-t": 3 * random.standard_t(2.5, 150),
     }[kind]
-    models = noise_models(position, shadowed=True)
+    models = noise_models(position, out_of_sight=True)
     assert sum(model.weight for model in models) == pytest.approx(1.0)
     assert sum(model.weight for model in models if model.offset) == pytest.approx(2 / 3)
     density = marginal(models, position=position, noise_db=2.0, excess=excess)

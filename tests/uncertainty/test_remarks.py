@@ -53,8 +53,8 @@ def test_noise_that_the_data_favour_is_reported():
         return [remark.kind for remark in departures(noise)]
 
     # Kinds that share the weight count against Gaussian noise; those of little weight do not.
-    assert kinds(gaussian=0.02, correlated=0.2, shadowed=0.7) == [RemarkKind.SHADOWED_ERRORS]
-    assert kinds(gaussian=0.5, correlated=0.2, shadowed=0.3) == []
+    assert kinds(gaussian=0.02, correlated=0.2, out_of_sight=0.7) == [RemarkKind.ERRORS_OUT_OF_SIGHT]
+    assert kinds(gaussian=0.5, correlated=0.2, out_of_sight=0.3) == []
     # Beforehand, half of the weight is that of buildings which differ.
     assert kinds(gaussian=0.9, heterogeneous=0.7) == []
     assert kinds(gaussian=0.9, heterogeneous=0.8) == [RemarkKind.HETEROGENEITY]

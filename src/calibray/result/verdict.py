@@ -115,7 +115,7 @@ class RemarkKind(StrEnum):
 
     CORRELATED_NOISE = "correlated noise"  # weight, gaussian_weight
     HEAVY_TAILS = "heavy tails"  # weight, gaussian_weight
-    SHADOWED_ERRORS = "shadowed errors"  # weight, gaussian_weight
+    ERRORS_OUT_OF_SIGHT = "errors out of sight"  # weight, gaussian_weight
     # observables, names, path_loss, further, standard_errors; slope and slope_error of measured over modelled values
     CONFLICT = "conflict"
     HETEROGENEITY = "heterogeneity"  # weight, gaussian_weight

@@ -145,7 +145,7 @@ def _noise_remark(finding: str) -> Callable[[dict[str, Any]], str]:
 
 _CAUSES: Final = {
     "correlated": "neighbouring links share part of their noise, so that many links count as few",
-    "shadowed": "weak links out of sight count less if the twin lacks paths to them",
+    "out_of_sight": "weak links out of sight count less if the twin lacks paths to them",
     "student-t": "outliers count less if noise has heavy tails",
     "heterogeneous": "links that depend on single buildings count less if buildings differ",
     "gaussian": "their noise model differs from the one that RMSE assumes",
@@ -264,7 +264,7 @@ def _ray_mapping(values: dict[str, Any]) -> str:
 _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.CORRELATED_NOISE: _noise_remark("Neighbouring links share part of their noise"),
     RemarkKind.HEAVY_TAILS: _noise_remark("The noise has heavy tails, as with outliers"),
-    RemarkKind.SHADOWED_ERRORS: _noise_remark(
+    RemarkKind.ERRORS_OUT_OF_SIGHT: _noise_remark(
         "Errors of weak links out of sight are larger than those of the others, as if the twin lacked paths to them. "
         "Trace with refraction and diffraction"
     ),

@@ -190,16 +190,16 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
     few = len(counted) < FEWEST
     # With correlated errors, the probability of censoring is an integral over all censored links.
     uncorrelated = few or bool(censored.any())
-    shadowed = not uncorrelated and section.range_m == "auto"
+    out_of_sight = not uncorrelated and section.range_m == "auto"
     models = noise_models(
         position,
         kind="gaussian" if few else None if section.kind == "auto" else section.kind,
         range_m=0.0 if uncorrelated else None if section.range_m == "auto" else float(section.range_m),
         offset=not has_offset(problem),
         censored=bool(censored.any()),
-        shadowed=shadowed,
+        out_of_sight=out_of_sight,
     )
-    excess = excess_db(problem)[counted] if shadowed else None
+    excess = excess_db(problem)[counted] if out_of_sight else None
     ridge = objective.noise_db / nuisance.prior[used] if nuisance.terms else np.zeros(0)
     marginal = Marginal.of(design[:, used], ridge, scale, position, noise_db, models, censored, excess)
     measured = objective.measured[counted] - design[:, at_bound] @ coefficients[at_bound]

@@ -67,7 +67,7 @@ COMMON: Final = 0.5
 """Share of these errors' variance that all links have in common: missing paths can only add power."""
 
 # Kinds of noise; "student-t" includes Gaussian noise with gross errors.
-GAUSSIAN, CORRELATED, SHADOWED, HEAVY = "gaussian", "correlated", "shadowed", "student-t"
+GAUSSIAN, CORRELATED, OUT_OF_SIGHT, HEAVY = "gaussian", "correlated", "out_of_sight", "student-t"
 
 DIFFERING: Final = "heterogeneous"
 """Buildings that differ, which have a weight like the kinds of noise."""
@@ -78,10 +78,10 @@ class NoiseModel:
     """One model of the errors.
 
     Attributes:
-        kind: "gaussian", "correlated", "shadowed" (larger out of sight) or "student-t".
+        kind: "gaussian", "correlated", "out_of_sight" (larger out of sight) or "student-t".
         weight: Its prior weight.
         offset: Whether it includes an undeclared offset.
-        range: Correlation range, if "correlated" [m]; level of the power that the twin lacks, if "shadowed" [dB].
+        range: Correlation range, if "correlated" [m]; level of the power that the twin lacks, if "out_of_sight" [dB].
         share: Correlated share of the variance, if "correlated".
         freedom: Degrees of freedom, if "student-t".
         gross: Whether the errors are Gaussian with some gross errors instead of Student's t, if "student-t".
@@ -103,7 +103,7 @@ def noise_models(
     range_m: float | None = None,
     offset: bool = True,
     censored: bool = False,
-    shadowed: bool = False,
+    out_of_sight: bool = False,
 ) -> tuple[NoiseModel, ...]:
     """The noise models to try, with their prior weights.
 
@@ -114,7 +114,7 @@ def noise_models(
         offset: Whether to try an undeclared offset.
         censored: Whether some links are censored; gross errors are then left out, because their probability of
             censoring is not implemented.
-        shadowed: Whether to try larger errors of links out of sight.
+        out_of_sight: Whether to try larger errors of links out of sight.
 
     Returns:
         The models; their weights sum to one.
@@ -123,8 +123,8 @@ def noise_models(
     ranges = _ranges(position) if range_m is None else (range_m,) * (range_m > 0)
     if kind != HEAVY and ranges:
         kinds.append([NoiseModel(CORRELATED, 1.0, range=r, share=s) for r in ranges for s in SHARES])
-    if kind != HEAVY and shadowed:
-        kinds.append([NoiseModel(SHADOWED, 1.0, range=level) for level in LEVELS])
+    if kind != HEAVY and out_of_sight:
+        kinds.append([NoiseModel(OUT_OF_SIGHT, 1.0, range=level) for level in LEVELS])
     if kind != GAUSSIAN and not range_m:
         tails = [NoiseModel(HEAVY, 1.0, freedom=freedom) for freedom in FREEDOMS]
         if kind != HEAVY and not censored:
@@ -170,7 +170,7 @@ class Marginal:
         column: The column of an undeclared offset, scaled in the same way [m].
         noise_db: Approximate noise level, which scales priors [dB].
         models: The noise models.
-        whiteners: Whitener of each correlated or shadowed model, by kind, range and share.
+        whiteners: Whitener of each correlated or "out_of_sight" model, by kind, range and share.
         censored: Mask of the censored links, whose gaps are lower limits [m]; no model has a whitener then.
     """
 
@@ -204,7 +204,7 @@ class Marginal:
             noise_db: Approximate noise level [dB].
             models: The noise models.
             censored: Mask of the censored links [m]; none if None.
-            excess_db: Loss out of sight in excess of the links in sight [m]; None if no model is shadowed [dB].
+            excess_db: Loss out of sight in excess of the links in sight [m]; None if no model is "out_of_sight" [dB].
         """
         censored = np.zeros(len(scale), dtype=bool) if censored is None else censored
         whiteners = {}
@@ -214,7 +214,7 @@ class Marginal:
         for kind, range_, share in keys:
             if kind == CORRELATED:
                 whiteners[kind, range_, share] = whitener(position, scale, range_, share, neighbours=near)
-            elif kind == SHADOWED and excess_db is not None:
+            elif kind == OUT_OF_SIGHT and excess_db is not None:
                 error = scale * missing_db(excess_db, range_) / noise_db
                 whiteners[kind, range_, share] = shared(error, COMMON)
         return cls(design * scale[:, None], ridge, scale, noise_db, tuple(models), whiteners, censored)
@@ -243,7 +243,7 @@ class Marginal:
             elif model.kind == HEAVY:
                 tail = gross() if model.gross else student(model.freedom)
                 value = evidence(gap, design, ridge / self.noise_db, tail)
-            elif model.kind in (CORRELATED, SHADOWED):
+            elif model.kind in (CORRELATED, OUT_OF_SIGHT):
                 filter_ = self.whiteners[key := (model.kind, model.range, model.share)]
                 if key not in white:
                     white[key] = filter_.apply(gap.T).T

@@ -17,7 +17,7 @@ from calibray.result.verdict import CONFIDENCE, Interval, Remark, RemarkKind, Va
 from calibray.result.wording import MOST_ODDS
 from calibray.uncertainty.draws import Draws
 from calibray.uncertainty.joint_model import has_offset
-from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, HEAVY, SHADOWED
+from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, HEAVY, OUT_OF_SIGHT
 
 LIKELY: Final = 0.75
 """Odds of three to one against independent Gaussian errors, or against equal buildings, at which a departure is
@@ -43,12 +43,12 @@ OFFSET_DB: Final = 0.1
 
 DEPARTURES: Final = {
     CORRELATED: RemarkKind.CORRELATED_NOISE,
-    SHADOWED: RemarkKind.SHADOWED_ERRORS,
+    OUT_OF_SIGHT: RemarkKind.ERRORS_OUT_OF_SIGHT,
     HEAVY: RemarkKind.HEAVY_TAILS,
     DIFFERING: RemarkKind.HETEROGENEITY,
 }
 
-CAUSES: Final = (CORRELATED, SHADOWED, HEAVY, DIFFERING, GAUSSIAN)
+CAUSES: Final = (CORRELATED, OUT_OF_SIGHT, HEAVY, DIFFERING, GAUSSIAN)
 
 
 def departures(noise: Mapping[str, float]) -> tuple[Remark, ...]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibray.result.verdict import Cause
 from calibray.uncertainty.joint_model import JointModel
-from calibray.uncertainty.noise_models import CORRELATED, HEAVY, SHADOWED
+from calibray.uncertainty.noise_models import CORRELATED, HEAVY, OUT_OF_SIGHT
 from calibray.uncertainty.sequential_monte_carlo import Posterior
 
 FEWEST: Final = 30
@@ -34,7 +34,7 @@ def remaining_widths(model: JointModel, posterior: Posterior) -> list[dict[Cause
     present = {
         Cause.BUILDINGS: posterior.spread > 0,
         Cause.CORRELATION: np.array([each.kind == CORRELATED for each in models]),
-        Cause.MISSING_PATHS: np.array([each.kind == SHADOWED for each in models]),
+        Cause.MISSING_PATHS: np.array([each.kind == OUT_OF_SIGHT for each in models]),
         Cause.HEAVY_TAILS: np.array([each.kind == HEAVY for each in models]),
         Cause.OFFSET: np.array([each.offset for each in models]),
     }
