@@ -142,12 +142,12 @@ def path_losses(
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
-        return np.asarray(_losses_by_formula(program, jax.device_put(tables), count, combining))[:count], 0.0
+        return np.asarray(_losses_by_formula(program, tables, count, combining))[:count], 0.0
     # Tables are looked up where coefficients are used, which is fastest if each is used once.
     single_use = all(set(group.signature) <= {COEFFICIENT} for group in program.groups)
     powers, errors = [], []
     for table in tables[:count]:
-        response = _material_response(program, jax.device_put(table))
+        response = _material_response(program, table)
         if single_use:
             powers.append(_link_power(program, response, combining))
         else:
@@ -173,11 +173,11 @@ def path_losses_and_slopes(
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
-        loss, slope = _slopes_by_formula(program, jax.device_put(tables), count, columns, combining)
+        loss, slope = _slopes_by_formula(program, tables, count, columns, combining)
         return np.asarray(loss)[:count], np.asarray(slope)[:count], 0.0
     powers, slopes, errors = [], [], []
     for table in tables[:count]:
-        response, derivatives = _response_and_derivatives(program, jax.device_put(table), columns)
+        response, derivatives = _response_and_derivatives(program, table, columns)
         power, by_step = _power_and_slope(program, _split_by_step_wide(program, response), combining)
         powers.append(power)
         slopes.append(_path_loss_slope(program, power, by_step, derivatives, table.shape[0]))
@@ -196,8 +196,7 @@ def path_losses_with_effects(
 ) -> NDArray[np.floating]:
     """Path loss [count, L], [dB], for material constants [n, M, 8] and effect parameters [n, e]; see `path_losses`."""
     count = len(tables) if count is None else count
-    arrays = jax.device_put(tables), jax.device_put(values)
-    return np.asarray(_losses_with_effects(program, *arrays, effects, count, combining))[:count]
+    return np.asarray(_losses_with_effects(program, tables, values, effects, count, combining))[:count]
 
 
 @jax_settings()
@@ -212,8 +211,7 @@ def path_losses_and_slopes_with_effects(
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
     """Path loss with effects, and its derivatives by materials [count, L, M, columns] and by effects [count, L, e]."""
     count = len(tables) if count is None else count
-    arrays = jax.device_put(tables), jax.device_put(values)
-    answers = _slopes_with_effects(program, *arrays, effects, count, columns, combining)
+    answers = _slopes_with_effects(program, tables, values, effects, count, columns, combining)
     loss, slope, by_effect = (np.asarray(answer)[:count] for answer in answers)
     return loss, slope, by_effect
 

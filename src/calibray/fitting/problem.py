@@ -167,7 +167,7 @@ class Problem:
         """Degrees of freedom: calibration links minus unknowns; below 1 the noise cannot be estimated."""
         return self.objective.num_counted - self.unknowns
 
-    @property
+    @cached_property
     def differentiable(self) -> bool:
         """Whether the engine provides derivatives of the observable."""
         return isinstance(self.engine, Differentiable) and self.observable.derivatives is not None

@@ -56,7 +56,8 @@ class Session:
         self._uses, self._objective = uses, objective
         self._search = search(self.archive)
         self._asked: NDArray[np.float64] | None = None
-        self._answers: list[Evaluations | None] = []
+        self._open = np.arange(0)
+        self._answers: dict[int, Evaluations] = {}
         self._links: int | None = None
         self._finished = False
         self.minima = np.empty((0, box.dimension))
@@ -74,7 +75,7 @@ class Session:
         self._advance()
         if self._asked is None:
             raise InputError(f"done after {len(self.archive)} evaluations; start a new optimizer to continue")
-        return self._asked[self._open()]
+        return self._asked[self._open]
 
     def tell(
         self,
@@ -99,26 +100,25 @@ class Session:
         self.archive.add(evaluations)
         if self._asked is None:
             return
-        for row in range(len(evaluations)):
-            waiting = self._open()
-            same = waiting[(self._asked[waiting] == evaluations.x[row]).all(axis=1)]
+        if np.array_equal(evaluations.x, self._asked) and len(self._open) == len(self._asked):
+            self._answers, self._open = {0: evaluations}, self._open[:0]
+            return
+        for row, point in enumerate(evaluations.x):
+            same = np.flatnonzero((self._asked[self._open] == point).all(axis=1))
             if same.size:
-                self._answers[same[0]] = evaluations.rows(np.array([row]))
-
-    def _open(self) -> NDArray[np.intp]:
-        """Rows of the batch without an answer."""
-        return np.array([row for row, answer in enumerate(self._answers) if answer is None], dtype=np.intp)
+                self._answers[int(self._open[same[0]])] = evaluations.rows(np.array([row]))
+                self._open = np.delete(self._open, same[0])
 
     def _advance(self) -> None:
         """Continue with the next batch once this one is complete."""
-        answers = [answer for answer in self._answers if answer is not None]
-        if self._finished or len(answers) < len(self._answers):
+        if self._finished or len(self._open):
             return
+        answers = [self._answers[row] for row in sorted(self._answers)]
         try:
             self._asked = self._search.send(Evaluations.joined(answers)) if answers else next(self._search)
-            self._answers = [None] * len(self._asked)
+            self._open, self._answers = np.arange(len(self._asked)), {}
         except StopIteration:
-            self._asked, self._answers, self._finished = None, [], True
+            self._asked, self._open, self._answers, self._finished = None, np.arange(0), {}, True
 
 
 def limited(search: Search, budget: int) -> Search:

@@ -122,23 +122,7 @@ def evidence(
     # Start at a robust scale: 1.2 median absolute deviations, at least 5 % of the root mean square.
     size = np.maximum(np.median(np.abs(gap - np.median(gap, axis=1)[:, None]), axis=1) * 1.2, 1e-9)
     size = np.maximum(size, 0.05 * np.sqrt(np.mean(gap**2, axis=1)) + 1e-12)
-    errors, coefficients, active = gap.copy(), np.zeros((len(gap), columns)), np.arange(len(gap))
-    for _ in range(MAX_STEPS):
-        before, change = size[active], np.zeros(len(active))
-        weight = tail.select(active).weight((errors[active] / before[:, None]) ** 2)
-        if columns:
-            matrix = regular(products(design, weight) + before[:, None, None] ** 2 * prior[active])
-            side = (weight * gap[active]) @ design
-            coefficients[active] = np.linalg.solve(matrix, side[..., None])[..., 0]
-            updated = gap[active] - coefficients[active] @ design.T
-            change = np.abs(updated - errors[active]).max(axis=1)
-            errors[active] = updated
-        number = np.sum(weight, axis=1) if tail.by_weights else links
-        after = np.maximum(np.sqrt(np.sum(weight * errors[active] ** 2, axis=1) / number), 1e-12)
-        size[active] = after
-        active = active[np.maximum(np.abs(after - before), change) > TOLERANCE * after]
-        if not len(active):
-            break
+    errors, coefficients, size = _mode(gap, design, prior, size, tail)
     # Log density at the mode, log prior, then Laplace's approximation for the log scale and the coefficients.
     value = tail.log_density((errors / size[:, None]) ** 2).sum(axis=1) - links * np.log(size)
     has_prior = ridge > 0
@@ -154,11 +138,41 @@ def evidence(
     return value
 
 
-def products(design: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Design^T diag(weight) design [n, q, q], for columns [m, q] and weights [n, m]."""
+def _mode(
+    gap: NDArray[np.float64],
+    design: NDArray[np.float64],
+    prior: NDArray[np.float64],
+    size: NDArray[np.float64],
+    tail: Tail,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Errors [n, m], coefficients [n, q] and scale [n] at the mode, from a first scale and the priors' precisions."""
     links, columns = design.shape
     outer = (design[:, :, None] * design[:, None, :]).reshape(links, -1)
-    return (weight @ outer).reshape(-1, columns, columns)
+    errors, coefficients, change = gap, np.zeros((len(gap), columns)), np.float64(0.0)
+    mode, rows = (gap.copy(), coefficients.copy(), size.copy()), np.arange(len(gap))
+    for step in range(MAX_STEPS):
+        variance = size**2
+        weight = tail.weight(errors**2 / variance[:, None])
+        if columns:
+            matrix = (weight @ outer).reshape(-1, columns, columns) + variance[:, None, None] * prior
+            side = (weight * gap) @ design
+            coefficients = np.linalg.solve(regular(matrix), side[..., None])[..., 0]
+            before, errors = errors, gap - coefficients @ design.T
+            change = np.abs(errors - before).max(axis=1)
+        number = weight.sum(axis=1) if tail.by_weights else links
+        after = np.maximum(np.sqrt((weight * errors**2).sum(axis=1) / number), 1e-12)
+        moving = np.maximum(np.abs(after - size), change) > TOLERANCE * after
+        size = after
+        if step + 1 < MAX_STEPS and moving.all():
+            continue
+        for target, values in zip(mode, (errors, coefficients, size), strict=True):
+            target[rows] = values
+        if not moving.any():
+            break
+        rows, tail = rows[moving], tail.select(np.flatnonzero(moving))
+        gap, prior = gap[moving], prior[moving]
+        errors, coefficients, size = errors[moving], coefficients[moving], size[moving]
+    return mode
 
 
 def regular(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
