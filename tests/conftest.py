@@ -3,12 +3,17 @@
 # ruff: noqa: E402  (what NumPy reads has to be set before it is imported)
 
 import os
+import sys
 from collections.abc import Iterator
 
 # Matrices of the tests are small, and BLAS threads that wait for each other cost more than they gain. NumPy and SciPy
 # read these when they are imported; subprocesses inherit them.
 for _library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
+
+# Some environments forbid bytecode; then every process that a test starts would compile all of Calibray again.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import pytest
 from hypothesis import settings
