@@ -189,7 +189,7 @@ def flat_walk(folder: Path) -> Walk:
 def hill_walk(folder: Path) -> Walk:
     """The hill, its scanner and its track."""
     gains = hill.received()
-    found, frame = read_footprints(hill.FOLDER / "houses.geojson", "height_m", 0.0)
+    found, frame = read_footprints(hill.FOLDER / "houses.geojson", "height_m")
     bounds = found.bounds + MARGIN * np.array([-1, -1, 1, 1])
     terrain, frame = lower_origin(read_terrain(hill.FOLDER / "ground.tif", frame, bounds), frame)
     scene = make_scene(found, folder, frame, terrain).path

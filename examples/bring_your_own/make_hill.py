@@ -93,7 +93,7 @@ def duration() -> int:
 def received() -> list[np.ndarray]:
     """Amplitudes of the paths from the mast to where the scanner is in the midst of every second."""
     with TemporaryDirectory() as folder:
-        found, frame = read_footprints(FOLDER / "houses.geojson", "height_m", 0.0)
+        found, frame = read_footprints(FOLDER / "houses.geojson", "height_m")
         bounds = found.bounds + 50 * np.array([-1, -1, 1, 1])
         terrain, frame = lower_origin(read_terrain(FOLDER / "ground.tif", frame, bounds), frame)
         scene = make_scene(found, Path(folder), frame, terrain).path

@@ -19,6 +19,7 @@ from rasterio.transform import Affine
 from calibray.coordinates import Frame
 from calibray.errors import InputError
 from calibray.scenes.authoring import (
+    FootprintColumns,
     HeightRule,
     lower_origin,
     make_scene,
@@ -139,7 +140,9 @@ def layer(path: Path, heights: list, driver: str, crs: str = "EPSG:32632", **col
 @pytest.mark.parametrize(("driver", "ending"), [("GPKG", "gpkg"), ("ESRI Shapefile", "shp")])
 def test_footprints_of_a_vector_file(tmp_path, driver, ending):
     path = layer(tmp_path / f"town.{ending}", [7.5, np.nan, 0.0], driver, storeys=[1.0, 5.0, np.nan])
-    buildings, frame = read_footprints(path, "hoehe", levels="storeys", frame=Frame.utm(11.5755, 48.1374))
+    buildings, frame = read_footprints(
+        path, "hoehe", FootprintColumns(levels="storeys"), frame=Frame.utm(11.5755, 48.1374)
+    )
     assert buildings.top == pytest.approx([7.5, 15.0, 9.0])
     assert buildings.height_from == ("height", "levels", "default")
     assert buildings.bounds == pytest.approx([0, 0, 120, 20], abs=1e-6)
@@ -156,7 +159,7 @@ def test_footprints_of_geojson_are_projected(tmp_path):
     }
     path = tmp_path / "town.geojson"
     path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature, feature]}))
-    buildings, frame = read_footprints(path, "h", name="name")
+    buildings, frame = read_footprints(path, "h", FootprintColumns(name="name"))
     assert buildings.name == ("Hall", "Hall-2")
     assert buildings.top == pytest.approx([12.5, 12.5])
     assert shapely.area(buildings.polygon) == pytest.approx([400, 400], rel=1e-3)

@@ -2,14 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, echo, log
+from calibray.cli.console import Overwrite, echo, log, with_groups
 
 
+@dataclass(frozen=True)
+class Runs:
+    """Options that state the runs to compare."""
+
+    methods: Annotated[
+        str,
+        typer.Option(
+            metavar="NAMES", help="Methods, separated by commas; METHOD@CALLS sets the budget of one method."
+        ),
+    ] = "sgwo-im,gwo,gwo@600,vector-surrogate,gaussian-process,differential-evolution,random,least-squares"
+    seeds: Annotated[int, typer.Option(metavar="N", help="Runs of each method, with seeds 0 to N - 1.")] = 25
+    budget: Annotated[int, typer.Option(metavar="CALLS", help="RT calls per run.")] = 225
+    workers: Annotated[int, typer.Option(metavar="N", help="Number of local processes.")] = 1
+
+
+@with_groups
 def compare(
     study_file: Annotated[Path, typer.Argument(metavar="STUDY", help="The study file, in TOML.")],
     out: Annotated[
@@ -21,15 +38,7 @@ def compare(
             help="Folder for the tables and the figure; it also keeps finished runs.",
         ),
     ],
-    methods: Annotated[
-        str,
-        typer.Option(
-            metavar="NAMES", help="Methods, separated by commas; METHOD@CALLS sets the budget of one method."
-        ),
-    ] = "sgwo-im,gwo,gwo@600,vector-surrogate,gaussian-process,differential-evolution,random,least-squares",
-    seeds: Annotated[int, typer.Option(metavar="N", help="Runs of each method, with seeds 0 to N - 1.")] = 25,
-    budget: Annotated[int, typer.Option(metavar="CALLS", help="RT calls per run.")] = 225,
-    workers: Annotated[int, typer.Option(metavar="N", help="Number of local processes.")] = 1,
+    runs: Runs,
     overwrite: Overwrite = False,
 ) -> None:
     """Compare methods on a study: many seeds, equal budgets of RT calls, replayed paths."""
@@ -50,18 +59,18 @@ def compare(
     from calibray.support.output_files import check_outputs
     from calibray.tables import render
 
-    names = [name.strip() for name in methods.split(",") if name.strip()]
+    names = [name.strip() for name in runs.methods.split(",") if name.strip()]
     check_outputs(out, FILES, Study.load(study_file).files(), overwrite)
-    parsed = parse_methods(names, budget)
-    calls = seeds * sum(method.budget for method in parsed)
+    parsed = parse_methods(names, runs.budget)
+    calls = runs.seeds * sum(method.budget for method in parsed)
     echo(
-        f"{seeds * len(parsed):,} runs with {calls:,} RT calls in total; runs are kept in {out} are not repeated",
+        f"{runs.seeds * len(parsed):,} runs with {calls:,} RT calls in total; runs are kept in {out} are not repeated",
         err=True,
     )
     with progress_bars(log()) as progress:
         comparison = run_comparison(
             partial(study_problem, study_file),
-            names, seeds=seeds, budget=budget, out=out, workers=workers, progress=progress,
+            names, seeds=runs.seeds, budget=runs.budget, out=out, workers=runs.workers, progress=progress,
         )  # fmt: skip
     write(comparison, out)
     echo(render(table(comparison), optimum_text(comparison)))

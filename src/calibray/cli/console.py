@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cache
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache, wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
@@ -55,29 +58,68 @@ StudyFile = Annotated[
     Path, typer.Argument(metavar="STUDY", help="The study file, in TOML.", show_default=False)
 ]
 
+ResultFolder = Annotated[
+    Path, typer.Argument(metavar="DIR", help="Folder that `calibray run` wrote.", show_default=False)
+]
+
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace existing files that Calibray did not write.")
 ]
 """Whether output may replace a user's file; an input is never replaced."""
 
-AllowChangedInputs = Annotated[
-    bool,
-    typer.Option(
-        "--allow-changed-inputs",
-        help="Continue although a file of the result, the scene or an antenna has changed.",
-    ),
-]
-"""Whether a result may be used although its inputs have changed."""
 
-Workers = Annotated[
-    int | None,
-    typer.Option(metavar="N", help="Number of local processes among which chunks of links are distributed."),
-]
+@dataclass(frozen=True)
+class Pool:
+    """Options that state the workers; their fields are the arguments of `calibray.engines.open_workers`."""
 
-Scheduler = Annotated[
-    str | None,
-    typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers process chunks of links."),
-]
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", help="Number of local processes among which chunks of links are distributed."
+        ),
+    ] = None
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers process chunks of links."),
+    ] = None
+
+
+@dataclass(frozen=True)
+class Permissions:
+    """Options that permit what is refused otherwise."""
+
+    allow_changed_inputs: Annotated[
+        bool,
+        typer.Option(
+            "--allow-changed-inputs",
+            help="Continue although a file of the result, the scene or an antenna has changed.",
+        ),
+    ] = False
+    overwrite: Overwrite = False
+
+
+def with_groups(command: Callable[..., None]) -> Callable[..., None]:
+    """A command in which each argument that is a dataclass becomes one option for each of its fields."""
+    arguments: dict[str, Any] = get_type_hints(command, include_extras=True)
+    groups = {name: kind for name, kind in arguments.items() if is_dataclass(kind)}
+    options: list[Parameter] = []
+    for argument in signature(command).parameters.values():
+        kind = arguments[argument.name]
+        hints = get_type_hints(kind, include_extras=True) if argument.name in groups else arguments
+        parts = signature(kind).parameters.values() if argument.name in groups else [argument]
+        options += [part.replace(kind=Parameter.KEYWORD_ONLY, annotation=hints[part.name]) for part in parts]
+
+    @wraps(command)
+    def flat(**values: Any) -> None:
+        grouped = {
+            name: kind(**{field.name: values.pop(field.name) for field in fields(kind)})
+            for name, kind in groups.items()
+        }
+        command(**values, **grouped)
+
+    flat.__annotations__ = {option.name: option.annotation for option in options}
+    flat.__signature__ = Signature(options)  # type: ignore[attr-defined]
+    return flat
 
 
 def warn(study: Study, links: Measurements) -> None:

@@ -2,70 +2,83 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from calibray.cli.console import AllowChangedInputs, Overwrite, Scheduler, Workers, echo, log, print_costs
+from calibray.cli.console import Permissions, Pool, ResultFolder, echo, log, print_costs, with_groups
 from calibray.errors import InputError
 from calibray.support.messages import shortened
 
 
-def map(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Folder that `calibray run` wrote.", show_default=False)
-    ],
+@dataclass(frozen=True)
+class Area:
+    """Options that state the transmitter and the receivers of a map."""
+
     tx: Annotated[
         tuple[float, float, float] | None,
         typer.Option(
             metavar="X Y Z",
             help="Transmitter position [m]; by default that of the links, if they have only one transmitter.",
         ),
-    ] = None,
+    ] = None
     height: Annotated[
         float, typer.Option(metavar="M", help="Height of the receivers above the ground [m].")
-    ] = 1.5,
-    cell: Annotated[float, typer.Option(metavar="M", help="Width of the cells [m].")] = 5.0,
+    ] = 1.5
+    cell: Annotated[float, typer.Option(metavar="M", help="Width of the cells [m].")] = 5.0
     bounds: Annotated[
         tuple[float, float, float, float] | None,
         typer.Option(
             metavar="W S E N",
             help="West, south, east and north end of the area [m]; by default the whole scene.",
         ),
-    ] = None,
+    ] = None
+
+
+@dataclass(frozen=True)
+class Values:
+    """Options that state what is predicted, and how."""
+
     level: Annotated[
         float,
         typer.Option(
             metavar="P", help="Probability that a measurement lies in the interval; 0 for no interval."
         ),
-    ] = 0.9,
+    ] = 0.9
     power: Annotated[
         float | None,
         typer.Option(metavar="DBM", help="Transmit power [dBm], for received power instead of path loss."),
-    ] = None,
+    ] = None
     samples: Annotated[
         str | None,
         typer.Option(
             metavar="N|auto",
             help="Number of rays, in place of the study's. The time grows with this number; too few rays miss paths.",
         ),
-    ] = None,
+    ] = None
     column: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=VALUE",
             help="Value of a group or frequency column of the links for this transmitter; can be repeated.",
         ),
-    ] = None,
+    ] = None
+
+
+@with_groups
+def map(
+    folder: ResultFolder,
+    area: Area,
+    values: Values,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", metavar="FOLDER", help="Folder for the map instead of DIR."),
     ] = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    allow_changed_inputs: AllowChangedInputs = False,
-    overwrite: Overwrite = False,
+    *,
+    pool: Pool,
+    permissions: Permissions,
 ) -> None:
     """Predict path loss over an area and write map.tif (GeoTIFF), map.png and map.csv.
 
@@ -84,27 +97,27 @@ def map(
         from calibray.support.output_files import check_outputs
 
         print_costs()
-        result = Result.load(folder, allow_changed_inputs=allow_changed_inputs)
+        result = Result.load(folder, allow_changed_inputs=permissions.allow_changed_inputs)
         inputs = result.study.files()
         # Checked before the tracing, which takes long.
-        check_outputs(target, FILES, inputs, overwrite)
-        with open_workers(workers, scheduler) as pool:
+        check_outputs(target, FILES, inputs, permissions.overwrite)
+        with open_workers(pool.workers, pool.scheduler) as workers:
             coverage = coverage_map(
                 result,
-                tx,
-                height=height,
-                cell=cell,
-                bounds=bounds,
-                level=level or None,
-                power_dbm=power,
-                samples=None if samples is None else _samples(samples),
-                columns=_columns(column or []),
+                area.tx,
+                height=area.height,
+                cell=area.cell,
+                bounds=area.bounds,
+                level=values.level or None,
+                power_dbm=values.power,
+                samples=None if values.samples is None else _samples(values.samples),
+                columns=_columns(values.column or []),
                 progress=progress,
-                workers=pool,
-                allow_changed_inputs=allow_changed_inputs,
+                workers=workers,
+                allow_changed_inputs=permissions.allow_changed_inputs,
             )
         progress("writing", 0, None)
-        names = coverage.save(target, inputs, overwrite)
+        names = coverage.save(target, inputs, permissions.overwrite)
     predicted, without_path = int(np.isfinite(coverage.path_loss_db).sum()), int(coverage.no_path.sum())
     echo(
         f"{coverage.z.size:,} cells: {predicted - without_path:,} predicted by the model, {without_path:,} without a "

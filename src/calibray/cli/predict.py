@@ -6,12 +6,13 @@ import json
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from calibray.cli.console import AllowChangedInputs, Overwrite, Scheduler, Workers, echo, log, print_costs
+from calibray.cli.console import Permissions, Pool, ResultFolder, echo, log, print_costs, with_groups
 from calibray.errors import InputError
 from calibray.tables import Column, Table, numbers
 
@@ -31,10 +32,9 @@ TEXTS: Final = ("basis", "remark")
 """Text columns that are added; the remark needs --level."""
 
 
+@with_groups
 def predict(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Folder that `calibray run` wrote.", show_default=False)
-    ],
+    folder: ResultFolder,
     links_file: Annotated[
         Path,
         typer.Argument(
@@ -58,10 +58,9 @@ def predict(
             "and upper_db, and a remark if an antenna is inside a building or outside the scene.",
         ),
     ] = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    allow_changed_inputs: AllowChangedInputs = False,
-    overwrite: Overwrite = False,
+    *,
+    pool: Pool,
+    permissions: Permissions,
 ) -> None:
     """Predict path loss at new links with the calibrated scene.
 
@@ -82,7 +81,7 @@ def predict(
         from calibray.support.output_tables import check_table, growing_table
 
         print_costs()
-        result = Result.load(folder, allow_changed_inputs=allow_changed_inputs)
+        result = Result.load(folder, allow_changed_inputs=permissions.allow_changed_inputs)
         study, table = result.study, PiecedTable.open(links_file)
         first = as_links(result, next(table.pieces(1)))
         names, texts = (PREDICTIONS[:1], TEXTS[:1]) if level is None else (PREDICTIONS, TEXTS)
@@ -91,15 +90,16 @@ def predict(
         further = observable_columns(study, level)
         renamed = _renamed_columns(links_file, first.frame, (*names, *measured, *further, *texts))
         if out is not None:
-            check_table(out, [links_file, *study.files()], overwrite)
+            check_table(out, [links_file, *study.files()], permissions.overwrite)
         warnings: dict[str, array[int]] = {}
         with (
-            open_workers(workers, scheduler) as pool,
+            open_workers(pool.workers, pool.scheduler) as workers,
             _printer() if out is None else growing_table(out) as append,
         ):
             for links, predictions in predict_batches(
-                result, table, level, progress, pool, allow_changed_inputs=allow_changed_inputs
-            ):
+                result, table, level, progress, workers,
+                allow_changed_inputs=permissions.allow_changed_inputs,
+            ):  # fmt: skip
                 columns = {name: predictions[name].to_numpy() for name in (*names, *texts)}
                 measured = as_measured(study, links, predictions)
                 measured |= {name: predictions[name].to_numpy() for name in further if name in predictions}
@@ -162,10 +162,25 @@ def _renamed_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) 
     return renamed
 
 
+@dataclass(frozen=True)
+class SuggestOptions:
+    """Options that state what is suggested, and in which form."""
+
+    count: Annotated[int, typer.Option(metavar="N", min=1, help="Number of links to suggest.")] = 5
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="FILE", help="Also write the table to this CSV or Parquet file."),
+    ] = None
+    observables: Annotated[
+        bool,
+        typer.Option("--observables", help="Also report which further observable is worth measuring there."),
+    ] = False
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False
+
+
+@with_groups
 def suggest(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Folder that `calibray run` wrote.", show_default=False)
-    ],
+    folder: ResultFolder,
     candidates_file: Annotated[
         Path,
         typer.Argument(
@@ -174,18 +189,8 @@ def suggest(
             show_default=False,
         ),
     ],
-    count: Annotated[int, typer.Option(metavar="N", min=1, help="Number of links to suggest.")] = 5,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="FILE", help="Also write the table to this CSV or Parquet file."),
-    ] = None,
-    observables: Annotated[
-        bool,
-        typer.Option("--observables", help="Also report which further observable is worth measuring there."),
-    ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
-    allow_changed_inputs: AllowChangedInputs = False,
-    overwrite: Overwrite = False,
+    options: SuggestOptions,
+    permissions: Permissions,
 ) -> None:
     """Suggest where to measure next: the candidate links that are expected to narrow the intervals most."""
     from calibray.cli.progress_bars import progress_bars
@@ -199,21 +204,22 @@ def suggest(
         from calibray.tables import render
 
         print_costs()
-        result = Result.load(folder, allow_changed_inputs=allow_changed_inputs)
+        result = Result.load(folder, allow_changed_inputs=permissions.allow_changed_inputs)
         study = result.study
         links = as_links(result, read_table(candidates_file))
-        if out is not None:
-            check_table(out, [candidates_file, *study.files()], overwrite)
+        if options.out is not None:
+            check_table(options.out, [candidates_file, *study.files()], permissions.overwrite)
         suggestion = suggest_links(
-            result, links, count, progress, allow_changed_inputs=allow_changed_inputs, observables=observables
-        )
+            result, links, options.count, progress,
+            allow_changed_inputs=permissions.allow_changed_inputs, observables=options.observables,
+        )  # fmt: skip
     echo(
         json.dumps(suggestion.to_dict("records"), indent=2)
-        if as_json
+        if options.as_json
         else render(*suggestion_tables(suggestion))
     )
-    if out is not None:
-        write_table(out, suggestion)
+    if options.out is not None:
+        write_table(options.out, suggestion)
 
 
 def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:

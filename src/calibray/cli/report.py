@@ -7,13 +7,11 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, echo, log
+from calibray.cli.console import Overwrite, ResultFolder, echo, log
 
 
 def report(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Folder that `calibray run` wrote.", show_default=False)
-    ],
+    folder: ResultFolder,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", metavar="FILE", help="HTML file to write instead of DIR/report.html."),
@@ -43,9 +41,7 @@ def report(
 
 
 def export(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Folder that `calibray run` wrote.", show_default=False)
-    ],
+    folder: ResultFolder,
     out: Annotated[
         Path, typer.Option("--out", "-o", metavar="FOLDER", help="Folder to write into.", show_default=False)
     ],

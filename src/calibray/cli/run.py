@@ -3,29 +3,37 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, StudyFile, echo, log
+from calibray.cli.console import Overwrite, StudyFile, echo, log, with_groups
 
 if TYPE_CHECKING:
     from calibray.calibration.result import Result
 
 
-def run(
-    study_file: StudyFile,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the result.")],
+@dataclass(frozen=True)
+class Changes:
+    """Options in place of the study's own."""
+
     method: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Method instead of the study's: auto, sgwo-im, gwo, ..."),
-    ] = None,
-    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed instead of the study's.")] = None,
+    ] = None
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed instead of the study's.")] = None
     engine: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Engine instead of the study's: replay, retrace or command."),
-    ] = None,
+    ] = None
+
+
+@dataclass(frozen=True)
+class RunPool:
+    """Options that state the workers, which may also run an external program."""
+
     workers: Annotated[
         int | None,
         typer.Option(
@@ -33,21 +41,36 @@ def run(
             help="Number of local processes among which chunks of links are distributed, or of simultaneous programs "
             "of the engine 'command'.",
         ),
-    ] = None,
+    ] = None
     scheduler: Annotated[
         str | None,
         typer.Option(
             metavar="ADDRESS",
             help="Dask scheduler whose workers process chunks of links, or run the engine 'command'.",
         ),
-    ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the result as JSON instead of tables.")
-    ] = False,
-    overwrite: Overwrite = False,
+    ] = None
+
+
+@dataclass(frozen=True)
+class Output:
+    """Options that state what is printed and written."""
+
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON instead of tables.")] = (
+        False
+    )
+    overwrite: Overwrite = False
     figures: Annotated[
         bool, typer.Option("--figures", help="Also write the figures of the report as SVG and PNG.")
-    ] = False,
+    ] = False
+
+
+@with_groups
+def run(
+    study_file: StudyFile,
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the result.")],
+    changes: Changes,
+    pool: RunPool,
+    output: Output,
 ) -> None:
     """Calibrate a study, print the result, and write it with the calibrated scene and a report."""
     from calibray.cli.progress_bars import progress_bars
@@ -65,21 +88,23 @@ def run(
             from calibray.support.output_files import check_outputs
             from calibray.tables import render
 
-            study = Study.load(study_file).replace(method, seed, engine)
+            study = Study.load(study_file).replace(changes.method, changes.seed, changes.engine)
             check_method(study.method.name)
-            check_outputs(out, FILES, study.files(), overwrite)
+            check_outputs(out, FILES, study.files(), output.overwrite)
             setup = study.opened()
             warn(study, setup.links)
-            with open_workers(workers, scheduler) as pool:
-                result = calibrate(setup, out=out, workers=pool, progress=progress, overwrite=overwrite)
+            with open_workers(pool.workers, pool.scheduler) as workers:
+                result = calibrate(
+                    setup, out=out, workers=workers, progress=progress, overwrite=output.overwrite
+                )
     except KeyboardInterrupt:
         echo(_kept_text(out), err=True)
         raise
-    if as_json:
+    if output.as_json:
         echo(json.dumps(result.content(), indent=2))
     else:
         echo(render(tables.heading(result), *tables.tables(result)))
-    names = [*FILES, *_write_report(result, out, figures, overwrite)]
+    names = [*FILES, *_write_report(result, out, output)]
     echo(f"Written to {out}: {', '.join(names)}", err=True)
 
 
@@ -103,22 +128,24 @@ def _kept_text(out: Path) -> str:
     return f"{kept} Start the same command again to continue; results that are kept are not computed again."
 
 
-def _write_report(result: Result, out: Path, figures: bool, overwrite: bool) -> list[str]:
+def _write_report(result: Result, out: Path, output: Output) -> list[str]:
     """Write the report next to the result; a failure is only a warning, because the result is already saved."""
     from calibray.cli.progress_bars import progress_bars
 
     try:
         from calibray.reporting import page
 
-        folder = out / page.FIGURES if figures else None
+        folder = out / page.FIGURES if output.figures else None
         with progress_bars(log()) as progress:
-            page.report(result, out / page.FILE, figures=folder, overwrite=overwrite, progress=progress)
+            page.report(
+                result, out / page.FILE, figures=folder, overwrite=output.overwrite, progress=progress
+            )
     except Exception as error:
         echo(
             f"Warning: the report was not written ({error}); try again with: calibray report {out}", err=True
         )
         return []
-    return [page.FILE, *([f"{page.FIGURES}/"] if figures else [])]
+    return [page.FILE, *([f"{page.FIGURES}/"] if output.figures else [])]
 
 
 def demo(

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from calibray.cli.console import Overwrite, echo, log
+from calibray.cli.console import Overwrite, echo, log, with_groups
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
     from calibray.coordinates import Frame
-    from calibray.scenes.authoring import Footprints, MadeScene, SurfaceMaterial, Trees
-    from calibray.support.progress import Progress
+    from calibray.scenes.authoring import Footprints, HeightRule, MadeScene, SurfaceMaterial, Trees
 
 SUMMARY: Final = "Make a scene from an OpenStreetMap extract, building footprints or a floor plan."
 
@@ -23,144 +24,159 @@ scene = typer.Typer(
 """The commands; `app.add_typer(scene)` adds them."""
 
 Out = Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for scene.xml and the meshes.")]
-Terrain = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="GeoTIFF height model of the ground; by default the ground is level."),
-]
-Spacing = Annotated[
-    float | None,
-    typer.Option(metavar="M", help="Cell width of the ground [m]; by default that of the height model."),
-]
-Origin = Annotated[
-    str | None,
-    typer.Option(
-        metavar="LON,LAT", help="Origin of the scene frame [deg]; by default the centre of the buildings."
-    ),
-]
-Utm = Annotated[
-    bool,
-    typer.Option(
-        "--utm", help="Use the UTM zone of the origin instead of a projection centred on the origin."
-    ),
-]
-Wall = Annotated[
-    str,
-    typer.Option(
-        metavar="ITU[:M]", help="P.2040 material of the walls, with the thickness [m] after a colon."
-    ),
-]
-Roof = Annotated[
-    str,
-    typer.Option(
-        metavar="ITU[:M]",
-        help="Material of the roofs. 'wall' makes one mesh of roofs and walls, so that eaves diffract.",
-    ),
-]
-Ground = Annotated[str, typer.Option(metavar="ITU[:M]", help="Material of the ground.")]
-WindowShare = Annotated[
-    float, typer.Option(metavar="SHARE", help="Share of windows in every wall, at least 0 and below 1.")
-]
-Storey = Annotated[
-    float,
-    typer.Option(metavar="M", help="Height of a storey [m], for buildings with only the number of storeys."),
-]
-DefaultHeight = Annotated[
-    float, typer.Option(metavar="M", help="Height of a building without height and storeys [m].")
-]
-Margin = Annotated[float, typer.Option(metavar="M", help="Width of the ground around the buildings [m].")]
-PerBuilding = Annotated[
-    bool,
-    typer.Option(
-        "--per-building", help="One mesh per building, so that [objects] can give each its own material."
-    ),
-]
 
 
-@scene.command()
-def osm(
-    extract: Annotated[Path, typer.Argument(metavar="EXTRACT", help="An .osm or .osm.pbf file.")],
-    out: Out,
-    terrain: Terrain = None,
-    spacing: Spacing = None,
-    origin: Origin = None,
-    utm: Utm = False,
-    wall: Wall = "concrete:0.3",
-    roof: Roof = "concrete:0.3",
-    ground: Ground = "concrete:1.0",
-    window_share: WindowShare = 0.0,
-    storey: Storey = 3.0,
-    default_height: DefaultHeight = 9.0,
-    margin: Margin = 50.0,
-    per_building: PerBuilding = False,
-    overwrite: Overwrite = False,
-) -> None:
-    """Make a scene from the buildings of an OpenStreetMap extract, with a file of its trees."""
-    from calibray.cli.progress_bars import progress_bars
-    from calibray.scenes.authoring import SCENE_FILES, TREES_FILE, HeightRule, read_openstreetmap, read_trees
-    from calibray.support.output_files import check_outputs
+@dataclass(frozen=True)
+class MapOptions:
+    """Options of scenes of buildings and ground."""
 
-    check_outputs(out, (*SCENE_FILES, TREES_FILE), [extract, *([terrain] if terrain else [])], overwrite)
-    with progress_bars(log()) as progress:
-        progress("reading", 0, None)
-        buildings, frame = read_openstreetmap(
-            extract, _frame(origin, utm), HeightRule(storey, default_height)
-        )
-        _check_origin(origin, buildings)
-        made = _make(
-            buildings, frame, out, terrain, spacing, wall, roof, ground, window_share, margin, per_building,
-            overwrite, progress, read_trees(extract, frame),
-        )  # fmt: skip
-    _print(made)
+    terrain: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="GeoTIFF height model of the ground; by default the ground is level."
+        ),
+    ] = None
+    spacing: Annotated[
+        float | None,
+        typer.Option(metavar="M", help="Cell width of the ground [m]; by default that of the height model."),
+    ] = None
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LON,LAT", help="Origin of the scene frame [deg]; by default the centre of the buildings."
+        ),
+    ] = None
+    utm: Annotated[
+        bool,
+        typer.Option(
+            "--utm", help="Use the UTM zone of the origin instead of a projection centred on the origin."
+        ),
+    ] = False
+    wall: Annotated[
+        str,
+        typer.Option(
+            metavar="ITU[:M]", help="P.2040 material of the walls, with the thickness [m] after a colon."
+        ),
+    ] = "concrete:0.3"
+    roof: Annotated[
+        str,
+        typer.Option(
+            metavar="ITU[:M]",
+            help="Material of the roofs. 'wall' makes one mesh of roofs and walls, so that eaves diffract.",
+        ),
+    ] = "concrete:0.3"
+    ground: Annotated[str, typer.Option(metavar="ITU[:M]", help="Material of the ground.")] = "concrete:1.0"
+    window_share: Annotated[
+        float, typer.Option(metavar="SHARE", help="Share of windows in every wall, at least 0 and below 1.")
+    ] = 0.0
+    storey: Annotated[
+        float,
+        typer.Option(
+            metavar="M", help="Height of a storey [m], for buildings with only the number of storeys."
+        ),
+    ] = 3.0
+    default_height: Annotated[
+        float, typer.Option(metavar="M", help="Height of a building without height and storeys [m].")
+    ] = 9.0
+    margin: Annotated[
+        float, typer.Option(metavar="M", help="Width of the ground around the buildings [m].")
+    ] = 50.0
+    per_building: Annotated[
+        bool,
+        typer.Option(
+            "--per-building",
+            help="One mesh per building, so that [objects] can give each its own material.",
+        ),
+    ] = False
+    overwrite: Overwrite = False
+
+    @property
+    def inputs(self) -> list[Path]:
+        """The files that the options name."""
+        return [] if self.terrain is None else [self.terrain]
+
+    @property
+    def heights(self) -> HeightRule:
+        """The assumptions for heights that a map does not state."""
+        from calibray.scenes.authoring import HeightRule
+
+        return HeightRule(self.storey, self.default_height)
+
+    def frame(self) -> Frame | None:
+        """The scene frame with the given origin; None without an origin."""
+        from calibray.coordinates import Frame
+
+        if self.origin is None:
+            if self.utm:
+                raise InputError("--utm needs --origin LON,LAT")
+            return None
+        try:
+            longitude, latitude = (float(part) for part in self.origin.split(","))
+        except ValueError:
+            raise InputError(
+                f"--origin {self.origin}: must be longitude and latitude in degrees, such as 11.5755,48.1374"
+            ) from None
+        return Frame.utm(longitude, latitude) if self.utm else Frame.local(longitude, latitude)
 
 
-@scene.command()
-def footprints(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="GeoJSON, Shapefile or GeoPackage.")],
-    out: Out,
+@dataclass(frozen=True)
+class ColumnOptions:
+    """Options that name the columns of a vector file."""
+
     height: Annotated[
         str, typer.Option(metavar="COLUMN", help="Column with the heights above the ground, or a number [m].")
-    ],
+    ]
     bottom: Annotated[
         str,
         typer.Option(metavar="COLUMN", help="Column with the heights of the lower ends, or a number [m]."),
-    ] = "0",
+    ] = "0"
     levels: Annotated[
         str | None, typer.Option(metavar="COLUMN", help="Column with the numbers of storeys.")
-    ] = None,
-    name: Annotated[str | None, typer.Option(metavar="COLUMN", help="Column with the names.")] = None,
-    layer: Annotated[str | None, typer.Option(metavar="NAME", help="Layer of the file.")] = None,
-    terrain: Terrain = None,
-    spacing: Spacing = None,
-    origin: Origin = None,
-    utm: Utm = False,
-    wall: Wall = "concrete:0.3",
-    roof: Roof = "concrete:0.3",
-    ground: Ground = "concrete:1.0",
-    window_share: WindowShare = 0.0,
-    storey: Storey = 3.0,
-    default_height: DefaultHeight = 9.0,
-    margin: Margin = 50.0,
-    per_building: PerBuilding = False,
-    overwrite: Overwrite = False,
+    ] = None
+    name: Annotated[str | None, typer.Option(metavar="COLUMN", help="Column with the names.")] = None
+    layer: Annotated[str | None, typer.Option(metavar="NAME", help="Layer of the file.")] = None
+
+
+@scene.command()
+@with_groups
+def osm(
+    extract: Annotated[Path, typer.Argument(metavar="EXTRACT", help="An .osm or .osm.pbf file.")],
+    out: Out,
+    options: MapOptions,
 ) -> None:
-    """Make a scene from building footprints with heights."""
-    from calibray.cli.progress_bars import progress_bars
-    from calibray.scenes.authoring import SCENE_FILES, HeightRule, read_footprints
+    """Make a scene from the buildings of an OpenStreetMap extract, with a file of its trees."""
+    from calibray.scenes.authoring import SCENE_FILES, TREES_FILE, read_openstreetmap, read_trees
     from calibray.support.output_files import check_outputs
 
-    check_outputs(out, SCENE_FILES, [file, *([terrain] if terrain else [])], overwrite)
-    with progress_bars(log()) as progress:
-        progress("reading", 0, None)
-        buildings, frame = read_footprints(
-            file, height, bottom, name, levels, layer,
-            _frame(origin, utm), HeightRule(storey, default_height),
-        )  # fmt: skip
-        _check_origin(origin, buildings)
-        made = _make(
-            buildings, frame, out, terrain, spacing, wall, roof, ground, window_share, margin, per_building,
-            overwrite, progress,
-        )  # fmt: skip
-    _print(made)
+    check_outputs(out, (*SCENE_FILES, TREES_FILE), [extract, *options.inputs], options.overwrite)
+
+    def read() -> tuple[Footprints, Frame, Trees]:
+        buildings, frame = read_openstreetmap(extract, options.frame(), options.heights)
+        return buildings, frame, read_trees(extract, frame)
+
+    _make(read, out, options)
+
+
+@scene.command()
+@with_groups
+def footprints(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="GeoJSON, Shapefile or GeoPackage.")],
+    out: Out,
+    columns: ColumnOptions,
+    options: MapOptions,
+) -> None:
+    """Make a scene from building footprints with heights."""
+    from calibray.scenes.authoring import SCENE_FILES, FootprintColumns, read_footprints
+    from calibray.support.output_files import check_outputs
+
+    check_outputs(out, SCENE_FILES, [file, *options.inputs], options.overwrite)
+    further = FootprintColumns(columns.bottom, columns.name, columns.levels)
+
+    def read() -> tuple[Footprints, Frame, None]:
+        reading = columns.height, further, columns.layer, options.frame(), options.heights
+        return *read_footprints(file, *reading), None
+
+    _make(read, out, options)
 
 
 @scene.command()
@@ -212,68 +228,36 @@ def _print(made: MadeScene) -> None:
     echo(render(contents(made)))
 
 
-def _make(
-    buildings: Footprints,
-    frame: Frame,
-    out: Path,
-    terrain: Path | None,
-    spacing: float | None,
-    wall: str,
-    roof: str,
-    ground: str,
-    window_share: float,
-    margin: float,
-    per_building: bool,
-    overwrite: bool,
-    progress: Progress,
-    trees: Trees | None = None,
-) -> MadeScene:
-    """Make a scene from footprints."""
+def _make(read: Callable[[], tuple[Footprints, Frame, Trees | None]], out: Path, options: MapOptions) -> None:
+    """Make a scene from the buildings and trees that `read` returns with their frame, and print its contents."""
     import numpy as np
 
+    from calibray.cli.progress_bars import progress_bars
     from calibray.scenes.authoring import Palette, Windows, lower_origin, make_scene, read_terrain
 
-    palette = Palette(
-        wall=_material("walls", wall, 0.3),
-        roof=None if roof == "wall" else _material("roofs", roof, 0.3),
-        ground=_material("ground", ground, 1.0),
-    )
-    windows = Windows(window_share) if window_share else None
-    surface = None
-    if terrain is not None:
-        bounds = buildings.bounds + margin * np.array([-1, -1, 1, 1])
-        surface, frame = lower_origin(read_terrain(terrain, frame, bounds, spacing), frame)
-    echo(f"Making a scene with {len(buildings)} buildings", err=True)
-    progress("making", 0, None)
-    return make_scene(
-        buildings,
-        out,
-        frame,
-        surface,
-        palette,
-        windows,
-        margin,
-        per_building=per_building,
-        overwrite=overwrite,
-        trees=trees,
-    )
-
-
-def _frame(origin: str | None, utm: bool) -> Frame | None:
-    """The scene frame with the given origin."""
-    from calibray.coordinates import Frame
-
-    if origin is None:
-        if utm:
-            raise InputError("--utm needs --origin LON,LAT")
-        return None
-    try:
-        longitude, latitude = (float(part) for part in origin.split(","))
-    except ValueError:
-        raise InputError(
-            f"--origin {origin}: must be longitude and latitude in degrees, such as 11.5755,48.1374"
-        ) from None
-    return Frame.utm(longitude, latitude) if utm else Frame.local(longitude, latitude)
+    with progress_bars(log()) as progress:
+        progress("reading", 0, None)
+        buildings, frame, trees = read()
+        _check_origin(options.origin, buildings)
+        palette = Palette(
+            wall=_material("walls", options.wall, 0.3),
+            roof=None if options.roof == "wall" else _material("roofs", options.roof, 0.3),
+            ground=_material("ground", options.ground, 1.0),
+        )
+        windows = Windows(options.window_share) if options.window_share else None
+        surface = None
+        if options.terrain is not None:
+            bounds = buildings.bounds + options.margin * np.array([-1, -1, 1, 1])
+            surface, frame = lower_origin(
+                read_terrain(options.terrain, frame, bounds, options.spacing), frame
+            )
+        echo(f"Making a scene with {len(buildings)} buildings", err=True)
+        progress("making", 0, None)
+        made = make_scene(
+            buildings, out, frame, surface, palette, windows, options.margin,
+            per_building=options.per_building, overwrite=options.overwrite, trees=trees,
+        )  # fmt: skip
+    _print(made)
 
 
 def _check_origin(origin: str | None, buildings: Footprints) -> None:

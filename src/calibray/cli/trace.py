@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, Scheduler, StudyFile, Workers, echo, log
+from calibray.cli.console import Overwrite, Pool, StudyFile, echo, log, with_groups
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from calibray.tracing.convergence import Convergence
 
 
+@with_groups
 def trace(
     study_file: StudyFile,
     out: Annotated[
@@ -30,8 +31,8 @@ def trace(
             "'auto', show the changes caused by the last round of rays.",
         ),
     ] = False,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
+    *,
+    pool: Pool,
     overwrite: Overwrite = False,
 ) -> None:
     """Trace the links of a study and store the paths, or check whether there are enough rays."""
@@ -53,12 +54,12 @@ def trace(
             check_file(out, study.files(), overwrite)
         setup = study.opened()
         links, trace_again = setup.links, check and not study.trace.adaptive
-        with open_workers(workers, scheduler) as pool:
-            if pool is None and stated_chunk_size(setup) is None:
+        with open_workers(pool.workers, pool.scheduler) as workers:
+            if workers is None and stated_chunk_size(setup) is None:
                 paths, change = _trace(setup, out, overwrite, trace_again, progress)
             else:
                 paths, change = trace_in_chunks(
-                    setup, pool or InProcess(), check=trace_again, progress=progress
+                    setup, workers or InProcess(), check=trace_again, progress=progress
                 )
                 if out is not None:
                     paths.save(out, overwrite)

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, Scheduler, StudyFile, Workers, echo, log
+from calibray.cli.console import Overwrite, Pool, StudyFile, echo, log, with_groups
 
 
-def validate(
-    study_file: StudyFile,
+@dataclass(frozen=True)
+class Division:
+    """Options that state which links are held out in turn."""
+
     blocks: Annotated[
         int | None,
         typer.Option(
@@ -21,14 +24,20 @@ def validate(
             max=100,
             help="Number of blocks, each held out in turn; by default the study's number, or 4.",
         ),
-    ] = None,
+    ] = None
     by: Annotated[
         str | None,
         typer.Option(
             metavar="COLUMN",
             help="Hold out the links of each value of a column in turn; use tx for each transmitter.",
         ),
-    ] = None,
+    ] = None
+
+
+@with_groups
+def validate(
+    study_file: StudyFile,
+    division: Division,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -38,8 +47,8 @@ def validate(
             help="Write the validation into this folder of a result, so that `calibray report DIR` shows it.",
         ),
     ] = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
+    *,
+    pool: Pool,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -57,8 +66,10 @@ def validate(
         study = Study.load(study_file)
         if out is not None:
             check_outputs(out, (VALIDATION_FILE,), study.files(), overwrite)
-        with open_workers(workers, scheduler) as pool:
-            validation = run_validation(study, blocks=blocks, by=by, workers=pool, progress=progress)
+        with open_workers(pool.workers, pool.scheduler) as workers:
+            validation = run_validation(
+                study, blocks=division.blocks, by=division.by, workers=workers, progress=progress
+            )
     echo(json.dumps(validation.content(), indent=2) if as_json else render(*validation.summary()))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)

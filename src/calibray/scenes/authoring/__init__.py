@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from calibray.scenes.authoring.floor_plan import read_plan as read_plan
     from calibray.scenes.authoring.floor_plan_scene import WALL_THICKNESS as WALL_THICKNESS
     from calibray.scenes.authoring.floor_plan_scene import make_plan_scene as make_plan_scene
+    from calibray.scenes.authoring.footprint_files import FootprintColumns as FootprintColumns
     from calibray.scenes.authoring.footprint_files import read_footprints as read_footprints
     from calibray.scenes.authoring.footprint_files import read_openstreetmap as read_openstreetmap
     from calibray.scenes.authoring.footprints import WIDEST as WIDEST
@@ -39,7 +40,7 @@ _MODULES = {
     "extrusion": ("Windows",),
     "floor_plan": ("Segment", "read_plan"),
     "floor_plan_scene": ("WALL_THICKNESS", "make_plan_scene"),
-    "footprint_files": ("read_footprints", "read_openstreetmap"),
+    "footprint_files": ("FootprintColumns", "read_footprints", "read_openstreetmap"),
     "footprints": ("WIDEST", "Footprints", "HeightRule", "HeightSource", "clean_footprints"),
     "made_scene": ("SCENE_FILES", "MadeScene", "Palette", "SurfaceMaterial", "material_name"),
     "terrain": ("Terrain", "lower_origin", "read_terrain"),

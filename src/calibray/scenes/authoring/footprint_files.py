@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -90,12 +91,25 @@ def read_openstreetmap(
     return clean_footprints(raw), frame
 
 
+@dataclass(frozen=True)
+class FootprintColumns:
+    """Columns of a vector file besides the heights of buildings.
+
+    Attributes:
+        bottom: Column with the heights at which the buildings begin [m], or one height for all.
+        name: Column with their names; by default they are numbered.
+        levels: Column with the numbers of storeys, for buildings without a height.
+    """
+
+    bottom: str | float = 0.0
+    name: str | None = None
+    levels: str | None = None
+
+
 def read_footprints(
     path: str | Path,
     height: str | float,
-    bottom: str | float = 0.0,
-    name: str | None = None,
-    levels: str | None = None,
+    columns: FootprintColumns | None = None,
     layer: str | None = None,
     frame: Frame | None = None,
     rule: HeightRule | None = None,
@@ -107,9 +121,7 @@ def read_footprints(
             system.
         height: Column with the heights of the buildings above the ground [m], or one height for all; a text that is
             both a number and the name of a column means the column.
-        bottom: Column with the heights at which the buildings begin [m], or one height for all.
-        name: Column with their names; by default they are numbered.
-        levels: Column with the numbers of storeys, for buildings without a height.
+        columns: Further columns.
         layer: Layer of the file, if it has several.
         frame: The scene's frame; by default a local frame centred on the footprints.
         rule: Assumptions for heights that are not given.
@@ -121,21 +133,21 @@ def read_footprints(
         InputError: The file does not exist, cannot be read, states no reference system, lacks a column or contains no
             polygon; or a height is negative or not a number.
     """
-    path, rule = Path(path), rule or HeightRule()
-    outlines, columns, crs = _read(path, layer)
+    path, rule, named = Path(path), rule or HeightRule(), columns or FootprintColumns()
+    outlines, table, crs = _read(path, layer)
     frame = frame or _local_frame(outlines, crs)
     count = len(outlines)
-    tops, bottoms = _numbers(path, columns, height, count), _numbers(path, columns, bottom, count)
+    tops, bottoms = (_numbers(path, table, source, count) for source in (height, named.bottom))
     bottoms = np.where(np.isfinite(bottoms), bottoms, 0.0)
-    storeys = np.full(count, np.nan) if levels is None else _numbers(path, columns, levels, count)
+    storeys = np.full(count, np.nan) if named.levels is None else _numbers(path, table, named.levels, count)
     has_height = np.isfinite(tops) & (tops > bottoms)
     has_levels = ~has_height & (storeys * rule.storey > bottoms)
-    names = range(1, count + 1) if name is None else _column(path, columns, name)
+    names = range(1, count + 1) if named.name is None else _column(path, table, named.name)
     raw = Footprints(
         polygon=project(outlines, frame, crs),
         bottom=bottoms,
         top=np.select([has_height, has_levels], [tops, storeys * rule.storey], bottoms + rule.default),
-        name=tuple(f"building-{label}" if name is None else str(label) for label in names),
+        name=tuple(f"building-{label}" if named.name is None else str(label) for label in names),
         height_from=tuple(_SOURCES[code] for code in 2 * has_height + has_levels),
         part=np.zeros(count, dtype=bool),
         repairs={},
