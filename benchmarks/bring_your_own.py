@@ -56,7 +56,7 @@ from calibray.scenes.authoring import (  # noqa: E402
     read_terrain,
 )
 from calibray.study import Setup, Study  # noqa: E402
-from calibray.study.draft import draft  # noqa: E402
+from calibray.study.draft import Given, draft  # noqa: E402
 from calibray.uncertainty.assessment import certainty  # noqa: E402
 
 CHOICES = 4  # recorded positions to draw from for each stop of the town
@@ -103,7 +103,10 @@ def town_walk(folder: Path, biased: bool) -> Walk:
     recorded[..., :2] += rng.normal(0.0, town.GPS_ERROR, (*shape, 2))
     recorded = placed(recorded.reshape(-1, 3)).reshape(recorded.shape)
     study = draft(
-        str(scene), EXAMPLES / "rsrp.csv", folder / "study.toml", EXAMPLES / "cells.csv", town.FREQUENCY
+        str(scene),
+        EXAMPLES / "rsrp.csv",
+        folder / "study.toml",
+        Given(EXAMPLES / "cells.csv", frequency=town.FREQUENCY),
     ).study
     count = recorded.size // 3
     links = Measurements(
@@ -169,7 +172,10 @@ def flat_walk(folder: Path) -> Walk:
     table = folder / "rss.csv"
     flat.measure(gains, np.random.default_rng(flat.SEED)).to_csv(table, index=False)
     study = draft(
-        str(scene), table, folder / "study.toml", flat.FOLDER / "access_points.csv", flat.FREQUENCY
+        str(scene),
+        table,
+        folder / "study.toml",
+        Given(flat.FOLDER / "access_points.csv", frequency=flat.FREQUENCY),
     ).study
     setup = study.opened()
     whole = Problem.of(setup, engines.make(setup))
@@ -202,8 +208,8 @@ def hill_walk(folder: Path) -> Walk:
         (place / "walk.gpx").write_text(hill.track(rng))
         hill.measure(gains, rng).to_csv(place / "power.csv", index=False)
         study = draft(
-            str(scene), place / "power.csv", place / "study.toml", hill.FOLDER / "masts.csv", hill.FREQUENCY,
-            track=place / "walk.gpx",
+            str(scene), place / "power.csv", place / "study.toml",
+            Given(hill.FOLDER / "masts.csv", place / "walk.gpx", frequency=hill.FREQUENCY),
         ).study  # fmt: skip
         setup = study.opened()
         return study, Problem.of(setup, engines.make(setup))

@@ -22,13 +22,18 @@ from calibray.measurements import SourceTable, column_names
 from calibray.scenes.authoring import Footprints, Terrain, make_plan_scene, make_scene, read_plan
 from calibray.scenes.checks import SceneSurfaces
 from calibray.study import Study
-from calibray.study.draft import draft, schema_text
+from calibray.study.draft import Draft, Given, schema_text
+from calibray.study.draft import draft as draft_study
 from calibray.study.link_checks import count_unknowns
 from calibray.study.toml_file import study_text
 
 REPOSITORY = Path(__file__).parents[2]
 TOWN = REPOSITORY / "examples" / "bring_your_own"
 FRAME = Frame.local(9.99, 50.01)
+
+
+def draft(scene: str, links: Path, target: Path, transmitters=None, frequency=None, **given) -> Draft:
+    return draft_study(scene, links, target, Given(transmitters, frequency=frequency, **given))
 
 
 @pytest.fixture

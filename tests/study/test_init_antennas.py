@@ -14,7 +14,7 @@ from calibray.errors import InputError
 from calibray.measurements.transmitter_columns import find_angles, find_antenna_names, find_powers
 from calibray.scenes.authoring import Footprints, make_scene
 from calibray.study import Setup, Study
-from calibray.study.draft import Draft, draft
+from calibray.study.draft import Draft, Given, draft
 
 HEADERS = {
     "Atoll": (
@@ -97,8 +97,8 @@ def drafted(scene: str, folder: Path, sites: pd.DataFrame, value: str = "rx_powe
     links = pd.DataFrame({**table, "Cell": np.repeat(["north", "south"], 20), value: -80.0})
     links.to_csv(folder / "links.csv", index=False)
     sites.to_csv(folder / "sites.csv", index=False)
-    files = (folder / "links.csv", folder / "study.toml", folder / "sites.csv")
-    return draft(scene, *files, frequency=2.1e9, **options)
+    given = Given(folder / "sites.csv", frequency=2.1e9, **options)
+    return draft(scene, folder / "links.csv", folder / "study.toml", given)
 
 
 def sector_file(tilt: int, name: str) -> str:

@@ -101,7 +101,7 @@ class Permissions:
 def with_groups(command: Callable[..., None]) -> Callable[..., None]:
     """A command in which each argument that is a dataclass becomes one option for each of its fields."""
     arguments: dict[str, Any] = get_type_hints(command, include_extras=True)
-    groups = {name: kind for name, kind in arguments.items() if is_dataclass(kind)}
+    groups: dict[str, Any] = {name: kind for name, kind in arguments.items() if is_dataclass(kind)}
     options: list[Parameter] = []
     for argument in signature(command).parameters.values():
         kind = arguments[argument.name]

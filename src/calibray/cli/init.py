@@ -2,15 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from calibray.cli.console import echo, log
+from calibray.cli.console import echo, log, with_groups
 from calibray.errors import InputError
 
 
+@dataclass(frozen=True)
+class Known:
+    """Options that state what the table of links lacks."""
+
+    transmitters: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Table of transmitter positions.")
+    ] = None
+    track: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="GPX track with the position of each row over time.")
+    ] = None
+    antennas: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of MSI files named after the antennas.")
+    ] = None
+    tx: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z", help="Transmitter position in the scene frame [m].")
+    ] = None
+    frequency: Annotated[float | None, typer.Option(metavar="HZ", help="Carrier frequency [Hz].")] = None
+
+
+@with_groups
 def init(
     scene: Annotated[
         str, typer.Argument(metavar="SCENE", help="Mitsuba XML file, or sionna:NAME.", show_default=False)
@@ -27,19 +48,8 @@ def init(
             "--out", "-o", metavar="FILE", help="Study file to write; an existing file is never replaced."
         ),
     ] = Path("study.toml"),
-    transmitters: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Table of transmitter positions.")
-    ] = None,
-    track: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="GPX track with the position of each row over time.")
-    ] = None,
-    antennas: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder of MSI files named after the antennas.")
-    ] = None,
-    tx: Annotated[
-        str | None, typer.Option(metavar="X,Y,Z", help="Transmitter position in the scene frame [m].")
-    ] = None,
-    frequency: Annotated[float | None, typer.Option(metavar="HZ", help="Carrier frequency [Hz].")] = None,
+    *,
+    known: Known,
     plot: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Draw the antennas over the scene (.png, .svg or .pdf)."),
@@ -55,21 +65,21 @@ def init(
 
     if out.exists() or out.is_symlink():
         raise InputError(f"{out}: already exists; choose another file with --out, or remove it")
-    inputs = [links, *(file for file in (transmitters, track) if file)]
+    inputs = [links, *(file for file in (known.transmitters, known.track) if file)]
     check_file(out, inputs)
     with progress_bars(log()) as progress:
         from calibray.reporting.position_plot import save_positions
         from calibray.reporting.scene_tables import assumptions, warning_lines
+        from calibray.study.draft import Given, schema_text
         from calibray.study.draft import draft as draft_study
-        from calibray.study.draft import schema_text
         from calibray.study.link_checks import count_unknowns
         from calibray.study.toml_file import SCHEMA_FILE
         from calibray.tables import render
 
         progress("reading scene and links", 0, None)
-        draft = draft_study(
-            scene, links, out, transmitters, frequency, None if tx is None else _position(tx), track, antennas
-        )
+        tx = None if known.tx is None else _position(known.tx)
+        given = Given(known.transmitters, known.track, known.antennas, tx, known.frequency)
+        draft = draft_study(scene, links, out, given)
         measured = draft.study.measurements()
     echo(render(assumptions(draft)))
     counts = [f"{number} {cause}" for cause, number in measured.prepared.items()]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -22,7 +21,7 @@ from calibray.scenes import Scene, read_frame, read_scene
 from calibray.scenes.authoring import TREES_FILE
 from calibray.scenes.checks import count_crossings
 from calibray.study.content import BUNDLED, VERSION
-from calibray.study.draft_links import Assumption, LinksDraft
+from calibray.study.draft_links import Assumption, Given, LinksDraft
 from calibray.study.link_checks import LINKS_PER_UNKNOWN, count_unknowns
 from calibray.study.regions import Place, RegionSection, dense_trees
 from calibray.study.study import Study
@@ -64,11 +63,7 @@ def draft(
     scene: str,
     links: str | Path,
     target: str | Path,
-    transmitters: str | Path | None = None,
-    frequency: float | None = None,
-    tx: Sequence[float] | None = None,
-    track: str | Path | None = None,
-    antennas: str | Path | None = None,
+    given: Given | None = None,
 ) -> Draft:
     """Draft a study; nothing is written.
 
@@ -76,11 +71,7 @@ def draft(
         scene: Mitsuba XML file, or `sionna:NAME`.
         links: The table of links.
         target: The future study file; other files are named relative to its folder.
-        transmitters: Table of the transmitters' positions, unless the links have them.
-        frequency: Carrier frequency [Hz], unless the links have it.
-        tx: Transmitter position (x, y, z) [m] in the scene's frame, unless a table contains it.
-        track: GPX track with the position of each row, unless the links contain it.
-        antennas: Folder of MSI files named after the transmitters' antennas.
+        given: What else is known.
 
     Returns:
         The draft.
@@ -88,16 +79,15 @@ def draft(
     Raises:
         InputError: A file cannot be read, or a value is neither given nor in the files.
     """
-    sites, route = (Path(file) if file else None for file in (transmitters, track))
-    drafted = LinksDraft(scene, Path(links), Path(target), sites, route, frequency, tx)
-    content = _content(drafted, Path(antennas) if antennas else None)
+    drafted = LinksDraft(scene, Path(links), Path(target), given or Given())
+    content = _content(drafted)
     _hold_out_blocks(drafted, content)
     text = study_text(content, {assumption.what: assumption.reason for assumption in drafted.assumptions})
     study = Study.from_content(tomllib.loads(text), target)
     return Draft(text, study, tuple(drafted.assumptions))
 
 
-def _content(links: LinksDraft, antennas: Path | None) -> dict[str, Any]:
+def _content(links: LinksDraft) -> dict[str, Any]:
     """The sections of the study."""
     section = links.section
     indoors = _indoors(links)
@@ -105,7 +95,7 @@ def _content(links: LinksDraft, antennas: Path | None) -> dict[str, Any]:
         section["inside"] = "move"
         reason = "satellite positions have errors of metres, and some are inside walls"
         links.assume("links.inside", "move", reason)
-    antenna_section = add_antennas(links, antennas)
+    antenna_section = add_antennas(links)
     trace = {"max_depth": _depth(links) if indoors else 3, "samples": 200_000}
     # Behind buildings most links have no other path.
     trace["refraction" if indoors else "diffraction"] = True
@@ -225,20 +215,14 @@ def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dic
 UNKNOWN: Final = {"pattern": "iso", "polarization": "V"}
 
 
-def add_antennas(links: LinksDraft, folder: Path | None) -> dict[str, Any]:
-    """Add the columns of transmit antennas to ``[links]``, and record the assumptions.
-
-    Args:
-        links: The draft.
-        folder: Folder of MSI files named after the antennas; None if there is none.
-
-    Returns:
-        The section ``[antennas]``.
+def add_antennas(links: LinksDraft) -> dict[str, Any]:
+    """Add the columns of transmit antennas to ``[links]``, and return the section ``[antennas]``.
 
     Raises:
-        InputError: The folder has no such file, or none for some antenna.
+        InputError: The folder of antennas has no such file, or none for some antenna.
     """
-    frame, of_transmitters = links.transmitter_rows, links.transmitters is not None
+    folder = links.given.antennas
+    frame, of_transmitters = links.transmitter_rows, links.given.transmitters is not None
     mount: dict[str, str] = {}
     antennas: dict[str, Any] = {"tx": dict(UNKNOWN), "rx": dict(UNKNOWN)}
     if folder is not None:
@@ -291,8 +275,8 @@ def _patterns(links: LinksDraft, folder: Path, mount: dict[str, str]) -> dict[st
         return {"tx": _antenna(links, files[0])}
     if column is None:
         raise InputError(
-            f"--antennas {folder}: no column of {links.transmitters or links.links} names the antennas; add one with "
-            f"names such as {files[0].stem!r}, or keep one file"
+            f"--antennas {folder}: no column of {links.given.transmitters or links.links} names the antennas; add one "
+            f"with names such as {files[0].stem!r}, or keep one file"
         )
     labels = sorted(links.transmitter_rows[column].astype(str).unique().tolist())
     lacking = [label for label in labels if plain_name(label) not in by_name]

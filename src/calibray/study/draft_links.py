@@ -69,13 +69,34 @@ class Assumption:
     reason: str
 
 
-@dataclass
-class LinksDraft:
-    """The draft of ``[links]``: its inputs as in `draft`, and its results.
-
-    Each method adds the keys of its subject to the section and records its assumptions.
+@dataclass(frozen=True)
+class Given:
+    """What a user states besides the scene and the table of links.
 
     Attributes:
+        transmitters: Table of the transmitters' positions, unless the links have them.
+        track: GPX track with the position of each row, unless the links contain it.
+        antennas: Folder of MSI files named after the transmitters' antennas.
+        tx: Transmitter position (x, y, z) [m] in the scene's frame, unless a table contains it.
+        frequency: Carrier frequency [Hz], unless the links have it.
+    """
+
+    transmitters: Path | None = None
+    track: Path | None = None
+    antennas: Path | None = None
+    tx: Sequence[float] | None = None
+    frequency: float | None = None
+
+
+@dataclass
+class LinksDraft:
+    """The draft of ``[links]``. Each method adds the keys of its subject and records its assumptions.
+
+    Attributes:
+        scene: Mitsuba XML file, or `sionna:NAME`.
+        links: The table of links.
+        target: The future study file.
+        given: What the user states.
         section: The keys of ``[links]``.
         assumptions: The assumptions.
         frequency: The study's carrier [Hz].
@@ -86,10 +107,7 @@ class LinksDraft:
     scene: str
     links: Path
     target: Path
-    transmitters: Path | None
-    track: Path | None
-    stated_frequency: float | None
-    stated_tx: Sequence[float] | None
+    given: Given
     section: dict[str, Any] = field(default_factory=dict)
     assumptions: list[Assumption] = field(default_factory=list)
     frequency: float = 0.0
@@ -99,7 +117,7 @@ class LinksDraft:
     def __post_init__(self) -> None:
         self._transmitter_key = ""
         self._table = read_table(self.links)
-        self._sites = None if self.transmitters is None else read_table(self.transmitters)
+        self._sites = None if self.given.transmitters is None else read_table(self.given.transmitters)
         self.section["file"] = self.relative(self.links)
         self._add_track()
         self._add_transmitters()
@@ -157,35 +175,32 @@ class LinksDraft:
 
     def _add_track(self) -> None:
         """Positions from a track, by the time of each row."""
-        if self.track is None:
+        if self.given.track is None:
             return
         name = column_names.find_time(self._table.frame)
         if name is None:
             raise InputError(
-                f"{self.links}: no column of times, which {self.track} needs ({self._columns()}); name it time"
+                f"{self.links}: no column of times, which {self.given.track} needs ({self._columns()}); name it time"
             )
-        self.section["track"] = {"file": self.relative(self.track), "time": name}
+        self.section["track"] = {"file": self.relative(self.given.track), "time": name}
         rows = len(self._table)
-        self._table = select_rows(self._table, Preparation(track=Track(str(self.track), name)))
+        self._table = select_rows(self._table, Preparation(track=Track(str(self.given.track), name)))
         reason = f"given; it covers {len(self._table)} of {rows} rows"
-        self.assume("links.track", f"{self.track.name} by {name}", reason)
+        self.assume("links.track", f"{self.given.track.name} by {name}", reason)
 
     def _add_transmitters(self) -> None:
         """Transmitters from their table, by a common column or by one column of values per transmitter."""
-        if self._sites is None or self.transmitters is None:
+        if self._sites is None or self.given.transmitters is None:
             return
-        self.section["transmitters"] = self.relative(self.transmitters)
-        name = transmitter_columns.find_shared_key(self._table.frame, self._sites.frame)
-        if name is not None:
-            self.section["transmitter"] = self._transmitter_key = name
-            self.assume("links.transmitter", name, "a column of both tables with common values")
-            self._leave_out_unknown_transmitters(name, self._sites.frame[name])
-            return
+        self.section["transmitters"] = self.relative(self.given.transmitters)
+        shared = transmitter_columns.find_shared_key(self._table.frame, self._sites.frame)
         key = transmitter_columns.find_naming_key(self._table.frame, self._sites.frame)
+        key = key if shared is None else (shared, shared)
         if key is not None:
             name, of_table = key
+            reason = f"its values are in column {of_table} of {self.given.transmitters.name}"
+            reason = reason if shared is None else "a column of both tables with common values"
             self.section["transmitter"] = self._transmitter_key = name
-            reason = f"its values are in column {of_table} of {self.transmitters.name}"
             self.assume("links.transmitter", name, reason)
             self._leave_out_unknown_transmitters(name, self._sites.frame[of_table])
             return
@@ -194,11 +209,11 @@ class LinksDraft:
         if not columns:
             raise InputError(
                 f"{self.links}: no column names the transmitter of a row, and no columns are named like the "
-                f"transmitters of {self.transmitters}; give both tables one column of the same name"
+                f"transmitters of {self.given.transmitters}; give both tables one column of the same name"
             )
         self.section |= {"wide": columns, "transmitter": name}
         self._transmitter_key = name
-        reason = f"named as in {self.transmitters.name}"
+        reason = f"named as in {self.given.transmitters.name}"
         if unknown := transmitter_columns.find_unknown_wide_columns(self._table.frame, columns):
             reason += f", which lacks the transmitters of {', '.join(unknown)}: left out"
         self.assume("links.wide", ", ".join(columns), reason)
@@ -217,7 +232,9 @@ class LinksDraft:
         # The known ones: rows without a name are left out too.
         self._add_filter(f"`{key}` in {column[~lacking].unique().tolist()}")
         named = ", ".join(map(str, names[:10])) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
-        source = "the table of transmitters" if self.transmitters is None else self.transmitters.name
+        source = (
+            "the table of transmitters" if self.given.transmitters is None else self.given.transmitters.name
+        )
         reason = f"{source} lacks {named or 'rows without a name'}: {lacking.sum()} rows are left out"
         self.assume("links.where", self.section["where"], reason)
         self._table = self._table.select(~lacking)
@@ -235,9 +252,9 @@ class LinksDraft:
             self.assume("links.missing", listed, f"far from all other values of {columns}: not measured")
 
     def _frequency(self) -> float:
-        if self.stated_frequency is not None:
-            self.assume("scene.frequency", f"{self.stated_frequency:g} Hz", "given")
-            return float(self.stated_frequency)
+        if self.given.frequency is not None:
+            self.assume("scene.frequency", f"{self.given.frequency:g} Hz", "given")
+            return float(self.given.frequency)
         column = column_names.find_frequency(self._table.frame)
         if column is None:
             raise InputError(
@@ -259,7 +276,7 @@ class LinksDraft:
 
     def _position_columns(self) -> tuple[PositionColumns, PositionColumns | None]:
         """Columns of the receivers' and the transmitters' positions; None if the transmitter has no columns."""
-        if self.track is None:
+        if self.given.track is None:
             rx = column_names.find_position(self._table.frame, "rx", unnamed=True)
         else:
             rx = PositionColumns("geographic", *TRACK_COLUMNS, height=None)
@@ -269,14 +286,14 @@ class LinksDraft:
                 "or longitude and latitude"
                 f"{column_names.text_instead(self._table.frame, 'x', 'y', 'longitude', 'latitude')}"
             )
-        if self.stated_tx is not None:
+        if self.given.tx is not None:
             return rx, None
         if self._sites is None:
             return rx, column_names.find_position(self._table.frame, "tx", unnamed=False)
         tx = column_names.find_position(self._sites.frame, "tx", unnamed=True)
         if tx is None:
             columns = ", ".join(map(str, self._sites.frame))
-            raise InputError(f"{self.transmitters}: no columns of positions ({columns})")
+            raise InputError(f"{self.given.transmitters}: no columns of positions ({columns})")
         x, y, height = (self._name_in_links(name) for name in (tx.x, tx.y, tx.height))
         return rx, PositionColumns(tx.position, str(x), str(y), height)
 
@@ -297,8 +314,7 @@ class LinksDraft:
             return rx, tx
         self.section["crs"] = crs
         self.assume("links.crs", crs, f"{rx.x} and {rx.y} are on the scene in this projection")
-        ends = (None if end is None else replace(end, position="geographic") for end in (rx, tx))
-        return next(ends), next(ends)  # type: ignore[return-value]
+        return replace(rx, position="geographic"), tx and replace(tx, position="geographic")
 
     def _name_in_links(self, column: str | None) -> str | None:
         """A column of transmitters is renamed if the links have a column of the same name."""
@@ -353,18 +369,22 @@ class LinksDraft:
                     f"({rx.x}, {rx.y}); give both in degrees, or both in metres"
                 )
             position = [tx.x, tx.y, TRANSMITTER_HEIGHT if tx.height is None else tx.height]
-            reason = "columns of these names" if self.transmitters is None else f"of {self.transmitters.name}"
+            reason = (
+                "columns of these names"
+                if self.given.transmitters is None
+                else f"of {self.given.transmitters.name}"
+            )
             reason += "" if tx.height else f"; no height: {TRANSMITTER_HEIGHT:g} m"
             self.assume("links.tx", ", ".join(map(str, position)), reason)
-            if self.transmitters is None:
+            if self.given.transmitters is None:
                 self._name_transmitters(tx)
             return position
-        if self.stated_tx is None:
+        if self.given.tx is None:
             return self._transmitter_at_origin(rx)
         if rx.position == "geographic":
             raise InputError("--tx: is in metres, but receivers are in degrees; give --transmitters, a table")
-        self.assume("links.tx", ", ".join(f"{part:g}" for part in self.stated_tx), "given")
-        return [float(part) for part in self.stated_tx]
+        self.assume("links.tx", ", ".join(f"{part:g}" for part in self.given.tx), "given")
+        return [float(part) for part in self.given.tx]
 
     def _name_transmitters(self, tx: PositionColumns) -> None:
         """The column that names transmitters whose positions are in the links."""
@@ -473,23 +493,22 @@ class LinksDraft:
         keys += [part for part in self.section["tx"] if isinstance(part, str) and part in frame]
         positions = len(frame[keys].drop_duplicates())
         repeated = frame.duplicated([*keys, self.section["value"]]).any()
-        if self.track is None and positions >= len(frame) / 2 and not repeated:
+        if self.given.track is None and positions >= len(frame) / 2 and not repeated:
             return
-        rows = f"{len(frame)} rows " + ("along a track" if self.track else f"at {positions} positions")
+        rows = f"{len(frame)} rows " + ("along a track" if self.given.track else f"at {positions} positions")
         samples = int(frame.groupby(keys, dropna=False).size().median())
-        if self.track is None and samples >= PLACE_SAMPLES:
+        if self.given.track is None and samples >= PLACE_SAMPLES:
             self.section["average"] = "place"
             self.assume("links.average", "place", f"{rows}, {samples} at each")
             return
         fading = float(np.clip(round(AVERAGING_WAVELENGTHS * speed_of_light / self.frequency, 1), 1.0, 10.0))
         bounds = self.overhead.bounds
-        largest = float(f"{CELL_SHARE * min(bounds[3:5] - bounds[:2]):.2g}")
-        size = min(fading, largest)
+        size = min(fading, float(f"{CELL_SHARE * min(bounds[3:5] - bounds[:2]):.2g}"))
         self.section["average"] = {"by": "cell", "size": size, "unbiased": True}
-        reason = f"{rows}; {AVERAGING_WAVELENGTHS} wavelengths average out fading"
+        reason = f"{AVERAGING_WAVELENGTHS} wavelengths average out fading"
         if size < fading:
-            reason = f"{rows}; {CELL_SHARE:.0%} of the scene, less than {AVERAGING_WAVELENGTHS} wavelengths"
-        self.assume("links.average", f"cells of {size:g} m", reason)
+            reason = f"{CELL_SHARE:.0%} of the scene, less than {AVERAGING_WAVELENGTHS} wavelengths"
+        self.assume("links.average", f"cells of {size:g} m", f"{rows}; {reason}")
 
     def _add_heights(self, tx: PositionColumns | None, rx: PositionColumns) -> None:
         """Heights above the ground, if the ground is not at z = 0 and no height is in the scene's frame."""
@@ -497,7 +516,7 @@ class LinksDraft:
             columns is not None and columns.position == "scene" and columns.height is not None
             for columns in (tx, rx)
         )
-        if in_scene_frame or self.stated_tx is not None:
+        if in_scene_frame or self.given.tx is not None:
             return
         links = self.measurements()
         try:
