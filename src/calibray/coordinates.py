@@ -64,13 +64,7 @@ class Frame:
     def local(cls, longitude: float, latitude: float, height: float = 0.0) -> Frame:
         """The frame centred on a point; distances from this point are not distorted.
 
-        Args:
-            longitude: East of Greenwich [deg].
-            latitude: North of the equator [deg].
-            height: Height of z = 0 [m].
-
-        Returns:
-            The frame.
+        Longitude is east of Greenwich and latitude north of the equator [deg]; `height` is that of z = 0 [m].
 
         Raises:
             InputError: The point is not on the globe.
@@ -82,15 +76,7 @@ class Frame:
 
     @classmethod
     def utm(cls, longitude: float, latitude: float, height: float = 0.0) -> Frame:
-        """The UTM zone of a point, with the origin at the nearest whole metre.
-
-        Args:
-            longitude: East of Greenwich [deg].
-            latitude: North of the equator [deg].
-            height: Height of z = 0 [m].
-
-        Returns:
-            The frame.
+        """The UTM zone of a point, with the origin at the nearest whole metre; arguments as for `local`.
 
         Raises:
             InputError: The point is not on the globe, or too close to a pole for UTM.

@@ -223,14 +223,7 @@ def suggest(
 
 
 def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
-    """Suggestions as tables for the terminal.
-
-    Args:
-        suggestions: The suggestions, from `suggest`.
-
-    Returns:
-        A table of positions, and a table of the gain expected from each suggestion together with those above it.
-    """
+    """Positions of suggestions, and the gain expected from each together with those above it, as tables."""
     from calibray.prediction.position_checks import POSITION_COLUMNS
 
     grouped = ["group"] if "group" in suggestions else []

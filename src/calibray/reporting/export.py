@@ -136,15 +136,7 @@ def _links(result: Record) -> pd.DataFrame:
 
 
 def matlab(materials: pd.DataFrame, frequency: float) -> str:
-    """Write a MATLAB function that returns the materials as a table, or as a structure in Octave.
-
-    Args:
-        materials: One row per material.
-        frequency: The carrier [Hz].
-
-    Returns:
-        Text of the function's file.
-    """
+    """Text of a MATLAB function that returns the materials as a table, or as a structure in Octave; carrier in [Hz]."""
     columns = []
     for name in materials.columns:
         cells = materials[name].tolist()

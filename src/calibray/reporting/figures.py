@@ -85,15 +85,7 @@ def cumulative_cost(results: Mapping[str, Record]) -> Figure:
 
 @styled()
 def convergence(results: Mapping[str, Record], optimum_db: float | None = None) -> Figure:
-    """Draw the best RMSE so far over RT calls.
-
-    Args:
-        results: Results by method.
-        optimum_db: RMSE of the global optimum, drawn as a line [dB]; None if unknown.
-
-    Returns:
-        The figure.
-    """
+    """Draw the best RMSE so far over RT calls, and if known the RMSE of the global optimum [dB]."""
     figure, axes = plain_figure("RT calls", "Best RMSE so far [dB]")
     for method, result in results.items():
         history = result.history
@@ -112,14 +104,7 @@ def convergence(results: Mapping[str, Record], optimum_db: float | None = None) 
 
 @styled()
 def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
-    """Draw the path loss of every link: measured, before and after calibration.
-
-    Args:
-        results: Results by method, all of the same links.
-
-    Returns:
-        The figure.
-    """
+    """Draw the path loss of every link: measured, before and after calibration; all results are of the same links."""
     links = next(iter(results.values())).links
     few, many = len(links) <= SYMBOLS, len(links) > FILE_ORDER
     number = np.arange(1, len(links) + 1)
@@ -203,11 +188,7 @@ def residual_over_distance(survey: Survey) -> Figure:
 
 @styled()
 def residual_by_group(survey: Survey) -> Figure:
-    """Draw the residuals of each group.
-
-    Returns:
-        The figure: quartiles as a box, the median as a line, and whiskers that contain 90 % of the links.
-    """
+    """Draw the residuals of each group: quartiles, median, and whiskers that contain 90 % of the links."""
     frame = pd.DataFrame({"group": survey.group, "residual": survey.residual_db})[survey.has_path].dropna()
     sizes = frame.groupby("group").size().sort_values(ascending=False, kind="stable")
     names = sorted(sizes.index[:GROUPS])
@@ -227,15 +208,7 @@ def residual_by_group(survey: Survey) -> Figure:
 
 
 def result_figures(result: Record, links: Survey | None) -> dict[str, Figure]:
-    """Draw all figures of a calibration.
-
-    Args:
-        result: The calibration.
-        links: The links with positions; None if these are unknown.
-
-    Returns:
-        Figures by name.
-    """
+    """All figures of a calibration by name; some need the links with positions."""
     method = {result.study.method.name: result}
     figures = {
         "convergence": convergence(method),
@@ -272,11 +245,7 @@ MOST: Final = 6
 
 @styled()
 def measured_over_modelled(result: Record) -> Figure | None:
-    """Draw measured over modelled values of the observables, without the biases of devices.
-
-    Returns:
-        The figure; None without further observables.
-    """
+    """Draw measured over modelled values of the observables, without biases of devices; None without observables."""
     fits = dict(list(result.fit.observables.items())[:MOST])
     if not fits:
         return None

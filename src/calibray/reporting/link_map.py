@@ -62,42 +62,19 @@ class Plan:
     walls: str = ""
 
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert positions to the map.
-
-        Args:
-            points: Positions [n, 2 or 3], [m].
-
-        Returns:
-            Units of the map from its upper left corner [n, 2].
-        """
+        """Convert positions [n, 2 or 3], [m], to units of the map from its upper left corner [n, 2]."""
         return np.stack(
             [(points[:, 0] - self.west) * self.scale, (self.north - points[:, 1]) * self.scale], axis=1
         )
 
 
 def plan(survey: Survey, triangles: Triangles | None) -> Plan:
-    """Lay out the map of a calibration's links.
-
-    Args:
-        survey: The links.
-        triangles: The scene; None if it cannot be read.
-
-    Returns:
-        The map.
-    """
+    """Lay out the map of a calibration's links, over the scene if it can be read."""
     return lay_out(np.concatenate([survey.tx, survey.rx]), triangles)
 
 
 def lay_out(ends: NDArray[np.float64], triangles: Triangles | None) -> Plan:
-    """Lay out a map that shows positions.
-
-    Args:
-        ends: The positions [n, 2 or 3], [m].
-        triangles: The scene; None if it cannot be read.
-
-    Returns:
-        The map.
-    """
+    """Lay out a map that shows positions [n, 2 or 3], [m], over the scene if it can be read."""
     ends = ends[:, :2]
     low, high = ends.min(axis=0), ends.max(axis=0)
     extent = np.maximum((high - low) * (1 + 2 * MARGIN), LEAST_EXTENT)
@@ -142,15 +119,7 @@ def marks(links: Survey, layout: Plan) -> dict[str, Any]:
 
 
 def ramp(value: NDArray[np.float64], limit: float) -> list[str]:
-    """Colours of values.
-
-    Args:
-        value: The values [n].
-        limit: Absolute value at which the ramp ends on both sides.
-
-    Returns:
-        Colours in CSS notation; "none" for NaN.
-    """
+    """Colours of values [n] in CSS notation, "none" for NaN; the ramp ends at plus and minus `limit`."""
     stops = np.array([[int(color[k : k + 2], 16) for k in (1, 3, 5)] for color in RAMP], dtype=float)
     position = np.clip((np.nan_to_num(value) / limit + 1) / 2, 0, 1) * (len(RAMP) - 1)
     channel = [np.interp(position, range(len(RAMP)), stops[:, k]).round().astype(int) for k in range(3)]
@@ -159,13 +128,7 @@ def ramp(value: NDArray[np.float64], limit: float) -> list[str]:
 
 
 def ramp_limit(value: NDArray[np.float64]) -> float:
-    """The end of the ramp: a round number that 95 % of the absolute values do not exceed.
-
-    Args:
-        value: The values [n]; NaN values are ignored.
-
-    Returns:
-        The limit, greater than 0.
+    """The end of the ramp: a round number that 95 % of the absolute values [n] do not exceed; NaN is ignored.
 
     Example:
         >>> ramp_limit(np.linspace(-4.3, 4.3, 50))

@@ -78,14 +78,9 @@ def measured_quantity(result: Record) -> Quantity:
 
 
 def in_measured_quantity(result: Record, name: str) -> NDArray[np.float64]:
-    """Values of the links in the measured quantity.
+    """Values of the links in the measured quantity [L], in its unit.
 
-    Args:
-        result: The calibration.
-        name: Which values: "measured", "before", "after" or "predicted".
-
-    Returns:
-        The values [L], in the quantity's unit.
+    `name` states which: "measured", "before", "after" or "predicted".
     """
     path_loss_db, column = result.links[f"{name}_db"].to_numpy(float), _column(result)
     if column not in result.links:
@@ -100,27 +95,19 @@ def _column(result: Record) -> str:
 
 
 def residual(table: pd.DataFrame, sign: int) -> NDArray[np.float64]:
-    """Predicted minus measured value, in the measured quantity.
+    """Predicted minus measured value of a result's links, in the measured quantity [L], [dB].
 
-    Args:
-        table: A result's links.
-        sign: 1 if the quantity rises with path loss, otherwise -1.
-
-    Returns:
-        Residuals [L], [dB]; those of the fallback for links without a path, NaN without a prediction.
+    The sign is 1 if the quantity rises with path loss, otherwise -1. For links without a path, the fallback predicts;
+    NaN without a prediction.
     """
     difference = table["predicted_db"].to_numpy(float) - table["measured_db"].to_numpy(float)
     return sign * np.where(np.isfinite(difference), difference, np.nan)
 
 
 def survey(result: Record) -> Survey | None:
-    """Collect the positions of a calibration's links.
+    """A calibration's links with their positions, from the result or otherwise the study's measurements.
 
-    Args:
-        result: The calibration. If its links have no positions, the study's measurements are read.
-
-    Returns:
-        The links with positions; None if the measurements cannot be read or have changed.
+    None if the measurements cannot be read or have changed.
     """
     table, sign = result.links, measured_quantity(result).sign
     if set(POSITION_COLUMNS) <= set(table.columns):

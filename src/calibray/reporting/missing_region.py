@@ -164,14 +164,11 @@ def _lengths(
 
 
 def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> Iterator[Explained]:
-    """What extra loss in rectangles of the grid explains, size by size.
+    """The best rectangle of the grid, size by size.
 
     Args:
         moments: Products of residuals and the columns of the cells, with the residuals in order first [k, cells].
         products: Products of the columns of the cells [cells, cells].
-
-    Yields:
-        The best rectangle of each size.
     """
     moment = _summed(moments.reshape(-1, GRID, GRID), (1, 2))
     total = _summed(products.reshape((GRID,) * 4), (0, 1, 2, 3))

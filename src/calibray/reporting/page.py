@@ -137,15 +137,7 @@ def report(
 
 
 def collect(result: Record, progress: Progress | None = None) -> PageData:
-    """Collect what a page shows in addition to the result; unavailable items are listed and are not an error.
-
-    Args:
-        result: The calibration.
-        progress: Called with the stage "tracing" after every launch.
-
-    Returns:
-        Links, scene and paths.
-    """
+    """Collect what a page shows in addition to the result; unavailable items are listed and are not an error."""
     study, missing = result.study, []
     links = survey(result)
     if links is None:
@@ -172,16 +164,7 @@ def collect(result: Record, progress: Progress | None = None) -> PageData:
 
 
 def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
-    """The report as text.
-
-    Args:
-        result: The calibration.
-        data: What the page shows in addition to the result.
-        figures: Figures by name.
-
-    Returns:
-        HTML.
-    """
+    """The report as HTML, with figures by name."""
     environment = Environment(
         loader=PackageLoader("calibray.reporting"),
         autoescape=True,

@@ -51,15 +51,7 @@ def save_positions(
 
 @styled()
 def draw_positions(source: str | Path, tx: ArrayLike, rx: ArrayLike) -> Figure:
-    """Draw a plan of the scene with the antennas.
-
-    Args:
-        source: Path of a Mitsuba XML file, or `sionna:NAME`.
-        tx: Transmitters [n, 3], [m].
-        rx: Receivers [m, 3], [m].
-
-    Returns:
-        The figure; its `savefig` writes PNG, SVG or PDF.
+    """Draw a plan of the scene with the antennas; arguments as for `save_positions`.
 
     Raises:
         InputError: The scene cannot be read.

@@ -36,11 +36,7 @@ def heading(result: Record) -> str:
 
 
 def summary(result: Record) -> tuple[Table | str, ...]:
-    """What Python and notebooks display for a calibration.
-
-    Returns:
-        The heading with the number of RT calls, and the tables of parameters, nuisances and accuracy.
-    """
+    """What Python and notebooks display: heading, and tables of parameters, nuisances and accuracy."""
     parts = (parameters(result), nuisances(result), accuracy(result), observables(result))
     parts = (*parts, observables_table(result.accuracy.observables))
     return (f"{heading(result)}, {result.rt_calls:,} RT calls", *(table for table in parts if table.rows))
@@ -83,15 +79,9 @@ def _held_out(result: Record) -> tuple[str, str]:
 def suspicious_rows(
     without_path: Sequence[int], treatment: str, enclosed: EnclosedAntennas | None
 ) -> Iterator[tuple[str, str, str]]:
-    """Lines about links to check, for a table of links.
+    """Lines about links to check: what is counted, the number, and the rows with a remedy.
 
-    Args:
-        without_path: Rows of the links without a path.
-        treatment: How the calibration treats them; appended to the row numbers.
-        enclosed: Antennas inside closed bodies; None if this was not checked.
-
-    Yields:
-        What is counted, the number, and the rows with a remedy.
+    The rows without a path are followed by their treatment; without `enclosed`, antennas were not checked.
     """
     text = rows_text(without_path)
     yield "without a path", str(len(without_path)), text + treatment if text else ""
@@ -132,11 +122,7 @@ def reasons(result: Record) -> Table:
 
 
 def observables(result: Record) -> Table:
-    """The fit of further observables, each in its unit.
-
-    Returns:
-        The table; without rows if the study has none.
-    """
+    """The fit of further observables, each in its unit; without rows if the study has none."""
     rows = []
     for name, fit in result.fit.observables.items():
         biases = ", ".join(
@@ -162,11 +148,7 @@ def remarks(result: Record) -> Table:
 
 
 def nuisances(result: Record) -> Table:
-    """Offsets and the coefficients of further nuisances, by group.
-
-    Returns:
-        The table; without rows if the study declares no nuisance.
-    """
+    """Offsets and the coefficients of further nuisances, by group; without rows if the study declares none."""
     nuisance = result.nuisance
     others = _nuisances_besides_offset(result)
     rows = [(group or "all links", f"{value:+.2f}") for group, value in nuisance.offsets_db.items()]
@@ -251,11 +233,7 @@ class Value:
 
 
 def values(result: Record) -> list[Value]:
-    """The parameters of a calibration in the form of the report.
-
-    Returns:
-        One entry per parameter, in the study's order.
-    """
+    """The parameters of a calibration in the form of the report."""
     entries, predicted = [], result.prediction.model.parameters
     for name, after in result.parameters.items():
         section, interval = result.study.parameters[name], result.intervals.get(name)

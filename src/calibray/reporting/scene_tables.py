@@ -27,11 +27,7 @@ _HEIGHT_SOURCES: Final = {
 
 
 def contents(scene: MadeScene) -> Table:
-    """The contents of a new scene, and the assumptions made.
-
-    Returns:
-        A table of two columns without headings.
-    """
+    """The contents of a new scene, and the assumptions made."""
     west, south, bottom, east, north, top = scene.bounds
     rows = [
         ("scene", str(scene.path)),
@@ -59,11 +55,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def findings(check: SceneCheck) -> list[Table]:
-    """The size of a scene and its defects.
-
-    Returns:
-        A table of size and verdict, and a table of the findings in the order of the check, if there are any.
-    """
+    """The size of a scene with the verdict, and if there are any, its defects."""
     west, south, bottom, east, north, top = check.bounds
     errors = sum(finding.severity == "error" for finding in check.findings)
     warnings = sum(finding.severity == "warning" for finding in check.findings)
@@ -107,21 +99,13 @@ def objects(check: SceneCheck) -> Table:
 
 
 def assumptions(draft: Draft) -> Table:
-    """The assumptions of a drafted study.
-
-    Returns:
-        One row per assumption, with its reason.
-    """
+    """The assumptions of a drafted study with their reasons."""
     rows = tuple((entry.what, entry.value, entry.reason) for entry in draft.assumptions)
     return Table("Assumptions", (Column(), Column(), Column("reason")), rows)
 
 
 def warning_lines(findings: Sequence[Finding]) -> str:
-    """Findings about links as warnings.
-
-    Returns:
-        A line each; empty without findings.
-    """
+    """Findings about links as warnings, a line each."""
     return "\n".join(
         f"Warning: {finding.subject}: {finding.problem}; {finding.remedy}" for finding in findings
     )
@@ -132,15 +116,9 @@ VISIBLE_DB: Final = 0.005
 
 
 def overview(paths: Paths, row: NDArray[np.int64], enclosed: EnclosedAntennas | None) -> Table:
-    """Numbers of links, paths and interactions, and the links to check.
+    """Numbers of links, paths and interactions, and the links to check by their rows in the source file [L].
 
-    Args:
-        paths: The traced paths.
-        row: Row of every link in the source file [L].
-        enclosed: Antennas inside closed bodies; None if this was not checked.
-
-    Returns:
-        The table.
+    Without `enclosed`, antennas were not checked.
     """
     reached = np.bincount(paths.link, minlength=paths.num_links) > 0
     rows = [
@@ -153,15 +131,9 @@ def overview(paths: Paths, row: NDArray[np.int64], enclosed: EnclosedAntennas | 
 
 
 def convergence(change: Convergence, row: NDArray[np.int64], tolerance_db: float) -> tuple[Table | str, ...]:
-    """How path loss changed when the scene was traced again with more samples.
+    """How path loss changed when traced again with more samples: a summary, links that changed most, and a verdict.
 
-    Args:
-        change: The changes.
-        row: Row of every link in the source file [L].
-        tolerance_db: Largest change of a link's path loss that is acceptable [dB].
-
-    Returns:
-        A summary, the links that changed most if any did, and a verdict.
+    Links are named by their rows in the source file [L]; `tolerance_db` is the largest acceptable change [dB].
     """
     most_changed = _most_changed(change, row)
     verdict = _verdict(change, len(row), tolerance_db)
@@ -169,14 +141,9 @@ def convergence(change: Convergence, row: NDArray[np.int64], tolerance_db: float
 
 
 def last_round(settings: Mapping[str, object], tolerance_db: float) -> str:
-    """How path loss changed in the last round of a trace whose rays are added in rounds.
+    """The verdict on the last round of a trace whose rays are added in rounds.
 
-    Args:
-        settings: How the paths were traced (`Paths.settings`).
-        tolerance_db: Largest change of a link's path loss that is acceptable [dB].
-
-    Returns:
-        The verdict.
+    `settings` are those of the paths; `tolerance_db` is the largest acceptable change of a link's path loss [dB].
     """
     rays, change = int(str(settings["rays"])), float(str(settings["last_round_db"]))
     if not rays:

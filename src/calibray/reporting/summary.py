@@ -47,16 +47,9 @@ class Sentence:
 
 
 def summary(result: Record, links_by_material: Mapping[str, int] | None = None) -> tuple[Sentence, ...]:
-    """Summarize a calibration in a few sentences.
+    """Summarize a calibration in a few sentences: what predictions use, fit, help, certainty, advice and warnings.
 
-    Args:
-        result: The calibration.
-        links_by_material: Number of links with at least one path that interacts with the material, by material; None
-            without paths.
-
-    Returns:
-        What was calibrated, how well it fits, whether it helped on held-out links, how certain the values are, what to
-        measure next, and warnings.
+    `links_by_material` is the number of links with a path that interacts with the material; None without paths.
     """
     return (
         Sentence("What do predictions use?", f"{prediction_text(result)} {scene_alone_text(result)}".strip()),

@@ -73,14 +73,7 @@ def trust_figures(result: Record) -> dict[str, Figure]:
 
 @styled()
 def possible_values(result: Record) -> Figure:
-    """Draw the posterior of every parameter over its bounds, with its 95 % interval.
-
-    Args:
-        result: The calibration, with draws of every parameter.
-
-    Returns:
-        The figure.
-    """
+    """Draw the posterior of every parameter over its bounds, with its 95 % interval."""
     names = sorted(result.parameters, key=lambda name: -_spread(result, name))[:PARAMETERS]
     columns = min(3, len(names))
     rows = -(-len(names) // columns)
@@ -217,8 +210,7 @@ def by_depth(table: pd.DataFrame) -> Figure:
 def residuals_by_direction(result: Record) -> Figure | None:
     """Draw the residuals of links over the direction from their transmitter, and its pattern on the horizon.
 
-    Returns:
-        The figure; None if the study does not state the mounting of transmitters, or its links cannot be read.
+    None if the study does not state the mounting of transmitters, or its links cannot be read.
     """
     study = result.study
     if "tx" not in study.links.mountings:

@@ -54,14 +54,7 @@ class Rays:
 
 
 def rays(result: Record, progress: Progress | None = None) -> Rays:
-    """Find the strongest paths of every link.
-
-    Args:
-        result: The calibration; paths that it does not contain come from the cache or are traced.
-        progress: Called with the stage "tracing" after every launch.
-
-    Returns:
-        The paths.
+    """Find the strongest paths of every link; those that the result lacks come from the cache or are traced.
 
     Raises:
         InputError: The scene or the links of the study can no longer be used.
@@ -74,15 +67,7 @@ def rays(result: Record, progress: Progress | None = None) -> Rays:
 
 
 def strongest(paths: Paths, result: Record) -> Rays:
-    """Select the strongest paths of every link.
-
-    Args:
-        paths: All traced paths.
-        result: The calibration with whose materials the paths are evaluated.
-
-    Returns:
-        The paths that are shown.
-    """
+    """Select the strongest paths of every link, with a result's materials."""
     gain = path_gains(paths, result.scene_materials).reshape(paths.num_paths, -1)
     # Summed over receive ports and averaged over transmit ports, as in path loss.
     power = (np.abs(gain) ** 2).sum(axis=1) / paths.tx_field.shape[1]
@@ -136,16 +121,9 @@ class Grid:
 def packed(
     survey: Survey, triangles: Triangles | None, rays: Rays | None, materials: list[str]
 ) -> dict[str, Any]:
-    """Pack what the viewer draws.
+    """What the viewer draws; arrays are base64 of little-endian whole numbers.
 
-    Args:
-        survey: The links.
-        triangles: The scene; None if it cannot be read.
-        rays: The paths; None without paths.
-        materials: Names of the scene's materials, in the scene's order.
-
-    Returns:
-        A dictionary; arrays are base64 of little-endian whole numbers.
+    `materials` are those of the scene, in its order; triangles or rays are None if there are none.
     """
     points = [survey.tx, survey.rx]
     if triangles is not None and len(triangles.face):

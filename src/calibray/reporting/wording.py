@@ -43,8 +43,7 @@ def prediction_text(record: Record) -> str:
 def scene_alone_text(record: Record) -> str:
     """How far the exported scene alone is from the predictions.
 
-    Returns:
-        One or two sentences; empty if the scene alone gives the predictions.
+    One or two sentences; empty if the scene alone gives the predictions.
     """
     links, model = record.links, record.prediction.model
     scene_db, predicted_db = (links[name].to_numpy(float) for name in ("scene_db", "predicted_db"))
@@ -133,11 +132,7 @@ EVEN_DB: Final = 0.1
 
 
 def diagnostics_table(result: Record) -> Table:
-    """Summarize the diagnostics in a line each.
-
-    Returns:
-        A table: the subject, and the finding.
-    """
+    """Summarize the diagnostics in a line each."""
     tables = diagnostics(result)
     findings = {
         "power": _power_text(tables),

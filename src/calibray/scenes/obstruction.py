@@ -63,10 +63,9 @@ class Obstruction:
         return (self.length_m > 0) | (self.walls > 0)
 
     def knife_edge_db(self, wavelength: NDArray[np.float64] | float) -> NDArray[np.float64]:
-        """Diffraction loss of the highest roof edge as a knife edge, ITU-R P.526-15 equation 31 [n], [dB].
+        """Diffraction loss of the highest roof edge as a knife edge [n], [dB], by ITU-R P.526-15 equation 31.
 
-        Args:
-            wavelength: The wavelength [m], of all links or of each [n].
+        The wavelength [m] is that of all links or of each [n].
         """
         parameter = self.clearance / np.sqrt(wavelength)
         above = np.maximum(parameter, CLEAR) - 0.1
@@ -75,15 +74,7 @@ class Obstruction:
 
 
 def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[np.float64]) -> Obstruction:
-    """Compute the obstruction of links.
-
-    Args:
-        triangles: The scene's triangles; those of the ground are not obstacles.
-        start: One end of each link [n, 3], [m].
-        end: The other end [n, 3], [m].
-
-    Returns:
-        The obstruction of every link.
+    """Obstruction of links with ends [n, 3], [m]; triangles of the ground are not obstacles.
 
     Example:
         A roof 10 m high over the square from (0, 0) to (10, 10) m, and one wall at x = 0:
@@ -130,10 +121,9 @@ def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[n
 def _pairs(
     first: NDArray[np.float64], last: NDArray[np.float64], corners: NDArray[np.float64]
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Lines and triangles that may cross in plan: the line's azimuth lies between those of the triangle's corners.
+    """Lines and triangles that may cross in plan, by their indices in batches.
 
-    Yields:
-        Index of the line and of the triangle of each pair, in batches.
+    The line's azimuth lies between those of the triangle's corners.
     """
     if not len(corners):
         return
@@ -295,12 +285,8 @@ CARRIERS: Final = (0.5e9, 67e9)
 def clutter_loss_db(distance: ArrayLike, frequency: ArrayLike) -> NDArray[np.float64]:
     """Median clutter loss at one end, over locations in urban or suburban clutter [n], [dB].
 
-    Args:
-        distance: Length of the paths [n], [m].
-        frequency: Carrier of all or of each [n], [Hz].
-
-    Returns:
-        The losses; 0 for paths shorter than `SHORTEST`, which the recommendation does not cover.
+    Distances are the lengths of the paths [n], [m]; the carrier is that of all or of each [n], [Hz]. The loss is 0 for
+    paths shorter than `SHORTEST`, which the recommendation does not cover.
 
     Raises:
         InputError: A carrier is outside `CARRIERS`.

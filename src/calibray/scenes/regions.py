@@ -30,14 +30,7 @@ class Region:
     top: NDArray[np.float64]
 
     def length_inside(self, start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Length of straight lines inside the region.
-
-        Args:
-            start: One end of each line [k, 3], [m].
-            end: The other end [k, 3], [m].
-
-        Returns:
-            The lengths [k], [m].
+        """Length inside the region [k], [m], of straight lines from `start` to `end` [k, 3], [m].
 
         Raises:
             InputError: shapely is not installed.
@@ -79,11 +72,7 @@ class Region:
 def united(
     spans: NDArray[np.float64],
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-    """The union of spans (line, lower, upper) that may overlap, line by line.
-
-    Yields:
-        Line, lower and upper end of each piece.
-    """
+    """The union of spans (line, lower, upper) that may overlap: line, lower and upper end of each piece."""
     count = len(spans)
     if not count:
         return

@@ -98,9 +98,6 @@ def _press(_: int, __: FrameType | None) -> None:
 def defer_interruption() -> Iterator[None]:
     """Delay Ctrl-C to the end of a short block that must not be interrupted.
 
-    Yields:
-        Nothing.
-
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed in the block.
     """

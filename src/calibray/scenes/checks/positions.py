@@ -161,15 +161,9 @@ def _count_crossings(
 
 
 def building_outlines(source: str | Path) -> Any:
-    """Find the area that buildings and other bodies of a scene cover in plan.
+    """The area that buildings and other bodies of a scene cover in plan, a shapely geometry [m]; empty without a body.
 
     Faces less than `KERB` above the scene's lowest point cover nothing: kerbs, floors, the ground.
-
-    Args:
-        source: Path of a Mitsuba XML file, or `sionna:NAME`.
-
-    Returns:
-        A shapely Polygon or MultiPolygon [m], empty if there is no body.
 
     Raises:
         InputError: The scene cannot be read, or shapely is not installed.
