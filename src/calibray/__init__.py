@@ -40,32 +40,24 @@ if TYPE_CHECKING:
     from calibray.validation.validate import validate as validate
     from calibray.version import __version__ as __version__
 
-# The module that defines each name.
-_HOMES = {
-    "Material": "calibray.materials",
-    "itu_material": "calibray.materials",
-    "Measurements": "calibray.measurements",
-    "read_measurements": "calibray.measurements",
-    "Paths": "calibray.paths",
-    "channel_statistics": "calibray.fields.channel",
-    "power_delay_profile": "calibray.fields.channel",
-    "trace": "calibray.study.trace",
-    "read_rays": "calibray.study.trace",
-    "write_rays": "calibray.study.trace",
-    "path_gains": "calibray.fields",
-    "path_loss": "calibray.fields",
-    "Study": "calibray.study",
-    "Setup": "calibray.study",
-    "Result": "calibray.calibration.result",
-    "calibrate": "calibray.calibration.calibrate",
-    "validate": "calibray.validation.validate",
-    "suggest": "calibray.prediction.suggestion",
-    "engines": "calibray.engines",
-    "optimizers": "calibray.optimizers",
-    "coverage_map": "calibray.prediction.coverage_map",
-    "report": "calibray.reporting.page",
-    "__version__": "calibray.version",
-}
-
-__all__ = sorted(_HOMES)
-__getattr__, __dir__ = lazy_attributes(__name__, _HOMES)
+__all__, __getattr__, __dir__ = lazy_attributes(
+    __name__,
+    {
+        "engines": "",
+        "optimizers": "",
+        "calibration.calibrate": "calibrate",
+        "calibration.result": "Result",
+        "fields": "path_gains path_loss",
+        "fields.channel": "channel_statistics power_delay_profile",
+        "materials": "Material itu_material",
+        "measurements": "Measurements read_measurements",
+        "paths": "Paths",
+        "prediction.coverage_map": "coverage_map",
+        "prediction.suggestion": "suggest",
+        "reporting.page": "report",
+        "study": "Setup Study",
+        "study.trace": "read_rays trace write_rays",
+        "validation.validate": "validate",
+        "version": "__version__",
+    },
+)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import inf, isfinite, pi
+from math import inf, isfinite
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
@@ -147,27 +147,6 @@ def constants_matrix(materials: Mapping[str, Material]) -> NDArray[np.float64]:
     """
     rows = [[getattr(material, name) for name in FIELDS] for material in materials.values()]
     return np.array(rows, dtype=np.float64).reshape(-1, len(FIELDS))
-
-
-def complex_relative_permittivity(material: Material, frequency: float) -> complex:
-    """Complex relative permittivity [1] for the time convention e^{+jwt} (ITU-R P.2040-1, eq. 9b).
-
-    The frequency is in [Hz]; the imaginary part is not positive.
-
-    Raises:
-        InputError: The frequency is not a positive finite number.
-
-    Example:
-        >>> complex_relative_permittivity(Material(4.0, 0.0, 0.1), frequency=1e9)
-        (4+0j)
-    """
-    # SciPy takes long to load and most callers need no permittivity.
-    from scipy.constants import epsilon_0
-
-    _check_frequency(frequency)
-    # eta = eps_r - j sigma / (2 pi f eps_0), ITU-R P.2040-1 eq. 9b
-    loss = material.conductivity / (2 * pi * frequency * epsilon_0)
-    return complex(material.relative_permittivity, -loss) if loss else complex(material.relative_permittivity)
 
 
 class ItuLaw(NamedTuple):

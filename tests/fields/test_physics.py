@@ -20,7 +20,7 @@ import synthetic
 from calibray.fields import path_gains, path_loss, slab
 from calibray.fields.diffraction import affine_form, transition
 from calibray.fields.material_response import pattern_value
-from calibray.materials import FIELDS, Material, complex_relative_permittivity, constants_matrix
+from calibray.materials import FIELDS, Material, constants_matrix
 from calibray.paths import Diffraction, Paths
 from calibray.scenes import read_scene
 from calibray.tracing.settings import Antenna, TraceSettings
@@ -141,8 +141,10 @@ def test_metal_reflects_all_and_grazing_waves_are_turned_over() -> None:
 def test_loss_is_the_imaginary_part_of_the_complex_permittivity(
     frequency: float, conductivity: float
 ) -> None:
-    eta = complex_relative_permittivity(Material(3.0, conductivity, 0.1), frequency)
-    assert slab.loss_term(conductivity, speed_of_light / frequency) == pytest.approx(-eta.imag, rel=1e-12)
+    """ITU-R P.2040-1, eq. 9b, with eps_0 from mu_0 c^2 instead of the code's constant."""
+    vacuum_permittivity = 1 / (4e-7 * np.pi * speed_of_light**2)
+    loss = conductivity / (2 * np.pi * frequency * vacuum_permittivity)
+    assert slab.loss_term(conductivity, speed_of_light / frequency) == pytest.approx(loss, rel=1e-8)
 
 
 # Free space, two rays

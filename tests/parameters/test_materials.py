@@ -1,5 +1,5 @@
 from dataclasses import FrozenInstanceError, replace
-from math import inf, nan, pi
+from math import inf, nan
 
 import numpy as np
 import pytest
@@ -12,7 +12,6 @@ from calibray.materials import (
     FIELDS,
     ITU_MATERIALS,
     Material,
-    complex_relative_permittivity,
     constants_matrix,
     itu_material,
 )
@@ -173,23 +172,3 @@ def test_constants_follow_the_field_order():
     matrix = constants_matrix({"a": PLAIN, "b": other})
     np.testing.assert_array_equal(matrix, [[5, 0.1, 0.2, 0, 0, 1, 1, 1], [5, 0.1, 0.2, 0.3, 0.2, 4, 3, 0.7]])
     assert constants_matrix({}).shape == (0, len(FIELDS))
-
-
-def test_complex_relative_permittivity_in_closed_form():
-    # With sigma = 2 pi f eps_0 the loss term is 1; eps_0 here from mu_0 c^2, not from the code's constant.
-    vacuum_permittivity = 1 / (4e-7 * pi * 299792458.0**2)
-    lossy = replace(PLAIN, conductivity=2 * pi * 3e9 * vacuum_permittivity)
-    assert complex_relative_permittivity(lossy, 3e9) == pytest.approx(5 - 1j, rel=1e-8)
-    assert complex_relative_permittivity(replace(PLAIN, conductivity=0.0), 3e9) == 5
-    with pytest.raises(InputError, match="frequency = 0"):
-        complex_relative_permittivity(PLAIN, 0)
-
-
-def test_complex_relative_permittivity_agrees_with_sionna():
-    import mitsuba as mi
-    import sionna.rt  # noqa: F401  (selects the Mitsuba variant)
-    from sionna.rt.utils import complex_relative_permittivity as sionna_complex_relative_permittivity
-
-    reference = sionna_complex_relative_permittivity(mi.Float(5.0), mi.Float(0.1), mi.Float(2 * pi * 3e9))
-    ours = complex_relative_permittivity(PLAIN, 3e9)
-    assert ours == pytest.approx(complex(reference.real[0], reference.imag[0]), rel=1e-6)

@@ -1,6 +1,7 @@
-"""Optional libraries: missing, or installed and not loadable."""
+"""Names loaded on first use; optional libraries that are missing, or installed and not loadable."""
 
 import sys
+from importlib import import_module
 
 import pytest
 
@@ -21,3 +22,11 @@ def test_a_library_that_cannot_be_loaded_is_not_called_missing(tmp_path, monkeyp
     monkeypatch.setitem(sys.modules, "absent", None)
     with pytest.raises(InputError, match=r"absent is not installed .*calibray\[scenes\]"):
         library("absent", "scenes")
+
+
+@pytest.mark.parametrize("room", ["engines", "paths", "scenes.authoring", "study", "support", "tracing"])
+def test_every_name_of_a_room_is_loaded_from_its_module(room):
+    module = import_module(f"calibray.{room}")
+    assert [name for name in module.__all__ if not hasattr(module, name)] == []
+    assert set(module.__all__) <= set(dir(module))
+    assert not hasattr(module, "nothing")

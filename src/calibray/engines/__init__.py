@@ -45,36 +45,21 @@ if TYPE_CHECKING:
     from calibray.engines.section import OpenedStudy as OpenedStudy
     from calibray.engines.section import RadioSettings as RadioSettings
 
-_HOMES = {
-    "Answer": "calibray.engines.protocol",
-    "Answering": "calibray.engines.protocol",
-    "Chunked": "calibray.engines.protocol",
-    "ChunkedReplay": "calibray.engines.cluster.chunks",
-    "Command": "calibray.engines.external.command",
-    "Differentiable": "calibray.engines.protocol",
-    "Engine": "calibray.engines.protocol",
-    "InProcess": "calibray.engines.cluster.workers",
-    "LEDGER_FILE": "calibray.engines.ledger.ledger",
-    "Ledger": "calibray.engines.ledger.ledger",
-    "LedgerEntry": "calibray.engines.ledger.database",
-    "Observable": "calibray.engines.protocol",
-    "OpenedStudy": "calibray.engines.section",
-    "PATH_LOSS": "calibray.engines.protocol",
-    "RadioSettings": "calibray.engines.section",
-    "Recorded": "calibray.engines.ledger.recorded",
-    "Replay": "calibray.engines.replay",
-    "ReplayCarriers": "calibray.engines.replay",
-    "Request": "calibray.engines.external.exchange",
-    "Retrace": "calibray.engines.retrace",
-    "Workers": "calibray.engines.cluster.workers",
-    "check_candidates": "calibray.engines.protocol",
-    "compress": "calibray.engines.compression",
-    "fingerprint": "calibray.engines.make_engine",
-    "key": "calibray.engines.ledger.database",
-    "make": "calibray.engines.make_engine",
-    "open_ledger": "calibray.engines.ledger.ledger",
-    "open_workers": "calibray.engines.cluster.workers",
-}
-
-__all__ = sorted(_HOMES)
-__getattr__, __dir__ = lazy_attributes(__name__, _HOMES)
+__all__, __getattr__, __dir__ = lazy_attributes(
+    __name__,
+    {
+        "cluster.chunks": "ChunkedReplay",
+        "cluster.workers": "InProcess Workers open_workers",
+        "compression": "compress",
+        "external.command": "Command",
+        "external.exchange": "Request",
+        "ledger.database": "LedgerEntry key",
+        "ledger.ledger": "LEDGER_FILE Ledger open_ledger",
+        "ledger.recorded": "Recorded",
+        "make_engine": "fingerprint make",
+        "protocol": "PATH_LOSS Answer Answering Chunked Differentiable Engine Observable check_candidates",
+        "replay": "Replay ReplayCarriers",
+        "retrace": "Retrace",
+        "section": "OpenedStudy RadioSettings",
+    },
+)

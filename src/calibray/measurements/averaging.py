@@ -139,21 +139,12 @@ millimetre at best, and conversions of coordinates differ by micrometres."""
 
 
 def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
-    """Merge the rows of one link.
+    """Merge the rows of one link: its first row, with the mean of linear power, and of weights or standard deviations.
 
     Rows belong to one link if their positions agree within `SAME_POSITION`, and transmitter, groups, carrier,
     transmitted power and times are equal. Rows at different times stay separate links. A link below the noise floor is
-    not merged with one above it.
-
-    Args:
-        table: The rows, before receivers inside buildings are moved: two positions may be moved to the same corner.
-        steps: The steps applied to the rows; `keep`, `transmitter`, `noise_floor_dbm` and `averaging` are used here.
-            Averages merge repeats already.
-        columns: The columns that describe the links; positions in metres.
-
-    Returns:
-        For each link its first row, with the value of the mean linear power and the mean weight or standard
-        deviation. If no row repeats a link, the table itself.
+    not merged with one above it. Receivers inside buildings are moved later: two positions may be moved to the same
+    corner. The steps `keep`, `transmitter`, `noise_floor_dbm` and `averaging` are used; averages merge repeats already.
 
     Raises:
         InputError: A column is missing or not numeric.
@@ -204,14 +195,10 @@ def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkCol
 def join_positions(
     positions: NDArray[np.float64], group: NDArray[np.int64] | None = None
 ) -> NDArray[np.int64]:
-    """Number the places of positions: those within `SAME_POSITION` of each other, directly or through others, are one.
+    """Number the places of positions [N, axes], [m], in the order of the first positions [N].
 
-    Args:
-        positions: The positions [N, axes], [m].
-        group: Group of every position; positions of different groups are different places [N]; one group if None.
-
-    Returns:
-        Number of each position's place [N], in the order of the first positions.
+    Positions within `SAME_POSITION` of each other, directly or through others, are one place, unless they are of
+    different groups [N].
 
     Example:
         >>> join_positions(np.array([[1.0, 2.0], [1.0, 3.0], [1.0 + 1e-7, 2.0]])).tolist()

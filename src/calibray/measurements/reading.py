@@ -86,15 +86,7 @@ def measured_links(
 def links_from_frame(
     frame: pd.DataFrame, group: str | Sequence[str] | None = None, frequency: str | None = None
 ) -> Measurements:
-    """Links without measured values, for predictions.
-
-    Args:
-        frame: Table with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] in the scene's frame.
-        group: Column of group labels, or several columns whose labels are joined.
-        frequency: Column of carrier frequencies [Hz]; if the table lacks it, all links have the study's carrier.
-
-    Returns:
-        The links, with NaN as path loss.
+    """Links without measured values from a table with the columns of positions [m]; see `links_from_table`.
 
     Raises:
         InputError: A column is missing, or a position is not finite.

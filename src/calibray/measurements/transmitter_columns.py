@@ -182,12 +182,8 @@ POWERS: Final = (-30.0, 100.0)
 def find_angles(frame: pd.DataFrame, of_transmitters: bool) -> dict[str, str]:
     """Find the columns of azimuth, mechanical and electrical downtilt by the key of ``[links.tx_antenna]``.
 
-    A downtilt whose name states no kind is mechanical, unless the name states that it is the sum of both.
-
-    Args:
-        frame: The table.
-        of_transmitters: Whether each row is a transmitter; otherwise the names must state that the antenna is a
-            transmitter's.
+    A downtilt whose name states no kind is mechanical, unless the name states that it is the sum of both. If rows are
+    no transmitters, the names must state that the antenna is a transmitter's.
 
     Example:
         >>> frame = pd.DataFrame(columns=["Azimuth (°)", "Mechanical Downtilt (°)", "E-Tilt", "Total Tilt"])

@@ -16,18 +16,12 @@ if TYPE_CHECKING:
     from calibray.paths.selection import take as take
     from calibray.paths.selection import take_links as take_links
 
-_HOMES = {
-    "FORMAT_VERSION": "calibray.paths.file_format",
-    "Diffraction": "calibray.paths.interactions",
-    "Diffuse": "calibray.paths.interactions",
-    "Kind": "calibray.paths.interactions",
-    "Paths": "calibray.paths.program",
-    "concatenate": "calibray.paths.selection",
-    "join_links": "calibray.paths.selection",
-    "seal": "calibray.paths.file_format",
-    "take": "calibray.paths.selection",
-    "take_links": "calibray.paths.selection",
-}
-
-__all__ = sorted(_HOMES)
-__getattr__, __dir__ = lazy_attributes(__name__, _HOMES)
+__all__, __getattr__, __dir__ = lazy_attributes(
+    __name__,
+    {
+        "file_format": "FORMAT_VERSION seal",
+        "interactions": "Diffraction Diffuse Kind",
+        "program": "Paths",
+        "selection": "concatenate join_links take take_links",
+    },
+)

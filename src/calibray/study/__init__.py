@@ -10,12 +10,12 @@ if TYPE_CHECKING:
     from calibray.study.study import Study as Study
     from calibray.study.toml_file import expand as expand
 
-_HOMES = {
-    "VERSION": "calibray.study.content",
-    "Setup": "calibray.study.setup",
-    "Study": "calibray.study.study",
-    "expand": "calibray.study.toml_file",
-}
-
-__all__ = sorted(_HOMES)
-__getattr__, __dir__ = lazy_attributes(__name__, _HOMES)
+__all__, __getattr__, __dir__ = lazy_attributes(
+    __name__,
+    {
+        "content": "VERSION",
+        "setup": "Setup",
+        "study": "Study",
+        "toml_file": "expand",
+    },
+)

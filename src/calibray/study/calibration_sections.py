@@ -102,11 +102,7 @@ class ParameterSection(Section):
     spread: Literal["auto"] | Annotated[float, Field(gt=0)] | None = None
 
     def centre(self, name: str, frequency: float) -> float:
-        """The centre of the prior, in the field's unit; 1 if it is like another parameter.
-
-        Args:
-            name: The parameter.
-            frequency: The carrier [Hz].
+        """The centre of a parameter's prior at a carrier [Hz], in the field's unit; 1 if it is like another parameter.
 
         Raises:
             InputError: There is no prior, ITU-R P.2040 gives no value of this kind, or a bound or the value is not

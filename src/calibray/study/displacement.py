@@ -98,10 +98,8 @@ def displacements(
 ) -> tuple[Displacement, ...]:
     """The displacements of links, one for each axis that parameters displace them along.
 
-    Args:
-        items: The parameters.
-        links: The links. Receivers of links without measured values are exact, and not displaced.
-        columns: Columns of the names of transmitters ("tx:") and of devices ("rx:").
+    Receivers of links without measured values are exact, and not displaced. `columns` name the transmitters ("tx:")
+    and the devices ("rx:").
 
     Raises:
         InputError: A column is missing.

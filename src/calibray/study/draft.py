@@ -65,16 +65,9 @@ def draft(
     target: str | Path,
     given: Given | None = None,
 ) -> Draft:
-    """Draft a study; nothing is written.
+    """Draft a study of a scene, its XML file or `sionna:NAME`, and a table of links; nothing is written.
 
-    Args:
-        scene: Mitsuba XML file, or `sionna:NAME`.
-        links: The table of links.
-        target: The future study file; other files are named relative to its folder.
-        given: What else is known.
-
-    Returns:
-        The draft.
+    Other files are named relative to the folder of `target`, the future study file. `given` is what else is known.
 
     Raises:
         InputError: A file cannot be read, or a value is neither given nor in the files.

@@ -83,17 +83,11 @@ def with_facade_materials(
     constants: Mapping[str, Mapping[str, object]],
     frequency: float,
 ) -> Scene:
-    """The scene with the materials of facades after its own.
-
-    Args:
-        scene: The scene.
-        facades: The facades by name.
-        constants: The constants that ``[materials]`` states for them.
-        frequency: Carrier [Hz].
+    """The scene with the materials of facades after its own, with the constants that ``[materials]`` states for them.
 
     Raises:
         InputError: A facade has the name of a material, or divides one that the scene lacks; or ITU-R P.2040 has no
-            such material.
+            such material at the carrier [Hz].
     """
     materials, laws = dict(scene.materials), dict(scene.laws)
     for name, section in facades.items():
@@ -139,12 +133,7 @@ def with_facades(
 ) -> Paths:
     """The paths with the materials of facades at their interactions; if several facades apply, the first one counts.
 
-    Args:
-        paths: The paths.
-        facades: The facades by name.
-        files: Their files, resolved.
-        place: Known data of the scene.
-        materials: The materials of the scene and of the facades.
+    `files` are those of the facades, resolved; `materials` are those of the scene and of the facades.
 
     Raises:
         InputError: A file cannot be used, or there is no ground below a wall.
@@ -205,11 +194,9 @@ def _applies(
 def _walls(
     surfaces: SceneSurfaces, point: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """The wall nearest to each point in plan.
+    """The wall nearest to each point in plan: bearing [deg], place along it from west or south, 0 to 1, length [m].
 
-    Returns:
-        Compass bearing of its outward normal [n], [deg], where along it the point lies, from 0 at its western or
-        southern end to 1 [n], and its length [n], [m].
+    Each is [n]; the compass bearing is that of its outward normal.
     """
     shapely, walls = library("shapely", "scenes"), surfaces.walls
     plan = np.round(walls[:, :, :2], 6)
@@ -234,10 +221,7 @@ def _walls(
 def roughness_effects(stated: Mapping[str, float], parameters: Parameters, paths: Paths) -> Effects:
     """The loss of specular reflections on rough surfaces; none if no material is rough.
 
-    Args:
-        stated: Standard deviation of the surface heights by material, where it is stated [mm].
-        parameters: The study's parameters.
-        paths: The paths.
+    `stated` is the standard deviation of the surface heights by material [mm].
     """
     names = [parameters.names[index] for index in parameters.of_effects]
     number = {

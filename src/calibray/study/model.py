@@ -348,11 +348,8 @@ class StudyModel(StudyContent, ABC):
     def held_out(self, links: Measurements) -> NDArray[np.bool_]:
         """Mask of the held-out links [L]: none without ``[holdout]``, or if blocks are held out in turn.
 
-        Args:
-            links: Links with the columns of the hold-out's filter.
-
         Raises:
-            InputError: The filter is malformed, or selects all links or none.
+            InputError: The filter is malformed, lacks a column, or selects all links or none.
         """
         if self.holdout is None or self.holdout.where is None:
             return np.zeros(len(links), dtype=bool)

@@ -108,12 +108,7 @@ def pose_effects(
 ) -> Effects:
     """Errors of transmit antennas on paths, if parameters such as "tx:CELL.azimuth" state any.
 
-    Args:
-        study: The study.
-        mountings: The antennas of all links.
-        table: The rows of all links.
-        parameters: The parameters of a candidate.
-        paths: The paths of some links, and the indices of these links.
+    `mountings` and `table` are those of all links; `paths` are those of some links, with the indices of these links.
 
     Raises:
         InputError: The column of transmitters is missing.

@@ -106,11 +106,7 @@ class RegionSection(Section):
         return scale * (frequency / 1e6) ** exponent if self.maximum_db is None else self.maximum_db
 
     def region(self, path: Path | None, place: Place) -> Region:
-        """The region in the scene's frame.
-
-        Args:
-            path: The file, resolved.
-            place: The data of the scene that the region needs.
+        """The region in the scene's frame, from its resolved file or boxes.
 
         Raises:
             InputError: The file cannot be read or contains no polygon, a height is not a number, or the scene's
@@ -150,10 +146,7 @@ class RegionSection(Section):
 def read_polygons(path: Path, position: str, frame: Frame | None) -> tuple[NDArray[Any], dict[str, NDArray]]:
     """Polygons of a vector file in the scene's frame [n], and the columns of its table.
 
-    Args:
-        path: The file.
-        position: "geographic" if its coordinates are those of its reference system, "scene" for the scene's frame.
-        frame: Position of the scene on the globe, if known.
+    `position` is "geographic" if its coordinates are those of its reference system, "scene" for the scene's frame.
 
     Raises:
         InputError: The file cannot be read or contains no polygon, or the scene's position on the globe is unknown.
@@ -223,15 +216,7 @@ def region_effects(
     paths: Paths,
     frequency: float,
 ) -> Effects:
-    """The extra loss of paths through regions.
-
-    Args:
-        sections: The sections by name.
-        regions: Their polygons by name.
-        parameters: The study's parameters.
-        paths: The paths.
-        frequency: The study's carrier [Hz], at which specific attenuations are stated.
-    """
+    """The extra loss of paths through regions; `frequency` [Hz] is the carrier of specific attenuations."""
     # JAX is slow to import, and every study file that is read imports this module.
     from calibray.fields import ExtraLoss
 

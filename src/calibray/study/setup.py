@@ -155,9 +155,7 @@ class Setup:
     def effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
         """Effects on paths that are not material constants: wrong directions of antennas, regions, and rough surfaces.
 
-        Args:
-            paths: The paths of some links.
-            links: Indices of these links among all links; all links if None.
+        `links` are the indices of the paths' links among all links; all if None.
         """
         effects = self._pose_and_region_effects(paths, links)
         return effects + self._displacement_effects(paths, effects)
@@ -319,13 +317,7 @@ class Setup:
         """The paths of the links, from the cache if they were traced before, or from the ray table of the study.
 
         A program that answers with rays is called once. Links that differ only in their carrier are traced once.
-
-        Args:
-            materials: Constants in place of the scene's, by material name.
-            progress: Called with "tracing" after every launch.
-
-        Returns:
-            The path program.
+        `materials` replace the scene's by name; `progress` is called with "tracing" after every launch.
 
         Raises:
             InputError: The tracer cannot be used, or the scene lacks a material.

@@ -48,11 +48,7 @@ def read_content(path: Path) -> dict[str, Any]:
 
 
 def study_text(content: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
-    """The text of a study file, with reasons of assumptions as comments.
-
-    Args:
-        content: The sections of the study.
-        reasons: Reasons by the dotted name of a section or key.
+    """The text of a study file, with reasons of assumptions, by the dotted name of a section or key, as comments.
 
     Raises:
         InputError: A name has characters that TOML cannot contain.

@@ -9,11 +9,10 @@ if TYPE_CHECKING:
     from calibray.support.cache_folder import Store as Store
     from calibray.support.output_files import SIGNATURES as SIGNATURES
 
-_HOMES = {
-    "CACHE_VARIABLE": "calibray.support.cache_folder",
-    "SIGNATURES": "calibray.support.output_files",
-    "Store": "calibray.support.cache_folder",
-}
-
-__all__ = sorted(_HOMES)
-__getattr__, __dir__ = lazy_attributes(__name__, _HOMES)
+__all__, __getattr__, __dir__ = lazy_attributes(
+    __name__,
+    {
+        "cache_folder": "CACHE_VARIABLE Store",
+        "output_files": "SIGNATURES",
+    },
+)

@@ -14,18 +14,19 @@ from calibray.support.messages import first_line
 
 
 def lazy_attributes(
-    package: str, homes: Mapping[str, str]
-) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Make `__getattr__` and `__dir__` of a package (PEP 562), given the module that defines each name.
+    package: str, modules: Mapping[str, str]
+) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
+    """Make `__all__`, `__getattr__` and `__dir__` of a package (PEP 562) from the names that its modules define.
 
-    For a submodule, this is its own full name.
+    The names of a module are words of one text; a name without words is the module itself.
     """
+    homes = {name: module for module, words in modules.items() for name in words.split() or [module]}
 
     def find(name: str) -> Any:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module = import_module(homes[name])
-        value = module if homes[name] == f"{package}.{name}" else getattr(module, name)
+        module = import_module(f"{package}.{homes[name]}")
+        value = getattr(module, name) if modules[homes[name]] else module
         # Set as an attribute, so that Python does not call this function again.
         setattr(sys.modules[package], name, value)
         return value
@@ -33,7 +34,7 @@ def lazy_attributes(
     def names() -> list[str]:
         return sorted({*vars(sys.modules[package]), *homes})
 
-    return find, names
+    return sorted(homes), find, names
 
 
 def library(name: str, extra: str) -> ModuleType:

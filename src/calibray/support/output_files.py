@@ -18,13 +18,10 @@ import uuid
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Final, NoReturn
+from typing import BinaryIO, Final, NoReturn
 
 from calibray.errors import InputError
 from calibray.support.messages import shortened
-
-if TYPE_CHECKING:
-    pass
 
 PARTIAL: Final = ".part"  # end of the name of an unfinished file
 SIGNATURES: Final = ".calibray"  # a line per file written, its SHA-256 and its name; only appended to

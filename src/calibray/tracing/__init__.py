@@ -25,23 +25,15 @@ if TYPE_CHECKING:
     from calibray.tracing.trace_plan import TracePlan as TracePlan
     from calibray.tracing.trace_plan import plan_trace as plan_trace
 
-_HOMES = {
-    "Antenna": "calibray.tracing.settings",
-    "AntennaPattern": "calibray.tracing.antennas",
-    "Convergence": "calibray.tracing.convergence",
-    "EnclosedAntennas": "calibray.tracing.antennas",
-    "Links": "calibray.tracing.protocol",
-    "SIONNA": "calibray.tracing.default_tracer",
-    "Solution": "calibray.tracing.protocol",
-    "TracePlan": "calibray.tracing.trace_plan",
-    "TraceSettings": "calibray.tracing.settings",
-    "Tracer": "calibray.tracing.protocol",
-    "TracerFactory": "calibray.tracing.protocol",
-    "compile_paths": "calibray.tracing.protocol",
-    "link_positions": "calibray.tracing.antennas",
-    "plan_trace": "calibray.tracing.trace_plan",
-    "read_gain_table": "calibray.tracing.gain_table",
-}
-
-__all__ = sorted(_HOMES)
-__getattr__, __dir__ = lazy_attributes(__name__, _HOMES)
+__all__, __getattr__, __dir__ = lazy_attributes(
+    __name__,
+    {
+        "antennas": "AntennaPattern",
+        "convergence": "Convergence",
+        "default_tracer": "SIONNA",
+        "gain_table": "read_gain_table",
+        "protocol": "EnclosedAntennas Links Solution Tracer TracerFactory compile_paths link_positions",
+        "settings": "Antenna TraceSettings",
+        "trace_plan": "TracePlan plan_trace",
+    },
+)

@@ -126,15 +126,10 @@ class Messages:
 
 
 def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
-    """The map of a study, or of a scene if there is no study.
+    """The map of a study, or of a scene of the folder if there is no study.
 
-    Args:
-        folder: The study's folder.
-        scene: A scene of the folder, relative to it.
-
-    Returns:
-        `west`, `north` [m] and `scale` [1/m] of the outlines, `buildings` and `walls` as data of SVG paths; `links`,
-        each with x, y [m], path loss [dB] and 1 where it is suspicious; `transmitters`, x, y, z [m].
+    `west`, `north` [m] and `scale` [1/m] of the outlines, `buildings` and `walls` as data of SVG paths; `links`, each
+    with x, y [m], path loss [dB] and 1 where it is suspicious; `transmitters`, x, y, z [m].
 
     Raises:
         InputError: The scene or the links cannot be read.

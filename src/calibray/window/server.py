@@ -27,12 +27,7 @@ SHOWN = ("report.html", "map.png")
 
 
 def serve(folder: Path, port: int, opened: Callable[[str], None]) -> None:
-    """Show a study's folder until Ctrl-C.
-
-    Args:
-        folder: The folder.
-        port: The port; 0 for a free one.
-        opened: It is called with the address when the port is open.
+    """Show a study's folder until Ctrl-C; port 0 is a free one. `opened` is called with the address.
 
     Raises:
         InputError: The port is in use.
@@ -129,13 +124,7 @@ HEADERS: Final = (
 
 @final
 class Guard:
-    """An ASGI application that refuses requests before they reach another one.
-
-    Args:
-        app: The application.
-        token: The secret of this session.
-        port: The port that the server listens on.
-    """
+    """An ASGI application that refuses requests, to the port of the server, before they reach another one."""
 
     def __init__(self, app: Any, token: str, port: int) -> None:
         self._app, self._token, self._port = app, token.encode(), port

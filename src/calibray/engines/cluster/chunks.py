@@ -59,9 +59,7 @@ _LATEST: Final[deque[Shared[Any]]] = deque(maxlen=1)
 class Shared(Generic[Content]):
     """Content that all chunks share, for instance an opened study; a process unpacks it once.
 
-    Args:
-        content: The content. If the content is an opened study, few of its links suffice, because each chunk has its
-            own.
+    If the content is an opened study, few of its links suffice, because each chunk has its own.
     """
 
     def __init__(self, content: Content) -> None:
@@ -243,11 +241,7 @@ class ChunkRecipe:
 
 @final
 class Chunk:
-    """Links that are traced and replayed together. Pickling a chunk sends its recipe instead of its paths.
-
-    Args:
-        recipe: What it is made from.
-    """
+    """Links that are traced and replayed together. Pickling a chunk sends its recipe instead of its paths."""
 
     def __init__(self, recipe: ChunkRecipe) -> None:
         self._recipe = recipe

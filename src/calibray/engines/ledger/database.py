@@ -117,10 +117,7 @@ _COLUMNS: Final = {
 
 
 def check_own_file(path: Path) -> None:
-    """Refuse a ledger whose path leads to another file, because SQLite would write to that file.
-
-    Args:
-        path: The SQLite file, which need not exist.
+    """Refuse a ledger whose path, which need not exist, leads to another file: SQLite would write to that file.
 
     Raises:
         InputError: The file, or a file that SQLite keeps next to it, is a link, a folder, a device or a FIFO, or has

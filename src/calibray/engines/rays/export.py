@@ -77,10 +77,6 @@ class Export:
 class Exporting:
     """An engine that answers with rays and stores them, so that it is called once for each candidate.
 
-    Args:
-        engine: The engine.
-        study: The opened study.
-
     Attributes:
         parameters: The parameters whose values a candidate contains.
         materials: The scene's materials before calibration.

@@ -35,19 +35,18 @@ if TYPE_CHECKING:
     from calibray.scenes.authoring.trees import read_trees as read_trees
     from calibray.scenes.authoring.wall_faces import merge_faces as merge_faces
 
-_MODULES = {
-    "building_scene": ("make_scene",),
-    "extrusion": ("Windows",),
-    "floor_plan": ("Segment", "read_plan"),
-    "floor_plan_scene": ("WALL_THICKNESS", "make_plan_scene"),
-    "footprint_files": ("FootprintColumns", "read_footprints", "read_openstreetmap"),
-    "footprints": ("WIDEST", "Footprints", "HeightRule", "HeightSource", "clean_footprints"),
-    "made_scene": ("SCENE_FILES", "MadeScene", "Palette", "SurfaceMaterial", "material_name"),
-    "terrain": ("Terrain", "lower_origin", "read_terrain"),
-    "trees": ("TREES_FILE", "Trees", "read_trees"),
-    "wall_faces": ("merge_faces",),
-}
-_HOMES = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
-
-__all__ = sorted(_HOMES)
-__getattr__, __dir__ = lazy_attributes(__name__, _HOMES)
+__all__, __getattr__, __dir__ = lazy_attributes(
+    __name__,
+    {
+        "building_scene": "make_scene",
+        "extrusion": "Windows",
+        "floor_plan": "Segment read_plan",
+        "floor_plan_scene": "WALL_THICKNESS make_plan_scene",
+        "footprint_files": "FootprintColumns read_footprints read_openstreetmap",
+        "footprints": "WIDEST Footprints HeightRule HeightSource clean_footprints",
+        "made_scene": "SCENE_FILES MadeScene Palette SurfaceMaterial material_name",
+        "terrain": "Terrain lower_origin read_terrain",
+        "trees": "TREES_FILE Trees read_trees",
+        "wall_faces": "merge_faces",
+    },
+)

@@ -42,13 +42,8 @@ def read_openstreetmap(
 ) -> tuple[Footprints, Frame]:
     """Read the buildings of an extract: closed ways and multipolygon relations tagged `building` or `building:part`.
 
-    Args:
-        path: The extract, .osm or .osm.pbf.
-        frame: The scene's frame; by default a local frame centred on the buildings.
-        rule: Assumptions for heights that are not given.
-
-    Returns:
-        The footprints, and their frame.
+    Returns the footprints and their frame, by default a local one centred on the buildings. `rule` states the heights
+    that the map does not.
 
     Raises:
         InputError: The file does not exist, is not an extract or contains no building, or pyosmium is not installed.

@@ -82,12 +82,7 @@ class SequenceCache:
 
 
 class SourceSequences:
-    """The interaction sequences that rays from one source find, launch by launch.
-
-    Args:
-        solver: The solver.
-        source: The position [3], [m].
-    """
+    """The interaction sequences that rays from one source [3], [m], find, launch by launch."""
 
     def __init__(self, solver: Solver, source: NDArray[np.float64]) -> None:
         self.meshes = Meshes(solver.mitsuba_scene)

@@ -46,11 +46,7 @@ PAIRS_PER_BATCH: Final = 8_000_000
 
 
 class Surfaces:
-    """Triangles of a scene, grouped by their planes.
-
-    Args:
-        corner: Corners of the triangles [T, 3, 3], [m].
-    """
+    """Triangles of a scene, grouped by their planes; corners are [T, 3, 3], [m]."""
 
     def __init__(self, corner: NDArray[np.float64]) -> None:
         cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
@@ -175,11 +171,7 @@ def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class Unobstructed:
-    """A scene in which nothing hides a receiver from the points that rays hit.
-
-    Args:
-        scene: Mitsuba's scene.
-    """
+    """A scene of Mitsuba in which nothing hides a receiver from the points that rays hit."""
 
     def __init__(self, scene: Any) -> None:
         self.ray_intersect = scene.ray_intersect
@@ -191,9 +183,6 @@ class Unobstructed:
 
 class Meshes:
     """The triangles of a scene in Mitsuba's memory.
-
-    Args:
-        scene: Mitsuba's scene.
 
     Raises:
         InputError: A shape does not consist of triangles.
