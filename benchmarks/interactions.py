@@ -22,6 +22,7 @@ from scipy.constants import speed_of_light
 
 from calibray import Material
 from calibray.engines import Replay
+from calibray.engines.replay import Computation
 from calibray.fields import compiled, layout
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Diffuse, Kind, Paths
@@ -127,7 +128,7 @@ def measure_compiling() -> None:
     for size in (60, 120, 300, 960):
         for small, name in ((0, "to run fast"), (size, "fast")):
             compiled.SMALL = small
-            engine = Replay(program(size, False), chosen, dtype=np.float64)
+            engine = Replay(program(size, False), chosen, computation=Computation(np.float64))
             started = time.process_time()
             engine.path_loss(points), engine.path_loss_and_jacobian(points)
             compiling = time.process_time() - started
@@ -144,7 +145,7 @@ def measure(paths: Paths, kind: str) -> None:
     unit = np.random.default_rng(1).random((8, len(chosen)))
     points = chosen.lower + unit * (chosen.upper - chosen.lower)
     turn = iter(np.tile(points, (1000, 1)))
-    engine = Replay(paths, chosen, dtype=np.float32, tabulate=True)
+    engine = Replay(paths, chosen, computation=Computation(np.float32, True))
     repeats = max(5, min(100, 10_000_000 // paths.num_interactions))
     value = seconds(lambda: engine.path_loss(next(turn)[None]), repeats)
     slope = seconds(lambda: engine.path_loss_and_jacobian(next(turn)[None]), repeats)
@@ -152,7 +153,7 @@ def measure(paths: Paths, kind: str) -> None:
     tabulated = engine.path_loss(points[:1])
     formula, difference = float("nan"), float("nan")
     if paths.num_interactions <= 1_000_000:
-        rival = Replay(paths, chosen, dtype=np.float32, tabulate=False)
+        rival = Replay(paths, chosen, computation=Computation(np.float32, False))
         formula = seconds(lambda: rival.path_loss(next(turn)[None]), max(3, repeats // 5))
         difference = np.abs(rival.path_loss(points[:1]) - tabulated).max()
     per = 1e9 / paths.num_interactions

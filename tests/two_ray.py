@@ -20,7 +20,7 @@ from calibray.scenes import Scene, read_scene
 from calibray.study import Study
 from calibray.support.progress import Progress
 from calibray.tracing.antennas import AntennaPattern
-from calibray.tracing.protocol import Links, Solution, compile_paths, link_positions
+from calibray.tracing.protocol import LinkPositions, Links, Solution, compile_paths, link_positions
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.trace_plan import TracePlan, plan_trace
 from small_scenes import write_scene
@@ -76,7 +76,7 @@ class TwoRay:
         if progress is not None:
             progress("tracing", count, count)
         return compile_paths(
-            chains, np.tile(np.arange(count), 2), tx, rx, frequency=self.frequency,
+            chains, np.tile(np.arange(count), 2), LinkPositions(tx, rx), frequency=self.frequency,
             materials={**self.scene.materials, **(materials or {})},
             antennas=(AntennaPattern.of(self.tx_antenna), AntennaPattern.of(self.rx_antenna)),
         )  # fmt: skip

@@ -368,9 +368,7 @@ def _paths(
 ) -> Paths:
     """The paths of links, from the cache if they were traced before."""
     scene = read_scene(file, frequency, materials)
-    digest = cache.trace_digest(
-        SIONNA.versions, scene, frequency, settings, (antenna, antenna), links.tx, links.rx
-    )
+    digest = cache.trace_digest(SIONNA.versions, scene, frequency, settings, (antenna, antenna), links)
     paths = cache.load_trace(digest)
     if paths is None:
         paths = SIONNA(scene, frequency, settings, antenna, antenna).trace(links)

@@ -10,6 +10,7 @@ import pytest
 import synthetic
 from calibray.engines import Replay
 from calibray.engines.compression import MIN_PATHS, compress, sparse_weights, strongest
+from calibray.engines.replay import Computation
 from calibray.errors import InputError
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Kind, Paths, take
@@ -52,7 +53,9 @@ def test_path_loss_stays_within_the_tolerance_at_fresh_candidates(paths, paramet
     unit = np.random.default_rng(99).random((200, 3))
     unit[100:] = np.where(np.random.default_rng(98).random((100, 3)) < 0.5, unit[100:].round(), unit[100:])
     candidates = parameters.from_unit(unit)
-    full, few = (Replay(some, parameters, dtype=np.float64) for some in (paths, compressed.paths))
+    full, few = (
+        Replay(some, parameters, computation=Computation(np.float64)) for some in (paths, compressed.paths)
+    )
     gap = np.abs(full.path_loss(candidates) - few.path_loss(candidates))
     assert gap.max() <= TOLERANCE_DB
     assert (compressed.error_db[:2] > 0).all()  # the error is measured
@@ -76,7 +79,7 @@ def test_without_weights_the_same_paths_would_not_do(paths, parameters, compress
     """The negative control: what is kept matters by its weights."""
     plain = replace(compressed.paths, spreading=np.full(compressed.paths.num_paths, 0.02))
     candidates = parameters.from_unit(np.random.default_rng(3).random((20, 3)))
-    full, few = (Replay(some, parameters, dtype=np.float64) for some in (paths, plain))
+    full, few = (Replay(some, parameters, computation=Computation(np.float64)) for some in (paths, plain))
     gap = full.path_loss(candidates)[:, :2] - few.path_loss(candidates)[:, :2]
     assert np.ptp(gap, axis=0).min() > 10 * TOLERANCE_DB  # not even up to a constant
 
@@ -111,11 +114,16 @@ def test_paths_left_out_carry_less_than_their_share(paths, parameters) -> None:
     assert kept.num_paths < 0.95 * paths.num_paths
     assert kept.num_links == paths.num_links
     candidates = parameters.from_unit(np.random.default_rng(4).random((50, 3)))
-    full, fewer = (Replay(some, parameters, dtype=np.float64).path_loss(candidates) for some in (paths, kept))
+    full, fewer = (
+        Replay(some, parameters, computation=Computation(np.float64)).path_loss(candidates)
+        for some in (paths, kept)
+    )
     loss_db = fewer - full
     assert loss_db.min() >= -1e-9
     assert loss_db.max() < -10 * np.log10(1 - share)
     assert np.mean(loss_db) < 0.05
     # Without a share to lose, only paths without power go.
     every = strongest(paths, parameters, 0.0)
-    assert Replay(every, parameters, dtype=np.float64).path_loss(candidates) == pytest.approx(full, abs=1e-9)
+    assert Replay(every, parameters, computation=Computation(np.float64)).path_loss(
+        candidates
+    ) == pytest.approx(full, abs=1e-9)

@@ -8,6 +8,7 @@ import pytest
 import planted
 from calibray import engines
 from calibray.engines import Engine, Replay, Retrace
+from calibray.engines.replay import Computation
 from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.scenarios import demo_study_path
@@ -104,7 +105,7 @@ def test_a_link_without_a_path_is_infinitely_lossy_and_has_no_slope():
 
 def test_single_precision_is_within_a_hundredth_of_a_decibel():
     replay = planted.engine()
-    single = Replay(replay.paths, replay.parameters, dtype=np.float32)
+    single = Replay(replay.paths, replay.parameters, computation=Computation(np.float32))
     assert single.path_loss(TRUTH) == pytest.approx(replay.path_loss(TRUTH), abs=0.01)
     assert (single.path_loss(TRUTH) != replay.path_loss(TRUTH)).any()
 

@@ -13,6 +13,7 @@ from scipy.constants import speed_of_light
 import reference_fields
 import synthetic
 from calibray.engines import Replay
+from calibray.engines.replay import Computation
 from calibray.fields import FINEST, layout, path_losses, program, table_intervals
 from calibray.fields.coefficient_tables import (
     COARSEST,
@@ -121,14 +122,16 @@ def candidates(parameters: Parameters) -> np.ndarray:
 @pytest.fixture(scope="module")
 def exact(paths: Paths, parameters: Parameters, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Path loss and derivatives by the formula."""
-    return Replay(paths, parameters, dtype=np.float64, tabulate=False).path_loss_and_jacobian(candidates)
+    return Replay(paths, parameters, computation=Computation(np.float64, False)).path_loss_and_jacobian(
+        candidates
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_replay_with_tables_equals_replay_with_the_formula(
     paths: Paths, parameters: Parameters, candidates: np.ndarray, exact: tuple, dtype: type
 ) -> None:
-    engine = Replay(paths, parameters, dtype=dtype, tabulate=True)
+    engine = Replay(paths, parameters, computation=Computation(dtype, True))
     loss, slope = engine.path_loss_and_jacobian(candidates)
     np.testing.assert_allclose(loss, exact[0], atol=2e-3)
     scale = np.abs(exact[1]).max(axis=(0, 1))
@@ -145,12 +148,12 @@ def test_a_table_that_is_too_coarse_is_refined(parameters: Parameters) -> None:
         frequency=FREQUENCY,
     )
     thick = np.array([[11.0, 0.5, 0.0, 0.3]])  # the narrowest resonances
-    engine = Replay(paths, parameters, dtype=np.float64, tabulate=True)
+    engine = Replay(paths, parameters, computation=Computation(np.float64, True))
     _, error = path_losses(
         layout(paths, np.float64, 256).program, parameters.constants_of(thick, paths.materials)
     )
     assert error > TOLERANCE
-    exact = Replay(paths, parameters, dtype=np.float64, tabulate=False)
+    exact = Replay(paths, parameters, computation=Computation(np.float64, False))
     np.testing.assert_allclose(engine.path_loss(thick), exact.path_loss(thick), atol=5e-3)
 
 

@@ -13,6 +13,7 @@ import pytest
 
 import synthetic
 from calibray.engines import Replay
+from calibray.engines.replay import Computation
 from calibray.fields import layout, program_path_loss
 from calibray.materials import BOUNDS, FIELDS, Material
 from calibray.parameters import Parameter, Parameters
@@ -43,7 +44,7 @@ def paths() -> Paths:
 
 @pytest.fixture(scope="module")
 def engine(paths: Paths) -> Replay:
-    return Replay(paths, all_parameters(paths), dtype=np.float64)
+    return Replay(paths, all_parameters(paths), computation=Computation(np.float64))
 
 
 def all_parameters(paths: Paths) -> Parameters:
@@ -92,7 +93,7 @@ def test_jacobian_of_combined_fields_equals_central_differences(combining: str) 
     paths = synthetic.program(
         [(Kind.SPECULAR,), (Kind.DIFFUSE,)] * 6, seed=3, ports=(2, 1), materials=synthetic.LAMBERTIAN
     )
-    engine = Replay(paths, all_parameters(paths), combining, BANDWIDTH, dtype=np.float64)
+    engine = Replay(paths, all_parameters(paths), combining, BANDWIDTH, computation=Computation(np.float64))
     at = engine.parameters.start
     _, jacobian = engine.path_loss_and_jacobian(at[None])
     expected = central_differences(lambda points: engine.path_loss_and_jacobian(points)[0], at)
@@ -113,7 +114,9 @@ def test_forward_mode_through_the_pure_function_equals_the_engine() -> None:
     step = np.random.default_rng(1).normal(size=len(parameters))
     direction = np.zeros(table.shape)
     direction[rows, columns] = step
-    _, jacobian = Replay(paths, parameters, dtype=np.float64).path_loss_and_jacobian(parameters.start[None])
+    _, jacobian = Replay(paths, parameters, computation=Computation(np.float64)).path_loss_and_jacobian(
+        parameters.start[None]
+    )
     np.testing.assert_allclose(rate(direction), jacobian[0] @ step, rtol=1e-9)
     # exponents of patterns that have none
     unused = np.ones(table.shape)
@@ -136,7 +139,9 @@ EDGES = {
 def test_derivatives_are_finite_at_the_edges_of_physics(paths: Paths, edge: str) -> None:
     cosine = paths.cos_incidence.copy()
     cosine[::5], cosine[1::5] = 1.0, 1e-6  # normal and grazing incidence as well
-    engine = Replay(replace(paths, cos_incidence=cosine), all_parameters(paths), dtype=np.float64)
+    engine = Replay(
+        replace(paths, cos_incidence=cosine), all_parameters(paths), computation=Computation(np.float64)
+    )
     candidate = [EDGES[edge].get(parameter.field, parameter.start) for parameter in engine.parameters]
     loss, jacobian = engine.path_loss_and_jacobian(np.array([candidate]))
     assert np.isfinite(loss[0, 0])

@@ -27,9 +27,10 @@ from calibray.materials import Material
 from calibray.reporting.export import FILES, export, matlab
 from calibray.reporting.wording import sampling_text
 from calibray.scenes import export_scene, read_scene
-from calibray.scenes.export import exported_names
+from calibray.tracing.protocol import LinkPositions
 from calibray.tracing.settings import Antenna, TraceSettings
-from calibray.tracing.sionna.exported import LinkPositions, verify_export
+from calibray.tracing.sionna import Tracer
+from calibray.tracing.sionna.exported import verify_export
 from changed import changed
 from small_scenes import block, write_scene
 
@@ -209,24 +210,14 @@ def test_any_name_of_a_material_or_an_object_is_exported_as_one_that_sionna_load
     wall.set("id", f"mesh-{name}.wall")
     ElementTree.ElementTree(root).write(file)
     scene = read_scene(file, 2e9)
-    names = exported_names(scene.materials)
     export_scene(scene, scene.materials, tmp_path / "out" / "scene.xml", copy_meshes=True)
-    verify(scene, names, tmp_path / "out" / "scene.xml")
+    verify(scene, tmp_path / "out" / "scene.xml")
 
 
-def verify(scene, names, target):
+def verify(scene, target):
     links = LinkPositions(np.array([[0.0, 0, 2.0]]), np.array([[2.0, 1.0, 1.5]]))
-    antennas = Antenna(), Antenna()
-    verify_export(
-        scene,
-        scene.materials,
-        names,
-        target,
-        frequency=2e9,
-        settings=TraceSettings(),
-        antennas=antennas,
-        links=links,
-    )
+    tracer = Tracer(scene, 2e9, TraceSettings(), Antenna(), Antenna())
+    verify_export(tracer, scene.materials, target, links)
 
 
 def test_an_export_that_sionna_loads_otherwise_is_refused(tmp_path):
@@ -234,7 +225,7 @@ def test_an_export_that_sionna_loads_otherwise_is_refused(tmp_path):
     scene = read_scene(write_scene(tmp_path / "in", blocks), 2e9)
     target = tmp_path / "out.xml"
     export_scene(scene, scene.materials, target)
-    verify(scene, {"stone": "stone"}, target)
+    verify(scene, target)
     sound = target.read_text()
     for old, new, message in (
         (
@@ -260,4 +251,4 @@ def test_an_export_that_sionna_loads_otherwise_is_refused(tmp_path):
         assert old in sound
         target.write_text(sound.replace(old, new))
         with pytest.raises(InputError, match=f"is not the calibrated scene: .*{message}"):
-            verify(scene, {"stone": "stone"}, target)
+            verify(scene, target)

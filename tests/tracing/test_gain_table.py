@@ -270,7 +270,7 @@ def digests(study: Study) -> tuple[str, str]:
     """The digest of the trace and the fingerprint of a study's RT calls."""
     setup = study.opened()
     scene, links = setup.scene, setup.links
-    trace = cache.trace_digest({}, scene, FREQUENCY, study.trace, study.antenna_pair, links.tx, links.rx)
+    trace = cache.trace_digest({}, scene, FREQUENCY, study.trace, study.antenna_pair, links)
     return trace, fingerprint(setup)
 
 

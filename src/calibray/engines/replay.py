@@ -43,6 +43,22 @@ OBSERVED_SIZE: Final = 64
 """Largest number of candidates in one call of a function of further observables, which is compiled for this number."""
 
 
+@dataclass(frozen=True)
+class Computation:
+    """How stored paths are evaluated.
+
+    Attributes:
+        dtype: Precision, `numpy.float64` or `numpy.float32`; if None, single precision for large programs whose paths
+            combine by power.
+        tabulate: Whether coefficients come from tables; if None, whenever that is faster.
+        batch: Largest number of candidates in one call; the program is compiled for this number.
+    """
+
+    dtype: type | None = None
+    tabulate: bool | None = None
+    batch: int = BATCH
+
+
 @final
 class Replay:
     """Stored paths, evaluated for any candidate.
@@ -52,11 +68,8 @@ class Replay:
         parameters: The parameters whose values a candidate contains.
         combining: How a link's paths combine: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
-        dtype: Precision, `numpy.float64` or `numpy.float32`; if None, single precision for large programs whose paths
-            combine by power.
-        tabulate: Whether coefficients come from tables; if None, whenever that is faster.
-        batch: Largest number of candidates in one call; the program is compiled for this number.
         effects: Effects on the paths, in the order of `paths`.
+        computation: Precision and speed.
 
     Raises:
         InputError: A parameter's material is not in the paths, or this kind of combining cannot be used.
@@ -68,16 +81,16 @@ class Replay:
         parameters: Parameters,
         combining: str = "power",
         bandwidth: float | None = None,
-        dtype: type | None = None,
-        tabulate: bool | None = None,
-        batch: int = BATCH,
         effects: fields.Effects = (),
+        computation: Computation | None = None,
     ) -> None:
+        computation = computation or Computation()
+        dtype, tabulate = computation.dtype, computation.tabulate
         self.paths, self.parameters, self.materials, self.calls = paths, parameters, dict(paths.materials), 0
         self.effects, self._options = effects, (combining, bandwidth)
         if dtype is None:
             dtype = np.float32 if self.large and combining == "power" else np.float64
-        self._dtype, self._batch = dtype, batch
+        self._dtype, self._batch = dtype, computation.batch
         self._combining = fields.Combining.make(combining, paths.link, paths.delay, bandwidth)
         # Row (material) and column (constant) of each parameter in the table of constants. Derivatives are computed for
         # the columns that occur, and then picked for each parameter.

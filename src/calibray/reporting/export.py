@@ -23,6 +23,7 @@ from calibray.scenes.export import exported_names
 from calibray.support.messages import printable
 from calibray.support.output_files import check_outputs, write_text
 from calibray.support.output_tables import csv_text
+from calibray.tracing.protocol import LinkPositions
 from calibray.tracing.settings import TraceSettings
 
 FILES: Final = (
@@ -109,20 +110,13 @@ def export(
 def _verify(scene: Scene, result: Record, target: Path, links: Survey) -> None:
     """Load the written scene in the same way as the user, and compare it with the calibrated one."""
     # Sionna RT takes seconds to import.
-    from calibray.tracing.sionna.exported import LinkPositions, verify_export
+    from calibray.tracing.sionna import Tracer
+    from calibray.tracing.sionna.exported import verify_export
 
     study = result.study
     few = np.unique(np.linspace(0, len(links.tx) - 1, VERIFIED_LINKS).astype(int))
-    verify_export(
-        scene,
-        result.scene_materials,
-        exported_names(result.scene_materials),
-        target,
-        frequency=study.scene.frequency,
-        settings=study.trace,
-        antennas=study.antenna_pair,
-        links=LinkPositions(links.tx[few], links.rx[few]),
-    )
+    tracer = Tracer(scene, study.scene.frequency, study.trace, *study.antenna_pair)
+    verify_export(tracer, result.scene_materials, target, LinkPositions(links.tx[few], links.rx[few]))
 
 
 def _links(result: Record) -> pd.DataFrame:

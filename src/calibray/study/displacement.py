@@ -150,8 +150,7 @@ def check_labels(
 
 def displacement_loss(
     displacements: Sequence[Displacement],
-    parameters: Parameters,
-    values: NDArray[np.float64],
+    placed: tuple[Parameters, NDArray[np.float64]],
     neighbours: Sequence[float],
     links: Measurements,
     here: tuple[Paths, Effects],
@@ -161,21 +160,21 @@ def displacement_loss(
 
     Args:
         displacements: The K displacements.
-        parameters: The study's parameters.
-        values: Their values at which the paths are traced [d].
+        placed: The study's parameters, and their values at which the paths are traced [d].
         neighbours: Distances of the n neighbours on each side, as shares of the largest displacement, ascending.
         links: The L links at these values.
         here: Their paths, and other effects on them.
         traced: Gives the same of displaced links, which may be fewer or more than these.
     """
     # JAX is slow to import, and every study file that is read imports this module.
-    from calibray.engines.replay import Replay
+    from calibray.engines.replay import Computation, Replay
     from calibray.fields import DisplacementLoss
 
+    (parameters, values), single = placed, Computation(batch=1)
     materials = parameters.materials(values, here[0].materials)
 
     def path_loss_db(paths: Paths, effects: Effects) -> NDArray[np.float64]:
-        replay = Replay(replace(paths, materials=materials), parameters, batch=1, effects=effects)
+        replay = Replay(replace(paths, materials=materials), parameters, effects=effects, computation=single)
         return replay.path_loss(values[None])[0]
 
     knots = np.array([each.knots(values, neighbours) for each in displacements])  # [K, 2n + 1, L]

@@ -211,16 +211,10 @@ class Setup:
             paths = moved._mounted(moved._trace_links(links, self.scene, None), self.scene)
             return paths, moved._pose_and_region_effects(paths)
 
-        loss = displacement_loss(
-            self._displacements,
-            self.parameters,
-            self._placed,
-            self.neighbours,
-            self._links_in_place,
-            (paths, others),
-            traced,
+        placed, links = (self.parameters, self._placed), self._links_in_place
+        return (
+            displacement_loss(self._displacements, placed, self.neighbours, links, (paths, others), traced),
         )
-        return (loss,)
 
     @property
     def radio(self) -> RadioSettings:
@@ -398,13 +392,7 @@ class Setup:
     def _trace(self, links: Measurements, scene: Scene, progress: Progress | None) -> Paths:
         study, scene = self.study, without_facade_materials(scene, self.study.facades)
         digest = cache.trace_digest(
-            self.factory.versions,
-            scene,
-            study.scene.frequency,
-            study.trace,
-            study.antenna_pair,
-            links.tx,
-            links.rx,
+            self.factory.versions, scene, study.scene.frequency, study.trace, study.antenna_pair, links
         )
         paths = cache.load_trace(digest)
         if paths is None:

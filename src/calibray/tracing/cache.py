@@ -21,12 +21,12 @@ from typing import Final
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.paths import FORMAT_VERSION, Paths
 from calibray.scenes import Scene
 from calibray.support.cache_folder import cache_folder
+from calibray.tracing.protocol import Links
 from calibray.tracing.settings import Antenna, TraceSettings
 
 _FILE_NAME: Final = re.compile(r"[0-9a-f]{64}\.h5")
@@ -40,8 +40,7 @@ def trace_digest(
     frequency: float,
     settings: TraceSettings,
     antennas: tuple[Antenna, Antenna],
-    tx: NDArray[np.float64],
-    rx: NDArray[np.float64],
+    links: Links,
 ) -> str:
     """Fingerprint (SHA-256, in hexadecimal) of everything that determines a trace.
 
@@ -61,7 +60,7 @@ def trace_digest(
     digest.update(scene.xml.encode())
     for mesh in mesh_files(scene):
         digest.update(mesh.read_bytes())
-    for position in (tx, rx):
+    for position in (links.tx, links.rx):
         digest.update(np.ascontiguousarray(position, dtype=np.float64).tobytes())
     return digest.hexdigest()
 

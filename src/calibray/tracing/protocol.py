@@ -35,6 +35,19 @@ class Links(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class LinkPositions:
+    """The ends of links.
+
+    Attributes:
+        tx: Transmitters [L, 3], [m].
+        rx: Receivers [L, 3], [m].
+    """
+
+    tx: NDArray[np.float64]
+    rx: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
 class Solution:
     """Path gains of links from the tracer's own field computation.
 
@@ -141,18 +154,16 @@ class TracerFactory(Protocol):
 def compile_paths(
     chains: Chains,
     link: NDArray[np.integer],
-    tx: NDArray[np.float64],
-    rx: NDArray[np.float64],
+    ends: Links,
     *,
     frequency: float,
     materials: Mapping[str, Material],
     antennas: tuple[AntennaPattern, AntennaPattern],
-    settings: Mapping[str, object] | None = None,
 ) -> Paths:
     """Compile the paths that a tracer found, in any order, into a path program.
 
-    Materials are in the order of the material numbers of `chains`; `link` [P] is the link of every path; `tx` and `rx`
-    are [L, 3], [m]. The program's paths are ordered by link, and within a link as given.
+    Materials are in the order of the material numbers of `chains`; `link` [P] is the link of every path, and
+    `ends` are those of all links. The program's paths are ordered by link, and within a link as given.
     """
     geometry = compile_chains(chains)
     departure, arrival = geometry.departure_direction, geometry.arrival_direction
@@ -160,8 +171,8 @@ def compile_paths(
     paths = Paths(
         frequency=frequency,
         materials=dict(materials),
-        tx_position=tx,
-        rx_position=rx,
+        tx_position=ends.tx,
+        rx_position=ends.rx,
         link=np.asarray(link).astype(np.int32),
         delay=geometry.delay,
         spreading=geometry.spreading,
@@ -179,7 +190,6 @@ def compile_paths(
         rotation=geometry.rotation,
         diffuse=geometry.diffuse,
         diffraction=geometry.diffraction,
-        settings=dict(settings or {}),
         vertex=chains.vertex[chains.kind != 0].astype(np.float32),
     )
     return paths if (np.diff(paths.link) >= 0).all() else concatenate([paths])

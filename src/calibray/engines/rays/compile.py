@@ -24,7 +24,7 @@ from calibray.paths import Kind, Paths, take_links
 from calibray.paths.chains import Chains
 from calibray.scenes import Scene, check_material_name
 from calibray.tracing.antennas import AntennaPattern
-from calibray.tracing.protocol import Links, compile_paths
+from calibray.tracing.protocol import LinkPositions, Links, compile_paths
 from calibray.tracing.settings import Antenna
 
 _LOG: Final = logging.getLogger(__name__)
@@ -76,17 +76,18 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
             raise InputError(
                 f"{table.source}: no path has a power above 0; export the rays of at least one link"
             )
-    tx, rx, link, chosen = _assign_links(table, setting.links)
+    ends, link, chosen = _assign_links(table, setting.links)
     order = np.argsort(link, kind="stable")[(link < 0).sum() :]
     table, link = table.take(order), link[order]
     chains, distance = _chains(table, scene)
     _check_delays(table, chains)
     antennas = setting.antennas or (UNKNOWN, UNKNOWN)
     paths = compile_paths(
-        chains, link, tx, rx, frequency=setting.frequency, materials=scene.materials,
+        chains, link, ends, frequency=setting.frequency, materials=scene.materials,
         antennas=(AntennaPattern.of(antennas[0]), AntennaPattern.of(antennas[1])),
-        settings={"rays": table.source, "scene": scene.source, "largest_distance_m": distance},
     )  # fmt: skip
+    settings = {"rays": table.source, "scene": scene.source, "largest_distance_m": distance}
+    paths = replace(paths, settings=settings)
     if scene.local_origin.any():
         # In double precision, because single precision would round vertices far from the origin.
         paths = replace(paths, vertex=table.vertex[table.kind != 0])
@@ -232,7 +233,7 @@ def _check_delays(table: RayTable, chains: Chains) -> None:
 
 def _assign_links(
     table: RayTable, links: Links | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.int64] | None]:
+) -> tuple[LinkPositions, NDArray[np.int64], NDArray[np.int64] | None]:
     """Ends of distinct links, the link of every path among them, and the links of the program among them or None.
 
     Paths between positions that are not in `links` have the link -1.
@@ -252,7 +253,7 @@ def _assign_links(
             "link; correct them"
         )
     if links is None:
-        return own[first, :3], own[first, 3:], link, None
+        return LinkPositions(own[first, :3], own[first, 3:]), link, None
     ends, chosen = np.unique(np.hstack([links.tx, links.rx]), axis=0, return_inverse=True)
     off, link = KDTree(ends).query(own)
     if (lost := off > TOLERANCE).any():
@@ -264,7 +265,7 @@ def _assign_links(
         if lost.all():
             raise InputError(f"{fault}; export the rays of the study's links, or correct the argument axes")
         _LOG.warning("%s; they are left out", fault)
-    return ends[:, :3], ends[:, 3:], np.where(lost, -1, link), chosen.reshape(-1)
+    return LinkPositions(ends[:, :3], ends[:, 3:]), np.where(lost, -1, link), chosen.reshape(-1)
 
 
 def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], known: bool) -> None:

@@ -7,19 +7,19 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import sionna.rt as rt
-from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.materials import Material
-from calibray.scenes import Scene, read_scene
+from calibray.scenes import read_scene
+from calibray.scenes.export import exported_names
 from calibray.support.messages import first_line, shortened
-from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.protocol import Links
 from calibray.tracing.sionna.scene import surfaces_agree, surfaces_by_material
 from calibray.tracing.sionna.solver import SCALAR_CONSTANTS
 from calibray.tracing.sionna.tracer import Tracer
@@ -33,37 +33,15 @@ SAMPLES: Final = 20_000
 _LOG: Final = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, eq=False)
-class LinkPositions:
-    """Ends of links.
-
-    Attributes:
-        tx: Transmitters [L, 3], [m].
-        rx: Receivers [L, 3], [m].
-    """
-
-    tx: NDArray[np.float64]
-    rx: NDArray[np.float64]
-
-
-def verify_export(
-    scene: Scene,
-    materials: Mapping[str, Material],
-    names: Mapping[str, str],
-    target: Path,
-    *,
-    frequency: float,
-    settings: TraceSettings,
-    antennas: tuple[Antenna, Antenna],
-    links: LinkPositions,
-) -> None:
+def verify_export(tracer: Tracer, materials: Mapping[str, Material], target: Path, links: Links) -> None:
     """Load an exported scene into plain Sionna RT; compare materials, surfaces and the path loss of some links.
 
-    The comparison uses fewer rays than the settings state. `names` are those of the materials in the exported scene.
+    `tracer` has the scene as it was read. The comparison uses fewer rays than its settings state.
 
     Raises:
         InputError: Sionna RT cannot load the exported scene, or it is another one.
     """
+    scene, names = tracer.scene, exported_names(materials)
     try:
         loaded = rt.load_scene(str(target))
     except Exception as error:  # Mitsuba and Sionna raise whatever they run into
@@ -93,14 +71,17 @@ def verify_export(
             "%s lies far from its origin: plain Sionna RT computes in single precision there and may lose paths; "
             "move the origin into the scene", target,
         )  # fmt: skip
+    settings = tracer.settings
     few_rays = replace(
         settings, samples=SAMPLES, max_depth=min(settings.max_depth, 2), diffuse_reflection=False
     )
     # Scene files hold the Lambertian pattern only, so the constants are given again.
-    written = read_scene(target, frequency, {names[name]: materials[name] for name in scene.materials})
+    constants = {name: materials[name] for name in scene.materials}
+    written = read_scene(target, tracer.frequency, {names[name]: item for name, item in constants.items()})
+    antennas = tracer.solver.tx_antenna, tracer.solver.rx_antenna
+    exported = Tracer(written, tracer.frequency, few_rays, *antennas)
     power = []
-    for traced, constants in ((scene, {name: materials[name] for name in scene.materials}), (written, {})):
-        solution = Tracer(traced, frequency, few_rays, *antennas).solve(links, constants)
+    for solution in (tracer.with_settings(few_rays).solve(links, constants), exported.solve(links, {})):
         gains = (np.abs(solution.gain) ** 2).sum(axis=(1, 2))
         power.append(np.bincount(solution.link, gains, len(links.tx)))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import drjit as dr
@@ -33,7 +33,7 @@ from calibray.paths import Paths
 from calibray.paths.chains import Chains
 from calibray.scenes import Scene, check_material_name
 from calibray.tracing.antennas import AntennaPattern
-from calibray.tracing.protocol import compile_paths
+from calibray.tracing.protocol import Links, compile_paths
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna.buffers import (
     TracedBuffer,
@@ -227,26 +227,16 @@ class Solver:
         buffer.valid = valid
         return np.array([[to_numpy_complex(gain) for gain in row] for row in fields.a]).transpose(2, 0, 1)
 
-    def compile(
-        self,
-        traced: TracedBuffer,
-        tx: NDArray[np.float64],
-        rx: NDArray[np.float64],
-        materials: Mapping[str, Material],
-    ) -> Paths:
-        """Compile the paths of one buffer; `tx` and `rx` are the ends of every link, local [L, 3], [m]."""
-        return compile_paths(
-            self._chains(traced, tx, rx),
-            traced.link,
-            tx,
-            rx,
-            frequency=self.frequency,
-            materials=materials,
-            antennas=self._patterns,
-            settings={**self.settings.record(), "scene": self.scene.source, "sionna_rt": rt.__version__},
+    def compile(self, traced: TracedBuffer, ends: Links, materials: Mapping[str, Material]) -> Paths:
+        """Compile the paths of one buffer; the ends of all links are local [L, 3], [m]."""
+        chains = self._chains(traced, ends)
+        paths = compile_paths(
+            chains, traced.link, ends, frequency=self.frequency, materials=materials, antennas=self._patterns
         )
+        settings = {**self.settings.record(), "scene": self.scene.source, "sionna_rt": rt.__version__}
+        return replace(paths, settings=settings)
 
-    def _chains(self, traced: TracedBuffer, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> Chains:
+    def _chains(self, traced: TracedBuffer, ends: Links) -> Chains:
         buffer, count = traced.buffer, len(traced.link)
         depth = buffer.depth_dim_size
         shape, of_path = np.unique(np.array(buffer.shapes, dtype=np.int64), return_inverse=True)
@@ -266,8 +256,8 @@ class Solver:
                 edge, normal_n = (np.array(part, dtype=float).T for part in (wedges.e_hat, wedges.nn))
                 edge_lengths = np.stack([np.array(before, dtype=float), np.array(after, dtype=float)], axis=1)
         return Chains(
-            source=tx[traced.link],
-            target=rx[traced.link],
+            source=ends.tx[traced.link],
+            target=ends.rx[traced.link],
             vertex=vertices_of(buffer),
             normal=normal,
             kind=kind,

@@ -26,7 +26,7 @@ from calibray.scenes import Scene
 from calibray.support.interruption import unwrap_interruption
 from calibray.support.memory import available_memory
 from calibray.support.progress import Progress
-from calibray.tracing.protocol import Links, Solution, link_positions
+from calibray.tracing.protocol import LinkPositions, Links, Solution, link_positions
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna.adaptive_sampling import AdaptiveSearch, SequenceCache
 from calibray.tracing.sionna.buffers import TracedBuffer, drop_repeats, reverse, to_points
@@ -71,8 +71,8 @@ class Trace:
     def paths(self) -> Paths:
         """Compile the paths, ordered by link."""
         origin = self.solver.origin
-        tx, rx = self.tx - origin, self.rx - origin
-        paths = concatenate([self.solver.compile(part, tx, rx, self.materials) for part in self.buffers])
+        ends = LinkPositions(self.tx - origin, self.rx - origin)
+        paths = concatenate([self.solver.compile(part, ends, self.materials) for part in self.buffers])
         if origin.any():
             # In double precision, because single precision would round vertices by up to half a metre.
             paths = replace(paths, tx_position=self.tx, rx_position=self.rx, vertex=paths.vertex + origin)
