@@ -137,7 +137,7 @@ def test_walls_drawn_as_closed_outlines_become_one_sheet_each_of_one_material(tm
     (tmp_path / "plan.csv").write_text(outlined())
     segments = read_plan(tmp_path / "plan.csv", 2.5)
     assert len(segments) == 8 * 4 + 1
-    made = make_plan_scene(segments, tmp_path / "flat", floor=False, ceiling=False)
+    made = make_plan_scene(segments, tmp_path / "flat", lids=())
     materials = read_scene(made.path, 5e9).materials
     assert {name: material.thickness for name, material in materials.items()} == {
         "brick_wall": pytest.approx(0.3, abs=0.004), "door": 0.04,
@@ -199,7 +199,7 @@ def test_walls_that_meet_share_their_corners(tmp_path):
 
 def test_doors_and_windows_replace_the_wall(tmp_path):
     plan = [*OUTER, line(2, 0, 3, 0, "door", 0.0, 2.1), line(10, 2, 10, 4, "window", 0.9, 2.2)]
-    make_plan_scene(plan, tmp_path, floor=False, ceiling=False)
+    make_plan_scene(plan, tmp_path, lids=())
     assert mesh(tmp_path, "door").area == pytest.approx(2.1)
     assert mesh(tmp_path, "window").area == pytest.approx(2 * 1.3)
     assert mesh(tmp_path, "brick_wall").area == pytest.approx(32 * 3 - 2.1 - 2.6)
@@ -214,7 +214,7 @@ def test_doors_and_windows_replace_the_wall(tmp_path):
 def test_types_become_materials(tmp_path):
     plan = [*OUTER, line(3, 0, 3, 6, "drywall"), line(5, 0, 5, 6, "brick", thickness=0.1)]
     types = {"drywall": SurfaceMaterial("drywall", "plasterboard", 0.09)}
-    made = make_plan_scene(plan, tmp_path, types, ceiling=False)
+    made = make_plan_scene(plan, tmp_path, types, lids=("floor",))
     materials = read_scene(made.path, 5e9).materials
     assert {name: material.thickness for name, material in materials.items()} == {
         "brick_wall_120mm": 0.12, "brick_wall_100mm": 0.1, "drywall": 0.09, "floor": 0.2,
@@ -285,7 +285,7 @@ def test_a_plan_that_encloses_no_area_has_no_floor(tmp_path, lines):
     walls = [line(*ends) for ends in lines]
     with pytest.raises(InputError, match=r"encloses no area.*--no-floor --no-ceiling"):
         make_plan_scene(walls, tmp_path / "with")
-    made = make_plan_scene(walls, tmp_path / "without", floor=False, ceiling=False)
+    made = make_plan_scene(walls, tmp_path / "without", lids=())
     assert made.bounds[5] == 3.0
 
 

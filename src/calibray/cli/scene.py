@@ -179,7 +179,28 @@ def footprints(
     _make(read, out, options)
 
 
+@dataclass(frozen=True)
+class PlanOptions:
+    """Options of scenes of floor plans."""
+
+    height: Annotated[
+        float, typer.Option(metavar="M", help="Height of walls for which the plan states none [m].")
+    ] = 3.0
+    unit: Annotated[
+        float, typer.Option(metavar="M", help="Unit of length of the plan [m]; 0.001 for mm.")
+    ] = 1.0
+    floor: Annotated[bool, typer.Option(help="Make a floor.")] = True
+    ceiling: Annotated[bool, typer.Option(help="Make a ceiling.")] = True
+    merge: Annotated[bool, typer.Option(help="Merge two parallel lines into one wall.")] = True
+    material: Annotated[
+        list[str] | None,
+        typer.Option(metavar="TYPE=ITU[:M]", help="Material of one type of wall; can be repeated."),
+    ] = None
+    overwrite: Overwrite = False
+
+
 @scene.command()
+@with_groups
 def plan(
     file: Annotated[
         Path,
@@ -190,33 +211,20 @@ def plan(
         ),
     ],
     out: Out,
-    height: Annotated[
-        float, typer.Option(metavar="M", help="Height of walls for which the plan states none [m].")
-    ] = 3.0,
-    unit: Annotated[
-        float, typer.Option(metavar="M", help="Unit of length of the plan [m]; 0.001 for mm.")
-    ] = 1.0,
-    floor: Annotated[bool, typer.Option(help="Make a floor.")] = True,
-    ceiling: Annotated[bool, typer.Option(help="Make a ceiling.")] = True,
-    merge: Annotated[bool, typer.Option(help="Merge two parallel lines into one wall.")] = True,
-    material: Annotated[
-        list[str] | None,
-        typer.Option(metavar="TYPE=ITU[:M]", help="Material of one type of wall; can be repeated."),
-    ] = None,
-    overwrite: Overwrite = False,
+    options: PlanOptions,
 ) -> None:
     """Make a scene from a floor plan, with one sheet per wall, door and window."""
     from calibray.cli.progress_bars import progress_bars
-    from calibray.scenes.authoring import SCENE_FILES, make_plan_scene, read_plan
+    from calibray.scenes.authoring import LIDS, SCENE_FILES, make_plan_scene, read_plan
     from calibray.support.output_files import check_outputs
 
-    types = _types(material or [])
-    check_outputs(out, SCENE_FILES, [file], overwrite)
+    types = _types(options.material or [])
+    lids = [name for name in LIDS if getattr(options, name)]
+    check_outputs(out, SCENE_FILES, [file], options.overwrite)
     with progress_bars(log()) as progress:
         progress("making", 0, None)
-        made = make_plan_scene(
-            read_plan(file, height, unit), out, types, floor, ceiling, merge, overwrite=overwrite
-        )
+        segments = read_plan(file, options.height, options.unit)
+        made = make_plan_scene(segments, out, types, lids, options.merge, options.overwrite)
     _print(made)
 
 

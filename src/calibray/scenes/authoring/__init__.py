@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from calibray.scenes.authoring.extrusion import Windows as Windows
     from calibray.scenes.authoring.floor_plan import Segment as Segment
     from calibray.scenes.authoring.floor_plan import read_plan as read_plan
+    from calibray.scenes.authoring.floor_plan_scene import LIDS as LIDS
     from calibray.scenes.authoring.floor_plan_scene import WALL_THICKNESS as WALL_THICKNESS
     from calibray.scenes.authoring.floor_plan_scene import make_plan_scene as make_plan_scene
     from calibray.scenes.authoring.footprint_files import FootprintColumns as FootprintColumns
@@ -41,7 +42,7 @@ __all__, __getattr__, __dir__ = lazy_attributes(
         "building_scene": "make_scene",
         "extrusion": "Windows",
         "floor_plan": "Segment read_plan",
-        "floor_plan_scene": "WALL_THICKNESS make_plan_scene",
+        "floor_plan_scene": "LIDS WALL_THICKNESS make_plan_scene",
         "footprint_files": "FootprintColumns read_footprints read_openstreetmap",
         "footprints": "WIDEST Footprints HeightRule HeightSource clean_footprints",
         "made_scene": "SCENE_FILES MadeScene Palette SurfaceMaterial material_name",

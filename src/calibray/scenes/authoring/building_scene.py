@@ -26,7 +26,7 @@ from calibray.scenes.authoring.extrusion import (
     split_overlaps,
 )
 from calibray.scenes.authoring.footprints import WIDEST, Footprints
-from calibray.scenes.authoring.made_scene import SCENE_FILES, MadeScene, Palette, write_made_scene
+from calibray.scenes.authoring.made_scene import SCENE_FILES, MadeScene, Palette, extent, write_made_scene
 from calibray.scenes.authoring.terrain import Terrain, make_level_ground
 from calibray.scenes.authoring.trees import TREES_FILE, Trees
 from calibray.scenes.authoring.wall_alignment import align
@@ -99,7 +99,8 @@ def make_scene(
     }
     guessed = {source: names for source, names in footprints.guessed().items() if names}
     materials = [palette.wall, palette.window, palette.roof or palette.wall, palette.ground]
-    scene = write_made_scene(folder, objects, materials, frame, counts, guessed, overwrite)
+    scene = MadeScene(folder / SCENE_FILES[0], frame, *extent(objects), counts, guessed)
+    write_made_scene(scene, objects, materials, overwrite)
     # The trees of a scene that this one replaces are no longer here.
     (folder / TREES_FILE).unlink(missing_ok=True)
     if trees is not None and frame is not None and len(trees):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -22,7 +22,13 @@ from calibray.scenes.authoring.extrusion import (
     wall_triangles,
 )
 from calibray.scenes.authoring.floor_plan import OPENINGS, Segment
-from calibray.scenes.authoring.made_scene import SCENE_FILES, MadeScene, SurfaceMaterial, write_made_scene
+from calibray.scenes.authoring.made_scene import (
+    SCENE_FILES,
+    MadeScene,
+    SurfaceMaterial,
+    extent,
+    write_made_scene,
+)
 from calibray.scenes.authoring.wall_alignment import align
 from calibray.scenes.authoring.wall_faces import MergedPlan, merge_faces
 from calibray.scenes.meshes import MILLIMETRE, MeshObject, weld
@@ -39,6 +45,9 @@ TYPES: Final = {
     "ceiling": SurfaceMaterial("ceiling", "concrete", 0.2),
 }
 """Materials of the types that are not materials of ITU-R P.2040 themselves."""
+
+LIDS: Final = ("floor", "ceiling")
+"""Level sheets over the whole area."""
 
 WALL_THICKNESS: Final = 0.12
 """Thickness of a wall of an ITU material if the plan does not state it [m]."""
@@ -59,8 +68,7 @@ def make_plan_scene(
     segments: Sequence[Segment],
     folder: str | Path,
     types: Mapping[str, SurfaceMaterial] | None = None,
-    floor: bool = True,
-    ceiling: bool = True,
+    lids: Collection[str] = LIDS,
     merge: bool = True,
     overwrite: bool = False,
 ) -> MadeScene:
@@ -76,8 +84,8 @@ def make_plan_scene(
         types: Materials by type, in addition to `TYPES` or replacing them. A type that is a material of ITU-R P.2040,
             such as `brick`, becomes the material `brick_wall`. Several thicknesses of one type that the
             plan states become several materials.
-        floor: Whether to make a floor: a sheet over the whole area that walls enclose, at the lowest bottom.
-        ceiling: Whether to make a ceiling, at the highest top.
+        lids: Which of `LIDS` to make: sheets over the whole area that walls enclose, the floor at the lowest bottom
+            and the ceiling at the highest top.
         merge: Whether two parallel lines are merged into one wall (`merge_faces`).
         overwrite: Replace files that Calibray did not write.
 
@@ -98,28 +106,24 @@ def make_plan_scene(
     pieces = _pieces(_extend_to_walls(sheets), [material.name for material in materials])
     objects = _wall_objects(pieces)
     outline = _enclosed(pieces)
-    if (floor or ceiling) and outline.area == 0:
+    if lids and outline.area == 0:
         raise InputError(
             "the floor plan encloses no area, so it has no floor or ceiling; draw walls around the room, or omit both "
             "(--no-floor --no-ceiling)"
         )
-    lids = {}
-    if floor:
-        lids["floor"] = min(sheet.bottom for sheet in sheets)
-    if ceiling:
-        lids["ceiling"] = max(sheet.top for sheet in sheets)
-    for kind, height in lids.items():
+    heights = {"floor": min(sheet.bottom for sheet in sheets), "ceiling": max(sheet.top for sheet in sheets)}
+    for kind in lids:
         name = types[kind].name
         materials.append(types[kind])
-        objects.append(MeshObject(f"all-{name}", name, weld(_lid(outline, height))))
+        objects.append(MeshObject(f"all-{name}", name, weld(_lid(outline, heights[kind]))))
     counts = {
         "lines": len(segments),
         "sheets": len(sheets),
         **({"lines merged as faces of one wall": merged.lines} if merged.lines else {}),
     }
-    return write_made_scene(
-        folder, objects, materials, None, counts, walls=merged.report, overwrite=overwrite
-    )
+    scene = MadeScene(folder / SCENE_FILES[0], None, *extent(objects), counts, walls=merged.report)
+    write_made_scene(scene, objects, materials, overwrite)
+    return scene
 
 
 def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) -> list[SurfaceMaterial]:

@@ -134,27 +134,29 @@ class MadeScene:
         }
 
 
+def extent(objects: Sequence[MeshObject]) -> tuple[tuple[float, ...], dict[str, int]]:
+    """Bounds of objects, in the order of `MadeScene.bounds`, and their number of triangles by material."""
+    triangles = dict.fromkeys(sorted({item.material for item in objects}), 0)
+    for item in objects:
+        triangles[item.material] += len(item.mesh.faces)
+    corners = np.array([[item.mesh.vertices.min(axis=0), item.mesh.vertices.max(axis=0)] for item in objects])
+    return (*corners[:, 0].min(axis=0).tolist(), *corners[:, 1].max(axis=0).tolist()), triangles
+
+
 def write_made_scene(
-    folder: Path,
+    scene: MadeScene,
     objects: Sequence[MeshObject],
     materials: Sequence[SurfaceMaterial],
-    frame: Frame | None,
-    counts: Mapping[str, int],
-    guessed: Mapping[str, Sequence[str]] | None = None,
     overwrite: bool = False,
-    walls: Sequence[str] = (),
-) -> MadeScene:
-    """Write a scene and the assumptions made.
+) -> None:
+    """Write a scene and the assumptions made; with `overwrite`, replace files that Calibray did not write.
 
-    Other materials and repeated ones are ignored. `counts` is the number of objects used, repaired or left out, by
-    kind; `guessed` are the buildings whose height is assumed, by the source of the assumption; `walls` describes how
-    the lines of a floor plan were used. With `overwrite`, files that Calibray did not write are replaced.
+    Other materials and repeated ones are ignored.
 
     Raises:
         InputError: Two different materials, or a material and a mesh, have the same name; or a file must not be
             replaced.
     """
-    used = {item.material for item in objects}
     constants: dict[str, Mapping[str, float | str]] = {}
     for material in materials:
         if constants.setdefault(material.name, material.constants()) != material.constants():
@@ -165,14 +167,8 @@ def write_made_scene(
         raise InputError(
             f"material {clash[0]!r}: a mesh has the same name, which Sionna RT refuses; use another name"
         )
-    triangles = dict.fromkeys(sorted(used), 0)
-    for item in objects:
-        triangles[item.material] += len(item.mesh.faces)
-    corners = np.array([[item.mesh.vertices.min(axis=0), item.mesh.vertices.max(axis=0)] for item in objects])
-    bounds = (*corners[:, 0].min(axis=0).tolist(), *corners[:, 1].max(axis=0).tolist())
+    folder = scene.path.parent
     check_outputs(folder, SCENE_FILES, overwrite=overwrite)
-    used_constants = {name: values for name, values in constants.items() if name in used}
-    path = write_scene(folder, objects, used_constants, frame, overwrite)
-    scene = MadeScene(path, frame, bounds, triangles, counts, guessed or {}, walls)
+    used = {name: values for name, values in constants.items() if name in scene.triangles}
+    write_scene(folder, objects, used, scene.frame, overwrite)
     write_text(folder / "scene.json", json.dumps(scene.record(), indent=2) + "\n")
-    return scene
