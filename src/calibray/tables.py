@@ -15,7 +15,7 @@ from typing import Final, Literal
 from calibray.support.messages import printable
 
 LISTED: Final = 12
-"""Largest number of rows of a file that are listed; the others are only counted."""
+"""Largest number of rows, names or findings that are listed; the others are only counted."""
 
 WIDEST: Final = 100_000
 """Characters per line: many, so that no cell is cut; output also goes to files and pipes."""

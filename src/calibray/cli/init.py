@@ -101,7 +101,7 @@ def init(
 
 
 def _position(text: str) -> list[float]:
-    from calibray.tracing.protocol import LARGEST_COORDINATE
+    from calibray.scenes.meshes import LARGEST_COORDINATE
 
     try:
         x, y, z = (float(part) for part in text.split(","))

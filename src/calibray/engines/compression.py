@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.stats import qmc
 
+from calibray.engines.replay import TABLE_TOLERANCE
 from calibray.errors import InputError
 from calibray.fields import layout, path_losses, path_powers
 from calibray.parameters import Parameters
@@ -63,9 +64,6 @@ BATCH_POWERS: Final = 400_000_000
 FIRST_INTERVALS: Final = 512
 LAST_INTERVALS: Final = 65536
 """First and largest number of intervals of a table of coefficients."""
-
-TABLE_TOLERANCE: Final = 1e-4
-"""Largest error of a tabulated coefficient."""
 
 
 @dataclass(frozen=True)

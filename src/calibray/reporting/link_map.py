@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calibray.reporting.link_survey import Survey
 from calibray.scenes import Triangles
 from calibray.scenes.buildings import footprints
+from calibray.scenes.triangles import STEEP
 
 WIDTH: Final = 1000
 """Width of the map in its own units."""
@@ -27,9 +28,6 @@ LEAST_EXTENT: Final = 5.0
 
 MOST_WALLS: Final = 20_000
 """Largest number of lines that are drawn for vertical faces, the longest first."""
-
-STEEP: Final = 0.1
-"""A face is a wall if the vertical part of its unit normal is below this [1]."""
 
 RAMP: Final = ("#1f5fa8", "#5b94cf", "#a9b4bd", "#e0953f", "#b34a00")
 """Colours from negative to positive residuals; colour-blind people can distinguish the ends."""

@@ -13,12 +13,9 @@ from calibray.reporting.result_tables import suspicious_rows
 from calibray.scenes.authoring import MadeScene
 from calibray.scenes.checks import Finding, SceneCheck
 from calibray.study.draft import Draft
-from calibray.tables import Column, Table, numbers, rows_text
+from calibray.tables import LISTED, Column, Table, numbers, rows_text
 from calibray.tracing.convergence import Convergence
 from calibray.tracing.protocol import EnclosedAntennas
-
-LISTED: Final = 12
-"""Number of names and findings that are listed; the others are only counted."""
 
 _HEIGHT_SOURCES: Final = {
     "levels": "height from the number of storeys",

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import os
-import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from shutil import copyfile
-from typing import Final
 
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.scenes.scene import TRACED, Scene, is_itu_name, material_element
-from calibray.scenes.scene_file import MESHES
+from calibray.scenes.scene_file import MESHES, plain_name, unique_names
 from calibray.support.output_files import check_outputs, replacing, write_text
-
-_NOT_PLAIN: Final = re.compile(r"[^0-9A-Za-z_-]+")
 
 
 def export_scene(
@@ -52,7 +48,9 @@ def export_scene(
         root.remove(bsdf)
     names = exported_names(materials)
     exported = {f"{TRACED}{index}": f"mat-{names[name]}" for index, name in enumerate(scene.materials)}
-    object_names = _unique((item.name or "object" for item in scene.objects), set(names.values()), "object")
+    object_names = unique_names(
+        (item.name or "object" for item in scene.objects), set(names.values()), "object"
+    )
     copies: dict[str, Path] = {}
     for shape, name in zip(root.findall("shape"), object_names, strict=True):
         shape.set("id", f"mesh-{name}")
@@ -81,33 +79,13 @@ def exported_names(names: Iterable[str]) -> dict[str, str]:
         {'stone': 'stone', 'concrete': 'calibrated-concrete', 'brick.old': 'brick_old', 'brick old': 'brick_old-2'}
     """
     listed = list(names)
-    plain = (f"calibrated-{name}" if is_itu_name(_plain(name)) else name for name in listed)
-    return dict(zip(listed, _unique(plain, set(), "material"), strict=True))
-
-
-def _plain(name: str) -> str:
-    return _NOT_PLAIN.sub("_", name)
-
-
-def _unique(names: Iterable[str], taken: set[str], kind: str) -> list[str]:
-    """Plain names without duplicates, also of names already in use: `NAME-2`, or `NAME-KIND` if that is in use."""
-    unique: list[str] = []
-    used = set(taken)
-    for name in names:
-        plain = _plain(name)[:80] or kind
-        candidate = f"{plain}-{kind}" if plain in taken else plain
-        number = 1
-        while candidate in used:
-            number += 1
-            candidate = f"{plain}-{number}"
-        used.add(candidate)
-        unique.append(candidate)
-    return unique
+    plain = (f"calibrated-{name}" if is_itu_name(plain_name(name)) else name for name in listed)
+    return dict(zip(listed, unique_names(plain, set(), "material"), strict=True))
 
 
 def _copy(mesh: Path, folder: Path, copies: dict[str, Path], overwrite: bool) -> Path:
     """Copy a mesh; meshes of the same name from different folders get numbers."""
-    stem, number = _plain(mesh.stem), 1
+    stem, number = plain_name(mesh.stem), 1
     name = f"{stem}{mesh.suffix}"
     while copies.setdefault(name, mesh) != mesh:
         number += 1

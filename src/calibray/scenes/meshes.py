@@ -28,7 +28,7 @@ MILLIMETRE: Final = 0.001
 """Unit of corners that are whole numbers [m]."""
 
 LARGEST_COORDINATE: Final = 1e9
-"""Largest coordinate of a vertex [m], as of a position in a path file."""
+"""Largest coordinate of a vertex or an antenna [m], as of a position in a path file."""
 
 _HEADER: Final = re.compile(
     rb"ply\r?\n(?:(?:comment|obj_info)\b.*\n)*"

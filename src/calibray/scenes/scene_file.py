@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -64,6 +65,31 @@ _PROPERTIES: Final[Mapping[str, tuple[str, ...]]] = {
 """Properties of shapes by element, in the spelling of Mitsuba 3 and of earlier versions."""
 
 _FRAME_COMMENT: Final = "calibray frame "
+
+
+def plain_name(name: str) -> str:
+    """A name for files and objects: only letters, digits, `_` and `-`."""
+    return re.sub(r"[^0-9A-Za-z_-]+", "_", name)
+
+
+def unique_names(names: Iterable[str], taken: Collection[str] = (), kind: str = "_") -> list[str]:
+    """Plain names without duplicates, also of names that are taken: `NAME-2`, or `NAME-KIND` if that is taken.
+
+    Example:
+        >>> unique_names(["Town hall", "Town/hall", '"><x'])
+        ['Town_hall', 'Town_hall-2', '_x']
+    """
+    unique: list[str] = []
+    used, numbers = set(taken), Counter[str]()
+    for name in names:
+        plain = plain_name(name)[:80] or kind
+        candidate = f"{plain}-{kind}" if plain in taken else plain
+        while candidate in used:
+            numbers[plain] += 1
+            candidate = f"{plain}-{numbers[plain] + 1}"
+        used.add(candidate)
+        unique.append(candidate)
+    return unique
 
 
 def scene_path(source: str) -> Path:

@@ -19,6 +19,9 @@ from calibray.scenes.scene_file import find_scene, shape_mesh
 LEVEL: Final = 0.5
 """A face is level, like a roof or the ground, if the vertical part of its unit normal is above this [1]."""
 
+STEEP: Final = 0.1
+"""A face is a wall if the vertical part of its unit normal is at most this [1]."""
+
 WITHOUT_GAPS: Final = 0.9
 """Share of its extent that a sheet over the whole scene covers, such as a floor or a ceiling [1]."""
 

@@ -32,7 +32,7 @@ STALE_SECONDS: Final = 60.0  # age at which an unfinished file is removed if its
 _UNFINISHED: Final = re.compile(r"\.([0-9]{1,10})-[0-9a-f]{32}" + re.escape(PARTIAL))  # with the process
 _SIGNATURE_LINE: Final = re.compile(rb"[0-9a-f]{64}  ")  # start of each line of a signature file
 # Windows has neither flag: its links need special rights, and it has no FIFO in a folder.
-_NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
+NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
 
 
 def exists(file: str | Path) -> bool:
@@ -194,7 +194,7 @@ def _open_signatures(folder: Path, flags: int) -> BinaryIO:
     with suppress(FileNotFoundError):
         _check_signature_status(path, path.lstat())
     stream = os.fdopen(
-        os.open(path, flags | _NO_LINK, 0o666), "rb" if flags == os.O_RDONLY else "r+b", buffering=0
+        os.open(path, flags | NO_LINK, 0o666), "rb" if flags == os.O_RDONLY else "r+b", buffering=0
     )
     try:
         _check_signature_status(path, os.fstat(stream.fileno()))
@@ -254,7 +254,7 @@ def replacing(path: Path, signed: bool = True) -> Iterator[Path]:
     )  # whether a regular file may be replaced was checked before the work
     _remove_unfinished(path)
     partial = path.with_name(f"{path.name}.{os.getpid()}-{uuid.uuid4().hex}{PARTIAL}")
-    descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_LINK, 0o666)
+    descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | NO_LINK, 0o666)
     try:
         with os.fdopen(descriptor, "wb") as created:
             yield partial
@@ -318,5 +318,5 @@ def append_text(path: Path, text: str) -> None:
         InputError: The file is a link, a device or a folder.
     """
     check_replaceable(path, overwrite=True)
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | _NO_LINK, 0o666), "ab") as stream:
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | NO_LINK, 0o666), "ab") as stream:
         stream.write(text.encode("utf-8"))

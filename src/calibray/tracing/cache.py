@@ -26,11 +26,11 @@ from calibray.errors import InputError
 from calibray.paths import FORMAT_VERSION, Paths
 from calibray.scenes import Scene
 from calibray.support.cache_folder import cache_folder
+from calibray.support.output_files import NO_LINK
 from calibray.tracing.protocol import Links
 from calibray.tracing.settings import Antenna, TraceSettings
 
 _FILE_NAME: Final = re.compile(r"[0-9a-f]{64}\.h5")
-_NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
 _LOG: Final = logging.getLogger(__name__)
 
 
@@ -74,7 +74,7 @@ def load_trace(digest: str) -> Paths | None:
     if path is None:
         return None
     try:
-        stream = os.fdopen(os.open(path, os.O_RDONLY | _NO_LINK), "rb")
+        stream = os.fdopen(os.open(path, os.O_RDONLY | NO_LINK), "rb")
     except OSError:  # there is none, or a link
         return None
     with stream:

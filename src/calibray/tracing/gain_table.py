@@ -17,11 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
 from calibray.measurements import SourceTable, read_table
-from calibray.tracing.two_cuts import TWO_CUT_SUFFIXES, read_two_cuts
+from calibray.tracing.two_cuts import LARGEST_STEP_DEG, TWO_CUT_SUFFIXES, read_two_cuts
 
 COLUMNS: Final = ("azimuth_deg", "elevation_deg", "gain_dbi")
 RANGES: Final = {"azimuth_deg": (-180.0, 360.0), "elevation_deg": (-90.0, 90.0), "gain_dbi": (-200.0, 60.0)}
-LARGEST_STEP_DEG: Final = 15.0
 LARGEST_EFFICIENCY: Final = 1.5
 """Ratio of radiated to accepted power above which the values cannot be absolute gains."""
 SEAM_TOLERANCE_DB: Final = 0.1

@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.materials import Material
+from calibray.measurements.links import MIN_DISTANCE
 from calibray.paths import Paths, concatenate
 from calibray.paths.chains import Chains, compile_chains, zenith_azimuth
 from calibray.scenes import Scene
+from calibray.scenes.meshes import LARGEST_COORDINATE
 from calibray.support.progress import Progress
 from calibray.tracing.antennas import AntennaPattern, rotate_jones
 from calibray.tracing.settings import Antenna, TraceSettings
@@ -195,13 +197,6 @@ def compile_paths(
     return paths if (np.diff(paths.link) >= 0).all() else concatenate([paths])
 
 
-LARGEST_COORDINATE: Final = 1e9
-"""Largest coordinate of an antenna [m], as in a path file."""
-
-LEAST_DISTANCE: Final = 1e-3
-"""Distance below which the ends of a link coincide [m]."""
-
-
 def link_positions(links: Links) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Positions of transmitters and receivers [L, 3] each, [m], checked.
 
@@ -220,7 +215,7 @@ def link_positions(links: Links) -> tuple[NDArray[np.float64], NDArray[np.float6
             link = wrong[0]
             fault = "is not finite" if not np.isfinite(position[link]).all() else "is too far away"
             raise InputError(f"link {link}: {name} position {position[link]} {fault}; give metres")
-    coincident = np.flatnonzero(np.linalg.norm(tx - rx, axis=1) < LEAST_DISTANCE)
+    coincident = np.flatnonzero(np.linalg.norm(tx - rx, axis=1) < MIN_DISTANCE)
     if len(coincident):
         link = coincident[0]
         raise InputError(f"link {link}: transmitter and receiver coincide at {tx[link]}; check the columns")

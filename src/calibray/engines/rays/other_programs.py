@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.io import loadmat, whosmat
 from scipy.io.matlab import MatReadError
 
-from calibray.engines.rays.table import ENDS, TYPES, read_ray_file
+from calibray.engines.rays.table import ENDS, LARGEST_ARRAYS, TYPES, read_ray_file
 from calibray.errors import InputError
 from calibray.measurements import SourceTable, read_table
 from calibray.support.messages import did_you_mean, first_line, shortened
@@ -250,9 +250,6 @@ DEEPMIMO_TYPES: Final = {"1": "reflection", "2": "diffraction", "3": "diffuse", 
 DEEPMIMO_OLD_NAMES: Final = {"delay": "toa", "inter_pos": "inter_loc", "tx_pos": "tx_loc", "rx_pos": "rx_loc"}
 """Matrices and their names in earlier versions."""
 
-LARGEST_MATRIX: Final = 2**30
-"""Largest size of a matrix in memory [bytes]."""
-
 
 def is_deepmimo(folder: Path) -> bool:
     """Whether a folder contains matrices of a scenario."""
@@ -321,9 +318,9 @@ def _matrix(file: Path) -> NDArray[np.float64]:
                 size = sum(part.file_size for part in parts.infolist())
         else:
             size = 8 * sum(int(np.prod(shape)) for _, shape, _ in whosmat(file))
-        if size > LARGEST_MATRIX:
+        if size > LARGEST_ARRAYS:
             raise InputError(
-                f"{file}: {size / 2**20:,.0f} MiB, must be at most {LARGEST_MATRIX // 2**20}; export fewer receivers"
+                f"{file}: {size / 2**20:,.0f} MiB, must be at most {LARGEST_ARRAYS // 2**20}; export fewer receivers"
             )
         if file.suffix == ".npz":
             with np.load(file, allow_pickle=False) as packed:

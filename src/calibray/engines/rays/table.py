@@ -256,8 +256,8 @@ LARGEST_JSON: Final = 2**26
 HDF5: Final = b"\x89HDF"
 """First bytes of an HDF5 file."""
 
-LARGEST_HDF5: Final = 2**30
-"""Largest size of the datasets in memory [bytes]; kilobytes may decompress to gigabytes."""
+LARGEST_ARRAYS: Final = 2**30
+"""Largest size of datasets or matrices in memory [bytes]; kilobytes may decompress to gigabytes."""
 
 
 def read_ray_file(file: str | Path) -> SourceTable:
@@ -343,9 +343,9 @@ def _read_hdf5(content: Path | BytesIO, source: str) -> pd.DataFrame:
                 raise InputError(
                     f"{source}: {shortened(name)!r} is stored in another file; store it in this one"
                 )
-        if (size := sum(item.nbytes for item in columns.values())) > LARGEST_HDF5:
+        if (size := sum(item.nbytes for item in columns.values())) > LARGEST_ARRAYS:
             raise InputError(
-                f"{source}: {size / 2**20:,.0f} MiB, must be at most {LARGEST_HDF5 // 2**20}; export fewer links"
+                f"{source}: {size / 2**20:,.0f} MiB, must be at most {LARGEST_ARRAYS // 2**20}; export fewer links"
             )
         # MATLAB writes a vector as a matrix with one row or column.
         return pd.DataFrame(

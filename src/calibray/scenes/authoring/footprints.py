@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from calibray.coordinates import Frame
 from calibray.errors import InputError
+from calibray.scenes.scene_file import unique_names
 from calibray.support.lazy_imports import library
 
 GRID: Final = 0.01
@@ -166,7 +166,7 @@ def clean_footprints(raw: Footprints) -> Footprints:
         polygon=polygons[keep],
         bottom=raw.bottom[keep],
         top=raw.top[keep],
-        name=tuple(make_unique([raw.name[index] for index in keep])),
+        name=tuple(unique_names([raw.name[index] for index in keep])),
         height_from=tuple(raw.height_from[index] for index in keep),
         part=raw.part[keep],
         repairs={reason: count for reason, count in repairs.items() if count},
@@ -213,22 +213,3 @@ def project(polygons: NDArray[Any], frame: Frame, crs: str) -> NDArray[Any]:
     return shapely.transform(
         shapely.force_2d(polygons), lambda corner: frame.to_scene(corner[:, 0], corner[:, 1], crs=crs)[:, :2]
     )
-
-
-def make_unique(names: Sequence[str]) -> list[str]:
-    """Make names usable for files and objects: only letters, digits, `_` and `-`, and no name twice.
-
-    Example:
-        >>> make_unique(["Town hall", "Town/hall", '"><x'])
-        ['Town_hall', 'Town_hall-2', '_x']
-    """
-    repeats: Counter[str] = Counter()
-    unique: dict[str, None] = {}
-    for name in names:
-        plain = re.sub(r"[^0-9A-Za-z_-]+", "_", name)[:80] or "_"
-        candidate = plain
-        while candidate in unique:
-            repeats[plain] += 1
-            candidate = f"{plain}-{repeats[plain] + 1}"
-        unique[candidate] = None
-    return list(unique)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
 from calibray.scenes.obstruction import BATCH, SAME_CROSSING, crossing
-from calibray.scenes.triangles import is_ground, read_meshes
+from calibray.scenes.triangles import STEEP, is_ground, read_meshes
 from calibray.support.lazy_imports import library
 
 KERB: Final = 2.0
@@ -21,12 +21,10 @@ KERB: Final = 2.0
 CLEARANCE: Final = 0.05
 """A surface is above an antenna if it is higher by more than this [m]."""
 
-_STEEP: Final = 0.1  # a face is a wall if the vertical part of its unit normal is at most this [1]
-
 
 def _is_wall(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return np.abs(normal[:, 2]) <= _STEEP * np.linalg.norm(normal, axis=1)
+    return np.abs(normal[:, 2]) <= STEEP * np.linalg.norm(normal, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
