@@ -13,7 +13,7 @@ import calibray as cb
 import two_ray
 from calibray.calibration.result import Result
 from calibray.errors import EngineError, InputError
-from calibray.study.live_study import write_study_file
+from calibray.study.toml_file import study_text
 from commands import run
 
 TRUTH = 7.7
@@ -66,7 +66,7 @@ def write_study(folder: Path, ripple: str = "pass", antennas: dict | None = None
         engine={"name": "command", "command": command, "rays": True, "retries": 0},
         **{name: section for name, section in sections.items() if section is not None},
     ).content()  # fmt: skip
-    write_study_file(folder, content)
+    (folder / "study.toml").write_text(study_text(content, {}))
     study = cb.Study.load(folder / "study.toml")
     links = pd.read_csv(folder / "links.csv")
     loss = cb.engines.make(study).path_loss(np.array([[TRUTH]]))[0]

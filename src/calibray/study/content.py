@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -41,6 +42,10 @@ BUNDLED: Final = "sionna:"
 
 OFFSET: Final = "offset"
 """Name of the nuisance term of which ``[offset]`` is the short form."""
+
+
+def _first_stated(keys: Mapping[str, bool]) -> str | None:
+    return next((key for key, stated in keys.items() if stated), None)
 
 
 class StudyContent(Section, ABC):
@@ -127,12 +132,20 @@ class StudyContent(Section, ABC):
             "[observables]": bool(self.observables),
             "coefficients of laws": any(".itu_" in name for name in self.parameters),
         }
-        for key, stated in refused.items():
-            if self.engine.exports_rays and stated:
-                raise InputError(
-                    "engine.rays = true: powers of rays are compared at one carrier and add up, so it does not go with "
-                    f"{key}; remove one of them"
-                )
+        key = _first_stated(refused)
+        if self.engine.exports_rays and key is not None:
+            raise InputError(
+                "engine.rays = true: powers of rays are compared at one carrier and add up, so it does not go with "
+                f"{key}; remove one of them"
+            )
+
+    def _without_replay(self) -> dict[str, bool]:
+        """Whether keys are stated that do not go with replay of sums of powers at one carrier."""
+        return {
+            "links.frequency": self.links.frequency is not None,
+            f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",
+            f"engine.name = {self.engine.name!r}": self.engine.name != "replay",
+        }
 
     def _check_observables(self) -> None:
         if not self.observables:
@@ -196,18 +209,12 @@ class StudyContent(Section, ABC):
         links = self.links
         if links.position_error_m is None:
             return
-        refused = {
-            "links.weight": links.weight is not None,
-            "links.frequency": links.frequency is not None,
-            f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",
-            f"engine.name = {self.engine.name!r}": self.engine.name != "replay",
-        }
-        for key, stated in refused.items():
-            if stated:
-                raise InputError(
-                    f"links.position_error_m: powers at displaced receivers are averaged on replay, at one carrier; it "
-                    f"does not go with {key}"
-                )
+        key = _first_stated({"links.weight": links.weight is not None} | self._without_replay())
+        if key is not None:
+            raise InputError(
+                f"links.position_error_m: powers at displaced receivers are averaged on replay, at one carrier; it "
+                f"does not go with {key}"
+            )
         if links.std is None and self.noise.std_db is None:
             raise InputError(
                 "links.position_error_m adds to the other errors of a link: give links.std or noise.std_db [dB]"
@@ -225,20 +232,14 @@ class StudyContent(Section, ABC):
 
     def _check_displacements(self) -> None:
         names, links = [name for name in self.parameters if displaces(name)], self.links
-        refused = {
-            "links.frequency": links.frequency is not None,
-            f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",
-            f"engine.name = {self.engine.name!r}": self.engine.name != "replay",
-            "engine.rays": getattr(self.engine, "rays", None) is not None,
-            "engine.compress_db": getattr(self.engine, "compress_db", None) is not None,
-            "engine.chunk_links": getattr(self.engine, "chunk_links", None) is not None,
-        }
-        for key, stated in refused.items():
-            if names and stated:
-                raise InputError(
-                    f"parameters: {names[0]!r}: path loss between traced positions is interpolated on replay, at one "
-                    f"carrier; it does not go with {key}"
-                )
+        of_engine = ("rays", "compress_db", "chunk_links")
+        stated = {f"engine.{key}": getattr(self.engine, key, None) is not None for key in of_engine}
+        key = _first_stated(self._without_replay() | stated)
+        if names and key is not None:
+            raise InputError(
+                f"parameters: {names[0]!r}: path loss between traced positions is interpolated on replay, at one "
+                f"carrier; it does not go with {key}"
+            )
         own = [
             name for name in names if name.startswith(RECEIVER) and not name.startswith(f"{RECEIVER}{EVERY}.")
         ]

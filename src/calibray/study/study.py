@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, Final, final
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
+from calibray.materials import Material
 from calibray.measurements import (
     LINK_COLUMNS,
     TRACK_COLUMNS,
@@ -19,12 +25,19 @@ from calibray.measurements import (
     melt,
     select_rows,
 )
+from calibray.scenes import write_scene
 from calibray.study.calibration_sections import HoldoutSection
 from calibray.study.content import OFFSET
 from calibray.study.model import StudyModel
 from calibray.study.row_steps import position_steps, row_track, study_links
 from calibray.study.setup import Setup
+from calibray.study.toml_file import study_text
+from calibray.support.output_files import check_folder, write_text
+from calibray.support.output_tables import write_table
 from calibray.tables import Column, Table, hertz, numbers, short_html, short_text
+
+if TYPE_CHECKING:
+    from calibray.tracing.sionna.live_scene import LiveScene
 
 
 @final
@@ -72,12 +85,10 @@ class Study(StudyModel):
         Raises:
             InputError: The scene or a value cannot be used, or the folder cannot be written.
         """
-        from calibray.study.live_study import write_live_study, write_study_file
-
         target = Path(mkdtemp(prefix="calibray-study-") if folder is None else folder)
-        content = write_live_study(scene, measured, target, sections)
+        content = _write_live_study(scene, measured, target, sections)
         study = cls.from_content(content, target / "study.toml")
-        write_study_file(target, content)
+        write_text(target / "study.toml", study_text(content, {}))
         return study
 
     def __repr__(self) -> str:
@@ -170,3 +181,90 @@ def summary(study: StudyModel) -> tuple[Table, Table]:
         Table(f"Study {study.path.name}", (Column(), Column()), tuple(rows)),
         Table("Parameters", columns, bounds),
     )
+
+
+VALUE: Final = "measured"
+LARGEST_PERMITTIVITY: Final = 15.0
+"""Upper bound of a permittivity that is calibrated by default, twice that of any building material of ITU-R P.2040."""
+
+
+def _write_live_study(
+    scene: object, measured: Any, folder: Path, sections: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Write the files of a scene in memory and its measured values; returns the content of the study.
+
+    Raises:
+        InputError: The scene or the measured values cannot be used, or the folder cannot be written.
+    """
+    from calibray.tracing.sionna.live_scene import LiveScene
+
+    live = LiveScene.of(scene)
+    links = dict(sections.get("links", {}))
+    table = _links(live, measured)
+    check_folder(folder)
+    write_scene(folder, live.objects, {name: _numbers(item) for name, item in live.materials.items()})
+    write_table(folder / "links.csv", table)
+    power = {"tx_power_dbm": "tx_power_dbm"} if links.get("quantity") == "received_power" else {}
+    antennas = zip(("tx", "rx"), live.antennas, strict=True)
+    ends = {"tx": LINK_COLUMNS[:3], "rx": LINK_COLUMNS[3:]}
+    return {
+        "version": 1,
+        "scene": {"file": "scene.xml", "frequency": live.frequency},
+        "materials": {
+            name: _numbers(item) | {"scattering_pattern": item.scattering_pattern}
+            for name, item in live.materials.items()
+        },
+        "antennas": {
+            end: asdict(antenna) | {"orientation": list(antenna.orientation)} for end, antenna in antennas
+        },
+        "parameters": _parameters(live.materials),
+        **sections,
+        "links": {"file": "links.csv", **ends, "value": VALUE, **power, **links},
+    }
+
+
+def _numbers(material: Material) -> dict[str, float]:
+    return {name: value for name, value in asdict(material).items() if not isinstance(value, str)}
+
+
+def _parameters(materials: Mapping[str, Material]) -> dict[str, dict[str, Any]]:
+    """The permittivity of every material but air and metal."""
+    names = [name for name, item in materials.items() if item.relative_permittivity > 1.5]
+    return {f"{name}.relative_permittivity": {"bounds": [1.5, LARGEST_PERMITTIVITY]} for name in names}
+
+
+def _links(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> pd.DataFrame:
+    """One row for each measured value, with the ends by name."""
+    values = _matrix(live, measured)
+    tx, rx = (np.array(list(ends.values())) for ends in (live.tx, live.rx))
+    row, column = np.nonzero(np.isfinite(values))
+    if not len(row):
+        raise InputError(
+            "measured: no value is a number; give one for each transmitter and receiver, NaN if none"
+        )
+    table = pd.DataFrame(np.hstack([tx[row], rx[column]]), columns=list(LINK_COLUMNS))
+    return table.assign(
+        transmitter=np.array(list(live.tx))[row],
+        receiver=np.array(list(live.rx))[column],
+        tx_power_dbm=np.array(list(live.tx_power_dbm.values()))[row],
+        **{VALUE: values[row, column]},
+    )
+
+
+def _matrix(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> NDArray[np.float64]:
+    """Measured values [tx, rx] in the order of the scene; NaN where nothing was measured."""
+    if isinstance(measured, pd.DataFrame):
+        for what, labels, names in (("row", measured.index, live.tx), ("column", measured.columns, live.rx)):
+            if unknown := [str(label) for label in labels if label not in names]:
+                kind = "transmitter" if what == "row" else "receiver"
+                raise InputError(
+                    f"measured: {what} {unknown[0]!r} is no {kind} of the scene; rows are transmitters, "
+                    "columns receivers"
+                )
+        measured = measured.reindex(index=list(live.tx), columns=list(live.rx))
+    values = np.asarray(measured, dtype=float)
+    if values.shape != (shape := (len(live.tx), len(live.rx))):
+        raise InputError(
+            f"measured: shape {values.shape}, must be {shape}: a row for each transmitter, a column for each receiver"
+        )
+    return values
