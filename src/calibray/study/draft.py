@@ -22,6 +22,7 @@ from calibray.scenes.authoring import TREES_FILE
 from calibray.scenes.checks import count_crossings
 from calibray.study.content import BUNDLED, VERSION
 from calibray.study.draft_links import Assumption, Given, LinksDraft
+from calibray.study.draft_values import draft_links
 from calibray.study.link_checks import LINKS_PER_UNKNOWN, count_unknowns
 from calibray.study.regions import Place, RegionSection, dense_trees
 from calibray.study.study import Study
@@ -72,7 +73,7 @@ def draft(
     Raises:
         InputError: A file cannot be read, or a value is neither given nor in the files.
     """
-    drafted = LinksDraft(scene, Path(links), Path(target), given or Given())
+    drafted = draft_links(scene, Path(links), Path(target), given or Given())
     content = _content(drafted)
     _hold_out_blocks(drafted, content)
     text = study_text(content, {assumption.what: assumption.reason for assumption in drafted.assumptions})
