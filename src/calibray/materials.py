@@ -75,11 +75,7 @@ BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
 """Physical bounds of each field: the bounds of Sionna RT, and a thickness greater than 0."""
 
 SCATTERING_PATTERNS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {
-        "lambertian": (),
-        "directive": ("alpha_r",),
-        "backscattering": ("alpha_r", "alpha_i", "lambda_"),
-    }
+    {"lambertian": (), "directive": ("alpha_r",), "backscattering": ("alpha_r", "alpha_i", "lambda_")}
 )
 """Scattering patterns, each with the fields that shape it."""
 
@@ -251,11 +247,7 @@ DEFAULT_REVISION: Final = "P.2040-3"
 
 
 def itu_material(
-    name: str,
-    frequency: float,
-    thickness: float = 0.1,
-    revision: str = DEFAULT_REVISION,
-    **scattering: Any,
+    name: str, frequency: float, thickness: float = 0.1, revision: str = DEFAULT_REVISION, **scattering: Any
 ) -> Material:
     """Make a material of ITU-R P.2040 Table 3 at one frequency.
 

@@ -83,9 +83,7 @@ def _draw(study: Study, plot: Path, overwrite: bool) -> None:
     echo(f"Written to {plot}", err=True)
 
 
-def cache(
-    clear: Annotated[bool, typer.Option("--clear", help="Remove all cached files.")] = False,
-) -> None:
+def cache(clear: Annotated[bool, typer.Option("--clear", help="Remove all cached files.")] = False) -> None:
     """Show where traces and compiled programs are kept between runs, or remove them.
 
     The environment variable CALIBRAY_CACHE sets the folder. If it is set but empty, Calibray caches nothing.
@@ -95,10 +93,7 @@ def cache(
     from calibray.tracing.cache import stored_traces
 
     folder, programs = cache_folder(), compiled_programs()
-    kept = {
-        "traces": stored_traces(),
-        "compiled programs": [] if programs is None else programs.entries(),
-    }
+    kept = {"traces": stored_traces(), "compiled programs": [] if programs is None else programs.entries()}
     size = {name: sum(path.stat().st_size for path in paths) / 1e6 for name, paths in kept.items()}
     if clear:
         for path in (path for paths in kept.values() for path in paths):

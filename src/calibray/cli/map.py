@@ -73,8 +73,7 @@ def map(
     area: Area,
     values: Values,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="FOLDER", help="Folder for the map instead of DIR."),
+        Path | None, typer.Option("--out", "-o", metavar="FOLDER", help="Folder for the map instead of DIR.")
     ] = None,
     *,
     pool: Pool,

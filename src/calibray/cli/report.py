@@ -46,8 +46,7 @@ def export(
         Path, typer.Option("--out", "-o", metavar="FOLDER", help="Folder to write into.", show_default=False)
     ],
     copy: Annotated[
-        bool,
-        typer.Option("--copy", help="Copy the meshes too, so that the folder is self-contained."),
+        bool, typer.Option("--copy", help="Copy the meshes too, so that the folder is self-contained.")
     ] = False,
     overwrite: Overwrite = False,
 ) -> None:

@@ -84,8 +84,7 @@ class MapOptions:
     per_building: Annotated[
         bool,
         typer.Option(
-            "--per-building",
-            help="One mesh per building, so that [objects] can give each its own material.",
+            "--per-building", help="One mesh per building, so that [objects] can give each its own material."
         ),
     ] = False
     overwrite: Overwrite = False

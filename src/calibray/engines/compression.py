@@ -82,11 +82,7 @@ class Compressed:
     candidates: int
 
 
-def compress(
-    paths: Paths,
-    parameters: Parameters,
-    tolerance_db: float = TOLERANCE_DB,
-) -> Compressed:
+def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERANCE_DB) -> Compressed:
     """Compress a program for given parameters within their bounds, for path loss by the sum of powers.
 
     The largest error of a link's path loss is `tolerance_db` [dB]. Returns the compressed program and its error.

@@ -166,11 +166,7 @@ class EngineSection(Section, ABC):
 
     @abstractmethod
     def open(
-        self,
-        study: OpenedStudy,
-        paths: Paths | None,
-        progress: Progress | None,
-        workers: Workers | None,
+        self, study: OpenedStudy, paths: Paths | None, progress: Progress | None, workers: Workers | None
     ) -> Engine:
         """The engine over all links of a study, on `paths` if they are already traced.
 

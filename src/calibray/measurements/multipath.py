@@ -200,10 +200,7 @@ distributed, so one in 22,000 exceeds its mean by this distance."""
 
 
 def read_impulse_responses(
-    source: str | Path,
-    labels: list[str],
-    sample_rate: float | None = None,
-    margin_db: float = MARGIN_DB,
+    source: str | Path, labels: list[str], sample_rate: float | None = None, margin_db: float = MARGIN_DB
 ) -> Multipath:
     """Read impulse responses, and keep the samples of each that exceed its noise.
 

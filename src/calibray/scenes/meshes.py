@@ -84,8 +84,7 @@ def join_meshes(meshes: Iterable[Mesh]) -> Mesh:
 
 
 def weld(
-    triangles: NDArray[np.int64],
-    position: Callable[[NDArray[np.int64]], NDArray[np.float64]] | None = None,
+    triangles: NDArray[np.int64], position: Callable[[NDArray[np.int64]], NDArray[np.float64]] | None = None
 ) -> Mesh:
     """Make a mesh of triangles with integer corners [F, 3, 3]: equal corners become one vertex.
 

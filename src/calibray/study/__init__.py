@@ -11,11 +11,5 @@ if TYPE_CHECKING:
     from calibray.study.toml_file import expand as expand
 
 __all__, __getattr__, __dir__ = lazy_attributes(
-    __name__,
-    {
-        "content": "VERSION",
-        "setup": "Setup",
-        "study": "Study",
-        "toml_file": "expand",
-    },
+    __name__, {"content": "VERSION", "setup": "Setup", "study": "Study", "toml_file": "expand"}
 )

@@ -60,12 +60,7 @@ class Draft:
     assumptions: tuple[Assumption, ...]
 
 
-def draft(
-    scene: str,
-    links: str | Path,
-    target: str | Path,
-    given: Given | None = None,
-) -> Draft:
+def draft(scene: str, links: str | Path, target: str | Path, given: Given | None = None) -> Draft:
     """Draft a study of a scene, its XML file or `sionna:NAME`, and a table of links; nothing is written.
 
     Other files are named relative to the folder of `target`, the future study file. `given` is what else is known.

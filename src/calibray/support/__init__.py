@@ -10,9 +10,5 @@ if TYPE_CHECKING:
     from calibray.support.output_files import SIGNATURES as SIGNATURES
 
 __all__, __getattr__, __dir__ = lazy_attributes(
-    __name__,
-    {
-        "cache_folder": "CACHE_VARIABLE Store",
-        "output_files": "SIGNATURES",
-    },
+    __name__, {"cache_folder": "CACHE_VARIABLE Store", "output_files": "SIGNATURES"}
 )

@@ -29,16 +29,7 @@ PAPER: Final = "#ffffff"
 BLUE: Final = "#0072b2"
 ORANGE: Final = "#d55e00"
 GREEN: Final = "#009e73"
-PALETTE: Final = (
-    "#cc79a7",
-    "#e69f00",
-    "#56b4e9",
-    "#8c5a3c",
-    "#882255",
-    "#6f7f2e",
-    "#5c6bc0",
-    "#777777",
-)
+PALETTE: Final = ("#cc79a7", "#e69f00", "#56b4e9", "#8c5a3c", "#882255", "#6f7f2e", "#5c6bc0", "#777777")
 """Colours for lines beyond the named ones."""
 
 COLORS: Final = {"gwo": GREEN, "sgwo-im": BLUE, "space-mapping": FAINT, "auto": ORANGE}

@@ -56,11 +56,7 @@ class CommandSection(EngineSection):
         return [*self.command, *(["rays"] if self.rays else [])]
 
     def open(
-        self,
-        study: OpenedStudy,
-        paths: Paths | None,
-        progress: Progress | None,
-        workers: Workers | None,
+        self, study: OpenedStudy, paths: Paths | None, progress: Progress | None, workers: Workers | None
     ) -> Command:
         """The program over a study's links; see `EngineSection.open`."""
         from calibray.engines.external.command import Command

@@ -54,11 +54,7 @@ class ReplaySection(EngineSection):
         return
 
     def open(
-        self,
-        study: OpenedStudy,
-        paths: Paths | None,
-        progress: Progress | None,
-        workers: Workers | None,
+        self, study: OpenedStudy, paths: Paths | None, progress: Progress | None, workers: Workers | None
     ) -> Replay | ReplayCarriers | ChunkedReplay:
         """The replay of a study's links; see `EngineSection.open`.
 

@@ -34,11 +34,7 @@ class RetraceSection(EngineSection):
         return list(study.tracer_versions.values())
 
     def open(
-        self,
-        study: OpenedStudy,
-        paths: Paths | None,
-        progress: Progress | None,
-        workers: Workers | None,
+        self, study: OpenedStudy, paths: Paths | None, progress: Progress | None, workers: Workers | None
     ) -> Retrace:
         """The ray tracer over a study's links; see `EngineSection.open`."""
         from calibray.engines.retrace import CarrierTracer, Retrace

@@ -13,14 +13,7 @@ from numpy.typing import NDArray
 
 from calibray.engines.ledger.database import LedgerEntry, key
 from calibray.engines.ledger.ledger import Ledger
-from calibray.engines.protocol import (
-    Answer,
-    Answering,
-    Responses,
-    check_candidates,
-    gather,
-    gather_responses,
-)
+from calibray.engines.protocol import Answer, Answering, Responses, check_candidates, gather, gather_responses
 from calibray.errors import EngineError, InputError
 from calibray.materials import Material
 from calibray.measurements.observables import Statistic
