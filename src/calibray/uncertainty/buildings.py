@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibray.engines.compression import strongest
 from calibray.engines.protocol import PATH_LOSS, Responses
-from calibray.engines.replay import Replay
+from calibray.engines.replay import Computation, Replay
 from calibray.fitting.problem import Problem
 from calibray.measurements.observables import Statistic
 from calibray.parameters import Parameters
@@ -123,8 +123,8 @@ def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool)
         Parameters(tuple(items), parameters.frequency),
         study.objective.combining,
         study.scene.bandwidth,
-        batch=1 << (batch.bit_length() - 1),
-        effects=effects,
+        effects,
+        Computation(batch=1 << (batch.bit_length() - 1)),
     )
     return SplitReplay(split, np.array(parameter_of), np.array(building_of))
 
