@@ -13,7 +13,7 @@ calibration can therefore at best find the means over the buildings, and residua
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -223,6 +223,9 @@ ANTENNA: Final = {"pattern": "dipole", "polarization": "V"}
 SPECULAR: Final[dict[str, Any]] = {"max_depth": 4, "samples": 500_000}
 DIFFUSE: Final[dict[str, Any]] = {"max_depth": 3, "samples": 300_000, "diffuse_reflection": True}
 
+EVERY: Final = slice(None)
+"""All links."""
+
 MODEL_MATERIALS: Final = {
     "concrete": {"type": "concrete", "thickness": PLANTED["concrete"].thickness},
     "glass": {"type": "glass", "thickness": PLANTED["glass"].thickness},
@@ -248,24 +251,25 @@ def write_model(folder: Path, truth: World) -> None:
     write_bytes(folder / "truth.json", truth_json(truth).encode("ascii"))
 
 
-def measure(truth: World, seed: int = SEED) -> NDArray[np.float64]:
+def measure(truth: World, seed: int = SEED, links: slice = EVERY) -> NDArray[np.float64]:
     """Path loss of every link and standard deviation of its snapshots [L, 2], [dB], in the true world.
 
     Specular paths and paths with a diffuse reflection are traced separately: all of the few specular paths are needed,
-    but only a sample of the diffuse ones.
+    but only a sample of the diffuse ones. Fewer `links` have the same values as among all.
     """
+    ends = replace(truth, tx=truth.tx[links], rx=truth.rx[links])
     with TemporaryDirectory() as folder:
         scene = write_scene(Path(folder), truth.scene_objects(), truth.materials())
         specular, mixed = (
             _powers(
-                trace(scene, truth, frequency=FREQUENCY, tx_antenna=ANTENNA, rx_antenna=ANTENNA, **settings)
+                trace(scene, ends, frequency=FREQUENCY, tx_antenna=ANTENNA, rx_antenna=ANTENNA, **settings)
             )
             for settings in (SPECULAR, DIFFUSE)
         )
     link, power, delay, diffuse = np.concatenate([specular, mixed[:, mixed[3] > 0]], axis=1)
     sounded = []
-    for index in range(len(truth.tx)):
-        mask = link == index
+    for place, index in enumerate(range(len(truth.tx))[links]):
+        mask = link == place
         rng = np.random.Generator(np.random.PCG64([seed, 2, index]))
         sounded.append(sounded_path_loss(power[mask], delay[mask], diffuse[mask] > 0, rng))
     return np.array(sounded)
