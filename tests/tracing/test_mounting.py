@@ -14,9 +14,9 @@ from calibray.fields import path_gains
 from calibray.scenes import Scene, read_scene
 from calibray.tracing.antennas import AntennaPattern
 from calibray.tracing.mounting import Mounting, Pose, jones_vectors, mount, wave_basis
+from calibray.tracing.protocol import LinkPositions
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
-from calibray.tracing.sionna.exported import LinkPositions
 from small_scenes import block, write_scene
 
 FREQUENCY = 3.5e9
