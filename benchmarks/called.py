@@ -34,7 +34,7 @@ from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares, SpaceMapping, VectorSurrogate
 from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
-from calibray.uncertainty.credible_sets import credible
+from calibray.uncertainty.credible_sets import credible_sets
 
 LEVELS = (0.9, 0.95)
 NOISES_DB = (1.0, 3.0)
@@ -147,7 +147,9 @@ def repetition(name: str, noise_db: float, turn: int, folder: Path) -> dict[str,
         draws = assessed.posterior.means
         sets = [
             {
-                str(level): credible(draws.point[:, k], draws.weight, bounds[0][k], bounds[1][k], level)
+                str(level): credible_sets(
+                    draws.point[:, k], draws.weight, bounds[0][k], bounds[1][k], [level]
+                )[0]
                 for level in LEVELS
             }
             for k in range(count)

@@ -30,7 +30,7 @@ from calibray.scenarios import demo_study_path
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
-from calibray.uncertainty.credible_sets import credible
+from calibray.uncertainty.credible_sets import credible_sets
 from calibray.uncertainty.draws import Draws
 from calibray.uncertainty.sequential_monte_carlo import KEPT, LAST_SWEEPS, SIZE
 from calibray.validation.choice import HeldOutResiduals, fit_prediction_model
@@ -77,8 +77,9 @@ def seeds(problem: Problem, count: int) -> Table:
             sys.exit(f"no draws: {found.remarks}")
         draws = found.posterior.means
         widths.append([
-            sum(high - low for low, high in credible(draws.point[:, k], draws.weight, lower[k], upper[k], LEVEL))
+            sum(high - low for low, high in pieces)
             for k in range(len(lower))
+            for pieces in credible_sets(draws.point[:, k], draws.weight, lower[k], upper[k], [LEVEL])
         ])  # fmt: skip
         shares = (f"{share:.2f}" for share in widths[-1] / (upper - lower))
         agree = "yes" if draws.agree else "no"

@@ -45,7 +45,7 @@ from calibray.fitting.search import Trail, search
 from calibray.optimizers import LeastSquares
 from calibray.tables import Column, Table, numbers, render, render_markdown
 from calibray.uncertainty.assessment import certainty
-from calibray.uncertainty.credible_sets import credible, credible_sets
+from calibray.uncertainty.credible_sets import credible_sets
 from calibray.uncertainty.draws import Draws
 from calibray.uncertainty.joint_model import joint_model
 from calibray.uncertainty.noise_models import GAUSSIAN, Marginal, NoiseModel
@@ -185,10 +185,10 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
     for k, parameter in enumerate(problem.parameters.names):
         told_sets = credible_sets(means.point[:, k], means.weight, lower[k], upper[k], LEVELS)
         sets = dict(zip(map(str, LEVELS), told_sets, strict=True))
-        control = credible(means.point[:, k], narrow / narrow.sum(), lower[k], upper[k], LEVELS[0])
+        control = credible_sets(means.point[:, k], narrow / narrow.sum(), lower[k], upper[k], [LEVELS[0]])[0]
         luck = None
         if reference is not None:
-            alike = credible(reference.point[:, k], reference.weight, lower[k], upper[k], LEVELS[0])
+            alike = credible_sets(reference.point[:, k], reference.weight, lower[k], upper[k], [LEVELS[0]])[0]
             luck = {"held": bool(_holds(alike, point[k])), "width": _width(alike) / (upper[k] - lower[k])}
         found.append({
             "name": parameter,

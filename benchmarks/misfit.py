@@ -31,7 +31,7 @@ from calibray.optimizers import LeastSquares
 from calibray.result.held_out import Model
 from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
-from calibray.uncertainty.credible_sets import credible
+from calibray.uncertainty.credible_sets import credible_sets
 from calibray.validation.validate import fit_models, validate_problem
 from calibray.validation.variants import fit_variants
 from misfit_worlds import WORLDS, World, make, named
@@ -70,7 +70,7 @@ def repetition(world: World, seed: int, choice: bool, spread: float | None) -> d
         raise RuntimeError(f"no draws; {assessed.remarks}")
     means, inside, widths = assessed.posterior.means, [], []
     for k, value in enumerate(drawn.truth):
-        pieces = credible(means.point[:, k], means.weight, lower[k], upper[k], LEVEL)
+        pieces = credible_sets(means.point[:, k], means.weight, lower[k], upper[k], [LEVEL])[0]
         inside.append(any(low <= value <= high for low, high in pieces))
         widths.append(sum(high - low for low, high in pieces) / (upper[k] - lower[k]))
     truth = parameters.from_search(drawn.truth)

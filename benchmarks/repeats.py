@@ -25,7 +25,7 @@ from calibray.optimizers import LeastSquares
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
-from calibray.uncertainty.credible_sets import credible
+from calibray.uncertainty.credible_sets import credible_sets
 
 NOISE_DB, ROW_DB = 3.0, 0.3
 ROWS = 3
@@ -57,7 +57,7 @@ def inside(problem: Problem, measured: np.ndarray, truth: np.ndarray, seed: int)
     return [
         any(low <= truth[k] <= high for low, high in pieces)
         for k in range(len(truth))
-        for pieces in (credible(draws.point[:, k], draws.weight, lower[k], upper[k], LEVEL),)
+        for pieces in (credible_sets(draws.point[:, k], draws.weight, lower[k], upper[k], [LEVEL])[0],)
     ]
 
 

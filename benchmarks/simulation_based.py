@@ -38,7 +38,7 @@ from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares
 from calibray.study import Setup, Study
 from calibray.tables import Column, Table, numbers, render
-from calibray.uncertainty.credible_sets import credible
+from calibray.uncertainty.credible_sets import credible_sets
 from calibray.uncertainty.joint_model import JointModel, joint_model
 from calibray.uncertainty.sequential_monte_carlo import BUDGET, draw_posterior
 
@@ -158,7 +158,7 @@ def run(
 def _inside(unit: np.ndarray, weight: np.ndarray, truth: np.ndarray) -> list[bool]:
     """Whether the credible set of each parameter contains the truth."""
     return [
-        any(low <= truth[k] <= high for low, high in credible(unit[:, k], weight, 0.0, 1.0, LEVEL))
+        any(low <= truth[k] <= high for low, high in credible_sets(unit[:, k], weight, 0.0, 1.0, [LEVEL])[0])
         for k in range(unit.shape[1])
     ]
 

@@ -147,6 +147,15 @@ def test_loss_is_the_imaginary_part_of_the_complex_permittivity(
     assert slab.loss_term(conductivity, speed_of_light / frequency) == pytest.approx(loss, rel=1e-8)
 
 
+def test_loss_agrees_with_sionna() -> None:
+    import mitsuba as mi
+    import sionna.rt  # noqa: F401  (selects the Mitsuba variant)
+    from sionna.rt.utils import complex_relative_permittivity
+
+    eta = complex_relative_permittivity(mi.Float(5.0), mi.Float(0.1), mi.Float(2 * np.pi * 3e9))
+    assert slab.loss_term(0.1, speed_of_light / 3e9) == pytest.approx(-float(eta.imag[0]), rel=1e-6)
+
+
 # Free space, two rays
 
 

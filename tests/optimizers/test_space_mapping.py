@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
 import numpy as np
 import pytest
 
 from calibray.optimizers import SpaceMapping, VectorSurrogate
 from calibray.optimizers.arguments import Box
-from calibray.optimizers.multifidelity.cheap_model import Constants, FunctionModel
+from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, Constants
 from calibray.optimizers.multifidelity.correction import (
     CAPPED,
     FOLLOWED,
@@ -68,13 +71,32 @@ def excess(optimizer) -> np.ndarray:
     return np.minimum.accumulate(best) - MINIMUM
 
 
+@dataclass(frozen=True, eq=False)
+class FunctionModel:
+    """A cheap model given as a function of points [n, 2] and constants [n, q]; derivatives are central differences."""
+
+    function: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    constants: Constants = field(default_factory=Constants.none)
+    known: np.ndarray = field(default_factory=lambda: np.ones(25, bool))
+
+    def residuals(self, points, constants):
+        return self.function(points, constants)
+
+    def answer(self, points, constants):
+        arguments = np.hstack([points, constants])
+        step = 1e-5 * np.concatenate([BOX.width, self.constants.width])
+        moves = np.concatenate([np.diag(step), -np.diag(step)])
+        moved = (arguments + moves[:, None]).reshape(-1, arguments.shape[1])
+        values = self.function(moved[:, :2], moved[:, 2:]).reshape(2, len(step), len(points), -1)
+        slopes = np.moveaxis((values[0] - values[1]) / (2.0 * step[:, None, None]), 0, -1)
+        return CheapAnswer(self.function(points, constants), slopes[:, :, :2], slopes[:, :, 2:])
+
+
 def cheap(thickness: float) -> FunctionModel:
     """The street without absorption, with a believed thickness."""
     centre = np.log([thickness])
     constants = Constants(centre, np.full(1, 0.5), centre - 1.5, centre + 1.5)
-    return FunctionModel(
-        lambda x, c: street_loss(x, np.exp(c)) - MEASURED, UPPER - LOWER, np.ones(25, bool), constants
-    )
+    return FunctionModel(lambda x, c: street_loss(x, np.exp(c)) - MEASURED, constants)
 
 
 def useless() -> FunctionModel:
@@ -86,7 +108,7 @@ def useless() -> FunctionModel:
     def tones(x, _):
         return 3.0 * np.cos(6.0 * BOX.to_unit(x) @ frequency + phase) @ amplitude / 5.0
 
-    return FunctionModel(tones, UPPER - LOWER, np.ones(25, bool))
+    return FunctionModel(tones)
 
 
 @pytest.mark.parametrize("thickness", [1.1, 1.8])
@@ -124,7 +146,7 @@ def test_input_mappings_start_from_the_likeliest_of_many_trials():
     true = np.array([1.1, 2.3])
     centre = np.log([1.8, 1.6])
     constants = Constants(centre, np.full(2, 0.5), centre - 1.5, centre + 1.5)
-    model = FunctionModel(lambda x, c: thick_walls(x, np.exp(c)), UPPER - LOWER, np.ones(25, bool), constants)
+    model = FunctionModel(lambda x, c: thick_walls(x, np.exp(c)), constants)
     unit = design("sobol", 3, 2, np.random.default_rng(0))
     residuals = thick_walls(BOX.from_unit(unit), np.tile(true, (3, 1)))
     trials = centre + 0.5 * np.random.default_rng(1).standard_normal((600, 2))

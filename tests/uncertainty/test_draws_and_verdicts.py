@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import norm, t
 
 from calibray.result.wording import reason_text
-from calibray.uncertainty.credible_sets import credible
+from calibray.uncertainty.credible_sets import credible_sets
 from calibray.uncertainty.draws import Draws
 from calibray.uncertainty.verdicts import Axes, verdicts
 
@@ -30,7 +30,7 @@ def normal_draws(mean, size, count=4000):
 def test_two_separate_ranges_are_ambiguous():
     value = np.concatenate([normal_draws([2.0], [0.2]).point, normal_draws([8.0], [0.2], 8000).point])
     draws = Draws(value, np.zeros(len(value)), np.full(len(value), 1 / len(value)))
-    pieces = credible(value[:, 0], draws.weight, 0.0, 10.0, 0.95)
+    pieces = credible_sets(value[:, 0], draws.weight, 0.0, 10.0, [0.95])[0]
     assert [round(0.5 * (low + high)) for low, high in pieces] == [2, 8]
     (verdict,) = verdicts(draws, lambda x: x, Axes(NAMES[:1], np.zeros(1), np.full(1, 10.0)), 1.0)
     assert verdict.name == "ambiguous"
@@ -138,12 +138,12 @@ def test_credible_sets_cover_their_level():
         random.gamma(2.0, 0.5, 3000),
         t(4).rvs(3000, random_state=random) + 5,
     ):
-        pieces = credible(draws, np.full(3000, 1 / 3000), 0.0, 10.0, 0.9)
+        pieces = credible_sets(draws, np.full(3000, 1 / 3000), 0.0, 10.0, [0.9])[0]
         inside = np.any([(draws >= low) & (draws <= high) for low, high in pieces], axis=0)
         assert inside.mean() == pytest.approx(0.9, abs=0.02)
     value = random.uniform(2, 8, 4000)
     weight = norm.pdf(value, 5, 0.5)
-    ((low, high),) = credible(value, weight / weight.sum(), 0.0, 10.0, 0.95)
+    ((low, high),) = credible_sets(value, weight / weight.sum(), 0.0, 10.0, [0.95])[0]
     assert (low, high) == pytest.approx((5 - 0.98, 5 + 0.98), abs=0.12)
 
 

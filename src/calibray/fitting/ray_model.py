@@ -42,7 +42,6 @@ TILT: Final = 0.3
 ANGLES: Final = 3
 """Slant and two tilts of an end."""
 
-Pair = tuple[jax.Array, jax.Array]
 Ends = tuple[bool, bool]
 """Whether the antenna is linearly polarized, at the transmitter and at the receiver."""
 

@@ -70,10 +70,6 @@ class Kriging:
         inputs = Inputs.plain(unit)
         return self.process.mean(inputs), self.process.slope(inputs)
 
-    def left_out(self) -> NDArray[np.float64]:
-        """Residuals of every evaluated point predicted from all other points, with unchanged scales [n, m]."""
-        return self.residuals - self.process.left_out_errors()
-
     def with_point(self, point: NDArray[np.float64]) -> Kriging:
         """Add a point [d] as if its evaluation equalled the prediction: same mean and prior, but no variance there."""
         unit = np.vstack([self.process.inputs.unit, point])

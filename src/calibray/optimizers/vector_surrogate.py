@@ -26,12 +26,11 @@ evaluation enters the model with the residuals of the worst successful one.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, final
+from typing import ClassVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.distance import cdist, pdist
-from scipy.stats import spearmanr
 
 from calibray.errors import InputError
 from calibray.optimizers.arguments import Box, real, whole
@@ -126,18 +125,6 @@ class VectorSurrogate(Optimizer):
         self._model: Kriging | None = None
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
         self._session = Session(self.box, self.uses, self._search, objective)
-
-    @property
-    def trust(self) -> float | None:
-        """How well the model ranks left-out points by their objective; None without a model.
-
-        The measure is Spearman's rank correlation: 1 is perfect, and 0 is useless and calls for more initial points.
-        """
-        if self._model is None:
-            return None
-        y, predicted = (root_mean_square(r) for r in (self._model.residuals, self._model.left_out()))
-        correlation: Any = spearmanr(y, predicted)
-        return float(correlation.statistic)
 
     def _search(self, archive: Archive) -> Search:
         d, left, quiet, turn = self.box.dimension, self._budget, 0, 0

@@ -36,30 +36,6 @@ LEAST_GAP: Final = 0.03
 """A gap between pieces is chance if it is narrower than this share of the range and than the wider piece."""
 
 
-def credible(
-    value: NDArray[np.float64], weight: NDArray[np.float64], lower: float, upper: float, level: float
-) -> tuple[tuple[float, float], ...]:
-    """The smallest set that covers a share of the posterior.
-
-    Args:
-        value: Draws of the parameter [n].
-        weight: Their weights [n].
-        lower: Lower bound of the parameter.
-        upper: Upper bound of the parameter.
-        level: Share of the posterior to cover.
-
-    Returns:
-        Lower and upper end of every piece, ascending.
-
-    Example:
-        >>> draws = np.random.default_rng(0).normal(5.0, 0.1, 4000)
-        >>> ((low, high),) = credible(draws, np.full(4000, 1 / 4000), 0.0, 10.0, 0.95)
-        >>> round(low, 1), round(high, 1)
-        (4.8, 5.2)
-    """
-    return credible_sets(value, weight, lower, upper, (level,))[0]
-
-
 def credible_sets(
     value: NDArray[np.float64],
     weight: NDArray[np.float64],
@@ -67,7 +43,24 @@ def credible_sets(
     upper: float,
     levels: Sequence[float],
 ) -> list[tuple[tuple[float, float], ...]]:
-    """The sets of `credible` for several levels, from one smoothed density."""
+    """The smallest sets that cover shares of the posterior, from one smoothed density.
+
+    Args:
+        value: Draws of the parameter [n].
+        weight: Their weights [n].
+        lower: Lower bound of the parameter.
+        upper: Upper bound of the parameter.
+        levels: Shares of the posterior to cover.
+
+    Returns:
+        Lower and upper end of every piece, ascending, for each level.
+
+    Example:
+        >>> draws = np.random.default_rng(0).normal(5.0, 0.1, 4000)
+        >>> (((low, high),),) = credible_sets(draws, np.full(4000, 1 / 4000), 0.0, 10.0, [0.95])
+        >>> round(low, 1), round(high, 1)
+        (4.8, 5.2)
+    """
     width = upper - lower
     edges, mass = _masses((value - lower) / width, weight)
     # Intervals by falling density, until the level is reached.

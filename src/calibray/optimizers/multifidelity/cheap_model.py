@@ -1,16 +1,12 @@
-"""The interface of a cheap model of an expensive engine, and a cheap model made from a function without derivatives."""
+"""The interface of a cheap model of an expensive engine."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Final, NamedTuple, Protocol, final
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-
-STEP: Final = 1e-5
-"""Step of central differences, as a share of a coordinate's range."""
 
 
 class CheapAnswer(NamedTuple):
@@ -78,41 +74,3 @@ class CheapModel(Protocol):
     def answer(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> CheapAnswer:
         """Residuals with their derivatives."""
         ...
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class FunctionModel:
-    """A cheap model given as a function; its derivatives are central differences.
-
-    Attributes:
-        function: Points [n, d] and constants [n, q] to residuals [n, m].
-        width: Range of each search coordinate [d].
-        known: Residuals that the function predicts [m].
-        constants: Its constants.
-
-    Example:
-        >>> import numpy as np
-        >>> model = FunctionModel(lambda x, c: x**2, np.ones(1), np.ones(1, dtype=bool))
-        >>> model.answer(np.array([[3.0]]), np.zeros((1, 0))).by_point.round(6).tolist()
-        [[[6.0]]]
-    """
-
-    function: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
-    width: NDArray[np.float64]
-    known: NDArray[np.bool_]
-    constants: Constants = field(default_factory=Constants.none)
-
-    def residuals(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See `CheapModel.residuals`."""
-        return self.function(points, constants)
-
-    def answer(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> CheapAnswer:
-        """See `CheapModel.answer`."""
-        d, arguments = points.shape[1], np.hstack([points, constants])
-        step = STEP * np.concatenate([self.width, self.constants.width])
-        moves = np.concatenate([np.diag(step), -np.diag(step)])
-        moved = (arguments + moves[:, None]).reshape(-1, arguments.shape[1])
-        values = self.function(moved[:, :d], moved[:, d:]).reshape(2, len(step), len(points), -1)
-        slopes = np.moveaxis((values[0] - values[1]) / (2.0 * step[:, None, None]), 0, -1)
-        return CheapAnswer(self.function(points, constants), slopes[:, :, :d], slopes[:, :, d:])

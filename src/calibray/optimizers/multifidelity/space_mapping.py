@@ -126,19 +126,6 @@ class SpaceMapping(Optimizer):
 
     Raises:
         InputError: An argument is out of range.
-
-    Example:
-        >>> import numpy as np
-        >>> from calibray.optimizers.multifidelity.cheap_model import FunctionModel
-        >>> width, known = np.full(2, 9.0), np.ones(2, dtype=bool)
-        >>> cheap = FunctionModel(lambda x, _: np.sin(x) - 0.4 * x[:, ::-1], width, known)
-        >>> opt = SpaceMapping([0.0, 0.0], [9.0, 9.0], cheap_model=cheap, budget=6)
-        >>> while not opt.done:
-        ...     x = opt.ask()
-        ...     r = np.sin(x) - 0.5 * x[:, ::-1] - 0.1
-        ...     opt.tell(x, np.sqrt(np.mean(r**2, axis=1)), residuals=r)
-        >>> opt.evaluations, bool(opt.best.y < 1e-2)
-        (6, True)
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value", "residuals"})
