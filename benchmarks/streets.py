@@ -89,7 +89,7 @@ def _rival(problem: Problem, loss: np.ndarray, apart: np.ndarray) -> np.ndarray:
     objective = replace(
         problem.objective, measured=loss, weight=np.where(apart, 0.0, problem.objective.weight)
     )
-    return obstructed(links, objective, without_scene(problem.setup.study, links))[apart]
+    return obstructed(links, objective, without_scene(problem.setup.study, links)).path_loss_db()[apart]
 
 
 def main() -> None:

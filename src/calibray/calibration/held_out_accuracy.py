@@ -19,7 +19,7 @@ from calibray.fitting.search import Trail
 from calibray.result.held_out import FittedTerm, Model, PredictionModel
 from calibray.result.record import Accuracy
 from calibray.scenes.obstruction import OUT_OF_SIGHT
-from calibray.validation.baselines import has_obstruction, log_distance_objective, obstructed, without_scene
+from calibray.validation.baselines import has_obstruction, log_distance, obstructed, without_scene
 from calibray.validation.choice import HeldOutResiduals, fitted_terms, quantiles
 from calibray.validation.held_out_statistics import (
     choose,
@@ -113,7 +113,7 @@ def _choice(
     }
     if has_obstruction(setup.links):
         known_db = without_scene(setup.study, setup.links)
-        modelled[Model.OBSTRUCTION] = obstructed(setup.links, objective, known_db)
+        modelled[Model.OBSTRUCTION] = obstructed(setup.links, objective, known_db).path_loss_db()
     errors: dict[str, NDArray[np.float64]] = {
         name: (path_loss_db - objective.measured)[judged] for name, path_loss_db in modelled.items()
     }
@@ -210,7 +210,7 @@ def fit_fallback(
         and if these are too few as well, from the calibration links.
     """
     setup, links = problem.setup, problem.setup.links
-    objective, known_db = log_distance_objective(links, problem.objective, without_scene(setup.study, links))
+    objective, known_db = log_distance(links, problem.objective, without_scene(setup.study, links))
     terms = fitted_terms(objective, known_db, setup.study)
     residuals = objective.measured - add_nuisance(objective, known_db)
     usable = without_path & ~setup.held_out

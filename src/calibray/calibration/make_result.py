@@ -117,7 +117,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
         objective.capped(problem.before),
         nuisance_only,
         with_nuisance,
-        log_distance(links, objective, without_scene(study, links)),
+        log_distance(links, objective, without_scene(study, links)).path_loss_db(),
     )
     paths = _replayed_paths(problem)
     diagnostics = diagnose_links(problem, trail.best, paths)

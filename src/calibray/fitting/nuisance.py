@@ -88,7 +88,7 @@ class Term:
         if (labels is None) != (self.labels == ("",)):
             need = "takes no labels" if labels is not None else "needs the labels of the links' groups"
             raise InputError(f"nuisance {self.name!r}: {need}")
-        value = _column(links, self.by) - self.centre
+        value = column(links, self.by) - self.centre
         if labels is None:
             return replace(self, value=value, group=np.zeros(len(links), dtype=np.int64))
         link_labels = _labels(self.name, links, labels)
@@ -139,7 +139,7 @@ def make_term(
         )
     if prior is not None and not prior > 0:
         raise InputError(f"nuisance {name!r}: prior = {prior:g}; a standard deviation must be greater than 0")
-    value = _column(links, by)
+    value = column(links, by)
     centre = float(value.mean()) if by == LOG_DISTANCE else 0.0
     if labels is None:
         groups, group = ("",), np.zeros(len(links), dtype=np.int64)
@@ -175,7 +175,12 @@ def transmitters(links: Measurements) -> NDArray[np.str_]:
     return np.array([",".join(f"{value:.2f}" for value in tx) for tx in links.tx], dtype=np.str_)
 
 
-def _column(links: Measurements, by: str) -> NDArray[np.float64]:
+def column(links: Measurements, by: str) -> NDArray[np.float64]:
+    """The column of a term [L], before it is centred; see `make_term`.
+
+    Raises:
+        InputError: The links' table lacks the column, or it is not numeric.
+    """
     if by == CONSTANT:
         return np.ones(len(links))
     return np.log10(links.distance) if by == LOG_DISTANCE else links.table.numbers(by)

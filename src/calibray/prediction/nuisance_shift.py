@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE, OFFSET, UNKNOWN_DB, transmitters
+from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, column, transmitters
 from calibray.measurements import Measurements
 from calibray.result.held_out import PredictionModel
 
@@ -65,8 +65,8 @@ def model_terms(model: PredictionModel, links: Measurements) -> Iterator[TermAtL
             labels = links.group
         else:
             labels = links.table.labels(term.per) if term.per else None
-        column = _column(links, term.by, term.centre)
-        yield TermAtLinks(term.name, column, labels, term.coefficients, term.spread_db)
+        values = column(links, term.by) - term.centre
+        yield TermAtLinks(term.name, values, labels, term.coefficients, term.spread_db)
 
 
 def nuisance_shift(
@@ -119,9 +119,3 @@ def nuisance_shift(
             spread = np.std(best, ddof=1) if len(best) > 1 else UNKNOWN_DB
         variance += np.where(group >= 0, 0.0, (term.column * spread) ** 2 * (1 + 1 / len(best)))
     return Shift(value, np.sqrt(variance))
-
-
-def _column(links: Measurements, by: str, centre: float) -> NDArray[np.float64]:
-    if by == CONSTANT:
-        return np.ones(len(links))
-    return (np.log10(links.distance) if by == LOG_DISTANCE else links.table.numbers(by)) - centre

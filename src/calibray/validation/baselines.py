@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,42 +58,31 @@ def without_scene(study: StudyModel, links: Measurements) -> NDArray[np.float64]
     return rise_db - direct_gain(study, links)
 
 
-def log_distance(
-    links: Measurements, objective: Objective, known_db: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Path loss of a log-distance model with the study's nuisances, fitted to the calibration links.
+class Baseline(NamedTuple):
+    """A model without paths: all its unknowns are nuisance coefficients, and its links with a weight determine them.
 
-    If the study has an offset per group, this model has an intercept per group. A group without calibration links gets
-    the mean intercept of the others.
+    Attributes:
+        objective: The model as an objective.
+        known_db: Known part of its path loss [links], [dB].
+    """
+
+    objective: Objective
+    known_db: NDArray[np.float64]
+
+    def path_loss_db(self) -> NDArray[np.float64]:
+        """Path loss at all links [links], [dB]; a group without links of a weight gets the mean of the others."""
+        coefficients = self.objective.coefficients(self.known_db[None])
+        filled, _ = self.objective.nuisance.filled(coefficients, self.objective.weight > 0)
+        return self.objective.nuisance.contribution(filled)[0] + self.known_db
+
+
+def log_distance(links: Measurements, objective: Objective, known_db: NDArray[np.float64]) -> Baseline:
+    """The log-distance model with the study's nuisances; an offset per group becomes an intercept per group.
 
     Args:
         links: All links.
         objective: The study's objective; its weights select the fitted links.
         known_db: Known part of their path loss [links], [dB]; see `without_scene`.
-
-    Returns:
-        Path loss at all links [links], [dB].
-
-    Raises:
-        EngineError: Fewer than two links have a weight.
-    """
-    model, known_db = log_distance_objective(links, objective, known_db)
-    filled, _ = model.nuisance.filled(model.coefficients(known_db[None]), objective.weight > 0)
-    return model.nuisance.contribution(filled)[0] + known_db
-
-
-def log_distance_objective(
-    links: Measurements, objective: Objective, known_db: NDArray[np.float64]
-) -> tuple[Objective, NDArray[np.float64]]:
-    """The log-distance model as an objective: all its unknowns are nuisance coefficients.
-
-    Args:
-        links: All links.
-        objective: The study's objective.
-        known_db: Known part of their path loss [links], [dB]; see `without_scene`.
-
-    Returns:
-        The objective, and the known part of its path loss [links], [dB].
 
     Raises:
         EngineError: Fewer than two links have a weight.
@@ -107,7 +96,7 @@ def log_distance_objective(
         if (by, ("",)) not in present:
             terms.append(make_term(links, _free_name(by, terms), by))
     nuisance = Nuisance(len(links), tuple(terms))
-    return replace(objective, nuisance=nuisance, ceiling_db=None), known_db
+    return Baseline(replace(objective, nuisance=nuisance, ceiling_db=None), known_db)
 
 
 def has_obstruction(links: Measurements) -> bool:
@@ -115,47 +104,21 @@ def has_obstruction(links: Measurements) -> bool:
     return OUT_OF_SIGHT in links.frame and bool(links.table.numbers(OUT_OF_SIGHT).any())
 
 
-def obstructed(
-    links: Measurements, objective: Objective, known_db: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Path loss of the log-distance model with a loss out of sight and a loss per wall, fitted in the same way.
-
-    Args:
-        links: All links, with the columns that follow from the scene.
-        objective: The study's objective; its weights select the fitted links.
-        known_db: Known part of their path loss [links], [dB]; see `without_scene`.
-
-    Returns:
-        Path loss at all links [links], [dB].
-
-    Raises:
-        EngineError: Fewer than two links have a weight.
-    """
-    model, known_db = obstructed_objective(links, objective, known_db)
-    filled, _ = model.nuisance.filled(model.coefficients(known_db[None]), objective.weight > 0)
-    return model.nuisance.contribution(filled)[0] + known_db
-
-
-def obstructed_objective(
-    links: Measurements, objective: Objective, known_db: NDArray[np.float64]
-) -> tuple[Objective, NDArray[np.float64]]:
-    """The log-distance model with obstruction as an objective, like `log_distance_objective`.
+def obstructed(links: Measurements, objective: Objective, known_db: NDArray[np.float64]) -> Baseline:
+    """The log-distance model with a loss out of sight and a loss per wall.
 
     The loss out of sight has a prior around a mean. The mean is part of the known path loss, and the rest is a
     coefficient.
 
     Args:
         links: All links, with the columns that follow from the scene.
-        objective: The study's objective.
+        objective: The study's objective; its weights select the fitted links.
         known_db: Known part of their path loss [links], [dB]; see `without_scene`.
-
-    Returns:
-        The objective, and the known part of its path loss [links], [dB].
 
     Raises:
         EngineError: Fewer than two links have a weight.
     """
-    model, known_db = log_distance_objective(links, objective, known_db)
+    model, known_db = log_distance(links, objective, known_db)
     terms, present = list(model.nuisance.terms), {term.by for term in model.nuisance.terms}
     for by, prior_db in ((OUT_OF_SIGHT, OUT_OF_SIGHT_DB[1]), (WALLS, WALL_DB)):
         if by not in present:
@@ -167,7 +130,7 @@ def obstructed_objective(
     # The priors are weighed against the errors that remain with the losses that these errors give.
     for _ in range(ROUNDS):
         model = replace(model, noise_db=max(float(model.rmse(known_db[None])[0]), LEAST_NOISE_DB))
-    return model, known_db
+    return Baseline(model, known_db)
 
 
 def _free_name(by: str, terms: Sequence[Term]) -> str:

@@ -24,8 +24,8 @@ from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study.model import StudyModel
 from calibray.validation.baselines import (
     OUT_OF_SIGHT_DB,
-    log_distance_objective,
-    obstructed_objective,
+    log_distance,
+    obstructed,
     without_scene,
 )
 from calibray.validation.variants import (
@@ -103,7 +103,7 @@ def fit_prediction_model(
     candidate, scene_db = trail.best, trail.best_modelled
     objective, modelled = problem.objective, scene_db
     if name in WITHOUT_MATERIALS:
-        make = log_distance_objective if name == Model.LOG_DISTANCE else obstructed_objective
+        make = log_distance if name == Model.LOG_DISTANCE else obstructed
         objective, modelled = make(setup.links, problem.objective, without_scene(setup.study, setup.links))
     elif name == Model.INITIAL:
         candidate, scene_db = parameters.start, problem.before

@@ -192,9 +192,9 @@ def fit_models(
         for name, (variant, minima) in fits.items()
     }
     known_db = without_scene(setup.study, setup.links)
-    path_loss_db[Model.LOG_DISTANCE] = log_distance(setup.links, objective, known_db)
+    path_loss_db[Model.LOG_DISTANCE] = log_distance(setup.links, objective, known_db).path_loss_db()
     if has_obstruction(setup.links):
-        path_loss_db[Model.OBSTRUCTION] = obstructed(setup.links, objective, known_db)
+        path_loss_db[Model.OBSTRUCTION] = obstructed(setup.links, objective, known_db).path_loss_db()
     for name, trend in ((Model.KRIGING, Model.LOG_DISTANCE), (Model.RESIDUAL_FIELD, Model.CALIBRATED)):
         try:
             path_loss_db[name] = kriging(setup.links, objective, path_loss_db[trend])
