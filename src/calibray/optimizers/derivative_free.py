@@ -75,23 +75,23 @@ class POUNDERS(Optimizer):
         self._budget = whole("budget", budget, at_least=1)
         self.radius = real("radius", radius, at_least=1e-6, at_most=LARGEST)
         self.tolerance = real("tolerance", tolerance, at_least=1e-12, at_most=self.radius)
-        rng, radii = np.random.default_rng(whole("seed", seed, at_least=0)), (self.radius, self.tolerance)
-        self._session = Session(
-            self.box,
-            self.uses,
-            lambda archive: limited(_searches(archive, rng, _descend, *radii), self._budget),
-            objective,
-        )
+        search = _searches(_descend, seed, self._budget, self.radius, self.tolerance)
+        self._session = Session(self.box, self.uses, search, objective)
 
 
 def _searches(
-    archive: Archive, rng: np.random.Generator, local: Callable[..., Search], *settings: float
-) -> Search:
-    """Run a local search from one starting point of the unit cube after the other, without end."""
-    start = first_start(archive)
-    while True:
-        yield from local(archive, start, *settings)
-        start = rng.random(len(start))
+    local: Callable[..., Search], seed: int, budget: int, *settings: float
+) -> Callable[[Archive], Search]:
+    """A local search from one starting point of the unit cube after the other, within the budget."""
+    rng = np.random.default_rng(whole("seed", seed, at_least=0))
+
+    def search(archive: Archive) -> Search:
+        start = first_start(archive)
+        while True:
+            yield from local(archive, start, *settings)
+            start = rng.random(len(start))
+
+    return lambda archive: limited(search(archive), budget)
 
 
 class _Points(NamedTuple):
@@ -265,13 +265,8 @@ class GaussNewton(Optimizer):
         self._budget = whole("budget", budget, at_least=1)
         self.step = real("step", step, at_least=1e-12, at_most=0.1)
         self.tolerance = real("tolerance", tolerance, at_least=1e-15, at_most=1.0)
-        rng, settings = np.random.default_rng(whole("seed", seed, at_least=0)), (self.step, self.tolerance)
-        self._session = Session(
-            self.box,
-            self.uses,
-            lambda archive: limited(_searches(archive, rng, _newton, *settings), self._budget),
-            objective,
-        )
+        search = _searches(_newton, seed, self._budget, self.step, self.tolerance)
+        self._session = Session(self.box, self.uses, search, objective)
 
 
 def _newton(archive: Archive, start: NDArray[np.float64], step: float, tolerance: float) -> Search:
