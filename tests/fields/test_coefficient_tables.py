@@ -48,7 +48,7 @@ def test_error_of_a_table_is_within_its_bound(case: str, mode: Mode) -> None:
     count, constants = len(cosine), constants_matrix({"one": DIFFICULT[case]})
     material, modes = np.zeros(count, dtype=int), np.full(count, mode)
     positions = table_layout(
-        material, modes, cosine, spacing_roots(constants, WAVELENGTH), [np.arange(count)], 512, float
+        (material, modes, cosine), spacing_roots(constants, WAVELENGTH), [np.arange(count)], 512, float
     )
     wavelength, table = jnp.asarray(WAVELENGTH), jnp.asarray(constants)
     tables = _fill_tables(positions, table, wavelength)

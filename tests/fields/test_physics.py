@@ -20,6 +20,7 @@ import synthetic
 from calibray.fields import path_gains, path_loss, slab
 from calibray.fields.diffraction import affine_form, transition
 from calibray.fields.material_response import pattern_value
+from calibray.fields.program import DiffuseArguments
 from calibray.materials import FIELDS, Material, constants_matrix
 from calibray.paths import Diffraction, Paths
 from calibray.scenes import read_scene
@@ -505,9 +506,15 @@ def test_scattering_patterns_spread_all_scattered_power_over_the_half_space(
         ],
         axis=-1,
     ).reshape(-1, 3)
-    value = pattern_value(
-        row, np.zeros(len(out), dtype=int), np.full(len(out), np.cos(incidence)),
-        out[:, 2], out @ mirrored, -out @ towards, (pattern,),
-    )  # fmt: skip
+    diffuse = DiffuseArguments(
+        material=np.zeros(len(out), dtype=int),
+        solid_angle=np.ones(len(out)),
+        cos_scattered=out[:, 2],
+        cos_incidence=np.full(len(out), np.cos(incidence)),
+        cos_specular=out @ mirrored,
+        cos_backward=-out @ towards,
+        patterns=(pattern,),
+    )
+    value = pattern_value(row, diffuse)
     total = np.sum(np.asarray(value).reshape(60, 120) * weight[:, None]) * 2 * np.pi / 120
     assert total == pytest.approx(1, abs=1e-6)

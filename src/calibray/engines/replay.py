@@ -191,7 +191,7 @@ class Replay:
     ) -> tuple[NDArray[np.floating], float]:
         if self.effects:
             return fields.path_losses_with_effects(
-                self._program, tables, self._effects, values, self._combining, count
+                self._program, tables, fields.EffectBatch(self._effects, values), self._combining, count
             ), 0.0
         return fields.path_losses(self._program, tables, self._combining, count)
 
@@ -199,8 +199,9 @@ class Replay:
         self, tables: NDArray[np.floating], values: NDArray[np.floating], count: int
     ) -> tuple[NDArray[np.floating], NDArray[np.floating], float]:
         if self.effects:
+            effects = fields.EffectBatch(self._effects, values)
             loss, slope, by_effect = fields.path_losses_and_slopes_with_effects(
-                self._program, tables, self._effects, values, self._used_columns, self._combining, count
+                self._program, tables, effects, self._used_columns, self._combining, count
             )
             return loss, self._by_parameter(slope, by_effect), 0.0
         loss, slope, error = fields.path_losses_and_slopes(

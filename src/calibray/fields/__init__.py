@@ -9,7 +9,7 @@ settings (`calibray.fields.jax_settings`); importing the package does not change
 
 from calibray.fields.coefficient_tables import FINEST, table_intervals
 from calibray.fields.combining import COMBINING, Combining, path_loss_of_gains
-from calibray.fields.effects import DisplacementLoss, Effect, Effects, ExtraLoss, RoughSurfaces
+from calibray.fields.effects import DisplacementLoss, Effect, EffectBatch, Effects, ExtraLoss, RoughSurfaces
 from calibray.fields.evaluation import (
     path_gains,
     path_loss,
@@ -32,6 +32,7 @@ __all__ = [
     "Combining",
     "DisplacementLoss",
     "Effect",
+    "EffectBatch",
     "Effects",
     "ExtraLoss",
     "GroupedProgram",

@@ -97,9 +97,11 @@ class CoefficientTables:
     values: jax.Array
 
 
-def coefficient_arguments(
-    paths: Paths,
-) -> tuple[NDArray[np.integer], NDArray[np.integer], NDArray[np.float64]]:
+Arguments = tuple[NDArray[np.integer], NDArray[np.integer], NDArray[np.float64]]
+"""Material, mode and cosine of incidence of coefficients [J] each."""
+
+
+def coefficient_arguments(paths: Paths) -> Arguments:
     """Material, mode and cosine of incidence of every coefficient of a path program [J] each.
 
     First those of all interactions, then those of the n-faces of diffracting wedges.
@@ -119,9 +121,7 @@ def spacing_roots(table: NDArray[np.float64], wavelength: float) -> NDArray[np.i
 
 
 def table_layout(
-    material: NDArray[np.integer],
-    mode: NDArray[np.integer],
-    cosine: NDArray[np.float64],
+    arguments: Arguments,
     root: NDArray[np.integer],
     steps: Sequence[NDArray[np.integer]],
     intervals: Intervals,
@@ -132,6 +132,7 @@ def table_layout(
     `steps` are the coefficients at each step of each group, of any shape; J marks an empty position, whose coefficient
     is 1.
     """
+    material, mode, cosine = arguments
     rows, row = np.unique(material.astype(np.int64) * len(Mode) + mode, return_inverse=True)
     row = row.reshape(-1)
     cells = np.broadcast_to(intervals, (len(rows),)) if np.ndim(intervals) == 0 else np.ravel(intervals)[rows]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial, reduce
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,13 @@ class Effect(Protocol):
 
 
 Effects = tuple[Effect, ...]
+
+
+class EffectBatch(NamedTuple):
+    """Effects, and values of all their parameters for a batch of candidates [n, e]."""
+
+    effects: Effects
+    values: jax.Array | NDArray[np.floating]
 
 
 def apply_effects(program: GroupedProgram, effects: Effects, values: jax.Array) -> GroupedProgram:

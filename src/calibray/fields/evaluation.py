@@ -30,7 +30,7 @@ from calibray.fields.combining import POWER, Combining, decibel, link_power, pat
 from calibray.fields.compiled import WIDE, compiled
 from calibray.fields.effects import (
     AntennaFields,
-    Effects,
+    EffectBatch,
     antenna_fields,
     apply_effects,
     with_antenna_fields,
@@ -189,29 +189,27 @@ def path_losses_and_slopes(
 def path_losses_with_effects(
     program: GroupedProgram,
     tables: NDArray[np.floating],
-    effects: Effects,
-    values: NDArray[np.floating],
+    effects: EffectBatch,
     combining: Combining = POWER,
     count: int | None = None,
 ) -> NDArray[np.floating]:
-    """Path loss [count, L], [dB], for material constants [n, M, 8] and effect parameters [n, e]; see `path_losses`."""
+    """Path loss [count, L], [dB], for material constants [n, M, 8] and effects; see `path_losses`."""
     count = len(tables) if count is None else count
-    return np.asarray(_losses_with_effects(program, tables, values, effects, count, combining))[:count]
+    return np.asarray(_losses_with_effects(program, tables, effects, count, combining))[:count]
 
 
 @jax_settings()
 def path_losses_and_slopes_with_effects(
     program: GroupedProgram,
     tables: NDArray[np.floating],
-    effects: Effects,
-    values: NDArray[np.floating],
+    effects: EffectBatch,
     columns: tuple[int, ...],
     combining: Combining = POWER,
     count: int | None = None,
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
     """Path loss with effects, and its derivatives by materials [count, L, M, columns] and by effects [count, L, e]."""
     count = len(tables) if count is None else count
-    answers = _slopes_with_effects(program, tables, values, effects, count, columns, combining)
+    answers = _slopes_with_effects(program, tables, effects, count, columns, combining)
     loss, slope, by_effect = (np.asarray(answer)[:count] for answer in answers)
     return loss, slope, by_effect
 
@@ -361,38 +359,32 @@ def _slopes_by_formula(
 
 @compiled
 def _losses_with_effects(
-    program: GroupedProgram,
-    tables: jax.Array,
-    values: jax.Array,
-    effects: Effects,
-    count: int,
-    combining: Combining,
+    program: GroupedProgram, tables: jax.Array, effects: EffectBatch, count: int, combining: Combining
 ) -> jax.Array:
     """Path loss [n, L] of the first candidates, one after the other."""
 
     def evaluate(index: jax.Array, losses: jax.Array) -> jax.Array:
-        changed = apply_effects(program, effects, values[index])
+        changed = apply_effects(program, effects.effects, effects.values[index])
         return losses.at[index].set(program_path_loss(changed, tables[index], combining).astype(losses.dtype))
 
     return jax.lax.fori_loop(0, count, evaluate, jnp.zeros((len(tables), program.num_links), tables.dtype))
 
 
-@compiled(static_argnums=5)
+@compiled(static_argnums=4)
 def _slopes_with_effects(
     program: GroupedProgram,
     tables: jax.Array,
-    values: jax.Array,
-    effects: Effects,
+    effects: EffectBatch,
     count: int,
     columns: tuple[int, ...],
     combining: Combining,
 ) -> tuple[jax.Array, ...]:
     """Path loss [n, L] and derivatives [n, L, M, columns], [n, L, e] of the first candidates, one after the other."""
-    stored = partial(materialize, positive=program.wavelength)
+    stored, values = partial(materialize, positive=program.wavelength), effects.values
 
     def evaluate(index: jax.Array, results: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         fields, push = jax.linearize(
-            lambda value: antenna_fields(apply_effects(program, effects, value)), values[index]
+            lambda value: antenna_fields(apply_effects(program, effects.effects, value)), values[index]
         )
         changed = with_antenna_fields(program, fields)
         response, derivatives = stored(response_and_derivatives(changed, tables[index], columns))

@@ -21,7 +21,7 @@ from scipy.special import binom
 from calibray.fields.arithmetic import Pair, safe_sqrt
 from calibray.fields.coefficient_tables import CoefficientTables, TableLayout, fill_tables, interpolate
 from calibray.fields.grouping import DIFFRACTION, SCATTERING
-from calibray.fields.program import FormulaArguments, GroupedProgram
+from calibray.fields.program import DiffuseArguments, FormulaArguments, GroupedProgram
 from calibray.fields.slab import FIELD_COLUMN, coefficients_of_materials, loss_term
 
 Coefficients = tuple[Pair, Pair]
@@ -72,16 +72,7 @@ def material_response(program: GroupedProgram, table: jax.Array) -> MaterialResp
     else:
         coefficients = fill_tables(source, table, program.wavelength)
     diffuse = program.diffuse
-    density = pattern_value(
-        table,
-        diffuse.material,
-        diffuse.cos_incidence,
-        diffuse.cos_scattered,
-        diffuse.cos_specular,
-        diffuse.cos_backward,
-        diffuse.patterns,
-    )
-    root = safe_sqrt(density * diffuse.solid_angle)  # sqrt(f_s dOmega)
+    root = safe_sqrt(pattern_value(table, diffuse) * diffuse.solid_angle)  # sqrt(f_s dOmega)
     scattering, xpd = (table[:, FIELD_COLUMN[name]] for name in ("scattering_coefficient", "xpd_coefficient"))
     co_polarized, cross_polarized = (
         (scattering * safe_sqrt(share)).at[diffuse.material].get(mode="promise_in_bounds") * root
@@ -190,21 +181,9 @@ LARGEST_EXPONENT = 64
 """Largest exponent alpha of a lobe whose normalization is tabulated; above it, it is extrapolated linearly."""
 
 
-def pattern_value(
-    table: jax.Array,
-    material: jax.Array,
-    cosine: jax.Array,
-    cos_scattered: jax.Array,
-    cos_specular: jax.Array,
-    cos_backward: jax.Array,
-    patterns: tuple[str, ...],
-) -> jax.Array:
-    """Density f_s [n], [1/sr], of the diffusely reflected power over directions.
-
-    The cosines [n] are those of the angle of incidence, and of the angles between the scattered direction and the
-    normal, the specular direction and the direction back to the source.
-    """
-    lambertian = cos_scattered / jnp.pi
+def pattern_value(table: jax.Array, diffuse: DiffuseArguments) -> jax.Array:
+    """Density f_s [D], [1/sr], of the diffusely reflected power over directions, for constants [M, 8]."""
+    material, patterns, lambertian = diffuse.material, diffuse.patterns, diffuse.cos_scattered / jnp.pi
     if all(pattern == "lambertian" for pattern in patterns):
         return lambertian
     alpha_r, alpha_i, share = (
@@ -214,8 +193,10 @@ def pattern_value(
     is_directive = jnp.asarray(np.array([pattern == "directive" for pattern in patterns]))[material]
     share, alpha_i = jnp.where(is_directive, 1.0, share), jnp.where(is_directive, 1.0, alpha_i)
     lobes = (
-        share * (0.5 * (1 + cos_specular)) ** alpha_r + (1 - share) * (0.5 * (1 + cos_backward)) ** alpha_i
+        share * (0.5 * (1 + diffuse.cos_specular)) ** alpha_r
+        + (1 - share) * (0.5 * (1 + diffuse.cos_backward)) ** alpha_i
     )
+    cosine = diffuse.cos_incidence
     norm = share * _normalization(alpha_r, cosine) + (1 - share) * _normalization(alpha_i, cosine)
     is_lambertian = jnp.asarray(np.array([pattern == "lambertian" for pattern in patterns]))[material]
     return jnp.where(is_lambertian, lambertian, lobes / norm)

@@ -290,10 +290,10 @@ def _joined(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
 def _coefficients(
     paths: Paths, numbering: _Numbering, dtype: type, intervals: Intervals | None
 ) -> FormulaArguments | TableLayout:
-    material, mode, cosine = coefficient_arguments(paths)
+    arguments = coefficient_arguments(paths)
     if intervals is not None:
         root = spacing_roots(paths.material_table(), speed_of_light / paths.frequency)
-        return table_layout(material, mode, cosine, root, numbering.steps, intervals, dtype)
+        return table_layout(arguments, root, numbering.steps, intervals, dtype)
     lines = [
         [_without_empty_end(line, numbering.count) for line in np.atleast_2d(step)]
         for step in numbering.steps
@@ -302,7 +302,7 @@ def _coefficients(
     blank = position == numbering.count
     # At empty positions the formula is evaluated for arbitrary arguments; the result is replaced by 1.
     material, mode, cosine = (
-        np.append(column, filler)[position] for column, filler in ((material, 0), (mode, 0), (cosine, 1.0))
+        np.append(column, filler)[position] for column, filler in zip(arguments, (0, 0, 1.0), strict=True)
     )
     return FormulaArguments(
         material=jax.device_put(material.astype(np.int32)),

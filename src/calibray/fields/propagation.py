@@ -59,7 +59,7 @@ def _group_gains(group: Group, response: GroupResponse, keep: Keep) -> Pair:
         if letter == COEFFICIENT:
             te, tm = multiply(c_te, te), multiply(c_tm, tm)
         elif letter == SCATTERING:
-            te, tm = _scatter(te, tm, c_te, c_tm, *next(amplitudes), group.turn[step], keep)
+            te, tm = _scatter((te, tm), (c_te, c_tm), next(amplitudes), group.turn[step], keep)
         else:
             te, tm = _diffract(te, tm, (c_te, c_tm, *next(coefficients)), group.wedge[step])
         te, tm = keep((te, tm))
@@ -99,16 +99,14 @@ def _run(te: Pair, tm: Pair, c_te: Pair, c_tm: Pair, rotation: jax.Array, keep: 
 
 
 def _scatter(
-    te: Pair,
-    tm: Pair,
-    r_te: Pair,
-    r_tm: Pair,
-    co_polarized: jax.Array,
-    cross_polarized: jax.Array,
+    field: tuple[Pair, Pair],
+    coefficients: tuple[Pair, Pair],
+    amplitudes: tuple[jax.Array, jax.Array],
     turn: jax.Array,
     keep: Keep,
 ) -> tuple[Pair, Pair]:
     """Diffuse reflection: S Gamma sqrt(f_s dOmega) times the XPD rotation (Degli-Esposti et al. 2007)."""
+    (te, tm), (r_te, r_tm), (co_polarized, cross_polarized) = field, coefficients, amplitudes
     incident = squared_magnitude(te) + squared_magnitude(tm)
     reflected = squared_magnitude(r_te) * squared_magnitude(te) + squared_magnitude(r_tm) * squared_magnitude(
         tm

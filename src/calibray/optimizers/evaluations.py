@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -174,12 +174,11 @@ def checked_evaluations(
     box: Box,
     x: ArrayLike,
     y: ArrayLike,
-    residuals: ArrayLike | None,
-    jacobian: ArrayLike | None,
+    parts: Mapping[str, ArrayLike | None],
     uses: frozenset[str],
     objective: Objective | None = None,
 ) -> Evaluations:
-    """Validate and copy evaluations: points x [n, d], values y [n], residuals [n, m], derivatives [n, m, d].
+    """Validate and copy evaluations: points x [n, d], values y [n]; the parts are residuals and jacobian.
 
     A value of +inf is a failed evaluation, whose residuals and derivatives are ignored. Parts that the optimizer does
     not use are checked and omitted. Values are compared with the `objective` of the residuals unless it is None.
@@ -201,7 +200,7 @@ def checked_evaluations(
         )
     for (row,) in np.argwhere(~((values > -np.inf) & (values <= np.inf))):
         raise InputError(f"y[{row}] = {values[row]}; it must be a number, +inf for a failed evaluation")
-    parts = {"residuals": residuals, "jacobian": jacobian}
+    residuals, jacobian = parts["residuals"], parts["jacobian"]
     for name in sorted(uses & parts.keys()):
         if parts[name] is None:
             raise InputError(f"{name} = None; this optimizer uses them: call tell(x, y, residuals=..., ...)")

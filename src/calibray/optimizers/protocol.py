@@ -85,9 +85,8 @@ class Session:
         jacobian: ArrayLike | None = None,
     ) -> None:
         """See `Optimizer.tell`."""
-        evaluations = checked_evaluations(
-            self.archive.box, x, y, residuals, jacobian, self._uses, self._objective
-        )
+        parts = {"residuals": residuals, "jacobian": jacobian}
+        evaluations = checked_evaluations(self.archive.box, x, y, parts, self._uses, self._objective)
         if evaluations.residuals is not None:
             links = evaluations.residuals.shape[1]
             if self._links not in (None, links):

@@ -143,7 +143,9 @@ def compile_chains(chains: Chains) -> Geometry:
             rows, k_in, k_out = row[wedge], incident[wedge], leaving[wedge]
             edge, (before, after) = chains.edge[rows], chains.edge_lengths[rows].T
             spread[rows] = 1 / np.sqrt(before * after * (before + after))
-            constants = _wedge(k_in, k_out, normal[wedge], chains.normal_n[rows], edge, before, after)
+            constants = _wedge(
+                k_in, k_out, normal[wedge], chains.normal_n[rows], edge, before * after / (before + after)
+            )
             tables[Kind.DIFFRACTION].append((rows, np.full(len(rows), step), *constants))
             entering[wedge] = _unit(_cross(k_in, edge))
             exiting[wedge], onward[wedge] = -_unit(_cross(k_out, edge)), k_out
@@ -250,11 +252,11 @@ def _wedge(
     normal_0: NDArray[np.float64],
     normal_n: NDArray[np.float64],
     edge: NDArray[np.float64],
-    before: NDArray[np.float64],
-    after: NDArray[np.float64],
+    distance: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], ...]:
     """Constants of a wedge diffraction, with Sionna RT's conventions.
 
+    With distances s and s' to the edge, `distance` is s s' / (s + s').
     The columns are those of `Diffraction` (Kouyoumjian and Pathak 1974; ITU-R P.526-15 section 4.5).
     """
     exterior = 2 * np.pi - np.arccos(np.clip(-_dot(normal_0, normal_n), -1, 1))
@@ -263,7 +265,6 @@ def _wedge(
     azimuth_in = _azimuth(-_unit(_reject(incident, edge)), tangent, normal_0)
     azimuth_out = _azimuth(_unit(_reject(leaving, edge)), tangent, normal_0)
     sin_edge = np.sqrt(np.maximum(1 - cos_edge**2, 0))
-    distance = before * after / (before + after) * sin_edge**2
     phi_in = _unit(_cross(incident, edge))
     turns = []
     for normal in (normal_0, normal_n):
@@ -278,7 +279,7 @@ def _wedge(
         azimuth_in,
         azimuth_out,
         sin_edge,
-        distance,
+        distance * sin_edge**2,
         np.stack(turns, axis=1),
     )
 
