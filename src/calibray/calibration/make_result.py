@@ -29,7 +29,7 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.measurements import Measurements
 from calibray.paths import Paths
-from calibray.prediction.fallback import fill_missing
+from calibray.prediction.nuisance_shift import fill_missing
 from calibray.prediction.residual_field import calibration_residuals
 from calibray.result.held_out import Model, ResidualField
 from calibray.result.record import (

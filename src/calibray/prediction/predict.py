@@ -17,8 +17,7 @@ from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements, SourceTable
 from calibray.parameters import fixed_constant, split_name
-from calibray.prediction.fallback import fill_missing
-from calibray.prediction.nuisance_shift import model_terms, nuisance_shift
+from calibray.prediction.nuisance_shift import fill_missing, model_terms, nuisance_shift
 from calibray.prediction.observables import Replayed, as_measured, further_observables
 from calibray.prediction.position_checks import POSITION_COLUMNS, remarks
 from calibray.prediction.residual_field import calibration_residuals, krige_residuals
