@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from calibray.errors import EngineError, InputError
-from calibray.fitting import arrowhead
+from calibray.fitting import elimination as elimination_module
 from calibray.fitting.elimination import DENSE, Elimination
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import Objective, make_objective
@@ -194,7 +194,7 @@ def test_exchanges_without_end_raise_an_error(monkeypatch):
     links = campaign(40, 2)
     terms = make_term(links, "offset", bounds=(-0.1, 0.1)), make_term(links, "slope", "log_distance")
     elimination = Elimination.of(Nuisance(40, terms), links.weight, np.zeros(2))
-    monkeypatch.setattr(arrowhead, "MAX_EXCHANGES", 1)
+    monkeypatch.setattr(elimination_module, "MAX_EXCHANGES", 1)
     with pytest.raises(EngineError, match="no minimum within the bounds"):
         elimination.coefficients(np.full((1, 40), 5.0))
 
@@ -210,7 +210,7 @@ def test_single_exchanges_give_the_same_result(monkeypatch):
     elimination = Elimination.of(Nuisance(80, terms), links.weight, np.zeros(7))
     gap = rng.normal(0, 3, (50, 80))
     all_at_once = elimination.coefficients(gap)
-    monkeypatch.setattr(arrowhead, "PATIENCE", 0)
+    monkeypatch.setattr(elimination_module, "PATIENCE", 0)
     assert elimination.coefficients(gap) == pytest.approx(all_at_once, abs=1e-10)
 
 
