@@ -1,6 +1,6 @@
-"""Ray mapping identifies the assumptions of an expensive engine that exports its rays from a few calls.
+"""Ray mapping identifies the assumptions of an expensive engine that exports its rays, and replaces it by a replay.
 
-Every call gives the power of each path. Ratios of a path's powers at two sets of constants do not depend on antenna
+A few calls are enough. Each gives the power of each path. Ratios of a path's powers at two sets of constants do not depend on antenna
 gains and units. They therefore show what the engine assumes: thickness, conductivity, slabs or half-spaces, and the
 polarization of its antennas. We fit these to all ratios of the calls so far (`ray_fit.py`). The last call then corrects
 the power of every path. The next call is at the minimum of the replay of this corrected program, and checks it.
@@ -11,6 +11,7 @@ constants: of some points of the box, the one with the largest mean log determin
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
@@ -18,13 +19,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.engines.rays.export import Export
+from calibray.engines.rays.export import Export, Exporting
 from calibray.engines.replay import Replay
+from calibray.fitting.methods import AUTO, local_searches
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_fit import Understanding, common, understand
 from calibray.fitting.ray_model import Call, RayModel
-from calibray.fitting.search import least_squares
+from calibray.fitting.search import Trail, least_squares
 from calibray.optimizers.sampling import design
+from calibray.result.verdict import Remark, RemarkKind
+from calibray.study import Setup
+from calibray.support.progress import Progress
 
 Ask = Callable[[NDArray[np.float64]], Export]
 """Calls the engine for a candidate [d]; returns its rays."""
@@ -81,6 +86,47 @@ class RayMap:
     def understood(self) -> bool:
         """Whether the model explains all calls and predicted the last one."""
         return self.understanding.misfit_db <= MISFIT_DB and self.gap_db <= UNDERSTOOD_DB
+
+
+def maps_rays(setup: Setup) -> bool:
+    """Whether a study is calibrated by ray mapping: the method `auto` on a program that answers with rays."""
+    return setup.study.engine.exports_rays and setup.study.method.name == AUTO
+
+
+def search_rays(
+    problem: Problem, engine: Exporting, progress: Progress | None = None
+) -> tuple[Problem, Trail, Remark]:
+    """Search by ray mapping.
+
+    Args:
+        problem: The problem on an engine that answers with rays.
+        engine: That engine.
+        progress: Called with the stage "calibrating" after every RT call.
+
+    Returns:
+        The problem on the replay that replaces the engine, the search, and how well the engine's assumptions are
+        identified.
+
+    Raises:
+        EngineError: A call failed.
+    """
+    started, trail = time.perf_counter(), Trail()
+
+    def ask(candidate: NDArray[np.float64]) -> Export:
+        export = engine.export(candidate)
+        evaluation = problem.evaluate(problem.parameters.to_search(candidate[None]))
+        number = len(trail.candidates) + 1
+        trail.add(candidate[None], evaluation, number, time.perf_counter() - started)
+        if progress is not None:
+            progress(f"calibrating: best RMSE {trail.best_rmse_db:.2f} dB", number, MOST_CALLS)
+        return export
+
+    mapped = map_rays(problem, ask, seed=problem.setup.study.method.seed)
+    problem = with_engine(problem, mapped.engine)
+    best = problem.parameters.to_search(trail.best)[None]
+    trail.minima = least_squares(problem, local_searches(mapped.engine.interactions), best).minima
+    trail.rt_calls, trail.ledger_hits = len(mapped.calls), engine.hits
+    return problem, trail, _remark(mapped)
 
 
 def map_rays(
@@ -171,3 +217,23 @@ def _changes(calls: list[Call]) -> tuple[int, float]:
     power, link = 10 ** (last.level_db / 10), last.paths.link
     share = np.bincount(link, power * ~kept) / np.maximum(np.bincount(link, power), 1e-300)
     return int((~kept).sum()), float(-10 * np.log10(max(1 - share.max(initial=0.0), 1e-12)))
+
+
+def _remark(mapped: RayMap) -> Remark:
+    understanding = mapped.understanding
+    constants = dict(understanding.model.described(understanding.values))
+    slabs = any(field == "thickness" for _, field in understanding.model.assumed)
+    return Remark(
+        RemarkKind.RAY_MAPPING,
+        {
+            "understood": mapped.understood,
+            "misfit_db": understanding.misfit_db,
+            "gap_db": mapped.gap_db,
+            "calls": len(mapped.calls),
+            "changed": mapped.changed,
+            "changed_db": mapped.changed_db,
+            "half_space": slabs and not any(name.endswith(".thickness") for name in constants),
+            "names": list(constants),
+            "values": list(constants.values()),
+        },
+    )

@@ -17,7 +17,7 @@ from calibray.errors import EngineError, InputError
 from calibray.fitting.methods import AUTO
 from calibray.fitting.preliminary_fits import estimate_noise, leave_out_near_floor
 from calibray.fitting.problem import Problem
-from calibray.fitting.ray_search import maps_rays, search_rays
+from calibray.fitting.ray_mapping import maps_rays, search_rays
 from calibray.result.held_out import Model
 from calibray.study import Setup, Study
 from calibray.study.model import StudyModel
