@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from calibray.fitting.ray_model import ANGLES, TILT
+from calibray.fitting.ray_model import ANGLES, TILT, ports, tilted_theta
 from calibray.fitting.ray_scan import ROBUST_DB
 
 STARTS: Final = 6
@@ -81,7 +81,7 @@ def errors(parts: list[Gains], angles: NDArray[np.float64]) -> NDArray[np.float6
     errors, weights = [], np.concatenate([part.weight for part in parts])
     for part in parts:
         tx, rx = (
-            _polarization(basis, each) for basis, each in zip(part.bases, angles.reshape(2, -1), strict=True)
+            ports(basis, each)[:, 0] for basis, each in zip(part.bases, angles.reshape(2, -1), strict=True)
         )
         last, earlier = (
             _level(np.abs(np.einsum("pr,prt,pt->p", rx, gain, tx)) ** 2) for gain in (part.last, part.earlier)
@@ -96,7 +96,7 @@ def _scan(parts: list[Gains], end: int, other: NDArray[np.float64]) -> list[NDAr
     axis, loss = np.stack([x, y, np.ones_like(x)], axis=1), 0.0
     cos, sin = np.cos(SLANTS)[:, None], np.sin(SLANTS)[:, None]
     for part in parts:
-        weight, theta = _polarization(part.bases[1 - end], other), _theta(part.bases[end], axis)
+        weight, theta = ports(part.bases[1 - end], other)[:, 0], tilted_theta(part.bases[end], axis)
         levels = []
         for gain in (part.last, part.earlier):
             along = np.einsum("prt,pr->pt" if end == 0 else "prt,pt->pr", gain, weight)
@@ -110,19 +110,6 @@ def _scan(parts: list[Gains], end: int, other: NDArray[np.float64]) -> list[NDAr
         loss = loss + (error / (1 + error / ROBUST_DB**2)) @ part.weight  # Geman and McClure's loss
     tilt, slant = np.unravel_index(np.argsort(np.ravel(loss))[:STARTS], (len(axis), len(SLANTS)))
     return [np.array([SLANTS[j], *axis[i, :2]]) for i, j in zip(tilt, slant, strict=True)]
-
-
-def _theta(basis: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Axis theta of antennas with tilted axes [n, 3] in the basis of the paths [n, P, 2]."""
-    theta = -np.einsum("pac,nc->npa", basis, axis)
-    return theta / np.sqrt(np.maximum((theta**2).sum(axis=2, keepdims=True), 1e-12))
-
-
-def _polarization(basis: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weights of the ports V and H in a linear polarization [P, 2]; 3GPP TR 38.901, eq. 7.3-4/5."""
-    theta = _theta(basis, np.array([[angles[1], angles[2], 1.0]]))[0]
-    phi = np.stack([-theta[:, 1], theta[:, 0]], axis=1)
-    return np.cos(angles[0]) * theta + np.sin(angles[0]) * phi
 
 
 def _level(power: NDArray[np.float64]) -> NDArray[np.float64]:

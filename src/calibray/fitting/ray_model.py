@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -146,10 +146,9 @@ class RayModel:
         """The program with values [k]: its materials, and its assumed antennas."""
         fields = [self.paths.tx_field, self.paths.rx_field]
         angles = values[len(self.assumed) :].reshape(-1, ANGLES)
-        with jax_settings():
-            for end in np.flatnonzero(linear).tolist() if not self.known else []:
-                weights = np.asarray(_ports(*jax.device_put((self.bases[end], angles[end]))))[:, 0]
-                fields[end] = np.einsum("pt,ptc->pc", weights, fields[end])[:, None]
+        for end in np.flatnonzero(linear).tolist() if not self.known else []:
+            weights = ports(self.bases[end], angles[end])[:, 0]
+            fields[end] = np.einsum("pt,ptc->pc", weights, fields[end])[:, None]
         materials = self.materials(candidate, values)
         return replace(self.paths, materials=materials, tx_field=fields[0], rx_field=fields[1])
 
@@ -203,15 +202,27 @@ def _basis(zenith_azimuth: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([theta, np.cross(direction, theta)], axis=1)
 
 
-def _ports(basis: jax.Array, angles: jax.Array) -> jax.Array:
-    """Weights of the ports V and H in a port with a slant and a tilted axis, and in its orthogonal port [P, 2, 2]."""
-    axis = jnp.stack([angles[1], angles[2], jnp.ones(())])
-    # The antenna's own axis theta points away from the pole: -axis, without its part along the direction.
-    theta = -basis @ axis
-    theta = theta / jnp.sqrt(jnp.maximum(jnp.sum(theta**2, axis=1, keepdims=True), 1e-12))
-    phi = jnp.stack([-theta[:, 1], theta[:, 0]], axis=1)
-    cos, sin = jnp.cos(angles[0]), jnp.sin(angles[0])
-    return jnp.stack([cos * theta + sin * phi, cos * phi - sin * theta], axis=1)
+def tilted_theta(basis: Any, axis: Any, xp: Any = np) -> Any:
+    """Axis theta of antennas with axes [..., 3], in the axes of the paths' fields [P, 2, 3]: [..., P, 2].
+
+    It points away from the pole: -axis, without its part along the direction.
+    """
+    theta = -xp.einsum("pac,...c->...pa", basis, axis)
+    return theta / xp.sqrt(xp.maximum(xp.sum(theta**2, axis=-1, keepdims=True), 1e-12))
+
+
+def ports(basis: Any, angles: Any, xp: Any = np) -> Any:
+    """Weights of the ports V and H in a linear polarization and in the orthogonal one [P, 2, 2].
+
+    Args:
+        basis: Axes theta and phi of the fields [P, 2, 3].
+        angles: Slant and two tilts [3], [rad].
+        xp: The array namespace: NumPy, or JAX for derivatives.
+    """
+    theta = tilted_theta(basis, xp.stack([angles[1], angles[2], xp.ones(())]), xp)
+    phi = xp.stack([-theta[:, 1], theta[:, 0]], axis=1)
+    cos, sin = xp.cos(angles[0]), xp.sin(angles[0])
+    return xp.stack([cos * theta + sin * phi, cos * phi - sin * theta], axis=1)
 
 
 @jax.jit
@@ -233,7 +244,6 @@ def _level_and_slope(
 
 def _polarized(frame: _Frame, gain: jax.Array, angles: jax.Array) -> jax.Array:
     """One part of the gains [R, T, P] between ports along and orthogonal to the polarizations."""
-    tx = _ports(jnp.asarray(frame.tx), angles[:ANGLES])
-    rx = _ports(jnp.asarray(frame.rx), angles[ANGLES:])
+    tx, rx = ports(frame.tx, angles[:ANGLES], jnp), ports(frame.rx, angles[ANGLES:], jnp)
     weight = [jnp.stack([jnp.ones(()), frame.crossed[end]]) for end in range(2)]
     return jnp.einsum("pab,pcd,bdp,a,c->acp", rx, tx, gain, weight[1], weight[0])
