@@ -1,9 +1,10 @@
 """Ray mapping identifies the assumptions of an expensive engine that exports its rays, and replaces it by a replay.
 
-A few calls are enough. Each gives the power of each path. Ratios of a path's powers at two sets of constants do not depend on antenna
-gains and units. They therefore show what the engine assumes: thickness, conductivity, slabs or half-spaces, and the
-polarization of its antennas. We fit these to all ratios of the calls so far (`ray_fit.py`). The last call then corrects
-the power of every path. The next call is at the minimum of the replay of this corrected program, and checks it.
+A few calls are enough. Each gives the power of each path. Ratios of a path's powers at two sets of constants do not
+depend on antenna gains and units. They therefore show what the engine assumes: thickness, conductivity, slabs or
+half-spaces, and the polarization of its antennas. We fit these to all ratios of the calls so far (`ray_fit.py`). The
+last call then corrects the power of every path. The next call is at the minimum of the replay of this corrected
+program, and checks it.
 
 The first call is at the start values. The second call is where the ratios are most informative about the assumed
 constants: of some points of the box, the one with the largest mean log determinant of their information.
