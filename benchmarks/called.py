@@ -34,7 +34,7 @@ from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares, SpaceMapping, VectorSurrogate
 from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
-from calibray.uncertainty.credible_sets import credible_sets
+from calibray.uncertainty.verdicts import credible_sets
 
 LEVELS = (0.9, 0.95)
 NOISES_DB = (1.0, 3.0)

@@ -30,9 +30,9 @@ from calibray.scenarios import demo_study_path
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
-from calibray.uncertainty.credible_sets import credible_sets
 from calibray.uncertainty.draws import Draws
 from calibray.uncertainty.sequential_monte_carlo import KEPT, LAST_SWEEPS, SIZE
+from calibray.uncertainty.verdicts import credible_sets
 from calibray.validation.choice import HeldOutResiduals, fit_prediction_model
 from calibray.validation.validate import validate_problem
 

@@ -45,11 +45,11 @@ from calibray.fitting.search import Trail, search
 from calibray.optimizers import LeastSquares
 from calibray.tables import Column, Table, numbers, render, render_markdown
 from calibray.uncertainty.assessment import certainty
-from calibray.uncertainty.credible_sets import credible_sets
 from calibray.uncertainty.draws import Draws
 from calibray.uncertainty.joint_model import joint_model
 from calibray.uncertainty.noise_models import GAUSSIAN, Marginal, NoiseModel
 from calibray.uncertainty.sequential_monte_carlo import draw_posterior
+from calibray.uncertainty.verdicts import credible_sets
 from districts import District
 
 NOISE_DB = 3.0

@@ -25,7 +25,7 @@ from calibray.optimizers import LeastSquares
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
-from calibray.uncertainty.credible_sets import credible_sets
+from calibray.uncertainty.verdicts import credible_sets
 
 NOISE_DB, ROW_DB = 3.0, 0.3
 ROWS = 3

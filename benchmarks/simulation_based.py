@@ -38,9 +38,9 @@ from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares
 from calibray.study import Setup, Study
 from calibray.tables import Column, Table, numbers, render
-from calibray.uncertainty.credible_sets import credible_sets
 from calibray.uncertainty.joint_model import JointModel, joint_model
 from calibray.uncertainty.sequential_monte_carlo import BUDGET, draw_posterior
+from calibray.uncertainty.verdicts import credible_sets
 
 NOISE_DB = 3.0
 LEVEL = 0.9

@@ -10,9 +10,8 @@ import pytest
 from scipy.stats import norm, t
 
 from calibray.result.wording import reason_text
-from calibray.uncertainty.credible_sets import credible_sets
 from calibray.uncertainty.draws import Draws
-from calibray.uncertainty.verdicts import Axes, verdicts
+from calibray.uncertainty.verdicts import Axes, credible_sets, verdicts
 
 NAMES = ("walls.relative_permittivity", "glass.relative_permittivity")
 

@@ -10,10 +10,10 @@ from scipy.stats import norm
 from calibray.parameters import NO_PRIOR, LogNormal, Parameter, Parameters
 from calibray.result.verdict import Cause
 from calibray.uncertainty import sequential_monte_carlo as module
+from calibray.uncertainty.assessment import remaining_widths
 from calibray.uncertainty.joint_model import ALIKE, MEAN_SPREAD, SPREAD_BOUNDS, JointModel
 from calibray.uncertainty.noise_models import Marginal, NoiseModel, noise_models
 from calibray.uncertainty.sequential_monte_carlo import EFFECTIVE, draw_posterior
-from calibray.uncertainty.width_causes import remaining_widths
 
 GAUSSIAN = NoiseModel("gaussian", 1.0)
 LOWER, UPPER = 1.5, 12.0

@@ -15,7 +15,16 @@ from calibray.fitting.cheap_replay import ReplayedModel
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, find_minima, relevant_minima
 from calibray.parameters import Parameters
-from calibray.result.verdict import CONFIDENCE, Interval, Reason, ReasonKind, Remark, RemarkKind, Verdict
+from calibray.result.verdict import (
+    CONFIDENCE,
+    Cause,
+    Interval,
+    Reason,
+    ReasonKind,
+    Remark,
+    RemarkKind,
+    Verdict,
+)
 from calibray.support.memory import single_blas_thread
 from calibray.support.progress import Progress
 from calibray.uncertainty.buildings import can_split
@@ -24,12 +33,11 @@ from calibray.uncertainty.draws import systematic_resampling
 from calibray.uncertainty.emulator import emulate
 from calibray.uncertainty.joint_model import JointModel, has_offset, joint_model
 from calibray.uncertainty.linear_theory import local_intervals, with_reason
-from calibray.uncertainty.noise_models import DIFFERING
+from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, HEAVY, OUT_OF_SIGHT
 from calibray.uncertainty.remarks import departures, fit_undeclared_offset, missed, outside_interval
 from calibray.uncertainty.sequential_monte_carlo import Posterior, draw_posterior, joined
 from calibray.uncertainty.verdicts import Axes, consistent, verdicts
 from calibray.uncertainty.verdicts import Verdict as VerdictOnDraws
-from calibray.uncertainty.width_causes import remaining_widths
 
 EQUAL: Final = 0.1
 """Difference between emulators, relative to the errors of the links, below which only their mean is used."""
@@ -59,6 +67,12 @@ decades. Wider bounds therefore do not improve a verdict."""
 
 EXACT_DB: Final = 1e-6
 """RMSE below which the data contain no noise, so that linear theory is exact [dB]."""
+
+FEWEST_DRAWS: Final = 30
+"""Number of effective draws below which a standard deviation, then uncertain by 13 %, is not compared."""
+
+NOTABLE_SHARE: Final = 0.85
+"""Largest share that is reported: the uncertainty of a standard deviation from `FEWEST_DRAWS` draws."""
 
 
 @dataclass(frozen=True)
@@ -314,3 +328,51 @@ def _named_draws(problem: Problem, model: JointModel, posterior: Posterior) -> d
         coefficients = problem.objective.coefficients(model.loss(values))
         by_name |= dict(zip(columns, coefficients.T.tolist(), strict=True))
     return by_name
+
+
+def remaining_widths(model: JointModel, posterior: Posterior) -> list[dict[Cause, float]]:
+    """By parameter of the study, the shares of its interval's width that remain without each cause.
+
+    Draws without a cause, for example those with equal buildings, follow the posterior of a study that rules it out.
+    Constants that the scene fixes are ruled out by a linear regression of the parameter on them; their share is an
+    upper bound, because the parameter may not depend linearly on them. Only causes that make an interval noticeably
+    wide are listed, with the smallest share first.
+    """
+    draws, width = posterior.means, len(model.study)
+    models = [model.marginal.models[index] for index in posterior.model]
+    present = {
+        Cause.BUILDINGS: posterior.spread > 0,
+        Cause.CORRELATION: np.array([each.kind == CORRELATED for each in models]),
+        Cause.MISSING_PATHS: np.array([each.kind == OUT_OF_SIGHT for each in models]),
+        Cause.HEAVY_TAILS: np.array([each.kind == HEAVY for each in models]),
+        Cause.OFFSET: np.array([each.offset for each in models]),
+    }
+    shares: list[dict[Cause, float]] = [{} for _ in range(width)]
+    full = _deviation(draws.point, draws.weight)
+    for cause, mask in present.items():
+        without = np.where(mask, 0.0, draws.weight)
+        if mask.any() and _effective(without) >= FEWEST_DRAWS:
+            _note(shares, cause, _deviation(draws.point, without) / full)
+    constants = posterior.joint[:, width:]
+    if constants.shape[1] and _effective(draws.weight) >= FEWEST_DRAWS + constants.shape[1]:
+        root = np.sqrt(draws.weight)[:, None]
+        design = np.hstack([np.ones((len(constants), 1)), constants]) * root
+        fitted = design @ np.linalg.lstsq(design, draws.point * root, rcond=None)[0]
+        left = np.sqrt(np.sum((draws.point * root - fitted) ** 2, axis=0))
+        _note(shares, Cause.CONSTANTS, left / full)
+    return [dict(sorted(each.items(), key=lambda entry: entry[1])) for each in shares]
+
+
+def _note(shares: list[dict[Cause, float]], cause: Cause, share: NDArray[np.float64]) -> None:
+    for noted, left in zip(shares, share.tolist(), strict=True):
+        if left <= NOTABLE_SHARE:
+            noted[cause] = left
+
+
+def _deviation(point: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    weight = weight / weight.sum()
+    return np.sqrt(np.maximum(weight @ (point - weight @ point) ** 2, 1e-300))
+
+
+def _effective(weight: NDArray[np.float64]) -> float:
+    return float(weight.sum() ** 2 / max(float(weight @ weight), 1e-300))
