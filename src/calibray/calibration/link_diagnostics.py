@@ -44,15 +44,9 @@ class LinkDiagnostics:
 
 
 def diagnose_links(problem: Problem, best: NDArray[np.float64], paths: Paths | None) -> LinkDiagnostics:
-    """Compute diagnostics of the links of a finished calibration.
+    """Diagnostics of the links at calibrated values [d], without columns that the engine cannot provide.
 
-    Args:
-        problem: The problem.
-        best: The calibrated values [d].
-        paths: The paths of the calibration, at the study's carrier; None if unavailable.
-
-    Returns:
-        The diagnostics, without columns that the engine cannot provide.
+    `paths` are those of the calibration at the study's carrier, if available.
     """
     columns: dict[str, NDArray[np.float64]] = {}
     if problem.differentiable:
@@ -145,12 +139,8 @@ SAMPLE: Final = 50
 def unreached_remark(problem: Problem, progress: Progress | None = None) -> tuple[Remark, ...]:
     """Count the links without a path, and test on a sample which switches of the tracer reach them.
 
-    Args:
-        problem: The problem, on stored paths.
-        progress: Called with the stage "links without a path".
-
-    Returns:
-        A remark, or none if nearly all links have a path, or nothing can be traced.
+    There is no remark if nearly all links have a path, or nothing can be traced. The stage of `progress` is "links
+    without a path".
     """
     setup, usable = problem.setup, np.ones(len(problem.setup.links), dtype=bool)
     for excluded in (setup.links.censored, problem.faint):
@@ -217,14 +207,8 @@ def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Rema
     """Test whether other directions than the stated ones would explain the residuals of transmit antennas.
 
     For each transmitter, this is an F test of two columns: the derivatives of path loss with respect to azimuth and
-    downtilt at the calibrated values, in addition to the parameters, the nuisance and a gain of that transmitter.
-
-    Args:
-        problem: The problem, on stored paths.
-        best: The calibrated values [d].
-
-    Returns:
-        A remark that names the transmitters, or none.
+    downtilt at the calibrated values [d], in addition to the parameters, the nuisance and a gain of that transmitter.
+    The problem is on stored paths; a remark names the transmitters.
     """
     setup, engine = problem.setup, problem.engine
     study, table = setup.study, setup.links.table

@@ -97,16 +97,7 @@ class Run:
 
 
 def make_result(run: Run, certainty: Certainty, validation: Validation | None) -> Result:
-    """Make the result of a finished run.
-
-    Args:
-        run: The finished search.
-        certainty: Intervals, verdicts and draws.
-        validation: Held-out errors, if blocks were held out in turn.
-
-    Returns:
-        The result.
-    """
+    """Make the result of a finished run, with its held-out errors if blocks were held out in turn."""
     problem, trail, gap_db, cheap = run.problem, run.trail, run.retrace_gap_db, run.cheap
     setup, objective, parameters = problem.setup, problem.objective, problem.parameters
     study, links = setup.study, setup.links
@@ -307,14 +298,10 @@ MOST_DRAWS: Final = 64
 def observable_fits(
     run: Run, draws: Mapping[str, Sequence[float]]
 ) -> tuple[dict[str, ObservableFit], dict[str, NDArray[np.float64]]]:
-    """The fit of every further observable, and its columns of the table of links.
+    """The fit of every further observable by name, and its columns of the table of links.
 
-    Args:
-        run: The finished search.
-        draws: Draws from the posterior by name of the parameter; may be empty.
-
-    Returns:
-        The fits by name; and measured, initial and calibrated values, and biases [L] in the unit, by column name.
+    The columns are measured, initial and calibrated values, and biases [L], in the unit. Draws from the posterior, by
+    name of the parameter, may be empty.
     """
     problem = run.problem
     if not problem.observed:

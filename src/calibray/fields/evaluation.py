@@ -248,13 +248,8 @@ def contract(
     """Derivatives of a quantity of every link with respect to material constants [L, M, columns].
 
     Every interaction belongs to one material, so one tangent per column serves all materials at once: the time does not
-    grow with their number.
-
-    Args:
-        program: The program.
-        slope: Derivatives of the quantity with respect to the response at every step.
-        derivatives: Derivatives of the response with respect to the constants of each column.
-        num_materials: Number of materials M.
+    grow with their number. `slope` has the derivatives of the quantity with respect to the response at every step, and
+    `derivatives` those of the response with respect to the constants of each column.
     """
     by_column = []
     for derivative in derivatives:

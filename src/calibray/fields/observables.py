@@ -159,10 +159,7 @@ def link_responses(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Path loss by the sum of powers [count, L], [dB], and statistics [count, K, L]; NaN for a link without a path.
 
-    Args:
-        channel: The paths.
-        values: Values of the parameters [n, d].
-        count: Number of candidates that are evaluated; the function is compiled for n.
+    Of the values of the parameters [n, d], the first `count` are evaluated; the function is compiled for n.
     """
     loss, observed = _responses(channel, jax.device_put(values), count)
     return np.asarray(loss)[:count], np.asarray(observed)[:count]

@@ -237,15 +237,9 @@ class CheapReplay:
 def make_cheap_replay(
     problem: Problem, progress: Progress | None = None, scene: Setup | None = None
 ) -> CheapReplay:
-    """Trace a problem's scene for a cheap model, if its method uses one.
+    """Trace a problem's scene for a cheap model, if its method uses one; otherwise the reason why there is none.
 
-    Args:
-        problem: The problem.
-        progress: Called with the stage "tracing" after every launch.
-        scene: A study of the same links to trace instead of the problem's study.
-
-    Returns:
-        The model, or the reason why there is none.
+    `scene` is a study of the same links to trace instead. The stage of `progress` is "tracing".
     """
     setup = problem.setup
     section = setup.study.method
@@ -273,15 +267,9 @@ def _no_model(cause: str) -> Remark:
 def with_constants(
     parameters: Parameters, materials: dict[str, Material], one_carrier: bool = True
 ) -> Parameters:
-    """Append the material constants that are not calibrated to the parameters.
+    """Append the material constants that are not calibrated to the parameters, on a logarithmic scale.
 
-    Args:
-        parameters: The parameters.
-        materials: The declared materials.
-        one_carrier: Whether all links have one carrier; otherwise constants that depend on frequency stay fixed.
-
-    Returns:
-        The parameters, then the constants on a logarithmic scale.
+    If the links have several carriers, constants that depend on frequency stay fixed.
     """
     calibrated = {f"{parameter.material}.{parameter.constant}" for parameter in parameters}
     constants = []

@@ -77,12 +77,9 @@ class Elimination:
 
     @classmethod
     def of(cls, nuisance: Nuisance, weight: NDArray[np.float64], ridge: NDArray[np.float64]) -> Elimination:
-        """Set up the normal equations.
+        """Set up the normal equations with weights of all links [L], of which 0 leaves a link out.
 
-        Args:
-            nuisance: The nuisance.
-            weight: Weights of all links; 0 leaves a link out [L].
-            ridge: Square root of the prior's term on the diagonal of the normal equations [q].
+        `ridge` is the square root of the prior's term on their diagonal [q].
         """
         counted = weight > 0
         design = nuisance.design if counted.all() else nuisance.design[counted]
@@ -106,14 +103,10 @@ class Elimination:
         )
 
     def coefficients(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The best coefficients.
+        """The best coefficients [n, q], [dB] per unit of the column.
 
-        Args:
-            gap: Measured minus modelled path loss at the links with weight [n, m], [dB].
-
-        Returns:
-            Coefficients [n, q], [dB] per unit of the column; an undetermined one takes the value within its bounds
-            that is nearest to 0.
+        The gap is measured minus modelled path loss at the links with weight [n, m], [dB]. An undetermined coefficient
+        takes the value within its bounds that is nearest to 0.
 
         Raises:
             EngineError: No minimum within the bounds was found.
@@ -121,13 +114,7 @@ class Elimination:
         return self.minimum((self.weighted @ gap.T).T)
 
     def minimum(self, side: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The best coefficients from sums over the links.
-
-        Args:
-            side: Right-hand side Z' W gap [n, q].
-
-        Returns:
-            Coefficients [n, q]; see `coefficients`.
+        """`coefficients` [n, q] from sums over the links, the right-hand side Z' W gap [n, q].
 
         Raises:
             EngineError: No minimum within the bounds was found.
@@ -143,16 +130,10 @@ class Elimination:
     def projection(
         self, slope: NDArray[np.float64], coefficients: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Least-squares coefficients of the derivatives on the design; 0 for a coefficient at its bound.
+        """Least-squares coefficients [n, q, d] of the derivatives on the design; 0 for a coefficient at its bound.
 
-        These are minus the derivatives of the best coefficients with respect to the parameters.
-
-        Args:
-            slope: Derivatives of the modelled path loss at the links with weight [n, m, d].
-            coefficients: The best coefficients [n, q].
-
-        Returns:
-            Coefficients of the derivatives [n, q, d].
+        These are minus the derivatives of the best coefficients [n, q] with respect to the parameters. `slope` has the
+        derivatives of the modelled path loss at the links with weight [n, m, d].
         """
         if isinstance(self.weighted, np.ndarray):
             side = self.weighted @ slope
@@ -163,27 +144,14 @@ class Elimination:
     def projection_from_sums(
         self, side: NDArray[np.float64], coefficients: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """`projection` from sums over the links.
-
-        Args:
-            side: Z' W times the derivatives [n, q, d].
-            coefficients: The best coefficients [n, q].
-
-        Returns:
-            Coefficients of the derivatives [n, q, d].
-        """
+        """`projection` [n, q, d] from sums over the links, Z' W times the derivatives [n, q, d]."""
         free = ((coefficients > self.lower) & (coefficients < self.upper))[:, self.order]
         projection = np.empty_like(side)
         projection[:, self.order] = self.normal.solve(free & ~self.normal.held, side[:, self.order])
         return projection
 
     def remove(self, slope: NDArray[np.float64], projection: NDArray[np.float64]) -> None:
-        """Subtract the projection from derivatives, in place.
-
-        Args:
-            slope: Derivatives of the modelled path loss at the links with weight [n, m, d]; changed.
-            projection: Their coefficients from `projection` [n, q, d].
-        """
+        """Subtract the projection [n, q, d] from derivatives at the links with weight [n, m, d], in place."""
         if isinstance(self.design, np.ndarray):
             slope -= self.design @ projection
             return
@@ -212,12 +180,9 @@ class Arrowhead:
 
     @classmethod
     def of(cls, matrix: sparse.coo_array, blocks: int, width: int) -> Arrowhead:
-        """Split a matrix into blocks, border and corner.
+        """Split a positive semidefinite matrix [q, q] into blocks, border and corner.
 
-        Args:
-            matrix: Positive semidefinite [q, q]; the blocks come first and do not overlap.
-            blocks: Number of blocks g.
-            width: Width b of a block.
+        The blocks, each of one width, come first and do not overlap.
         """
         diagonal, split = matrix.diagonal(), blocks * width
         scale = np.where(diagonal > 0, np.sqrt(diagonal), 1.0)
@@ -239,14 +204,9 @@ class Arrowhead:
         return arrowhead
 
     def solve(self, free: NDArray[np.bool_], side: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Unbounded minimum over the free components; the others are zero.
+        """Unbounded minima [m, q, k] over the free components for right-hand sides [m, q, k]; the others are zero.
 
-        Args:
-            free: Mask of the free components; none of them is fixed [m, q].
-            side: Right-hand sides [m, q, k].
-
-        Returns:
-            The minima [m, q, k].
+        None of the free components [m, q] is fixed.
         """
         problems, count, sides = side.shape
         if problems > 1 and (free == free[0]).all():  # all problems share one matrix
@@ -258,15 +218,9 @@ class Arrowhead:
     def minimum(
         self, side: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Minimum within bounds; fixed components take the value within their bounds that is nearest to zero.
+        """Minima [m, q] within bounds [q] for right-hand sides [m, q].
 
-        Args:
-            side: Right-hand sides [m, q].
-            lower: Lower bounds [q].
-            upper: Upper bounds [q].
-
-        Returns:
-            The minima [m, q].
+        Fixed components take the value within their bounds that is nearest to zero.
 
         Raises:
             EngineError: The exchanges did not terminate.
@@ -366,16 +320,10 @@ def _to_exchange(
     patience: NDArray[np.int64],
     pending: NDArray[np.intp],
 ) -> NDArray[np.bool_]:
-    """Components to exchange: all infeasible ones while their number decreases, else the last of each independent part.
+    """Components to exchange [r, q]: all infeasible ones while their number decreases, else the last of each part.
 
-    Args:
-        infeasible: Infeasible components of the r unsolved problems [r, q].
-        fewest: Smallest number of infeasible components so far, by independent part [m, i]; updated.
-        patience: Remaining full exchanges without progress [m, i]; updated.
-        pending: Indices of the unsolved problems [r].
-
-    Returns:
-        Mask of the components to exchange [r, q].
+    Infeasible components [r, q] belong to the unsolved problems `pending` [r]. The fewest so far, and the remaining
+    full exchanges without progress, of each independent part [m, i] are updated.
     """
     parts = infeasible.reshape(len(infeasible), fewest.shape[1], -1)
     count = parts.sum(axis=2)

@@ -36,12 +36,7 @@ def retrace(
 
     The tracer samples refraction and diffuse reflection by the materials, so the set of paths can depend on them; and
     path loss at displaced antennas is interpolated. A trace without all of these needs no check. Only the method `auto`
-    calibrates again; other methods have a fixed budget of RT calls.
-
-    Args:
-        problem: The problem.
-        trail: Its first search.
-        progress: Called with the stage "checking" while tracing.
+    calibrates again; other methods have a fixed budget of RT calls. The stage of `progress` is "checking".
 
     Returns:
         The problem on the last trace that was calibrated on, its search, and the gap of every link: path loss on paths
@@ -99,15 +94,11 @@ def retrace(
 def with_interpolation_error(
     objective: Objective, modelled: NDArray[np.float64], error_db: NDArray[np.float64]
 ) -> Objective:
-    """The objective with errors of interpolated path loss in the weights of the links.
+    """The objective with errors of interpolated path loss [L], [dB], in the weights of the links.
 
-    Interpolation errs most where paths appear or vanish between the traced positions. Its error at the last check and
-    that between the new positions count as standard deviations, in addition to that of the link's other errors.
-
-    Args:
-        objective: The objective without such errors.
-        modelled: Interpolated path loss at the best values [L], [dB].
-        error_db: Error of the interpolation [L], [dB]; infinite for links that are left out.
+    Interpolation errs most where paths appear or vanish between the traced positions. Its error at the last check,
+    infinite for links that are left out, and that between the new positions at the modelled path loss [L], [dB], count
+    as standard deviations, in addition to that of the link's other errors.
     """
     counted = (objective.weight > 0) & np.isfinite(error_db)
     residual = (objective.model(modelled[None])[0] - objective.measured)[counted]

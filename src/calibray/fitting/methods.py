@@ -40,13 +40,6 @@ def check_method(name: str) -> None:
 def choose(problem: Problem, model: CheapModel | None = None) -> Optimizer:
     """Make the optimizer that a study names; "auto" chooses the best one for its engine.
 
-    Args:
-        problem: The problem.
-        model: A cheap model of the engine, if available.
-
-    Returns:
-        The optimizer.
-
     Raises:
         InputError: The method needs derivatives that the engine does not provide, or its options cannot be used.
     """

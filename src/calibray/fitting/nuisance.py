@@ -72,15 +72,9 @@ class Term:
         return tuple(f"{self.name}[{label}]" if label else self.name for label in self.labels)
 
     def at(self, links: Measurements, labels: ArrayLike | None = None) -> Term:
-        """The same term at other links, for prediction.
+        """The same term, with the same columns, at other links, for prediction.
 
-        Args:
-            links: The links.
-            labels: Labels of their groups [n]; a link with an unknown label belongs to no group. None for a term
-                without groups.
-
-        Returns:
-            The term with the same columns at these links.
+        A link whose group label [n] is unknown belongs to no group. A term without groups takes no labels.
 
         Raises:
             InputError: The links' table lacks the column, or the labels do not match the term.
@@ -151,27 +145,17 @@ def make_term(
 
 
 def random_effect(links: Measurements, name: str, by: str, labels: ArrayLike) -> tuple[Term, Term]:
-    """Make the terms of a random effect: a coefficient that all links share, and the deviation of each group from it.
+    """The terms of a random effect by a column, as for `make_term`, with the labels of the links' groups [L].
 
-    Args:
-        links: The links.
-        name: Name of the term.
-        by: The column, as for `make_term`.
-        labels: Labels of the links' groups [L].
-
-    Returns:
-        The shared coefficient, and the deviations, whose prior `estimate_noise` replaces by the estimated spread.
+    They are a coefficient that all links share, and the deviation of each group from it, whose prior `estimate_noise`
+    replaces by the estimated spread.
     """
     deviations = make_term(links, f"{name}, deviation", by, labels=labels, prior=START_SPREAD)
     return make_term(links, name, by), replace(deviations, around=name)
 
 
 def transmitters(links: Measurements) -> NDArray[np.str_]:
-    """Label each link's transmitter by its position to the centimetre.
-
-    Returns:
-        A label for each link [L].
-    """
+    """Label each link's transmitter by its position to the centimetre [L]."""
     return np.array([",".join(f"{value:.2f}" for value in tx) for tx in links.tx], dtype=np.str_)
 
 
@@ -271,30 +255,16 @@ class Nuisance:
         return order.astype(np.int64), groups, len(finest)
 
     def contribution(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Contribution of the nuisance to path loss: design times coefficients.
-
-        Args:
-            coefficients: Coefficients [n, q].
-
-        Returns:
-            The contribution [n, L], [dB].
-        """
+        """Contribution of the nuisance to path loss [n, L], [dB]: design times coefficients [n, q]."""
         return (self.design @ coefficients.T).T
 
     def filled(
         self, coefficients: NDArray[np.float64], counted: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Fill in the coefficients of unmeasured groups with the mean over the measured groups of the term.
+        """Coefficients [n, q], the mean of a term's measured groups for the others, and standard deviations [q].
 
-        Deviations of a random effect have the mean 0 and its spread.
-
-        Args:
-            coefficients: Coefficients fitted to some links [n, q].
-            counted: Mask of these links [L].
-
-        Returns:
-            All coefficients [n, q], and their standard deviations [q]: the spread between groups for a filled-in
-            coefficient, otherwise 0.
+        Measured groups have links in `counted` [L]. Deviations of a random effect have the mean 0 and its spread. The
+        standard deviation is the spread between groups for a filled-in coefficient, otherwise 0.
         """
         measured = np.asarray(abs(self.design[counted]).sum(axis=0)).ravel() > 0
         filled, deviation, first = coefficients.copy(), np.zeros(len(measured)), 0
@@ -314,8 +284,7 @@ class Nuisance:
     def new_group_spread(self, block: NDArray[np.int64]) -> NDArray[np.float64]:
         """Standard deviation of random effects at links whose group is only in one block, if it is left out [L], [dB].
 
-        Args:
-            block: Block of every link [L]; -1 for a link that is not used.
+        The block of a link that is not used is -1 [L].
         """
         variance = np.zeros(self.num_links)
         for term in self.terms:
@@ -329,12 +298,7 @@ class Nuisance:
     def by_term(
         self, coefficients: NDArray[np.float64], determined: NDArray[np.bool_]
     ) -> dict[str, dict[str, float]]:
-        """Determined coefficients by term and group; a random effect counts as one term, with its groups' sums.
-
-        Args:
-            coefficients: The coefficients [q].
-            determined: Mask of the coefficients that the links determine [q].
-        """
+        """Determined coefficients [q] by term and group; a random effect counts as one term, with its groups' sums."""
         coefficient: dict[str, dict[str, float]] = {}
         first = 0
         for term in self.terms:

@@ -44,14 +44,10 @@ class Objective:
     noise_db: float = 1.0
 
     def coefficients(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The best coefficients of the nuisance.
+        """The best coefficients of the nuisance [n, q], [dB] per unit of their columns, for path loss [n, L], [dB].
 
-        Args:
-            path_loss: Modelled path loss [n, L], [dB]. A candidate's links without a path are left out of its fit.
-
-        Returns:
-            Coefficients [n, q], [dB] per unit of their columns; if not `determined`, the value within the bounds that
-            is nearest to 0.
+        A candidate's links without a path are left out of its fit. A coefficient that is not `determined` has the value
+        within the bounds that is nearest to 0.
 
         Raises:
             EngineError: No minimum within the bounds was found.
@@ -75,15 +71,7 @@ class Objective:
     def coefficient_slopes(
         self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Derivatives of the best coefficients with respect to the parameters.
-
-        Args:
-            path_loss: Modelled path loss [n, L], [dB].
-            derivative: Its derivatives [n, L, d], [dB] per unit.
-
-        Returns:
-            Derivatives of the coefficients [n, q, d].
-        """
+        """Derivatives of the best coefficients [n, q, d], from path loss [n, L] and its derivatives [n, L, d]."""
         if not self.nuisance.terms:
             return np.zeros((len(path_loss), 0, derivative.shape[2]))
         slope = self._slopes(path_loss, derivative)
@@ -106,25 +94,14 @@ class Objective:
         return ~((self.nuisance.design != 0) @ ~self.determined)
 
     def model(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The full model: path loss, limited to the ceiling, plus the best nuisance.
-
-        Args:
-            path_loss: Modelled path loss [n, L], [dB].
-
-        Returns:
-            The model that is compared with the measurements [n, L], [dB].
-        """
+        """The full model [n, L], [dB]: path loss [n, L], limited to the ceiling, plus the best nuisance."""
         return self._model(path_loss, self.coefficients(path_loss))
 
     def residuals(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Residuals, whose root mean square is `value`.
+        """Residuals [n, links with weight + priors], [dB], whose root mean square is `value`, for path loss [n, L].
 
-        Args:
-            path_loss: Modelled path loss [n, L], [dB].
-
-        Returns:
-            Model minus measurement times the square root of the weights, followed by one row per coefficient with a
-            prior [n, links with weight + priors], [dB].
+        They are model minus measurement times the square root of the weights, then one row per coefficient with a
+        prior.
         """
         coefficients = self.coefficients(path_loss)
         links = (self._model(path_loss, coefficients) - self.measured)[:, self._counted] * self._scale
@@ -133,15 +110,7 @@ class Objective:
     def jacobian(
         self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Derivatives of the residuals.
-
-        Args:
-            path_loss: Modelled path loss [n, L], [dB].
-            derivative: Its derivatives [n, L, d], [dB] per unit.
-
-        Returns:
-            Derivatives of the residuals [n, links with weight + priors, d].
-        """
+        """Derivatives of the residuals [n, links with weight + priors, d], from path loss and its own [n, L, d]."""
         slope, prior_rows = self._slopes(path_loss, derivative), None
         if self.nuisance.terms:
             projection = self._elimination.projection(slope, self.coefficients(path_loss))
@@ -153,34 +122,19 @@ class Objective:
         return slope if prior_rows is None else np.concatenate([slope, prior_rows], axis=1)
 
     def value(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The minimised value: the root mean square of all residuals, including the rows of priors.
+        """The minimised value [n], [dB]: the root mean square of all residuals, including the rows of priors.
 
-        Args:
-            path_loss: Modelled path loss [n, L], [dB].
-
-        Returns:
-            The value [n], [dB]; the RMSE if no coefficient has a prior; +inf if a link with weight has no path.
+        It is the RMSE if no coefficient has a prior, and +inf if a link with weight has no path.
         """
         return np.sqrt(np.mean(self.residuals(path_loss) ** 2, axis=1))
 
     def rmse(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """RMSE of candidates over the links only (paper eq. 1).
-
-        Args:
-            path_loss: Modelled path loss [n, L], [dB].
-
-        Returns:
-            RMSE [n], [dB]; +inf if a link with weight has no path.
-        """
+        """RMSE [n], [dB], over the links only (paper eq. 1); +inf if a link with weight has no path."""
         links = self.residuals(path_loss)[:, : len(self._scale)]
         return np.sqrt(np.mean(links**2, axis=1))
 
     def shares(self, chunks: Sequence[NDArray[np.int64]]) -> list[Share]:
-        """Split the objective by chunks of links, each of which can be summed separately.
-
-        Returns:
-            The share of every chunk.
-        """
+        """The shares of the objective by chunks of links, each of which can be summed separately."""
         weight, shares = np.zeros(len(self.weight)), []
         weight[self._counted] = self._scale**2
         for chunk in chunks:
@@ -200,14 +154,10 @@ class Objective:
         return shares
 
     def products(self, sums: Sums) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Squares and products of residuals and their derivatives, from sums over the links.
+        """Squares and products of residuals and their derivatives, from sums over all links.
 
-        Args:
-            sums: Sums over all links, from their `shares`.
-
-        Returns:
-            Products of the k columns [derivatives, -residuals], rows of priors included [n, k, k], and the sum of
-            squares of the links only [n], [dB^2].
+        They are the products of the k columns [derivatives, -residuals], rows of priors included [n, k, k], and the sum
+        of squares of the links only [n], [dB^2].
 
         Raises:
             EngineError: No minimum of the nuisance within its bounds was found.

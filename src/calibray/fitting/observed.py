@@ -70,9 +70,7 @@ class Observed:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Modelled minus measured values [n, m] in the unit, with the bias eliminated, and the biases [n, groups].
 
-        Args:
-            modelled: Modelled values [n, L] in SI units.
-            weight: Weights of the links [L].
+        Modelled values [n, L] are in SI units; the links have weights [L].
         """
         used = self.used(weight)
         gap = modelled[:, used] / self.scale - self.measured[used]
@@ -174,10 +172,7 @@ def with_errors(
 ) -> tuple[Observed, ...]:
     """The observables with errors estimated from their residuals, if the study states none.
 
-    Args:
-        every: The observables.
-        modelled: Modelled values [K, L], in SI units.
-        weight: Weights of the links [L].
+    Modelled values [K, L] are in SI units; the links have weights [L].
     """
     updated = []
     for observable, values in zip(every, modelled, strict=True):

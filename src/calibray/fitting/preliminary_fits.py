@@ -57,15 +57,10 @@ SEARCHES: Final = 32
 
 
 def leave_out_near_floor(problem: Problem, progress: Progress | None = None) -> Problem:
-    """Leave out the links whose predicted path loss is near the noise floor.
+    """Give the links whose predicted path loss is near the noise floor weight 0, and mark them in `faint`.
 
-    Args:
-        problem: The problem.
-        progress: Called with the stage "choosing links" after every fit.
-
-    Returns:
-        The problem with these links at weight 0 and marked in `faint`. The problem is unchanged without a noise floor,
-        and on an engine without derivatives, because its calls are expensive.
+    The problem is unchanged without a noise floor, and on an engine without derivatives, because its calls are
+    expensive. The stage of `progress` is "choosing links".
     """
     limit, objective = problem.setup.links.limit_db, problem.objective
     if limit is None or not problem.differentiable:
@@ -104,13 +99,7 @@ def _determines_as_much(problem: Problem, selected: Objective) -> bool:
 def estimate_noise(problem: Problem, progress: Progress | None = None) -> Problem:
     """Estimate the noise level that scales the priors, unless the study declares it, and the spread of random effects.
 
-    Args:
-        problem: The problem.
-        progress: Called with the stage "estimating noise" after every estimate.
-
-    Returns:
-        The problem with the standard deviation of a link's error and the spreads in its objective; unchanged without
-        priors.
+    The problem is unchanged without priors. The stage of `progress` is "estimating noise".
 
     Raises:
         InputError: The noise is not declared and cannot be estimated.
@@ -165,8 +154,7 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
 def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tuple[Problem, float]:
     """The problem with the spreads of its random effects, estimated at a point of the search space [d].
 
-    Returns:
-        The problem, and the standard deviation of a link's error within the groups of the last effect [dB].
+    Also the standard deviation of a link's error within the groups of the last effect [dB].
     """
     objective = problem.objective
     counted = np.flatnonzero(objective.weight > 0)
@@ -193,11 +181,7 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
 
 
 def with_estimated_errors(problem: Problem, point: NDArray[np.float64]) -> Problem:
-    """The problem with errors of its further observables, estimated at a point of the search space [d].
-
-    Returns:
-        The problem; unchanged without further observables.
-    """
+    """The problem with errors of any further observables, estimated at a point of the search space [d]."""
     if not problem.observed:
         return problem
     candidate = problem.parameters.from_search(point[None])
@@ -284,12 +268,7 @@ LEAST: Final = 1e-3
 def estimate_spreads(problem: Problem, progress: Progress | None = None) -> Problem:
     """Estimate the spread of every population of transmitters for which the study states none.
 
-    Args:
-        problem: The problem.
-        progress: Called with the stage "estimating spreads" after every estimate.
-
-    Returns:
-        The problem with these spreads in its study and priors; unchanged without such a population.
+    The spreads are in the study and the priors of the new problem. The stage of `progress` is "estimating spreads".
     """
     fields, parameters = estimated_fields(problem.setup.study), problem.parameters
     if not fields or not problem.differentiable:

@@ -105,11 +105,6 @@ class Problem:
     def of(cls, setup: Setup, engine: Engine, observable: Observable = PATH_LOSS) -> Problem:
         """Set up a study's problem. This runs the engine once, for the initial parameters.
 
-        Args:
-            setup: The opened study.
-            engine: The engine over all its links.
-            observable: The quantity that is measured and modelled.
-
         Raises:
             InputError: No calibration link is left, or a group has only held-out links.
         """
@@ -173,15 +168,7 @@ class Problem:
         return isinstance(self.engine, Differentiable) and self.observable.derivatives is not None
 
     def evaluate(self, points: NDArray[np.float64], derivatives: bool = False) -> Evaluation:
-        """Run the engine on points of the search space.
-
-        Args:
-            points: The points [n, d].
-            derivatives: Whether to compute the Jacobian.
-
-        Returns:
-            Objective, residuals and the engine's values.
-        """
+        """Run the engine on points of the search space [n, d]."""
         parameters, objective, jacobian = self.parameters, self.objective, None
         candidates = parameters.from_search(points)
         with_slopes = derivatives and self.differentiable
@@ -199,11 +186,9 @@ class Problem:
         return Evaluation(value, residuals, jacobian, modelled, rmse_db, observed=observed)
 
     def respond(self, candidates: NDArray[np.float64], derivatives: bool = False) -> Responses:
-        """The engine's answer: the links' values and the further observables.
+        """The engine's answer for candidates in the fields' units [n, d]: the links' values and further observables.
 
-        Args:
-            candidates: Candidates in the fields' units [n, d].
-            derivatives: Whether to compute derivatives with respect to the parameters; the engine must provide them.
+        The engine must provide derivatives with respect to the parameters if these are wanted.
         """
         if self.observed:
             return self._observing.respond(candidates, self.statistics, derivatives)
@@ -219,13 +204,6 @@ class Problem:
 
         If the engine has the links in chunks, each chunk returns sums, and d + 1 compressed residuals represent those
         of all links. Otherwise the residuals are the full ones.
-
-        Args:
-            points: The points [n, d].
-            derivatives: Whether to compute the Jacobian.
-
-        Returns:
-            The objective and residuals, compressed or full.
         """
         if self._chunks is None:
             return self.evaluate(points, derivatives)

@@ -85,13 +85,9 @@ class Ratio(NamedTuple):
 def understand(
     parameters: Parameters, calls: list[Call], known: bool, before: Understanding | None = None
 ) -> Understanding:
-    """Find the assumptions that explain the ratios of all calls.
+    """Find the assumptions that explain the ratios of all calls, from those of all but the last one if available.
 
-    Args:
-        parameters: The study's parameters.
-        calls: The calls; the last one is modelled.
-        known: Whether the program's antennas are those of the engine.
-        before: The explanation of the calls before the last one, if any.
+    The last call is modelled. `known` states whether the program's antennas are those of the engine.
     """
     last, ratios = calls[-1], ratios_of(calls)
     model = RayModel.of(parameters, last.export.paths, known)

@@ -51,16 +51,7 @@ def rounds(optimizer: Optimizer, evaluate: Evaluate) -> Iterator[tuple[NDArray[n
 
 
 def least_squares(problem: Problem, starts: int, x0: NDArray[np.float64]) -> LeastSquares:
-    """Run local least-squares searches on a problem.
-
-    Args:
-        problem: The problem.
-        starts: Number of random starting points.
-        x0: Further starting points [k, d].
-
-    Returns:
-        The finished optimizer.
-    """
+    """Run local least-squares searches on a problem, from random starting points and from x0 [k, d]."""
     optimizer = LeastSquares(*problem.parameters.search_bounds, starts=starts, x0=x0)
     for _ in rounds(optimizer, problem.squares):
         pass
@@ -106,14 +97,7 @@ class Trail:
     def add(
         self, candidates: NDArray[np.float64], evaluation: Evaluation, iteration: int, seconds: float
     ) -> None:
-        """Record one round.
-
-        Args:
-            candidates: Its candidates in the fields' units [n, d].
-            evaluation: Their evaluation.
-            iteration: Its number, from 1.
-            seconds: Time since the start [s].
-        """
+        """Record a round: candidates in the fields' units [n, d], its number from 1, and time since the start [s]."""
         self.candidates += list(candidates)
         self.rmse_db += evaluation.rmse_db.tolist()
         self.iteration += [iteration] * len(evaluation.value)
@@ -138,15 +122,9 @@ class Trail:
 
 
 def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = None) -> Trail:
-    """Run an optimizer on a problem until it is done.
+    """Run an optimizer over the search space of a problem's parameters until it is done.
 
-    Args:
-        problem: The problem.
-        optimizer: The optimizer, over the search space of the problem's parameters.
-        progress: Called with the stage "calibrating" after every round.
-
-    Returns:
-        The record of the search.
+    The stage of `progress` is "calibrating".
 
     Raises:
         InputError: No candidate could be evaluated.
@@ -185,8 +163,7 @@ def _hits(engine: Engine) -> int:
 def find_minima(problem: Problem, trail: Trail) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Collect the known minima of a problem; search for more if the method kept only its best.
 
-    Returns:
-        Points of the search space, the calibrated one first [k, d], and their mean squares [k].
+    They are points of the search space, the calibrated one first [k, d], and their mean squares [k].
     """
     points = np.concatenate([problem.parameters.to_search(trail.best)[None], trail.minima])
     if len(points) <= 2:
@@ -197,15 +174,9 @@ def find_minima(problem: Problem, trail: Trail) -> tuple[NDArray[np.float64], ND
 def relevant_minima(
     minima: NDArray[np.float64], square: NDArray[np.float64], freedom: int
 ) -> NDArray[np.float64]:
-    """Select the minima that can contribute to an interval.
+    """Select the minima [k, d] that can contribute to an interval, the lowest first [j, d].
 
-    Args:
-        minima: Minima [k, d].
-        square: Their mean squares [k].
-        freedom: Number of residuals minus unknowns.
-
-    Returns:
-        The relevant minima, the lowest first [j, d].
+    They have mean squares [k]; the freedom is the number of residuals minus unknowns.
     """
     order = np.argsort(square, kind="stable")
     order = order[square[order] <= square.min() * (1.0 + RELEVANT / freedom)]

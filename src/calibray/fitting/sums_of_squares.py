@@ -56,14 +56,9 @@ class Share:
     ceiling_db: float | None
 
     def __call__(self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64] | None = None) -> Sums:
-        """Sum over the links of the chunk.
+        """Sums over the links of the chunk, from path loss [n, l], [dB], and its derivatives [n, l, d].
 
-        Args:
-            path_loss: Modelled path loss of the chunk's links [n, l], [dB].
-            derivative: Its derivatives [n, l, d], [dB] per unit.
-
-        Returns:
-            The sums; `side` for the columns of the chunk only [n, c, k].
+        `side` has only the columns of the chunk [n, c, k].
         """
         loss = path_loss[:, self.links]
         at_ceiling = loss >= (np.inf if self.ceiling_db is None else self.ceiling_db)
@@ -82,16 +77,7 @@ class Share:
 
 
 def total(parts: Sequence[Sums], shares: Sequence[Share], columns: int) -> Sums:
-    """Add the sums of all chunks, in their order.
-
-    Args:
-        parts: The sums of every chunk.
-        shares: The shares from which they were made.
-        columns: Number of columns of the nuisance q.
-
-    Returns:
-        The sums over all links.
-    """
+    """Add the sums of all chunks, in the order of their shares, for `columns` columns of the nuisance."""
     square = np.zeros_like(parts[0].square)
     side = np.zeros((len(square), columns, square.shape[2]))
     for part, share in zip(parts, shares, strict=True):
@@ -101,13 +87,7 @@ def total(parts: Sequence[Sums], shares: Sequence[Share], columns: int) -> Sums:
 
 
 def rows(products: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows with given squares and products.
-
-    Args:
-        products: Positive semidefinite matrices [n, k, k].
-
-    Returns:
-        Matrices R with R'R = products [n, k, k].
+    """Matrices R [n, k, k] with R'R = products, which are positive semidefinite [n, k, k].
 
     Example:
         >>> root = rows(np.array([[[4.0, 2.0], [2.0, 1.0]]]))

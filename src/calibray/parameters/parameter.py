@@ -114,8 +114,7 @@ class Parameter:
 def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:
     """A parameter for a constant that a scene fixes, within four standard deviations of its logarithm.
 
-    Returns:
-        The parameter; None if the constant is 0 or these values are impossible for it.
+    None if the constant is 0 or these values are impossible for it.
 
     Example:
         >>> fixed_constant("walls.thickness", 0.2, 0.1).upper

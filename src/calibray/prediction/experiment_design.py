@@ -181,13 +181,9 @@ def choose_candidates(
 
 
 def initial_range_probability(piece: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Probability of knowing in which of its separate ranges a parameter lies, before any candidate is measured.
+    """Probability [d] that two draws lie in the same range of a parameter, before any candidate is measured.
 
-    Args:
-        piece: Range of every draw [n, d].
-
-    Returns:
-        The probability that two draws lie in the same range [d].
+    `piece` is the range of every draw [n, d].
     """
     return _range_probability(piece, np.zeros((len(piece), len(piece))))
 

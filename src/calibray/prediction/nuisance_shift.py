@@ -85,19 +85,11 @@ def nuisance_shift(
     *,
     new_groups: bool = False,
 ) -> Shift:
-    """The contribution of nuisance terms to the path loss of new links.
+    """The contribution of nuisance terms to the path loss of new links, with draws from the posterior by coefficient.
 
     A group without a coefficient gets the mean of the other coefficients. Its spread is their standard deviation s,
-    enlarged by the uncertainty of a mean of n values: s sqrt(1 + 1 / n).
-
-    Args:
-        terms: The terms.
-        links: The links.
-        draws: Draws from the posterior by coefficient [draws]; none if None.
-        new_groups: Whether groups without a coefficient are allowed in terms whose spread is not estimated.
-
-    Returns:
-        The contribution.
+    enlarged by the uncertainty of a mean of n values: s sqrt(1 + 1 / n). With `new_groups`, such groups are allowed
+    also in terms whose spread is not estimated.
 
     Raises:
         InputError: A group has no coefficient, and `new_groups` is False.

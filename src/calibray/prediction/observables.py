@@ -44,12 +44,7 @@ class Replayed(NamedTuple):
 def observable_columns(study: Study, level: float | None) -> tuple[str, ...]:
     """Names of the columns of further observables, such as spread_ns, spread_lower_ns and spread_upper_ns.
 
-    Args:
-        study: The study.
-        level: Probability of an interval; None for values without an interval.
-
-    Returns:
-        The names; empty without further observables.
+    Without a level, values have no interval.
     """
     ends = ("",) if level is None else ("", "_lower", "_upper")
     return tuple(f"{name}{end}_{section.unit}" for name, section in study.observables.items() for end in ends)

@@ -27,12 +27,9 @@ POSITION_COLUMNS: Final = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
 
 
 def remarks(result: Record, setup: Setup) -> NDArray[np.str_]:
-    """Remarks on the positions of links.
+    """A remark on the position of every link [links]; empty where the positions are plausible.
 
     Indoors, if most calibrated receivers are inside a building, that remark is omitted.
-
-    Returns:
-        A remark for every link [links]; empty where the positions are plausible.
     """
     triangles, links = read_triangles(setup.scene), setup.links
     if not len(triangles.face):
@@ -52,11 +49,7 @@ def remarks(result: Record, setup: Setup) -> NDArray[np.str_]:
 
 
 def is_indoors(result: Record, triangles: Triangles) -> bool:
-    """Whether most calibrated receivers are inside a building.
-
-    Returns:
-        True if they are; False if their positions are unknown.
-    """
+    """Whether most calibrated receivers are inside a building; False if their positions are unknown."""
     if not set(POSITION_COLUMNS) <= set(result.links):
         return False
     receivers = result.links[list(POSITION_COLUMNS[3:])].to_numpy(float)
@@ -64,17 +57,10 @@ def is_indoors(result: Record, triangles: Triangles) -> bool:
 
 
 def locate(triangles: Triangles, points: NDArray[np.float64]) -> NDArray[np.str_]:
-    """Find points that are beyond the scene, under the ground or inside a building.
+    """The location of every point [n, 3], [m]: `BEYOND`, `UNDER` or `INSIDE`; empty in the open.
 
     A point is inside a building if a vertical ray upwards crosses an odd number of surfaces, as in any closed body.
     Sheets under the whole scene are ground.
-
-    Args:
-        triangles: The scene.
-        points: The points [n, 3], [m].
-
-    Returns:
-        The location of every point [n], one of `BEYOND`, `UNDER` and `INSIDE`; empty in the open.
     """
     if not len(triangles.face):
         return np.full(len(points), "")

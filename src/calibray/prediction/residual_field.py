@@ -83,11 +83,7 @@ def _krige(
 
 
 def calibration_residuals(links: pd.DataFrame) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Residuals of the prediction model at the calibration links.
-
-    Returns:
-        Rows of the calibration links that have a path [m], and their measured minus modelled path loss [m], [dB].
-    """
+    """Rows of the calibration links with a path [m], and their measured minus predicted path loss [m], [dB]."""
     modelled = links["predicted_db"].to_numpy(float)
     counted = links["has_path"].to_numpy(bool) & ~links["held_out"].to_numpy(bool) & np.isfinite(modelled)
     if "faint" in links:

@@ -88,15 +88,9 @@ SECTIONS: Final = ("fit", "accuracy", "uncertainty", "nuisance", "prediction", "
 def content(
     record: Record, sentences: tuple[str, ...] = (), files: dict[str, str] | None = None
 ) -> dict[str, Any]:
-    """A result as a dictionary, without its tables.
+    """A result as the content of `result.json`, without its tables, with its remarks as sentences.
 
-    Args:
-        record: The result.
-        sentences: Its remarks as text.
-        files: SHA-256 of every other file of the result, by name; None before they are written.
-
-    Returns:
-        The content of `result.json`.
+    `files` has the SHA-256 of every other file of the result, by name, once they are written.
     """
     values = {
         name: TypeAdapter(type(part)).dump_python(part, mode="json") for name, part in _sections(record)
@@ -285,14 +279,7 @@ def _check_consistent(stored: Stored, study: Study, source: Path) -> None:
 
 
 def write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figures: dict[str, Any]) -> None:
-    """Write held-out errors into a result's folder.
-
-    Args:
-        held_out: The errors.
-        study: The study that was validated.
-        folder: The folder.
-        figures: The figures of the validation, for readers of the file.
-    """
+    """Write held-out errors of a study into a result's folder; the figures are for readers of the file."""
     values = {
         "version": VERSION,
         **figures,

@@ -97,15 +97,7 @@ class Interval:
         return f"{self.verdict}, approximate" if self.approximate else str(self.verdict)
 
     def contains(self, value: float, slack: float = 0.0) -> bool:
-        """Whether a value lies in one of the pieces.
-
-        Args:
-            value: The value.
-            slack: Distance outside a piece up to which a value still counts as inside.
-
-        Returns:
-            True if it does.
-        """
+        """Whether a value lies in one of the pieces, or within the distance `slack` of one."""
         pieces = self.pieces or ((self.lower, self.upper),)
         return any(low - slack <= value <= high + slack for low, high in pieces)
 

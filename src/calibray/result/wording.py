@@ -23,31 +23,19 @@ NOT_JUDGED: Final = (
 
 
 def interval_text(interval: Interval) -> str:
-    """The ends of an interval, or of each piece if there are few.
-
-    Returns:
-        The ends, as "2.1 to 3.4".
-    """
+    """The ends of an interval, or of each piece if there are few, as "2.1 to 3.4"."""
     hull = ((interval.lower, interval.upper),)
     pieces = interval.pieces if 1 < len(interval.pieces) <= SHOWN_PIECES else hull
     return ", ".join(f"{low:.4g} to {high:.4g}" for low, high in pieces)
 
 
 def reason_text(reason: Reason | None) -> str:
-    """The reason of a verdict.
-
-    Returns:
-        A clause without a full stop; empty without a reason.
-    """
+    """The reason of a verdict as a clause without a full stop; empty without a reason."""
     return "" if reason is None else _REASONS[reason.kind](reason.values, reason.ranges)
 
 
 def explanation_text(interval: Interval) -> str:
-    """The reason of a verdict, and what would narrow the interval.
-
-    Returns:
-        Clauses separated by semicolons, without a full stop; empty if nothing is known.
-    """
+    """The reason of a verdict, and what would narrow the interval: clauses without a full stop, or nothing."""
     clauses = [reason_text(interval.reason)]
     if interval.seen:
         ends = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in interval.seen[:SHOWN_PIECES])
@@ -309,15 +297,7 @@ def judgement_text(judgement: Judgement) -> str:
 
 
 def choice_text(chosen: str, best: str) -> str:
-    """Which model predictions use, with the reason.
-
-    Args:
-        chosen: The prediction model.
-        best: The model with the lowest held-out RMSE among those that predict anywhere.
-
-    Returns:
-        A sentence.
-    """
+    """Which model predictions use, and why; `best` has the lowest held-out RMSE among those that predict anywhere."""
     if chosen == best:
         return f"Predictions use the model {str(chosen)!r}, the best on held-out blocks."
     reason = "uses the scene" if best in WITHOUT_MATERIALS else "keeps the initial materials"
@@ -328,11 +308,7 @@ def choice_text(chosen: str, best: str) -> str:
 
 
 def chosen_model_text(record: Record) -> str:
-    """The held-out accuracy of the prediction model, if it is not the calibrated one.
-
-    Returns:
-        A sentence; empty if predictions use the calibrated model.
-    """
+    """The held-out accuracy of the prediction model; empty if it is the calibrated one."""
     model, calibrated_db = record.prediction.model, record.accuracy.holdout_rmse_db
     if model.name == Model.CALIBRATED or model.residual_db is None or calibrated_db is None:
         return ""
@@ -343,14 +319,9 @@ def chosen_model_text(record: Record) -> str:
 
 
 def remarks(record: Record, choice: str = "") -> tuple[str, ...]:
-    """All remarks about a result.
+    """All remarks about a result: warnings and advice, the judgement on held-out links, the choice of the model.
 
-    Args:
-        record: The result.
-        choice: The reason for the prediction model, if validation chose it.
-
-    Returns:
-        The sentences: warnings and advice, the judgement on held-out links, the choice of the prediction model.
+    `choice` is the reason for the prediction model, if validation chose it.
     """
     sentences = [remark_text(remark) for remark in record.uncertainty.remarks]
     if record.accuracy.judgement is not None:

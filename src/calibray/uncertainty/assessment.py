@@ -107,16 +107,10 @@ class Certainty:
 def certainty(
     problem: Problem, trail: Trail, progress: Progress | None = None, model: ReplayedModel | None = None
 ) -> Certainty:
-    """Assess the uncertainty of a calibration.
+    """Assess the uncertainty of a calibration from its finished search.
 
-    Args:
-        problem: The problem.
-        trail: Its finished search.
-        progress: Called with the stage "drawing" after every round.
-        model: The replay of the study's scene, if the search had one as a cheap model.
-
-    Returns:
-        The uncertainty.
+    `model` is the replay of the study's scene, if the search had one as a cheap model. The stage of `progress` is
+    "drawing".
     """
     started = time.perf_counter()
     # Matrices of few links are small; BLAS threads cost more than they save.

@@ -80,13 +80,8 @@ def can_split(problem: Problem) -> bool:
 def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool) -> SplitReplay:
     """Give a problem's replay further parameters, and each building of its scene its own constants.
 
-    Args:
-        problem: A problem that `can_split`.
-        parameters: The parameters: the study's first.
-        by_building: Whether buildings have their own constants.
-
-    Returns:
-        The replay. If the paths meet fewer than two buildings, no constant belongs to a building.
+    The problem is one that `can_split`; the study's parameters come first. If the paths meet fewer than two buildings,
+    no constant belongs to a building.
     """
     study, engine = problem.setup.study, problem.engine
     paths, effects = engine.paths, engine.effects  # type: ignore[attr-defined]

@@ -276,16 +276,7 @@ class Ensemble:
 
 
 def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) -> Ensemble | None:
-    """Emulate an engine from its calls.
-
-    Args:
-        problem: The problem.
-        trail: Its finished search.
-        model: The replay of the study's scene, if available.
-
-    Returns:
-        The emulators; None if there are too few calls.
-    """
+    """Emulate an engine from its calls, with the replay of the study's scene if available; None if they are too few."""
     objective, parameters, method = problem.objective, problem.parameters, problem.setup.study.method
     box, rows = Box(*parameters.search_bounds), ResponseRows(problem, np.flatnonzero(objective.weight > 0))
     calls = _calls(problem, trail, box, rows)

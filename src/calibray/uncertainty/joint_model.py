@@ -168,13 +168,9 @@ class JointModel:
 
 
 def joint_model(problem: Problem, best: NDArray[np.float64], square: float, freedom: int) -> JointModel:
-    """Set up the unknowns that a study does not fix.
+    """Set up the unknowns that a study does not fix, from the optimum in the search space [d].
 
-    Args:
-        problem: The problem.
-        best: The optimum, a point of the search space [d].
-        square: Mean square of the residuals at the optimum [dB^2].
-        freedom: Number of links minus unknowns.
+    `square` is the mean square of its residuals [dB^2], and `freedom` the number of links minus unknowns.
     """
     objective, links, section = problem.objective, problem.setup.links, problem.setup.study.noise
     weight, censored = _weights_and_censoring(problem)

@@ -17,15 +17,9 @@ from calibray.result.verdict import CONFIDENCE, Interval, Reason, ReasonKind, Ve
 
 
 def local_intervals(problem: Problem, trail: Trail, optimum: Evaluation) -> dict[str, Interval]:
-    """Intervals by linear theory in the search space, where a parameter over decades is logarithmic.
+    """Intervals by linear theory, by name, in the search space, where a parameter over decades is logarithmic.
 
-    Args:
-        problem: The problem.
-        trail: Its finished search.
-        optimum: The evaluation of the optimum, with derivatives.
-
-    Returns:
-        The interval of every parameter, by name.
+    `optimum` is the evaluation of the optimum, with derivatives.
     """
     parameters = problem.parameters
     # Compressed residuals are scaled to the sum of squares of the full ones.
@@ -70,21 +64,11 @@ def intervals(
     upper: NDArray[np.float64],
     freedom: int,
 ) -> list[Interval]:
-    """95 % confidence intervals from the curvature of the sum of squares at the optimum.
+    """95 % confidence intervals from the curvature of the sum of squares at the optimum [d], one per parameter.
 
-    A parameter is not identifiable if its interval is wider than half of its bounds. Other minima and correlated errors
-    can make the true interval wider.
-
-    Args:
-        best: The optimum [d].
-        residuals: Residuals at the optimum, nuisance eliminated [m], [dB].
-        jacobian: Their derivatives [m, d].
-        lower: Lower bounds [d].
-        upper: Upper bounds [d].
-        freedom: Number of full residuals minus unknowns.
-
-    Returns:
-        One interval per parameter.
+    A parameter is not identifiable if its interval is wider than half of its bounds [d]. Other minima and correlated
+    errors can make the true interval wider. Residuals [m], [dB], and their derivatives [m, d] have the nuisance
+    eliminated; the freedom is the number of full residuals minus unknowns.
     """
     freedom = max(freedom, 1)
     quantile = float(stdtrit(freedom, (1 + CONFIDENCE) / 2))  # of Student's t

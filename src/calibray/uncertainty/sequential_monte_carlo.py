@@ -115,15 +115,8 @@ def draw_posterior(
 ) -> Posterior:
     """Draw from the joint posterior.
 
-    Args:
-        model: The joint model.
-        seed: Seed of the random numbers.
-        progress: Called with the share of the work done after every step.
-        budget: Interactions that may be evaluated.
-        models: Number of models whose draws are pooled, which share the budget.
-
-    Returns:
-        The draws.
+    `progress` is called with the share of the work done after every step. The budget is the number of interactions that
+    may be evaluated; it is shared if the draws of several models are pooled.
     """
     size, replays, budget = population_size(model.interactions, budget, models), 0, budget // models
 

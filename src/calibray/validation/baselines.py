@@ -38,17 +38,10 @@ MOST_KRIGED: Final = 1000
 
 
 def without_scene(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
-    """The part of path loss that needs no scene: the free-space increase over carriers, minus the antennas' gain.
+    """The part of path loss [links], [dB], that needs no scene: the rise over carriers, minus the antennas' gain.
 
-    Path loss rises by 20 log10(f / f0) from the study's carrier f0. The gain is that of the stated antennas along the
-    straight line.
-
-    Args:
-        study: The study.
-        links: The links, with the columns of their antennas.
-
-    Returns:
-        This part of path loss [links], [dB]; 0 at the study's carrier without antennas.
+    Path loss rises by 20 log10(f / f0) from the study's carrier f0, as in free space. The gain is that of the stated
+    antennas, with the columns of the links, along the straight line.
 
     Raises:
         InputError: A column of the antennas is missing or malformed.
@@ -79,10 +72,8 @@ class Baseline(NamedTuple):
 def log_distance(links: Measurements, objective: Objective, known_db: NDArray[np.float64]) -> Baseline:
     """The log-distance model with the study's nuisances; an offset per group becomes an intercept per group.
 
-    Args:
-        links: All links.
-        objective: The study's objective; its weights select the fitted links.
-        known_db: Known part of their path loss [links], [dB]; see `without_scene`.
+    The weights of the study's objective select the fitted links; `known_db` is the part of path loss from
+    `without_scene` [links], [dB].
 
     Raises:
         EngineError: Fewer than two links have a weight.
@@ -105,15 +96,10 @@ def has_obstruction(links: Measurements) -> bool:
 
 
 def obstructed(links: Measurements, objective: Objective, known_db: NDArray[np.float64]) -> Baseline:
-    """The log-distance model with a loss out of sight and a loss per wall.
+    """The log-distance model with a loss out of sight and a loss per wall, by the columns that follow from the scene.
 
     The loss out of sight has a prior around a mean. The mean is part of the known path loss, and the rest is a
-    coefficient.
-
-    Args:
-        links: All links, with the columns that follow from the scene.
-        objective: The study's objective; its weights select the fitted links.
-        known_db: Known part of their path loss [links], [dB]; see `without_scene`.
+    coefficient. Arguments are those of `log_distance`.
 
     Raises:
         EngineError: Fewer than two links have a weight.
@@ -141,15 +127,9 @@ def _free_name(by: str, terms: Sequence[Term]) -> str:
 
 
 def kriging(links: Measurements, objective: Objective, trend_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Path loss of a model plus its residuals, kriged from the calibration links.
+    """Path loss of a model at all links [links], [dB], plus its residuals, kriged from the links with a weight.
 
-    Args:
-        links: All links.
-        objective: The study's objective; its weights select the links for kriging.
-        trend_db: Path loss of the model, fitted to these links [links], [dB].
-
-    Returns:
-        Path loss at all links [links], [dB].
+    The model was fitted to these links; its path loss is `trend_db` [links], [dB].
 
     Raises:
         InputError: There are too few links, or more than `MOST_KRIGED`, or all have the same position.

@@ -62,16 +62,9 @@ FEWEST_FOR_RANKS: Final = 40
 
 
 def spatial_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Divide positions into compact blocks of about equal size.
+    """Divide positions [n, 2 or 3], [m], into compact blocks of about equal size: the block of each, from 0 [n].
 
-    The largest block is halved across its longer side until there are enough.
-
-    Args:
-        position: Positions [n, 2 or 3], [m].
-        count: Number of blocks; at most n are made.
-
-    Returns:
-        Block of every position, from 0 [n].
+    The largest block is halved across its longer side until there are enough; at most n are made.
 
     Example:
         >>> spatial_blocks(np.array([[0.0, 0.0], [9.0, 0.0], [1.0, 0.0], [8.0, 0.0]]), 2).tolist()
@@ -152,15 +145,7 @@ def choose(errors: Errors, position: NDArray[np.float64]) -> str:
 
 
 def least(errors: Errors, names: tuple[str, ...]) -> str:
-    """The model with the lowest RMSE among some models.
-
-    Args:
-        errors: Held-out residuals by model [n], [dB].
-        names: The models; at least one has residuals.
-
-    Returns:
-        Its name.
-    """
+    """The model with the lowest RMSE among those names that have residuals by model [n], [dB]."""
     return min((name for name in names if name in errors), key=lambda name: float(np.mean(errors[name] ** 2)))
 
 
@@ -201,14 +186,9 @@ def two_levels(
 
 
 def out_of_sight_ratio(errors: NDArray[np.float64], blocked: NDArray[np.bool_]) -> float:
-    """Root mean square error of links out of sight relative to that of all links.
+    """Root mean square error of links out of sight relative to that of all links, from residuals [n], [dB].
 
-    Args:
-        errors: Residuals on held-out links [n], [dB].
-        blocked: Which of them are out of sight [n].
-
-    Returns:
-        The ratio; at least 1, so that links in sight keep the interval of all links.
+    It is at least 1, so that links in sight keep the interval of all links.
 
     Example:
         >>> errors, blocked = np.array([1.0, -1, 1, 5, -5, 5, 5, -5, 5, -5, 5]), np.arange(11) > 2
@@ -221,14 +201,9 @@ def out_of_sight_ratio(errors: NDArray[np.float64], blocked: NDArray[np.bool_]) 
 
 
 def interval_half_width(absolute_errors: NDArray[np.float64], level: float) -> float:
-    """Half the width of the interval that contains a new error with a given probability.
+    """Half the width [dB] of the interval that contains a new error with a probability.
 
-    Args:
-        absolute_errors: Absolute errors, ascending [n], [dB].
-        level: The probability.
-
-    Returns:
-        Half the width [dB].
+    Absolute errors are ascending [n], [dB].
 
     Example:
         >>> errors = np.sort(np.abs(np.random.default_rng(0).standard_normal(999)))

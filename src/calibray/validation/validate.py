@@ -177,14 +177,9 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
 def fit_models(
     part: Problem, fits: Mapping[Model, tuple[Problem, NDArray[np.float64]]]
 ) -> dict[str, NDArray[np.float64]]:
-    """Fit every model to the links with weight, and predict all links.
+    """Path loss at all links by model [links], [dB], fitted to the links with weight; NaN if kriging is impossible.
 
-    Args:
-        part: The problem; held-out links have weight 0.
-        fits: The fitted variants that use the scene, from `fit_variants`.
-
-    Returns:
-        Path loss at all links by name of the model [links], [dB]; NaN if kriging is impossible.
+    `fits` are the fitted variants that use the scene, from `fit_variants`.
     """
     setup, objective = part.setup, part.objective
     path_loss_db: dict[str, NDArray[np.float64]] = {

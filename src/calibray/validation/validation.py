@@ -35,11 +35,7 @@ from calibray.validation.held_out_statistics import choose, compare, interval_ha
 
 
 def observables_table(observables: Mapping[str, ObservableErrors]) -> Table:
-    """Held-out errors of further observables, each in its unit.
-
-    Returns:
-        The table; without rows if there are none.
-    """
+    """Held-out errors of further observables, each in its unit; without rows if there are none."""
     columns = (
         Column(), numbers("links"), numbers("RMSE"), numbers("RMSE of the mean"), numbers("RMSE of a law of distance"),
     )  # fmt: skip
@@ -122,36 +118,20 @@ class Validation(HeldOutErrors):
         )
 
     def scale(self, name: str) -> float:
-        """Standard deviation of a model's residuals on new links.
-
-        Returns:
-            Root mean square of its held-out residuals [dB].
-        """
+        """Standard deviation of a model's residuals on new links [dB]: the root mean square of the held-out ones."""
         return float(np.sqrt(np.nanmean(self.errors[name][self.judged] ** 2)))
 
     def levels(self, name: str, links: Measurements) -> BlockErrors | None:
-        """Held-out residuals of a model within and between blocks.
-
-        Returns:
-            The errors in two levels; None if there are too few links.
-        """
+        """Held-out residuals of a model within and between blocks; None if there are too few links."""
         position = np.hstack([links.tx, links.rx])[self.judged]
         return two_levels(self.errors[name][self.judged], self.block[self.judged], position)
 
     def sizes(self, name: str) -> NDArray[np.float64]:
-        """Absolute held-out residuals of a model.
-
-        Returns:
-            Absolute residuals, ascending [dB].
-        """
+        """Absolute held-out residuals of a model, ascending [dB]."""
         return np.sort(np.abs(self.errors[name][self.judged]))
 
     def summary(self) -> tuple[Table | str, ...]:
-        """A comparison of the models.
-
-        Returns:
-            A table, one of further observables if there are any, the judgement, and the choice of the prediction model.
-        """
+        """Tables of the models and of further observables, the judgement, and the choice of the prediction model."""
         columns = (
             Column(), numbers("RMSE", "dB"), numbers("standard deviation", "dB"), numbers("log density"),
             numbers(f"in {percent(self.level)} interval"),
