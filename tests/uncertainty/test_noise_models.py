@@ -19,7 +19,7 @@ from calibray.study import Setup, Study
 from calibray.uncertainty import heavy_tails as tails
 from calibray.uncertainty.missing_paths import excess_db, missing_db
 from calibray.uncertainty.noise_models import IMPROBABLE, OFFSET_DB, Marginal, NoiseModel, noise_models
-from calibray.uncertainty.whitening import EXACT, shared, whitener
+from calibray.uncertainty.residual_correlation import EXACT, shared, whitener
 
 RANDOM = np.random.default_rng(1)
 COUNT = 6

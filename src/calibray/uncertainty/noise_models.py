@@ -30,7 +30,14 @@ from scipy.special import gammaln
 from calibray.uncertainty.censoring import log_evidence
 from calibray.uncertainty.heavy_tails import evidence, gross, regular, student
 from calibray.uncertainty.missing_paths import missing_db
-from calibray.uncertainty.whitening import EXACT, Whitener, nearest_earlier, pairwise, shared, whitener
+from calibray.uncertainty.residual_correlation import (
+    EXACT,
+    Whitener,
+    nearest_earlier,
+    pairwise,
+    shared,
+    whitener,
+)
 
 OFFSET_DB: Final = 6.0
 """Prior standard deviation of an undeclared offset, for example from a cable or an antenna gain [dB]."""

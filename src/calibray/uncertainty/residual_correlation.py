@@ -1,10 +1,14 @@
-"""Spatial correlation of the residuals: restricted-likelihood fit, test and variogram.
+"""Spatial correlation of errors: restricted-likelihood fit, test, variogram and whitening.
 
 A link's error has a correlated and an uncorrelated part. Nearby receivers share the correlated part, for example
 because clutter that the scene lacks shadows all of them. Its covariance falls off exponentially with distance. Range
 and size maximise the restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971), so that fitted
 parameters do not bias the noise low. The fit is exact with one Cholesky factor per trial, for up to some thousand
 links.
+
+Whitening makes errors independent. For up to some hundred links, it factors their covariance. For more links, each
+error is its conditional mean given its nearest neighbours among the earlier links, plus an independent rest (A. V.
+Vecchia, J. R. Stat. Soc. B 50, 1988). The time is then proportional to the number of links.
 """
 
 from __future__ import annotations
@@ -14,7 +18,8 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy import sparse
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist, pdist
 
@@ -32,6 +37,18 @@ MOST_LINKS: Final = 500
 
 SIGNIFICANT: Final = 3.0
 """Gain in log likelihood above which correlation is reported: about the 95 % quantile for two further parameters."""
+
+EXACT: Final = 600
+"""Number of links up to which the covariance is factored exactly."""
+
+NEAREST: Final = 20
+"""Neighbours in Vecchia's approximation."""
+
+CHUNK: Final = 500
+"""Number of links whose neighbourhoods are solved together."""
+
+Neighbours = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""An order of links [m], and the positions of each one's nearest earlier links in it, -1 for none [m, NEAREST]."""
 
 
 @dataclass(frozen=True)
@@ -151,15 +168,9 @@ def variogram(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Empirical variogram: half the mean squared difference of errors over the distance between links.
 
-    A rising variogram indicates correlated errors, and a flat one indicates independent errors.
-
-    Args:
-        errors: Errors [m], [dB].
-        position: Positions of the receivers, or of both ends [m, k], [m].
-        bins: Number of distance classes with about equal numbers of pairs.
-
-    Returns:
-        Mean distance [k], [m], semivariance [k], [dB^2], and number of pairs [k] of every class.
+    A rising variogram indicates correlated errors [m], [dB], and a flat one indicates independent errors. Positions
+    [m, k], [m], are those of the receivers or of both ends. The result is the mean distance [k], [m], the semivariance
+    [k], [dB^2], and the number of pairs [k] of classes with about equal numbers of pairs.
     """
     chosen = np.linspace(0, len(errors) - 1, min(len(errors), MOST_LINKS)).round().astype(int)
     distance, half = pdist(position[chosen]), 0.5 * pdist(errors[chosen, None], "sqeuclidean")
@@ -173,3 +184,104 @@ def variogram(
         np.array([half[part].mean() for part in parts]),
         np.array([len(part) for part in parts], dtype=np.int64),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Whitener:
+    """A factor of the inverse of a covariance.
+
+    Attributes:
+        factor: Matrix that turns the errors into independent ones of unit variance [m, m].
+        log_determinant: Log determinant of the covariance.
+    """
+
+    factor: NDArray[np.float64] | sparse.csr_array
+    log_determinant: float
+
+    def apply(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Whiten values of the links [m, k]."""
+        return self.factor @ values
+
+
+def pairwise(position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances between positions [n, k] of links; beyond `EXACT` links those of an evenly spaced subset [m, m]."""
+    subset = position[:: max(1, len(position) // EXACT)]
+    return np.asarray(cdist(subset, subset), dtype=np.float64)
+
+
+def whitener(
+    position: NDArray[np.float64],
+    scale: NDArray[np.float64],
+    range_m: float,
+    share: float,
+    exact: int = EXACT,
+    neighbours: Neighbours | None = None,
+) -> Whitener:
+    """Make the whitener of errors of links whose ends have positions [m, k], [m].
+
+    The errors were multiplied by `scale` so that the uncorrelated part has unit size [m]. The correlated part, a share
+    of the variance from 0 to below 1, has fallen to 1/e at the distance `range_m` [m]. Up to `exact` links, the
+    covariance is factored exactly. Nearest earlier neighbours may be given if they are known.
+    """
+    count = len(position)
+    if count <= exact:
+        common = np.exp(-cdist(position, position) / range_m) * np.outer(scale, scale)
+        return _exact(share * common + (1 - share) * np.eye(count))
+    return _vecchia(position, scale, range_m, share, neighbours or nearest_earlier(position))
+
+
+def shared(error: NDArray[np.float64], share: float) -> Whitener:
+    """The whitener of errors of unit variance plus further ones with these standard deviations [m].
+
+    All links have a share of the further variance in common; beyond `EXACT` links, all errors are independent.
+    """
+    if len(error) > EXACT:
+        variance = 1.0 + error**2
+        return Whitener(sparse.diags_array(1.0 / np.sqrt(variance)).tocsr(), float(np.log(variance).sum()))
+    return _exact(np.diag(1.0 + (1 - share) * error**2) + share * np.outer(error, error))
+
+
+def _exact(covariance: NDArray[np.float64]) -> Whitener:
+    factor = cholesky(covariance, lower=True)
+    inverse = solve_triangular(factor, np.eye(len(covariance)), lower=True)
+    return Whitener(inverse, 2.0 * float(np.log(np.diag(factor)).sum()))
+
+
+def nearest_earlier(position: NDArray[np.float64]) -> Neighbours:
+    """A random order of links at positions [m, k], with earlier ones both near and far; and the nearest ones."""
+    order = np.random.default_rng(0).permutation(len(position))
+    shuffled, near = position[order], np.full((len(order), NEAREST), -1)
+    for index in range(1, len(order)):
+        distance = np.sum((shuffled[:index] - shuffled[index]) ** 2, axis=1)
+        near[index, :index] = (
+            np.arange(index) if index <= NEAREST else np.argpartition(distance, NEAREST)[:NEAREST]
+        )
+    return order, near
+
+
+def _vecchia(
+    position: NDArray[np.float64],
+    scale: NDArray[np.float64],
+    range_m: float,
+    share: float,
+    neighbours: Neighbours,
+) -> Whitener:
+    order, nearest = neighbours
+    count = len(position)
+    members = np.column_stack([nearest, np.arange(count)])
+    entries, log_determinant, diagonal = np.zeros(members.shape), 0.0, np.eye(NEAREST + 1)
+    for rows in np.array_split(np.arange(count), -(-count // CHUNK)):
+        chosen = order[members[rows]]
+        place, factor = position[chosen], np.where(members[rows] < 0, 0.0, scale[chosen])
+        distance = np.sqrt(np.sum((place[:, :, None] - place[:, None]) ** 2, axis=-1))
+        # A neighbour that does not exist has no covariance with others.
+        common = np.exp(-distance / range_m) * factor[:, :, None] * factor[:, None]
+        matrix = share * common + (1 - share) * diagonal
+        # Conditional mean and variance of the last member given its neighbours.
+        weight = np.linalg.solve(matrix[:, :-1, :-1], matrix[:, :-1, -1:])[..., 0]
+        variance = matrix[:, -1, -1] - np.sum(matrix[:, -1, :-1] * weight, axis=1)
+        entries[rows] = np.column_stack([-weight, np.ones(len(rows))]) / np.sqrt(variance)[:, None]
+        log_determinant += float(np.log(variance).sum())
+    row, column = np.nonzero(members >= 0)
+    parts = (entries[row, column], (row, order[members[row, column]]))
+    return Whitener(sparse.csr_array(parts, shape=(count, count)), log_determinant)
