@@ -197,17 +197,10 @@ WITHOUT_PATH: Final = "without a path"
 def fit_fallback(
     problem: Problem, without_path: NDArray[np.bool_], held_out_db: NDArray[np.float64], basis: str
 ) -> PredictionModel:
-    """Fit the fallback to the calibration links.
+    """Fit the fallback, the log-distance model, to the calibration links.
 
-    Args:
-        problem: The problem.
-        without_path: Mask of its links without a path [links].
-        held_out_db: Residuals of the log-distance model on held-out links [n], [dB].
-        basis: What these links are.
-
-    Returns:
-        The log-distance model. Its errors come from links without a path; if these are too few, from held-out links;
-        and if these are too few as well, from the calibration links.
+    Its errors come from links without a path; if these are too few, from its residuals on held-out links [n], [dB],
+    which `basis` describes; and if these are too few as well, from the calibration links.
     """
     setup, links = problem.setup, problem.setup.links
     objective, known_db = log_distance(links, problem.objective, without_scene(setup.study, links))

@@ -106,7 +106,7 @@ class Result(Record):
             allow_changed_inputs: Predict although a file of the scene or an antenna has changed since the calibration.
 
         Returns:
-            Path loss with nuisances [links], [dB]; +inf for a link without a path.
+            Path loss with nuisances [links], [dB]; that of the fallback for a link without a path.
 
         Raises:
             InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of
@@ -195,10 +195,7 @@ class Result(Record):
         return report(self, file, overwrite=overwrite, progress=progress)
 
     def apply(self, scene: object) -> None:
-        """Set the calibrated materials in a Sionna RT scene in memory.
-
-        Args:
-            scene: The `sionna.rt.Scene`, at the study's carrier.
+        """Set the calibrated materials in a `sionna.rt.Scene` in memory, at the study's carrier.
 
         Raises:
             InputError: It is not a scene of Sionna RT, or lacks a material.

@@ -267,15 +267,9 @@ class Problem:
         modelled: NDArray[np.float64],
         observed: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
-        """Weighted residuals of modelled values, one row per prior of a parameter, then those of further observables.
+        """Weighted residuals [n, m]: of modelled values [n, L], of priors of parameters, then of further observables.
 
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-            modelled: The engine's values for them [n, L].
-            observed: Its further observables [n, K, L], in SI units; None if there are none.
-
-        Returns:
-            The residuals [n, m].
+        Candidates [n, d] are in the fields' units, and further observables [n, K, L] in SI units.
         """
         parts = [self.objective.residuals(modelled)]
         if len(self.priors):
@@ -291,16 +285,9 @@ class Problem:
         slope: NDArray[np.float64],
         observed_slope: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
-        """Derivatives of `residuals`.
+        """Derivatives of `residuals` [n, m, k] with respect to k variables: the d search coordinates, then any others.
 
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-            modelled: The engine's values for them [n, L].
-            slope: Their derivatives with respect to k variables [n, L, k]: the d search coordinates, then any others.
-            observed_slope: The same for the further observables [n, K, L, k]; None if there are none.
-
-        Returns:
-            Derivatives of the residuals with respect to the same variables [n, m, k].
+        They follow from the derivatives of the modelled values [n, L, k] and of further observables [n, K, L, k].
         """
         parts = [self.objective.jacobian(modelled, slope)]
         if len(self.priors):

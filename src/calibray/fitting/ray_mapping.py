@@ -97,16 +97,10 @@ def maps_rays(setup: Setup) -> bool:
 def search_rays(
     problem: Problem, engine: Exporting, progress: Progress | None = None
 ) -> tuple[Problem, Trail, Remark]:
-    """Search by ray mapping.
+    """Search by ray mapping, on an engine that answers with rays.
 
-    Args:
-        problem: The problem on an engine that answers with rays.
-        engine: That engine.
-        progress: Called with the stage "calibrating" after every RT call.
-
-    Returns:
-        The problem on the replay that replaces the engine, the search, and how well the engine's assumptions are
-        identified.
+    The results are the problem on the replay that replaces the engine, the search, and how well the engine's
+    assumptions are identified. The stage of `progress` is "calibrating".
 
     Raises:
         EngineError: A call failed.
@@ -133,17 +127,9 @@ def search_rays(
 def map_rays(
     problem: Problem, ask: Ask, *, tolerance_db: float = 0.01, most_calls: int = MOST_CALLS, seed: int = 0
 ) -> RayMap:
-    """Call an engine until the path loss at the minimum is predicted.
+    """Call an engine until the path loss at the minimum is predicted to the tolerance, or for most calls.
 
-    Args:
-        problem: The problem; its engine is not called.
-        ask: Calls the engine.
-        tolerance_db: Gap at which the mapping ends [dB].
-        most_calls: Calls after which it ends.
-        seed: Seed of the random numbers.
-
-    Returns:
-        The replay that replaces the engine, and its accuracy.
+    The result is the replay that replaces the engine, and its accuracy. The engine of the problem is not called.
     """
     parameters, known = problem.parameters, problem.setup.known_antennas is not None
     understanding: Understanding | None = None

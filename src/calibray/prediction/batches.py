@@ -59,16 +59,8 @@ def predict_links(
 ) -> pd.DataFrame:
     """Predict path loss, intervals and remarks on positions, in this process or on workers.
 
-    Args:
-        result: The calibration.
-        setup: Its study, opened for the links.
-        level: Probability that the interval contains a measurement; None for path loss without an interval.
-        progress: Called with the stage "tracing" as links are traced.
-        workers: Workers that predict chunks of links; None for this process.
-        with_remarks: Whether positions are checked.
-
-    Returns:
-        The table of `interval` with a column `remark`, empty if there is none or positions are not checked.
+    The result is the table of `interval` with a column `remark`, empty if there is none or positions are not checked.
+    The stage of `progress` is "tracing".
 
     Raises:
         InputError: What `interval` refuses.
@@ -99,15 +91,8 @@ def predict_batches(
 ) -> Iterator[tuple[Measurements, pd.DataFrame]]:
     """Predict the links of a table batch by batch, so that memory does not grow with their number.
 
-    All rows are checked before the first is traced.
-
-    Args:
-        result: The calibration.
-        table: The table, with the columns that `predict` reads.
-        level: Probability that the interval contains a measurement; None for path loss without an interval.
-        progress: Called with the stages "checking" and "tracing", the number of links done, and of all links.
-        workers: Workers that predict chunks of links; None for this process.
-        allow_changed_inputs: Predict although a file of the scene or an antenna has changed since the calibration.
+    All rows are checked before the first is traced. The table has the columns that `predict` reads. The stages of
+    `progress` are "checking" and "tracing".
 
     Yields:
         Links and their predictions, as returned by `predict_links`, in the order of the table.

@@ -194,16 +194,12 @@ def separation_probability(
     squares: NDArray[np.float64],
     predicted: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Probability of ruling out all ranges of a parameter but one, after a candidate is measured.
+    """Probability of ruling out all ranges of a parameter but one, after a candidate is measured [candidates].
 
-    Args:
-        excess: Sum of squares of every value above the least, in noise variances [m]; the first n values are the draws.
-        piece: Range that each parameter lies in [m, d].
-        squares: Squared differences between draws and values at the candidates chosen before [n, m].
-        predicted: Path loss of the candidates for every value, in standard deviations of their errors [m, candidates].
-
-    Returns:
-        The probability, averaged over draws and parameters; a parameter with one range adds nothing [candidates].
+    It is averaged over draws and parameters; a parameter with one range adds nothing. The excess is the sum of squares
+    of every value above the least, in noise variances [m]; the first n values are the draws. Every parameter lies in a
+    range [m, d]. Squared differences between draws and values at the candidates chosen before are [n, m]; the path loss
+    of the candidates for every value is in standard deviations of their errors [m, candidates].
     """
     draws, candidates = len(squares), predicted.shape[1]
     ambiguous = [column for column in piece.T if np.ptp(column)]

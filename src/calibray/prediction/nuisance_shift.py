@@ -130,19 +130,10 @@ def fill_missing(
     level: float | None = None,
     least_db: NDArray[np.float64] | float = 0.0,
 ) -> pd.DataFrame:
-    """Use the fallback to predict the links without a path.
+    """Use the fallback to predict the links without a path, in a table of the predictions of all links.
 
-    Args:
-        prediction: The prediction model and its fallback.
-        study: The study.
-        links: The links.
-        table: Their predictions: path_loss_db, infinite without a path, basis and, with a level, lower_db and upper_db.
-        level: Probability that the interval contains a measurement; None for no interval.
-        least_db: Half the width of the prediction model's interval [links], [dB]; the fallback's interval is at least
-            as wide.
-
-    Returns:
-        The table, with the fallback's predictions for links without a path; unchanged if there are none.
+    The columns are path_loss_db, infinite without a path, basis and, with a level, lower_db and upper_db. The interval
+    is at least twice `least_db` [links], [dB], wide: that of the prediction model.
     """
     missing = ~np.isfinite(table["path_loss_db"].to_numpy(float))
     if not missing.any():

@@ -55,15 +55,8 @@ def further_observables(
 ) -> dict[str, NDArray[np.float64]]:
     """Further observables at opened links [links] by column name; without the biases of devices.
 
-    The interval has two parts: the errors of single values, from held-out links if there are any, and the draws.
-
-    Args:
-        result: The calibration.
-        replayed: The engine over the links; None if the prediction model uses no scene.
-        level: Probability that an interval contains a measurement; None for values without an interval.
-
-    Returns:
-        The columns; empty without further observables, or without a scene.
+    The interval has two parts: the errors of single values, from held-out links if there are any, and the draws. There
+    are no columns without further observables, or without a scene in the prediction model.
     """
     sections = result.study.observables
     if not sections or replayed is None or not isinstance(replayed.engine, Observing):
@@ -117,17 +110,10 @@ def worth_measuring(
     index: NDArray[np.int64],
     information: NDArray[np.float64],
 ) -> list[Worth]:
-    """Compare the observables at suggested links.
+    """The best observable of every suggested link [suggestions], the best link first.
 
-    Args:
-        result: The calibration.
-        engine: The replay of the candidates.
-        draws: Draws of the parameters, and their derivatives with respect to the coordinates of the unit cube [n, d].
-        index: The suggested candidates, the best first [suggestions].
-        information: Information matrices with path loss of each suggestion and those above it [suggestions, n, d, d].
-
-    Returns:
-        The best observable of every suggestion.
+    Draws of the parameters, and their derivatives with respect to the coordinates of the unit cube, are [n, d].
+    Information matrices are those with path loss of each suggestion and those above it [suggestions, n, d, d].
     """
     own = {section.kind: (name, section) for name, section in result.study.observables.items()}
     statistics = tuple(own[kind][1].statistic if kind in own else Statistic(kind) for kind in CHOICES)
@@ -161,17 +147,11 @@ def _deviation(information: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
-    """Predictions in the measured quantity of the study's links.
+    """Predictions of path_loss_db and its interval in the measured quantity of the study's links, by column name.
 
-    Args:
-        study: The study.
-        links: The links.
-        table: Their path_loss_db and, if they have an interval, lower_db and upper_db.
-
-    Returns:
-        Path gain [dB], received power or RSRP [dBm] and the ends of its interval [links], by column name, as
-        `received_power_dbm`, `received_power_lower_dbm` and `received_power_upper_dbm`. Empty if path loss was
-        measured, or the transmitted power of these links is unknown.
+    It is path gain [dB], received power or RSRP [dBm], as `received_power_dbm`, `received_power_lower_dbm` and
+    `received_power_upper_dbm` [links]. Empty if path loss was measured, or the transmitted power of these links is
+    unknown.
     """
     quantity = study.links.quantity
     reference = _reference_level(study, links)

@@ -43,18 +43,7 @@ def predict(
     *,
     allow_changed_inputs: bool = False,
 ) -> NDArray[np.float64]:
-    """Predict path loss at new links.
-
-    Args:
-        result: The calibration.
-        links: The links, or a table with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], or with the position
-            columns that the study names, and with its group column, if it has one. The study's column of frequencies
-            gives the carriers; without it, all links have the scene's carrier.
-        progress: Called with the stage "tracing" after every launch.
-        allow_changed_inputs: Predict although a file of the scene or an antenna has changed since the calibration.
-
-    Returns:
-        Path loss with nuisances [links], [dB]; for a link without a path, that of the fallback.
+    """Predict path loss at new links; see `Result.predict`.
 
     Raises:
         InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of the
@@ -72,23 +61,10 @@ def predict_interval(
     *,
     allow_changed_inputs: bool = False,
 ) -> pd.DataFrame:
-    """Predict path loss at new links, with an interval for a measurement there.
+    """Predict path loss at new links, with an interval for a measurement there; see `Result.predict_interval`.
 
     The width of the interval has three parts: the residuals of single links, from held-out links if the calibration has
     any; the draws of the parameters; and for groups without measurements, the spread between groups.
-
-    Args:
-        result: The calibration.
-        links: The links, or a table, as for `predict`; their groups need no measurements.
-        level: Probability that the interval contains a measurement.
-        progress: Called with the stage "tracing" after every launch.
-        allow_changed_inputs: Predict although a file of the scene or an antenna has changed since the calibration.
-
-    Returns:
-        One row per link: path_loss_db, lower_db, upper_db [dB] and basis, the source of the interval. For a link
-        without a path, basis begins with "no path", and the log-distance model predicts. If the study measured another
-        quantity, the three values follow in that quantity. The last column is a remark on ends outside the scene, under
-        the ground or inside a building.
 
     Raises:
         InputError: `predict` would refuse the input, except for unknown groups; the level is not between 0 and 1; or
@@ -101,14 +77,7 @@ def predict_interval(
 
 
 def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -> Measurements:
-    """New links from a table or from rows of a file.
-
-    Args:
-        result: The calibration.
-        links: The links, a table as for `predict`, or rows of a file with such a table.
-
-    Returns:
-        The links, with the groups and carriers of the study's columns.
+    """New links, with the groups and carriers of the study's columns, from a table or from rows of a file.
 
     Raises:
         InputError: A column is missing, or a position is not finite.
@@ -123,15 +92,6 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
 def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs: bool = False) -> Setup:
     """Open the study of a calibration for new links.
 
-    Args:
-        result: The calibration.
-        links: The links.
-        allow_changed_inputs: Open the study although a file of the scene or an antenna has changed since the
-            calibration.
-
-    Returns:
-        The opened study.
-
     Raises:
         InputError: The scene or the parameters cannot be used, or one of these files has changed.
     """
@@ -141,16 +101,10 @@ def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs:
 
 
 def traced_materials(result: Record, materials: dict[str, Material] | None) -> dict[str, Material] | None:
-    """Materials to trace with.
+    """The materials with which paths are evaluated if these depend on them; otherwise None: one trace serves all.
 
-    Args:
-        result: The calibration.
-        materials: Materials with which the paths are evaluated.
-
-    Returns:
-        None if the paths do not depend on the materials, so that one cached trace can be used for all of them: the
-        tracer samples only refraction and diffuse reflection by the materials. The powers of a program's rays depend on
-        the materials.
+    The tracer samples only refraction and diffuse reflection by the materials. The powers of a program's rays depend on
+    the materials.
     """
     trace, rays = result.study.trace, result.study.engine.exports_rays
     return materials if trace.refraction or trace.diffuse_reflection or rays else None
@@ -178,16 +132,9 @@ def _with_columns(result: Record, setup: Setup) -> Setup:
 def interval(
     result: Record, setup: Setup, level: float | None = 0.9, progress: Progress | None = None
 ) -> pd.DataFrame:
-    """Predict path loss and its interval at links that are already opened.
+    """Predict path loss and its interval at links for which the study was opened.
 
-    Args:
-        result: The calibration.
-        setup: Its study, opened for the links.
-        level: Probability that the interval contains a measurement; None for path loss without an interval.
-        progress: Called with the stage "tracing" after every launch.
-
-    Returns:
-        One row per link: path_loss_db and basis and, with a level, lower_db and upper_db.
+    There is one row per link: path_loss_db, basis and, with a level, lower_db and upper_db.
 
     Raises:
         InputError: The level is not between 0 and 1, or the calibration had too few links to estimate the size of

@@ -36,17 +36,11 @@ def krige_residuals(
     residuals: NDArray[np.float64],
     position: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Krige the residual field from measured links to new ones.
+    """Krige the residual field from measured links to new ones, whose ends have positions [m, 6] and [n, 6], [m].
 
-    Args:
-        field: The field's range and standard deviations.
-        measured: Positions of both ends of the measured links [m, 6], [m].
-        residuals: Measured minus modelled path loss there [m], [dB].
-        position: Positions of both ends of the new links [n, 6], [m].
-
-    Returns:
-        Correction of the modelled path loss [n], [dB], and the share of the field's variance that the measured links
-        explain, which is 0 far from all of them and below 1 near one [n].
+    Residuals are measured minus modelled path loss [m], [dB]. The results are the correction of the modelled path loss
+    [n], [dB], and the share of the field's variance that the measured links explain, which is 0 far from all of them
+    and below 1 near one [n].
     """
     if len(measured) <= MOST_EXACT:
         return _krige(field, measured, residuals, position)

@@ -164,9 +164,8 @@ class _ReplayedDraws:
     def at(self, setup: Setup) -> tuple[NDArray[np.float64], NDArray[np.float64], Errors]:
         """Predict the candidates.
 
-        Returns:
-            Path loss for every value [m, candidates], [dB]; its derivatives with respect to the coordinates of the unit
-            cube for the draws [n, candidates, d], [dB]; and the expected errors of measurements.
+        The results are path loss for every value [m, candidates], [dB]; its derivatives with respect to the coordinates
+        of the unit cube for the draws [n, candidates, d], [dB]; and the expected errors of measurements.
         """
         objective, links = self.problem.objective, setup.links
         loss, slope = self._replay(self._engine(setup))

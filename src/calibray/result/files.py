@@ -310,15 +310,7 @@ def _problem_digest(study: Study) -> str:
 
 
 def read_validation(folder: Path, study: Study, measured_db: NDArray[np.float64]) -> HeldOutErrors | None:
-    """Read the held-out errors of a result.
-
-    Args:
-        folder: The result's folder.
-        study: The result's study.
-        measured_db: Measured path loss of the result's links [links], [dB].
-
-    Returns:
-        The errors; None without validation.
+    """Read the held-out errors of a result with measured path loss [links], [dB]; None without validation.
 
     Raises:
         InputError: The file was damaged or edited, or belongs to another study or other links.

@@ -113,18 +113,10 @@ def joint(
     ridge: NDArray[np.float64],
     freedom: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """The joint log density of errors, coefficients and log scale, with its derivatives.
+    """The joint log density of errors, coefficients and log scale, with its derivatives; see `log_evidence`.
 
-    Args:
-        point: Coefficients and log scale [n, q + 1].
-        gap: Measured minus modelled path loss; for a censored link, with the floor as measured value [n, m], [dB].
-        censored: Mask of the censored links [m].
-        design: Columns of the nuisance [m, q].
-        ridge: Inverse standard deviations of the coefficients' priors [q]; 0 for a flat prior.
-        freedom: Degrees of freedom of Student's t; +inf for a Gaussian.
-
-    Returns:
-        Its value up to a constant [n], its gradient [n, q + 1], and minus its Hessian [n, q + 1, q + 1].
+    At coefficients and log scale [n, q + 1], the results are its value up to a constant [n], its gradient [n, q + 1],
+    and minus its Hessian [n, q + 1, q + 1].
     """
     coefficients, scale = point[:, :-1], np.exp(point[:, -1])
     error = (gap - coefficients @ design.T) / scale[:, None]

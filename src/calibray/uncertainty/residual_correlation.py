@@ -80,16 +80,10 @@ def fit_correlation(
     position: NDArray[np.float64],
     design: NDArray[np.float64] | None = None,
 ) -> Correlation:
-    """Fit range and size of the correlated part by restricted maximum likelihood.
+    """Fit range and size of the correlated part of errors [m], [dB], by restricted maximum likelihood.
 
-    Args:
-        errors: Errors at the best fit [m], [dB].
-        position: Positions of the receivers, or of both ends [m, k], [m].
-        design: Columns that were fitted to the same links, of full rank [m, q]: nuisances, and derivatives with respect
-            to the parameters.
-
-    Returns:
-        The correlation.
+    Positions [m, k], [m], are those of the receivers or of both ends. The design has the columns that were fitted to
+    the same links, of full rank [m, q]: nuisances, and derivatives with respect to the parameters.
 
     Raises:
         InputError: The number of links exceeds that of columns by fewer than three, or all receivers have one position.

@@ -135,18 +135,10 @@ def verdicts(
     level: float = 0.95,
     seen: Draws | None = None,
 ) -> list[Verdict]:
-    """Judge every parameter by its posterior.
+    """Judge every parameter by its posterior, of the means over all buildings if these differ.
 
-    Args:
-        draws: The posterior, of the means over all buildings if these differ.
-        modelled: Computes path loss.
-        axes: The axes of the search space.
-        noise_db: Standard deviation of the links' errors [dB].
-        level: Share of the posterior that intervals cover.
-        seen: The posterior for the measured buildings; the same as `draws` if None.
-
-    Returns:
-        One verdict per parameter.
+    The links' errors have the standard deviation `noise_db` [dB]. Intervals cover the share `level` of the posterior.
+    `seen` is the posterior for the measured buildings; the same as `draws` if None.
     """
     best = draws.point[np.argmax(draws.density)]
     seen = draws if seen is None else seen
@@ -286,17 +278,9 @@ def credible_sets(
     upper: float,
     levels: Sequence[float],
 ) -> list[tuple[tuple[float, float], ...]]:
-    """The smallest sets that cover shares of the posterior, from one smoothed density.
+    """The smallest sets that cover shares of the posterior, for each level, from one smoothed density.
 
-    Args:
-        value: Draws of the parameter [n].
-        weight: Their weights [n].
-        lower: Lower bound of the parameter.
-        upper: Upper bound of the parameter.
-        levels: Shares of the posterior to cover.
-
-    Returns:
-        Lower and upper end of every piece, ascending, for each level.
+    Draws [n] have weights [n]; a set is the lower and upper end of every piece, ascending.
 
     Example:
         >>> draws = np.random.default_rng(0).normal(5.0, 0.1, 4000)

@@ -86,18 +86,10 @@ def compare(
     position: NDArray[np.float64],
     seed: int = 0,
 ) -> Judgement:
-    """Compare a model with its best baseline.
+    """Compare a model with its best baseline, by residuals on the same held-out links [n], [dB].
 
-    The error of the difference comes from resampling clusters of neighbouring links, the same ones for both models.
-
-    Args:
-        errors: Residuals of the model on held-out links [n], [dB]; links with a non-finite residual are left out.
-        baselines: Residuals of each baseline on the same links [n], [dB].
-        position: Positions of the receivers [n, 3], [m].
-        seed: Seed of the resampling.
-
-    Returns:
-        The comparison.
+    The error of the difference comes from resampling clusters of links whose receivers [n, 3], [m], are neighbours, the
+    same ones for both models. Links with a non-finite residual are left out.
     """
     table = np.stack([errors, *baselines.values()])
     finite = np.isfinite(table).all(axis=0)
@@ -122,17 +114,10 @@ def compare(
 
 
 def choose(errors: Errors, position: NDArray[np.float64]) -> str:
-    """Choose the model for predictions by held-out errors.
+    """Choose the model for predictions by held-out residuals [n], [dB], `Model.INITIAL` among them.
 
     The initial materials are kept until another model is better by more than the bootstrap error of the difference, and
     by more than `LEAST_GAIN`. Kriging is never chosen, because it predicts well only near the measured links.
-
-    Args:
-        errors: Held-out residuals by model [n], [dB]; those of `Model.INITIAL` among them.
-        position: Positions of the receivers [n, 3], [m].
-
-    Returns:
-        The model's name.
     """
     chosen: str = Model.INITIAL
     for name in (least(errors, FITTED), *WITHOUT_MATERIALS):
@@ -152,17 +137,10 @@ def least(errors: Errors, names: tuple[str, ...]) -> str:
 def two_levels(
     errors: NDArray[np.float64], block: NDArray[np.int64], position: NDArray[np.float64]
 ) -> BlockErrors | None:
-    """Variance of held-out errors within and between blocks (analysis of variance of random effects).
+    """Variance of held-out errors [n], [dB], within and between blocks (analysis of variance of random effects).
 
-    A new street has its own error, so a few blocks contain less information than their many links.
-
-    Args:
-        errors: Residuals on held-out links [n], [dB].
-        block: Block of every link [n].
-        position: Positions of the links' ends [n, k], [m].
-
-    Returns:
-        The errors in two levels; None with fewer than two blocks, or if there are no more links than blocks.
+    A new street has its own error, so a few blocks contain less information than their many links. Positions [n, k],
+    [m], are of the links' ends. None with fewer than two blocks, or if there are no more links than blocks.
 
     Example:
         >>> blocks = two_levels(np.array([3.0, 4, -4, -3, 1, 0]), np.array([0, 0, 1, 1, 2, 2]), np.eye(6))
@@ -227,15 +205,9 @@ MODELS: Final = ("calibrated", "mean", "law of distance")
 def held_out_gaps(
     problem: Problem, best: NDArray[np.float64], held_out: NDArray[np.bool_]
 ) -> dict[str, NDArray[np.float64]]:
-    """Predicted minus measured values of every observable on held-out links.
+    """Predicted minus measured values of every observable on held-out links: `MODELS` [3, L], in its unit.
 
-    Args:
-        problem: The problem; its links without a weight are predicted from the others.
-        best: Its optimum, in the fields' units [d].
-        held_out: Which links are held out [L].
-
-    Returns:
-        Gaps of `MODELS` by name of the observable [3, L], in its unit; NaN if a link is not judged.
+    They are predicted from the other links at the optimum, in the fields' units [d]; NaN if a link is not judged.
     """
     if not problem.observed:
         return {}

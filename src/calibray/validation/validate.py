@@ -107,15 +107,9 @@ def validate_problem(
 ) -> Validation:
     """Compare models on all links of a problem, each block held out in turn.
 
-    Args:
-        problem: The problem.
-        blocks: Number of spatial blocks; the study's number if None and `by` is None.
-        by: Column whose labels are held out in turn.
-        progress: Called with the stage "validating".
-        known_minima: Minima of the study's own model over all links, under its name [k, d]; searched if absent.
-
-    Returns:
-        Held-out errors of every model.
+    Blocks are spatial, as many as stated or as in the study, or the labels of the column `by`. Known minima of the
+    study's own model over all links stand under its name [k, d]; they are searched if absent. The stage of `progress`
+    is "validating".
 
     Raises:
         InputError: The links cannot be divided into these blocks.
