@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
@@ -26,7 +27,6 @@ from calibray.result.record import (
     Record,
     Uncertainty,
 )
-from calibray.result.rows import COLUMNS, read_rows
 from calibray.scenes import export_scene, read_scene
 from calibray.study import Study
 from calibray.support.messages import shortened
@@ -38,7 +38,7 @@ from calibray.support.output_files import (
     is_unchanged_output,
     write_text,
 )
-from calibray.support.output_tables import csv_text
+from calibray.support.output_tables import csv_text, without_formula_mark
 from calibray.support.strict_models import Section, explain
 
 VERSION: Final = 1
@@ -52,6 +52,20 @@ SIGNED_FILES: Final = (LINKS_FILE, HISTORY_FILE, SCENE_FILE)
 """The files whose digests `result.json` contains."""
 
 VALIDATION_FILE: Final = "result-validation.json"
+
+LINKS: Final = {
+    "row": "i", "measured_db": "f", "before_db": "f", "after_db": "f", "log_distance_db": "f", "has_path": "b",
+    "held_out": "b", "retrace_gap_db": "f", "predicted_db": "f", "scene_db": "f",
+}  # fmt: skip
+HISTORY: Final = {"call": "i", "iteration": "i", "rmse_db": "f", "best_db": "f", "seconds": "f"}
+COLUMNS: Final = {"result-links.csv": LINKS, "result-history.csv": HISTORY}
+"""Columns of each file and the NumPy kind of their values: integer, float or Boolean."""
+
+OPTIONAL: Final = ("leverage", "depth", "out_of_sight", "obstruction_m", "region_m")
+"""Columns of numbers that are optional."""
+
+FINITE: Final = ("measured_db", "log_distance_db", "best_db", "seconds")
+"""Columns without infinite or missing values; in other columns, a link without a path is infinite or empty."""
 
 
 class LinkCounts(Section):
@@ -92,9 +106,8 @@ def content(
 
     `files` has the SHA-256 of every other file of the result, by name, once they are written.
     """
-    values = {
-        name: TypeAdapter(type(part)).dump_python(part, mode="json") for name, part in _sections(record)
-    }
+    parts = {name: getattr(record, name) for name in SECTIONS}
+    values = {name: TypeAdapter(type(part)).dump_python(part, mode="json") for name, part in parts.items()}
     return {
         "version": VERSION,
         "study_file": str(record.study.path.resolve()),
@@ -104,10 +117,6 @@ def content(
         "files": files or {},
         "sentences": list(sentences),
     }
-
-
-def _sections(record: Record) -> list[tuple[str, Any]]:
-    return [(name, getattr(record, name)) for name in SECTIONS]
 
 
 def write(
@@ -122,14 +131,7 @@ def write(
 
     Each file is written under a temporary name and then renamed, so every file is complete or absent. `result.json` is
     written last and contains the digests of the others: if the run is killed before that, `read` refuses the mixture of
-    two runs.
-
-    Args:
-        record: The result.
-        folder: Folder to write into; created if absent.
-        overwrite: Replace files that Calibray did not write.
-        sentences: Its remarks as text.
-        validation: Figures of the validation, for readers of the file.
+    two runs. Sentences and the figures of the validation are for readers of the files.
 
     Raises:
         InputError: The folder cannot be written, or a file there must not be replaced.
@@ -157,14 +159,9 @@ def write(
 
 
 def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str, Any]:
-    """Read a folder that `write` wrote.
+    """Read the fields of a `Record` from a folder that `write` wrote.
 
-    Args:
-        folder: The folder.
-        allow_changed_inputs: Read the result although its files were changed after they were written.
-
-    Returns:
-        The fields of a `Record`.
+    With `allow_changed_inputs`, files may have been changed after they were written.
 
     Raises:
         InputError: The folder contains no result, one of another version, one that was damaged or edited, or files of
@@ -365,3 +362,38 @@ def _checked_validation(file: Path, values: dict[str, Any], links: int) -> HeldO
     if not 0 < held_out.level < 1:
         raise InputError(f"{file}: level = {held_out.level:g}: must be between 0 and 1; validate again")
     return held_out
+
+
+def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
+    """Read a table of a result's folder with the required columns of kinds "i", "f" or "b"; others stay unchanged.
+
+    Raises:
+        InputError: The file does not exist, lacks a column, or has invalid values in one.
+    """
+    file = folder / name
+    if not exists(file):
+        raise InputError(f"{file}: does not exist; give the --out folder of `calibray run`")
+    try:
+        # Group labels such as 7 or NA must stay text.
+        table = pd.read_csv(file, converters={"group": without_formula_mark})
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{file}: is not a table of `calibray run` ({str(error).splitlines()[0]}); give its --out folder"
+        ) from None
+    for column, kind in columns.items():
+        if column not in table:
+            raise InputError(f"{file}: has no column {column!r}; run the study again")
+        actual = table[column].dtype.kind
+        # Whole numbers are valid floats. A table without rows has no kinds.
+        if len(table) and actual != kind and not (kind == "f" and actual == "i"):
+            raise InputError(f"{file}: column {column!r} has values of the wrong type; run the study again")
+        if kind == "f":
+            table[column] = table[column].astype(float)
+        if column in FINITE and not np.isfinite(table[column]).all():
+            raise InputError(f"{file}: column {column!r} has a value that is not finite; run the study again")
+    if not len(table):
+        raise InputError(f"{file}: has no rows; run the study again")
+    numeric = [column for column in table if str(column)[:3] in ("tx_", "rx_") or column in OPTIONAL]
+    if invalid := [column for column in numeric if table[column].dtype.kind not in "if"]:
+        raise InputError(f"{file}: column {invalid[0]!r} has values of the wrong type; run the study again")
+    return table.astype(dict.fromkeys(numeric, float))
