@@ -30,6 +30,7 @@ from calibray.fitting.search import Trail
 from calibray.measurements import Measurements
 from calibray.paths import Paths
 from calibray.prediction.nuisance_shift import fill_missing
+from calibray.prediction.observables import MOST_DRAWS
 from calibray.prediction.residual_field import calibration_residuals
 from calibray.result.held_out import Model, ResidualField
 from calibray.result.record import (
@@ -49,6 +50,7 @@ from calibray.study.facades import without_facade_materials
 from calibray.study.model import StudyModel
 from calibray.tracing.protocol import EnclosedAntennas
 from calibray.uncertainty.assessment import Certainty
+from calibray.uncertainty.draws import evenly_spaced
 from calibray.uncertainty.emulator import emulate
 from calibray.uncertainty.noise_models import HEAVY
 from calibray.uncertainty.residual_correlation import shared_errors
@@ -291,10 +293,6 @@ def _replayed_paths(problem: Problem) -> Paths | None:
     return problem.engine.paths if uncompressed and isinstance(problem.engine, Replay) else None
 
 
-MOST_DRAWS: Final = 64
-"""Largest number of posterior draws for the errors of biases; the error of a standard deviation from them is 9 %."""
-
-
 def observable_fits(
     run: Run, draws: Mapping[str, Sequence[float]]
 ) -> tuple[dict[str, ObservableFit], dict[str, NDArray[np.float64]]]:
@@ -364,8 +362,7 @@ def _observed_at_draws(run: Run, draws: Mapping[str, Sequence[float]]) -> tuple[
             return ()
         problem = replace(problem, engine=ensemble.mean, observable=PATH_LOSS)
     drawn = np.stack([draws[name] for name in problem.parameters.names], axis=1)
-    chosen = np.linspace(0, len(drawn) - 1, min(len(drawn), MOST_DRAWS)).round().astype(int)
-    return tuple(problem.respond(drawn[chosen]).observed)
+    return tuple(problem.respond(drawn[evenly_spaced(len(drawn), MOST_DRAWS)]).observed)
 
 
 def _rms(values: NDArray[np.float64]) -> float:

@@ -19,16 +19,13 @@ from calibray.optimizers.arguments import Box, whole
 from calibray.optimizers.evaluations import Archive, merge_repeated
 from calibray.optimizers.kriging import Kriging, fit, solve
 from calibray.optimizers.protocol import Optimizer, Search, Session
-from calibray.optimizers.sampling import distance_to_nearest, draw_around, maximin_design
+from calibray.optimizers.sampling import SEPARATION, distance_to_nearest, draw_around, maximin_design
 
 CANDIDATES = 300
 """Number of candidates drawn over the box, and of candidates around the best points."""
 
 REFINEMENTS = (0.1, 0.01, 0.001)
 """Standard deviations, in the unit cube, of further candidates around the most promising one."""
-
-SEPARATION = 1e-4
-"""Distance in the unit cube below which a point counts as already evaluated."""
 
 OFTEN = 40
 """Number of evaluations up to which the scales are estimated every time; beyond it, every tenth time."""

@@ -5,7 +5,7 @@ An optimizer that is not better than these at an equal budget has learned nothin
 
 from __future__ import annotations
 
-from typing import ClassVar, final
+from typing import ClassVar, Final, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,6 +54,10 @@ def draw_around(
     near = points[rng.integers(0, len(points), count)]
     reach = 10.0 ** rng.uniform(log_reach, -0.5, (count, 1))
     return np.clip(near + reach * rng.standard_normal(near.shape), 0.0, 1.0)
+
+
+SEPARATION: Final = 1e-4
+"""Distance in the unit cube below which a point counts as already evaluated."""
 
 
 def distance_to_nearest(x: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:

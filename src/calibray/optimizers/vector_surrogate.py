@@ -38,7 +38,7 @@ from calibray.optimizers.descent import descend_all
 from calibray.optimizers.evaluations import Archive, Objective, merge_repeated, root_mean_square
 from calibray.optimizers.kriging import Kriging, fit, solve
 from calibray.optimizers.protocol import Optimizer, Search, Session
-from calibray.optimizers.sampling import distance_to_nearest, draw_around, maximin_design
+from calibray.optimizers.sampling import SEPARATION, distance_to_nearest, draw_around, maximin_design
 
 FIRST = 5
 """Largest number of points of the initial design beyond the number of parameters."""
@@ -57,9 +57,6 @@ REFIT = 1.1
 
 SEARCHES = 16
 """Local searches on the model."""
-
-SEPARATION = 1e-4
-"""Distance in the unit cube below which a point counts as already evaluated."""
 
 UNCERTAIN = 1e-3
 """Share of the prior variance above which a predicted minimum counts as another basin."""

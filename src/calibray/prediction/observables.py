@@ -23,10 +23,11 @@ from calibray.measurements.observables import (
 from calibray.result.record import Record
 from calibray.study import Study
 from calibray.study.mounting import PORT_POWER, states_port_power
+from calibray.uncertainty.draws import evenly_spaced
 
 MOST_DRAWS: Final = 64
-"""Largest number of posterior draws for the width of an interval; the error of a standard deviation from them is 9
-%."""
+"""Largest number of posterior draws for the width of an interval and the errors of biases; the error of a standard
+deviation from them is 9 %."""
 
 
 class Replayed(NamedTuple):
@@ -62,7 +63,7 @@ def further_observables(
     if not sections or replayed is None or not isinstance(replayed.engine, Observing):
         return {}
     best, draws = replayed.values[:1], replayed.values[1:] if level is not None else replayed.values[:0]
-    draws = draws[np.linspace(0, len(draws) - 1, min(len(draws), MOST_DRAWS)).round().astype(int)]
+    draws = draws[evenly_spaced(len(draws), MOST_DRAWS)]
     statistics = tuple(section.statistic for section in sections.values())
     answers = replayed.engine.respond(np.vstack([best, draws]), statistics).observed
     columns: list[NDArray[np.float64]] = []

@@ -31,6 +31,7 @@ from calibray.result.record import Record
 from calibray.study import Setup
 from calibray.support.messages import percent
 from calibray.support.progress import Progress
+from calibray.uncertainty.draws import evenly_spaced
 from calibray.uncertainty.residual_correlation import Correlation, shared_errors
 
 MOST_DRAWS: Final = 96
@@ -148,7 +149,7 @@ class _ReplayedDraws:
         self.lower, upper = parameters.search_bounds
         self.width = upper - self.lower
         all_draws = np.stack([result.uncertainty.draws[name] for name in parameters.names], axis=1)
-        chosen = np.linspace(0, len(all_draws) - 1, min(len(all_draws), MOST_DRAWS)).round().astype(int)
+        chosen = evenly_spaced(len(all_draws), MOST_DRAWS)
         self.num_draws = len(chosen)
         self.values = np.vstack([all_draws[chosen], self._further_values(all_draws)])
         self.evaluation = self.problem.evaluate(parameters.to_search(self.values), derivatives=True)

@@ -36,6 +36,11 @@ def pooled(draws: Sequence[Draws]) -> Draws:
     )
 
 
+def evenly_spaced(count: int, most: int) -> NDArray[np.int64]:
+    """Indices of evenly spaced items among a number of them, all if there are no more than `most`."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
+
+
 def systematic_resampling(
     weight: NDArray[np.float64], count: int, random: np.random.Generator
 ) -> NDArray[np.intp]:

@@ -25,6 +25,7 @@ from scipy.spatial.distance import cdist, pdist
 
 from calibray.errors import EngineError, InputError
 from calibray.support.memory import single_blas_thread
+from calibray.uncertainty.draws import evenly_spaced
 
 SHARES: Final = (0.001, 0.999)
 """Bounds of the correlated share of the variance; at 1 the covariance of nearby links is singular."""
@@ -148,7 +149,7 @@ def shared_errors(errors: NDArray[np.float64], position: NDArray[np.float64]) ->
     """The correlation of errors at the best fit [m], [dB], at positions [m, k], [m]; None if it is not significant."""
     if len(errors) < FEWEST_LINKS:
         return None
-    chosen = np.linspace(0, len(errors) - 1, min(len(errors), MOST_LINKS)).round().astype(int)
+    chosen = evenly_spaced(len(errors), MOST_LINKS)
     try:
         correlation = fit_correlation(errors[chosen], position[chosen])
     except (InputError, EngineError):  # all links at one position, or no errors
@@ -166,7 +167,7 @@ def variogram(
     [m, k], [m], are those of the receivers or of both ends. The result is the mean distance [k], [m], the semivariance
     [k], [dB^2], and the number of pairs [k] of classes with about equal numbers of pairs.
     """
-    chosen = np.linspace(0, len(errors) - 1, min(len(errors), MOST_LINKS)).round().astype(int)
+    chosen = evenly_spaced(len(errors), MOST_LINKS)
     distance, half = pdist(position[chosen]), 0.5 * pdist(errors[chosen, None], "sqeuclidean")
     if len(distance):  # pairs beyond half the extent are few, and all at its ends
         near = distance <= max(np.median(distance), distance.max() / 2)
