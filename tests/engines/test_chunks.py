@@ -16,9 +16,8 @@ from calibray.engines.cluster.chunks import cut
 from calibray.engines.kinds.replay import trace_and_replay
 from calibray.errors import InputError
 from calibray.fitting.nuisance import Nuisance, make_term
-from calibray.fitting.objective import make_objective
+from calibray.fitting.objective import make_objective, total
 from calibray.fitting.problem import Problem
-from calibray.fitting.sums_of_squares import total
 from calibray.measurements import Measurements
 from calibray.study import Setup
 

@@ -21,9 +21,8 @@ from calibray.engines.protocol import (
 )
 from calibray.errors import InputError
 from calibray.fitting.nuisance import study_nuisance
-from calibray.fitting.objective import Objective, make_objective
+from calibray.fitting.objective import Objective, Share, make_objective, rows, total
 from calibray.fitting.observed import Observed, observed
-from calibray.fitting.sums_of_squares import Share, rows, total
 from calibray.measurements import Measurements
 from calibray.measurements.observables import Statistic
 from calibray.parameters import NO_PRIOR, LogNormal, Parameters
