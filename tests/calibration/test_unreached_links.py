@@ -15,8 +15,8 @@ from calibray.calibration.result import Result
 from calibray.cli.app import app
 from calibray.measurements import links_from_frame
 from calibray.prediction.batches import LOG, announce
+from calibray.prediction.corrections import fill_missing
 from calibray.prediction.map_files import figure
-from calibray.prediction.nuisance_shift import fill_missing
 from calibray.reporting.wording import prediction_text
 from calibray.result import RemarkKind
 from small_scenes import block, write_scene

@@ -15,8 +15,8 @@ import planted
 from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.cli.app import app
+from calibray.prediction.corrections import calibration_residuals, krige_residuals
 from calibray.prediction.position_checks import locate
-from calibray.prediction.residual_field import calibration_residuals, krige_residuals
 from calibray.prediction.suggestion import suggest
 from calibray.result.held_out import BlockErrors, ResidualField
 from calibray.scenes import Triangles

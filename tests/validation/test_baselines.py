@@ -13,7 +13,7 @@ from calibray.errors import EngineError
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import make_objective
 from calibray.measurements import Measurements, SourceTable
-from calibray.prediction.nuisance_shift import fill_missing
+from calibray.prediction.corrections import fill_missing
 from calibray.result.held_out import FittedTerm, Model, PredictionModel
 from calibray.result.record import Prediction
 from calibray.study import Study

@@ -29,9 +29,8 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.measurements import Measurements
 from calibray.paths import Paths
-from calibray.prediction.nuisance_shift import fill_missing
+from calibray.prediction.corrections import calibration_residuals, fill_missing
 from calibray.prediction.observables import MOST_DRAWS
-from calibray.prediction.residual_field import calibration_residuals
 from calibray.result.held_out import Model, ResidualField
 from calibray.result.record import (
     Accuracy,

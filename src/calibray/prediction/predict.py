@@ -17,10 +17,15 @@ from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements, SourceTable
 from calibray.parameters import fixed_constant, split_name
-from calibray.prediction.nuisance_shift import fill_missing, model_terms, nuisance_shift
+from calibray.prediction.corrections import (
+    calibration_residuals,
+    fill_missing,
+    krige_residuals,
+    model_terms,
+    nuisance_shift,
+)
 from calibray.prediction.observables import Replayed, as_measured, further_observables
 from calibray.prediction.position_checks import POSITION_COLUMNS, remarks
-from calibray.prediction.residual_field import calibration_residuals, krige_residuals
 from calibray.result.held_out import Model, PredictionModel
 from calibray.result.record import Record
 from calibray.scenes.obstruction import CLUSTER, OUT_OF_SIGHT
