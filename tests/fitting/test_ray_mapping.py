@@ -13,9 +13,8 @@ from calibray.engines import Replay
 from calibray.engines.rays.compile import RaySetting, compile_rays, powers, rays_of
 from calibray.engines.rays.export import Export
 from calibray.engines.rays.table import RayTable
-from calibray.fitting import ray_antennas, ray_fit
+from calibray.fitting import ray_fit, ray_scan
 from calibray.fitting.problem import Problem
-from calibray.fitting.ray_antennas import Gains
 from calibray.fitting.ray_fit import understand
 from calibray.fitting.ray_mapping import RayMap, map_rays
 from calibray.fitting.ray_model import ANGLES, HALF_SPACE, Call, RayModel
@@ -136,13 +135,13 @@ def test_tilted_antennas_are_found_among_the_minima_near_their_nulls(slant: floa
     last, earlier = (
         np.exp(2j * np.pi * random.random(shape)) * random.random(shape) * coupling for _ in range(2)
     )
-    part = Gains(last, earlier, (bases[0], bases[1]), np.full(count, 1 / count), np.zeros(count))
+    part = ray_scan.Gains(last, earlier, (bases[0], bases[1]), np.full(count, 1 / count), np.zeros(count))
     truth = np.array([np.pi / 2, 0.08, -0.06, slant, 0.0, 0.0])
-    parts = [part._replace(observed=ray_antennas.errors([part], truth))]
+    parts = [part._replace(observed=ray_scan.errors([part], truth))]
     upright = np.array([np.pi / 2, 0.0, 0.0, slant, 0.0, 0.0])
-    local = least_squares(lambda angles: ray_antennas.errors(parts, angles), upright, loss="soft_l1").x
-    assert np.linalg.norm(ray_antennas.errors(parts, local)) > 1.0
-    difference = ray_antennas.antennas(parts, local)[0] - truth
+    local = least_squares(lambda angles: ray_scan.errors(parts, angles), upright, loss="soft_l1").x
+    assert np.linalg.norm(ray_scan.errors(parts, local)) > 1.0
+    difference = ray_scan.antennas(parts, local)[0] - truth
     slants = [0, ANGLES]
     difference[slants] -= np.pi * np.round(difference[slants] / np.pi)
     np.testing.assert_allclose(difference, 0.0, atol=1e-6)

@@ -3,7 +3,7 @@
 Materials are added one after the other. Each is scanned (`ray_scan.py`) on paths that meet no material that is added
 later. The best points, with several polarizations, are refined together with the values so far, by least squares with
 exact derivatives on all these paths. The best few go on. If a misfit remains at the end, linear polarizations are
-searched with the materials fixed (`ray_antennas.py`), and then each material is scanned again on all its paths.
+searched with the materials fixed, and then each material is scanned again on all its paths.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 from calibray.engines.rays.compile import powers
 from calibray.engines.rays.surfaces import TOLERANCE
 from calibray.engines.replay import Replay
-from calibray.fitting import ray_antennas, ray_scan
+from calibray.fitting import ray_scan
 from calibray.fitting.ray_model import Call, Ends, RayModel
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take
@@ -195,13 +195,13 @@ def _turned(fit: Understanding, ratios: list[Ratio], last: Call) -> list[Underst
     model, count = fit.model, len(fit.model.assumed)
     gains = model.gains(last.candidate, fit.values)
     parts = [
-        ray_antennas.Gains(
+        ray_scan.Gains(
             gains[each.here], model.gains(each.call.candidate, fit.values)[each.here],
             (model.bases[0][each.here], model.bases[1][each.here]), each.weight, each.observed,
         )
         for each in ratios
     ]  # fmt: skip
-    found = ray_antennas.antennas(parts, fit.values[count:])
+    found = ray_scan.antennas(parts, fit.values[count:])
     return [replace(fit, values=np.concatenate([fit.values[:count], angles])) for angles in found]
 
 
