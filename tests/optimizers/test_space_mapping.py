@@ -16,6 +16,7 @@ from calibray.optimizers.multifidelity.correction import (
     FOLLOWED,
     UNLIKELY,
     ErrorRecord,
+    UnitModel,
     average,
     constants_fit,
     correct,
@@ -124,7 +125,7 @@ def corrected_by(count: int):
     """The cheap model with thickness 1.8 instead of 1.1, corrected by some answers; and starts of its members."""
     unit = design("sobol", count, 2, np.random.default_rng(0))
     starts = np.log(1.8) + 0.5 * np.random.default_rng(1).standard_normal((16, 1))
-    return correct(cheap(1.8), BOX, unit, engine(BOX.from_unit(unit)), CLOUD, starts), starts
+    return correct(UnitModel(cheap(1.8), BOX), (unit, engine(BOX.from_unit(unit))), CLOUD, starts), starts
 
 
 def test_the_constants_are_those_that_explain_the_answers():
@@ -150,9 +151,9 @@ def test_input_mappings_start_from_the_likeliest_of_many_trials():
     unit = design("sobol", 3, 2, np.random.default_rng(0))
     residuals = thick_walls(BOX.from_unit(unit), np.tile(true, (3, 1)))
     trials = centre + 0.5 * np.random.default_rng(1).standard_normal((600, 2))
-    few = correct(model, BOX, unit, residuals, CLOUD, trials[:FOLLOWED])
+    few = correct(UnitModel(model, BOX), (unit, residuals), CLOUD, trials[:FOLLOWED])
     assert np.abs(np.exp(few.constants) - true).max() > 0.1
-    many = correct(model, BOX, unit, residuals, CLOUD, trials)
+    many = correct(UnitModel(model, BOX), (unit, residuals), CLOUD, trials)
     assert np.exp(many.constants) == pytest.approx(true, rel=1e-3)
     believed, fitted = misfit(many, np.stack([centre, many.constants]))
     assert fitted < believed - 50.0
@@ -160,7 +161,9 @@ def test_input_mappings_start_from_the_likeliest_of_many_trials():
 
 def test_slopes_of_a_corrected_model_equal_finite_differences():
     unit = design("sobol", 6, 2, np.random.default_rng(3))
-    corrected = correct(cheap(1.4), BOX, unit, engine(BOX.from_unit(unit)), unit, np.zeros((0, 1)))
+    corrected = correct(
+        UnitModel(cheap(1.4), BOX), (unit, engine(BOX.from_unit(unit))), unit, np.zeros((0, 1))
+    )
     point = np.array([[0.4, 0.7]])
     _, slope = corrected.mean_and_slope(point)
     for axis, move in enumerate(1e-5 * np.eye(2)):
@@ -187,7 +190,7 @@ def test_members_that_explain_the_answers_badly_are_left_out(monkeypatch):
         "calibray.optimizers.multifidelity.correction.STEPS", 0
     )  # members stay at their start
     kept = average(corrected, starts, np.random.default_rng(3)).members[1:]
-    fit, prior = constants_fit(corrected), corrected.model.constants
+    fit, prior = constants_fit(corrected), corrected.cheap.constants
 
     def cost(constants):
         return 0.5 * np.sum(fit((constants[None] - prior.lower) / prior.width)[0] ** 2)
@@ -220,13 +223,17 @@ def test_errors_larger_than_predicted_stretch_later_predictions():
 def test_a_cheap_model_is_judged_by_the_median_link():
     unit = design("sobol", 4, 2, np.random.default_rng(0))
     residuals = engine(BOX.from_unit(unit))
-    assert error_ratio(correct(cheap(1.1), BOX, unit, residuals, CLOUD, np.zeros((0, 1)))) < HELPFUL
-    assert error_ratio(correct(useless(), BOX, unit, residuals, CLOUD, np.zeros((1, 0)))) > HELPFUL
+    assert (
+        error_ratio(correct(UnitModel(cheap(1.1), BOX), (unit, residuals), CLOUD, np.zeros((0, 1)))) < HELPFUL
+    )
+    assert (
+        error_ratio(correct(UnitModel(useless(), BOX), (unit, residuals), CLOUD, np.zeros((1, 0)))) > HELPFUL
+    )
     wild = residuals.copy()
     wild[:, :5] = 30.0 * np.random.default_rng(7).standard_normal(
         (4, 5)
     )  # no model predicts these five links
-    assert error_ratio(correct(cheap(1.1), BOX, unit, wild, CLOUD, np.zeros((0, 1)))) < HELPFUL
+    assert error_ratio(correct(UnitModel(cheap(1.1), BOX), (unit, wild), CLOUD, np.zeros((0, 1)))) < HELPFUL
 
 
 def test_a_useless_cheap_model_costs_three_calls_at_most():

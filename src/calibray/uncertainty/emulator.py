@@ -27,7 +27,7 @@ from calibray.measurements.observables import Statistic
 from calibray.optimizers.arguments import Box
 from calibray.optimizers.evaluations import merge_repeated
 from calibray.optimizers.multifidelity import discrepancy
-from calibray.optimizers.multifidelity.correction import Corrected, correct
+from calibray.optimizers.multifidelity.correction import Corrected, UnitModel, correct
 from calibray.optimizers.multifidelity.discrepancy import (
     SampledFunction,
     sample_function,
@@ -366,7 +366,7 @@ def _corrected(
     trials = constants.draw(random.standard_normal((TRIALS, len(constants.centre))))
     trials = np.vstack([constants.centre, trials])
     cloud = design("sobol", CLOUD, box.dimension, random)
-    return correct(model, box, calls.unit, calls.rows, cloud, trials, noisy=noisy)
+    return correct(UnitModel(model, box), (calls.unit, calls.rows), cloud, trials, noisy=noisy)
 
 
 def _replayed(model: ReplayedModel, rows: ResponseRows) -> ReplayedModel | None:

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from calibray.optimizers.arguments import Box
 from calibray.optimizers.descent import Residuals, descend_all
 from calibray.optimizers.multifidelity import discrepancy
-from calibray.optimizers.multifidelity.cheap_model import CheapModel
+from calibray.optimizers.multifidelity.cheap_model import CheapModel, Constants
 from calibray.optimizers.regression import Inputs, Kernel, Process
 
 TURNS: Final = 2
@@ -42,6 +42,30 @@ FOLLOWED: Final = 8
 
 CONVERGED: Final = 1e-4
 """Relative decrease of the cost, or step in the unit cube, at which an input mapping has converged."""
+
+
+@dataclass(frozen=True, eq=False)
+class UnitModel:
+    """A cheap model over the unit cube of a box."""
+
+    model: CheapModel
+    box: Box
+
+    @property
+    def constants(self) -> Constants:
+        """See `CheapModel.constants`."""
+        return self.model.constants
+
+    def residuals(self, unit: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Residuals at points of the unit cube [k, m], with constants [q]."""
+        return self.model.residuals(self.box.from_unit(unit), np.tile(constants, (len(unit), 1)))
+
+    def residuals_and_slope(
+        self, unit: NDArray[np.float64], constants: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Residuals at points of the unit cube [k, m], with constants [q], and their Jacobian [k, m, d]."""
+        answer = self.model.answer(self.box.from_unit(unit), np.tile(constants, (len(unit), 1)))
+        return answer.residuals, answer.by_point * self.box.width
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,16 +103,14 @@ class Corrected:
     """A cheap model with its discrepancy.
 
     Attributes:
-        model: The cheap model.
-        box: The box searched.
+        cheap: The cheap model over the box searched.
         constants: Its constants as adjusted [q].
         response: Its response over the box.
         residuals: Answers of the engine [n, m].
         discrepancy: The discrepancy.
     """
 
-    model: CheapModel
-    box: Box
+    cheap: UnitModel
     constants: NDArray[np.float64]
     response: Response
     residuals: NDArray[np.float64]
@@ -117,7 +139,7 @@ class Corrected:
 
     def base(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], Inputs]:
         """Residuals [k, m] of the cheap model with adjusted constants, and the points with their responses."""
-        cheap = cheap_residuals(self.model, self.box, unit, self.constants)
+        cheap = self.cheap.residuals(unit, self.constants)
         return cheap, self.response.inputs(unit, cheap)
 
     def base_and_slope(
@@ -128,7 +150,7 @@ class Corrected:
         Residuals [k, m], their derivatives [k, m, d], the points in the form for the discrepancy, and the derivatives
         of their responses [k, r, d].
         """
-        cheap, slope = cheap_and_slope(self.model, self.box, unit, self.constants)
+        cheap, slope = self.cheap.residuals_and_slope(unit, self.constants)
         return cheap, slope, self.response.inputs(unit, cheap), self.response.scaled(slope)
 
     def with_point(self, point: NDArray[np.float64], residuals: NDArray[np.float64]) -> Corrected:
@@ -147,60 +169,44 @@ class Corrected:
 
 
 def correct(
-    model: CheapModel,
-    box: Box,
-    unit: NDArray[np.float64],
-    residuals: NDArray[np.float64],
+    cheap: UnitModel,
+    answers: tuple[NDArray[np.float64], NDArray[np.float64]],
     cloud: NDArray[np.float64],
     trials: NDArray[np.float64],
     *,
     noisy: bool = False,
     before: Corrected | None = None,
 ) -> Corrected:
-    """Fit a corrected model to an engine's answers [n, m] at points of the unit cube [n, d].
+    """Fit a corrected model to points of the unit cube [n, d] and an engine's answers there [n, m].
 
     The response of the cheap model is measured at the points of `cloud` [k, d]. The input mapping starts from the
     likeliest of the `trials` [s, q] and from the constants of `before`, the model of fewer points. `noisy` states
     whether the answers scatter.
     """
+    unit, residuals = answers
 
     def with_discrepancy(constants: NDArray[np.float64], guess: tuple[Kernel, float] | None) -> Corrected:
-        response = Response.of(cheap_residuals(model, box, cloud, constants), model.known)
-        cheap = cheap_residuals(model, box, unit, constants)
+        response = Response.of(cheap.residuals(cloud, constants), cheap.model.known)
+        base = cheap.residuals(unit, constants)
         # The kernel's variances are relative to the response, which depends on the constants.
         kernel = None if guess is None else Kernel.of(guess[0].logarithms(guess[1]), response.scale)
         process = discrepancy.fit(
-            response.inputs(unit, cheap), residuals - cheap, response.scale, noisy=noisy, guess=kernel
+            response.inputs(unit, base), residuals - base, response.scale, noisy=noisy, guess=kernel
         )
-        return Corrected(model, box, constants, response, residuals, process)
+        return Corrected(cheap, constants, response, residuals, process)
 
     def guess(corrected: Corrected) -> tuple[Kernel, float]:
         return corrected.discrepancy.kernel, corrected.response.scale
 
-    constants = model.constants.centre if before is None else before.constants
+    constants = cheap.constants.centre if before is None else before.constants
     corrected = with_discrepancy(constants, None if before is None else guess(before))
     for _ in range(TURNS if len(constants) else 0):
         constants = _adjusted(corrected, trials)
-        moved = np.abs(constants - corrected.constants).max() > 1e-3 * model.constants.spread.max()
+        moved = np.abs(constants - corrected.constants).max() > 1e-3 * cheap.constants.spread.max()
         corrected, trials = with_discrepancy(constants, guess(corrected)), trials[:0]
         if not moved:
             break
     return corrected
-
-
-def cheap_residuals(
-    model: CheapModel, box: Box, unit: NDArray[np.float64], constants: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Residuals of a cheap model with constants [q] at points of the unit cube [k, m]."""
-    return model.residuals(box.from_unit(unit), np.tile(constants, (len(unit), 1)))
-
-
-def cheap_and_slope(
-    model: CheapModel, box: Box, unit: NDArray[np.float64], constants: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Residuals of a cheap model with constants [q] at points of the unit cube [k, m], and Jacobian [k, m, d]."""
-    answer = model.answer(box.from_unit(unit), np.tile(constants, (len(unit), 1)))
-    return answer.residuals, answer.by_point * box.width
 
 
 def constants_fit(
@@ -214,8 +220,8 @@ def constants_fit(
     their standard deviations [n m]. Returns a function of constants, in the unit cube between their bounds [s, q], that
     returns rows and their Jacobian. Half the sum of squares of the rows is the negative log density.
     """
-    model, process, prior = corrected.model, corrected.discrepancy, corrected.model.constants
-    points, width = corrected.box.from_unit(corrected.unit), prior.width
+    model, process, prior = corrected.cheap.model, corrected.discrepancy, corrected.cheap.constants
+    points, width = corrected.cheap.box.from_unit(corrected.unit), prior.width
     (count, links), size = corrected.residuals.shape, len(prior.centre)
     whiten = np.linalg.inv(process.lower)
     weight = np.sqrt(process.precision)
@@ -243,8 +249,8 @@ def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> NDArray[np.f
     The variances of the links are integrated out. A link that the present constants do not explain therefore has full
     weight for other constants.
     """
-    model, prior = corrected.model, corrected.model.constants
-    points, (count, links) = corrected.box.from_unit(corrected.unit), corrected.residuals.shape
+    model, prior = corrected.cheap.model, corrected.cheap.constants
+    points, (count, links) = corrected.cheap.box.from_unit(corrected.unit), corrected.residuals.shape
     cheap = model.residuals(np.tile(points, (len(constants), 1)), np.repeat(constants, count, axis=0))
     errors = corrected.residuals - cheap.reshape(-1, count, links)
     rows = np.linalg.inv(corrected.discrepancy.lower) @ errors
@@ -254,7 +260,7 @@ def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> NDArray[np.f
 
 def _adjusted(corrected: Corrected, trials: NDArray[np.float64]) -> NDArray[np.float64]:
     """The constants [q] that explain the answers best, with a fixed kernel of the discrepancy."""
-    prior, present = corrected.model.constants, corrected.constants[None]
+    prior, present = corrected.cheap.constants, corrected.constants[None]
     if len(trials):
         trials = trials[np.argsort(misfit(corrected, trials), kind="stable")[:FOLLOWED]]
     starts = (np.vstack([present, trials]) - prior.lower) / prior.width
@@ -336,7 +342,7 @@ class ErrorRecord:
 
 def average(corrected: Corrected, starts: NDArray[np.float64], random: np.random.Generator) -> Averaged:
     """Fit members from constants [s, q] around a model; keep those that explain the answers nearly as well."""
-    prior = corrected.model.constants
+    prior = corrected.cheap.constants
     size = len(prior.centre)
     if not size:
         return Averaged((corrected,))

@@ -42,8 +42,8 @@ from calibray.optimizers.multifidelity.correction import (
     Averaged,
     Corrected,
     ErrorRecord,
+    UnitModel,
     average,
-    cheap_and_slope,
     correct,
 )
 from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, Session
@@ -179,7 +179,7 @@ class SpaceMapping(Optimizer):
             else:
                 unit, residuals = merge_repeated(self.box.to_unit(answers.x), answers.errors)
                 self._corrected = correct(
-                    model, self.box, unit, residuals, cloud, self._trials(model, len(unit)),
+                    UnitModel(model, self.box), (unit, residuals), cloud, self._trials(model, len(unit)),
                     noisy=self.noisy, before=self._corrected,
                 )  # fmt: skip
                 if len(unit) >= JUDGED:
@@ -221,7 +221,7 @@ class SpaceMapping(Optimizer):
         d = self.box.dimension
 
         def evaluate(unit: NDArray[np.float64]) -> Residuals:
-            return cheap_and_slope(model, self.box, unit, model.constants.centre)
+            return UnitModel(model, self.box).residuals_and_slope(unit, model.constants.centre)
 
         starts = design("sobol", FIRST_SEARCHES, d, self._rng)
         self._minima = distinct(descend_all(starts, evaluate, SEARCH_STEPS, CONVERGED), APART).unit
@@ -229,7 +229,7 @@ class SpaceMapping(Optimizer):
 
     def _averaged(self, corrected: Corrected) -> Averaged:
         """The corrected model and others that explain the answers; half of them start from the previous ones."""
-        prior = corrected.model.constants
+        prior = corrected.cheap.constants
         if len(corrected.residuals) > AVERAGED or not len(prior.centre):
             return Averaged((corrected,))
         draws = prior.draw(self._rng.standard_normal((MEMBERS, len(prior.centre))))
