@@ -130,7 +130,8 @@ def measure_compiling() -> None:
             compiled.SMALL = small
             engine = Replay(program(size, False), chosen, computation=Computation(np.float64))
             started = time.process_time()
-            engine.path_loss(points), engine.path_loss_and_jacobian(points)
+            engine.path_loss(points)
+            engine.path_loss_and_jacobian(points)
             compiling = time.process_time() - started
             value, slope = (
                 1e6 / len(points) * seconds(lambda f=function: f(points), 100)
