@@ -2,7 +2,6 @@
 
 # ruff: noqa: E402  (what NumPy reads has to be set before it is imported)
 
-import gc
 import os
 import sys
 from collections.abc import Iterator
@@ -53,11 +52,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Long files first; `make test` keeps this order, where xdist would put files of few tests last."""
     rank = {name: index for index, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
-
-
-def pytest_collection_finish() -> None:
-    """What was imported and collected stays to the end: garbage collection need not look through it every time."""
-    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
