@@ -43,7 +43,7 @@ from calibray.measurements.observables import Statistic
 from calibray.result.verdict import Remark, RemarkKind
 from calibray.scenes import Mesh, MeshObject, write_scene
 from calibray.study import Setup, Study
-from calibray.uncertainty.conflict import conflict
+from calibray.uncertainty.remarks import conflict
 
 NOISE_DB: Final = 3.0
 NOISE_NS: Final = 3.0

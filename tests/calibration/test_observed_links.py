@@ -21,7 +21,7 @@ from calibray.result.held_out import Model
 from calibray.result.verdict import RemarkKind
 from calibray.study import Setup, Study
 from calibray.tables import render
-from calibray.uncertainty.conflict import conflict
+from calibray.uncertainty.remarks import conflict
 from calibray.validation.validate import validate_problem
 
 MARBLE = "marble.relative_permittivity"

@@ -21,7 +21,7 @@ import programs
 from calibray import engines
 from calibray.calibration.calibrate import calibrate
 from calibray.engines import Answer, Ledger, Recorded
-from calibray.engines.ledger import claims, database
+from calibray.engines.ledger import database
 from calibray.engines.ledger.database import LedgerEntry, key
 from calibray.engines.process_owner import ProcessOwner
 from calibray.errors import EngineError, InputError
@@ -374,7 +374,7 @@ CURRENT = ProcessOwner.current()
     ],
 )
 def test_a_claim_holds_for_as_long_as_its_run_may_be_alive(path, monkeypatch, owner, expires, waits):
-    monkeypatch.setattr(claims, "_active_runs", {"another run"})
+    monkeypatch.setattr(database, "_active_runs", {"another run"})
     text = "no owner" if owner is None else json.dumps(owner.record())
     with closing(Ledger(path)) as ledger:
         with closing(sqlite3.connect(path)) as file, file:
@@ -386,9 +386,9 @@ def test_a_claim_holds_for_as_long_as_its_run_may_be_alive(path, monkeypatch, ow
 
 def test_a_claim_of_another_machine_ends_once_nobody_renews_it(path, monkeypatch):
     """By the observer's clock: neither clock of the two machines is asked for the time of day."""
-    monkeypatch.setattr(claims, "_observed", {})
+    monkeypatch.setattr(database, "_observed", {})
     clock = [1000.0]
-    monkeypatch.setattr(claims.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(database.time, "monotonic", lambda: clock[0])
     owner = json.dumps(replace(CURRENT, host="elsewhere").record())
     with closing(Ledger(path)) as ledger, closing(sqlite3.connect(path)) as file:
         row = ("p", key(CANDIDATES[2]), "another run", owner, time.time() - 3600.0)
@@ -396,13 +396,13 @@ def test_a_claim_of_another_machine_ends_once_nobody_renews_it(path, monkeypatch
             file.execute("INSERT INTO claims VALUES (?, ?, ?, ?, ?)", row)
         wanted = [key(CANDIDATES[2])]
         assert ledger.claim("p", wanted, 2) == []
-        clock[0] += 0.9 * claims.EXPIRY
+        clock[0] += 0.9 * database.EXPIRY
         with file:
             file.execute("UPDATE claims SET expires = expires + 60")
         assert ledger.claim("p", wanted, 2) == []
-        clock[0] += 0.9 * claims.EXPIRY
+        clock[0] += 0.9 * database.EXPIRY
         assert ledger.claim("p", wanted, 2) == []
-        clock[0] += 0.2 * claims.EXPIRY
+        clock[0] += 0.2 * database.EXPIRY
         assert ledger.claim("p", wanted, 2) == wanted
 
 
@@ -414,7 +414,7 @@ def test_the_owner_of_a_claim_is_known_again_after_the_clock_was_set(monkeypatch
 
 
 def test_a_sign_of_life_renews_a_claim_and_the_end_of_work_gives_it_up(path, monkeypatch):
-    monkeypatch.setattr(claims, "RENEWAL", 0.01)
+    monkeypatch.setattr(database, "RENEWAL", 0.01)
     with closing(Ledger(path)) as ledger, closing(sqlite3.connect(path)) as file:
         ledger.claim("p", [key(CANDIDATES[2])], 2)
         (before,) = file.execute("SELECT expires FROM claims").fetchone()

@@ -16,7 +16,7 @@ import pandas as pd
 import calibray as cb
 from calibray.fields import path_loss
 from calibray.paths import Paths
-from calibray.tracing.two_cuts import read_two_cuts
+from calibray.tracing.gain_table import read_two_cuts
 from fuzzing import world
 from fuzzing.mutations import damage, edited, hostile, toml
 from fuzzing.outcome import Case

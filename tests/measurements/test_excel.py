@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from calibray.errors import InputError
-from calibray.measurements import excel, read_table
+from calibray.measurements import read_table, table_files
 
 SHEET = [["x", "loss"], [10.0, 80.25], [20.0, 81.5], [30.0, 0.1]]
 
@@ -96,11 +96,11 @@ def test_rows_out_of_order_are_refused(tmp_path, row):
 
 def test_a_workbook_beyond_the_limits_is_refused(tmp_path, monkeypatch):
     path = workbook(tmp_path / "links.xlsx", SHEET)
-    monkeypatch.setattr(excel, "MAX_UNPACKED", 1000)
+    monkeypatch.setattr(table_files, "MAX_UNPACKED", 1000)
     with pytest.raises(InputError, match="MiB unpacked"):
         read_table(path)
-    monkeypatch.setattr(excel, "MAX_UNPACKED", 2**28)
-    monkeypatch.setattr(excel, "MAX_CELLS", 5)
+    monkeypatch.setattr(table_files, "MAX_UNPACKED", 2**28)
+    monkeypatch.setattr(table_files, "MAX_CELLS", 5)
     with pytest.raises(InputError, match="more than 5 cells"):
         read_table(path)
 

@@ -4,10 +4,18 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_t
 
-from calibray.optimizers import kriging
-from calibray.optimizers.kriging import Kriging, fit, solve
+from calibray.optimizers import regression
 from calibray.optimizers.multifidelity import discrepancy
-from calibray.optimizers.regression import Inputs, Kernel, Likelihood, matern, matern_slope
+from calibray.optimizers.regression import (
+    Inputs,
+    Kernel,
+    Kriging,
+    Likelihood,
+    fit,
+    matern,
+    matern_slope,
+    solve,
+)
 
 RNG = np.random.default_rng(1)
 POINTS = RNG.random((25, 3))
@@ -88,7 +96,7 @@ WITH_RESPONSE = Inputs(POINTS, np.random.default_rng(3).standard_normal((25, 2))
 @pytest.mark.parametrize(
     ("likelihood", "hyper"),
     [
-        (kriging.likelihood(POINTS, truth(POINTS)), [-np.inf, -np.inf, 0.0, 1.0, 0.3, -0.5, -5.0]),
+        (regression.likelihood(POINTS, truth(POINTS)), [-np.inf, -np.inf, 0.0, 1.0, 0.3, -0.5, -5.0]),
         (Likelihood(WITH_RESPONSE, truth(POINTS), freedom=4.0), [0.3, -1.0, -0.5, 0.4, 0.9, 0.2, -3.0]),
     ],
     ids=["with a trend", "with a prior of the variances"],

@@ -5,7 +5,7 @@ import pytest
 
 from calibray.errors import InputError
 from calibray.optimizers import LatinHypercube, VectorSurrogate
-from calibray.optimizers.kriging import fit
+from calibray.optimizers.regression import fit
 from calibray.optimizers.vector_surrogate import improvement, mean_square, predicted_minima
 from problem_families.landscapes import street
 

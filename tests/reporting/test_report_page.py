@@ -29,7 +29,7 @@ from calibray.result.held_out import HeldOutErrors, Judgement, Model
 from calibray.scenes import read_scene, read_triangles
 from calibray.scenes.buildings import _loops
 from calibray.support.figure_style import plain_number
-from calibray.uncertainty.linear_theory import Interval
+from calibray.uncertainty.verdicts import Interval
 from changed import changed
 from small_scenes import block, write_scene
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from calibray.errors import InputError
-from calibray.tracing.gain_table import read_gain_table
-from calibray.tracing.two_cuts import read_two_cuts
+from calibray.tracing.gain_table import read_gain_table, read_two_cuts
 
 ANGLES = np.arange(360)
 

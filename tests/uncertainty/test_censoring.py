@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibray.uncertainty.censoring import joint, log_evidence, log_survival
+from calibray.uncertainty.laplace import joint, log_evidence, log_survival
 from calibray.uncertainty.noise_models import GAUSSIAN, HEAVY, Marginal, NoiseModel, noise_models
 
 SLOPE, OFFSET_DB, SPREAD_DB, LIMIT_DB = 5.0, 80.0, 4.0, 105.0

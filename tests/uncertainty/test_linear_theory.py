@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import t
 
-from calibray.uncertainty.linear_theory import intervals
+from calibray.uncertainty.verdicts import intervals
 
 
 def linear_problem(noise: np.ndarray, offset: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

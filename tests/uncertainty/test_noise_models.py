@@ -16,9 +16,16 @@ from calibray.engines import Replay
 from calibray.fitting.problem import Problem
 from calibray.measurements import links_from_frame
 from calibray.study import Setup, Study
-from calibray.uncertainty import heavy_tails as tails
-from calibray.uncertainty.missing_paths import excess_db, missing_db
-from calibray.uncertainty.noise_models import IMPROBABLE, OFFSET_DB, Marginal, NoiseModel, noise_models
+from calibray.uncertainty import laplace as tails
+from calibray.uncertainty.noise_models import (
+    IMPROBABLE,
+    OFFSET_DB,
+    Marginal,
+    NoiseModel,
+    excess_db,
+    missing_db,
+    noise_models,
+)
 from calibray.uncertainty.residual_correlation import EXACT, shared, whitener
 
 RANDOM = np.random.default_rng(1)

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibray.uncertainty import quadratic_forms as module
+from calibray.uncertainty import joint_model as module
+from calibray.uncertainty.joint_model import QuadraticForms
 from calibray.uncertainty.noise_models import Marginal, noise_models
-from calibray.uncertainty.quadratic_forms import QuadraticForms
 
 LINKS, COUNT = 30, 120
 

@@ -12,19 +12,17 @@ from typing import Annotated, Any, Final
 import typer
 from typer.core import TyperGroup
 
-from calibray.cli.compare import compare
 from calibray.cli.console import echo
 from calibray.cli.doctor import cache, doctor
 from calibray.cli.init import init, schema
 from calibray.cli.ledger import ledger
-from calibray.cli.map import map
 from calibray.cli.open import open
-from calibray.cli.predict import predict, suggest
+from calibray.cli.predict import map, predict, suggest
 from calibray.cli.report import export, report
 from calibray.cli.run import demo, run
 from calibray.cli.scene import scene
 from calibray.cli.trace import trace
-from calibray.cli.validate import validate
+from calibray.cli.validate import compare, validate
 from calibray.errors import EngineError, InputError
 from calibray.support.interruption import INTERRUPTED, ensure_interruption
 from calibray.support.memory import check_address_space

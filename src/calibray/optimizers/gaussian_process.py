@@ -1,6 +1,6 @@
 """Bayesian optimization of the objective with a Gaussian process of the value and its expected improvement.
 
-It models one number, while `VectorSurrogate` models every residual, with the same `kriging.py`. A run begins with a
+It models one number, while `VectorSurrogate` models every residual, with the same `regression.py`. A run begins with a
 maximin Latin hypercube. Every further candidate maximises the logarithm of the expected improvement (D. R. Jones, M.
 Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15; the logarithm after S. Ament et al., NeurIPS 2023,
 arXiv:2310.20708). A failed evaluation enters the model with the worst successful value.
@@ -17,8 +17,8 @@ from scipy.stats import norm
 
 from calibray.optimizers.arguments import Box, whole
 from calibray.optimizers.evaluations import Archive, merge_repeated
-from calibray.optimizers.kriging import Kriging, fit, solve
 from calibray.optimizers.protocol import Optimizer, Search, Session
+from calibray.optimizers.regression import Kriging, fit, solve
 from calibray.optimizers.sampling import SEPARATION, distance_to_nearest, draw_around, maximin_design
 
 CANDIDATES = 300

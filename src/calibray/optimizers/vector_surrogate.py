@@ -2,7 +2,7 @@
 
 The objective is a sum over links, so an evaluation that returns the residual of every link contains far more
 information than their sum. Residuals are smoother than the objective, and tens of them share one dependence on the
-parameters (`kriging.py`).
+parameters (`regression.py`).
 
 A run begins with a maximin Latin hypercube. The design has few points for many parameters, because residuals can be
 modelled as soon as a plane fits through them. After the design, three kinds of step take turns on a model that is
@@ -36,8 +36,8 @@ from calibray.errors import InputError
 from calibray.optimizers.arguments import Box, real, whole
 from calibray.optimizers.descent import descend_all
 from calibray.optimizers.evaluations import Archive, Objective, merge_repeated, root_mean_square
-from calibray.optimizers.kriging import Kriging, fit, solve
 from calibray.optimizers.protocol import Optimizer, Search, Session
+from calibray.optimizers.regression import Kriging, fit, solve
 from calibray.optimizers.sampling import SEPARATION, distance_to_nearest, draw_around, maximin_design
 
 FIRST = 5

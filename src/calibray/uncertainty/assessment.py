@@ -28,15 +28,13 @@ from calibray.result.verdict import (
 from calibray.support.memory import single_blas_thread
 from calibray.support.progress import Progress
 from calibray.uncertainty.buildings import can_split
-from calibray.uncertainty.conflict import conflict
 from calibray.uncertainty.draws import systematic_resampling
 from calibray.uncertainty.emulator import emulate
 from calibray.uncertainty.joint_model import JointModel, has_offset, joint_model
-from calibray.uncertainty.linear_theory import local_intervals, with_reason
 from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, HEAVY, OUT_OF_SIGHT
-from calibray.uncertainty.remarks import departures, fit_undeclared_offset, missed, outside_interval
+from calibray.uncertainty.remarks import conflict, departures, fit_undeclared_offset, missed, outside_interval
 from calibray.uncertainty.sequential_monte_carlo import Posterior, draw_posterior, joined
-from calibray.uncertainty.verdicts import Axes, consistent, verdicts
+from calibray.uncertainty.verdicts import Axes, consistent, local_intervals, verdicts, with_reason
 from calibray.uncertainty.verdicts import Verdict as VerdictOnDraws
 
 EQUAL: Final = 0.1

@@ -2,7 +2,7 @@
 
 Errors may be independent and Gaussian, correlated between neighbours, larger out of sight, or heavy-tailed, and an
 offset may be undeclared. Larger errors out of sight are a discrepancy of the twin (M. C. Kennedy and A. O'Hagan, J.
-Royal Statistical Society B 63, 2001): paths that it lacks change the path loss of its weak links (`missing_paths.py`).
+Royal Statistical Society B 63, 2001): paths that it lacks change the path loss of its weak links (`excess_db`).
 The right model is unknown, and choosing the best-fitting one ignores others that fit nearly as well. Every model
 therefore gets a prior weight, and results are averages over all models (Bayesian model averaging). A discrepancy that
 the data do not need thus has almost no weight, and does not absorb what the parameters explain.
@@ -14,7 +14,10 @@ whitened errors y and design Z, ridge R, A = Z'Z + R'R and S = y'y - y'Z A^-1 Z'
     p = (2 pi)^(-f/2) Gamma(f/2) / 2 (S/2)^(-f/2) |C|^(-1/2) |A|^(-1/2) |R|,
 
 where f is the number of links minus the number of columns with a flat prior. For heavy tails, both integrals use
-Laplace's approximation (`heavy_tails.py`).
+Laplace's approximation (`laplace.py`).
+
+Paths that the twin lacks, such as paths through buildings, add power. They hardly change links in sight, but raise the
+power of links out of sight by as much as the twin makes these too weak.
 """
 
 from __future__ import annotations
@@ -26,10 +29,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
+from scipy.stats import qmc
 
-from calibray.uncertainty.censoring import log_evidence
-from calibray.uncertainty.heavy_tails import evidence, gross, regular, student
-from calibray.uncertainty.missing_paths import missing_db
+from calibray.fitting.problem import Problem
+from calibray.uncertainty.laplace import evidence, gross, log_evidence, regular, student
 from calibray.uncertainty.residual_correlation import (
     EXACT,
     Whitener,
@@ -38,6 +41,32 @@ from calibray.uncertainty.residual_correlation import (
     shared,
     whitener,
 )
+
+CANDIDATES: Final = 16
+"""Candidates between the bounds whose median is the loss that the twin expects of a link."""
+
+STRONGEST: Final = 0.05
+"""Quantile of the excess of the strongest links, which is that of the line of sight if some links have it."""
+
+
+def excess_db(problem: Problem) -> NDArray[np.float64]:
+    """Path loss of links out of sight in excess of free space and of the strongest links [L], [dB].
+
+    It is the median over candidates between the bounds; minus infinity in sight, where the twin has the strongest path.
+    """
+    links, (lower, upper) = problem.setup.with_obstruction().links, problem.parameters.search_bounds
+    points = qmc.scale(qmc.Sobol(len(lower), rng=0).random(CANDIDATES), lower, upper)
+    electrical = np.maximum(links.distance, 1e-3) * (1.0 if links.frequency is None else links.frequency)
+    excess = np.median(problem.modelled(points), axis=0) - 20.0 * np.log10(electrical)
+    strongest = np.quantile(excess[problem.objective.weight > 0], STRONGEST)
+    weak = (links.table.numbers("out_of_sight") > 0) & np.isfinite(excess)
+    return np.where(weak, excess - strongest, -np.inf)
+
+
+def missing_db(excess: NDArray[np.float64], level: float) -> NDArray[np.float64]:
+    """Change of path loss by missing power at a level below the line of sight, for links of this excess [dB]."""
+    return 10.0 * np.logaddexp(0.0, (excess - level) * (0.1 * np.log(10.0))) / np.log(10.0)
+
 
 OFFSET_DB: Final = 6.0
 """Prior standard deviation of an undeclared offset, for example from a cable or an antenna gain [dB]."""

@@ -22,7 +22,7 @@ from typing import Final, final
 import numpy as np
 import pandas as pd
 
-from calibray.engines.ledger import claims, database
+from calibray.engines.ledger import database
 from calibray.engines.ledger.database import (
     LedgerEntry,
     check_own_file,
@@ -168,16 +168,16 @@ class Ledger:
             missing = [
                 candidate for candidate in candidates if self.find(problem, candidate, num_links) is None
             ]
-            return claims.claim(self._connection, self._run, problem, missing)
+            return database.claim(self._connection, self._run, problem, missing)
 
     @contextmanager
     def working(self) -> Iterator[None]:
         """Renew this run's claims while its engine works, and release them afterwards."""
         try:
-            with claims.renewing(self.path, self._run):
+            with database.renewing(self.path, self._run):
                 yield
         finally:
-            claims.release(self._connection, self._run)
+            database.release(self._connection, self._run)
 
     def commit(self, problem: str, candidate: bytes, entry: LedgerEntry) -> LedgerEntry:
         """Write an entry, unless another run has written one first; return the stored entry.
