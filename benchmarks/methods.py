@@ -25,7 +25,7 @@ for library in (
 
 from calibray.cli.console import log
 from calibray.cli.progress_bars import progress_bars
-from calibray.comparison.comparison import compare, figure, table
+from calibray.comparison.comparison import compare, figure, parse_methods, table
 from calibray.comparison.method_runs import ComparisonProblem, study_problem
 from calibray.scenarios import demo_study_path
 from calibray.support.figure_style import write
@@ -73,7 +73,7 @@ def main() -> None:
         title, open_problem = PROBLEMS[name]
         with progress_bars(log()) as progress:
             finished = compare(
-                open_problem, chosen.methods, seeds=chosen.seeds, budget=chosen.budget,
+                open_problem, parse_methods(chosen.methods, chosen.budget), seeds=chosen.seeds,
                 out=chosen.runs / name, workers=chosen.workers, progress=progress,
             )  # fmt: skip
         write_table(chosen.out / f"{name}.csv", finished.table())

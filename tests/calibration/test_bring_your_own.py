@@ -10,11 +10,11 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 
+from calibray import trace
 from calibray.fields import path_loss
 from calibray.measurements import Averaging, LinkColumns, Preparation, measured_links, read_table
 from calibray.scenes.authoring import make_scene, read_openstreetmap
 from calibray.scenes.checks import building_outlines, move_outside
-from calibray.tracing.default_tracer import trace
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "bring_your_own"
 

@@ -13,7 +13,7 @@ import planted
 from calibray.calibration.calibrate import calibrate
 from calibray.cli.app import app
 from calibray.comparison import comparison as module
-from calibray.comparison.comparison import FILES, FLOOR_DB, Comparison, compare, figure
+from calibray.comparison.comparison import FILES, FLOOR_DB, Comparison, compare, figure, parse_methods
 from calibray.comparison.comparison import table as render_table
 from calibray.comparison.method_runs import BudgetedMethod, MethodRun, RunFile, run_optimizer, study_problem
 from calibray.errors import InputError
@@ -38,7 +38,9 @@ def _few_starts():
 def small(tmp_path_factory):
     """A comparison of cheap methods, and the folder that it was run in."""
     out = tmp_path_factory.mktemp("small")
-    return compare(STREET, ["random", "gwo@60", "sgwo-im", "least-squares"], seeds=3, budget=45, out=out), out
+    return compare(
+        STREET, parse_methods(["random", "gwo@60", "sgwo-im", "least-squares"], 45), seeds=3, out=out
+    ), out
 
 
 @pytest.fixture
@@ -129,7 +131,7 @@ def test_finished_runs_are_not_repeated(small, monkeypatch):
 
     monkeypatch.setattr(BudgetedMethod, "run", refuse)
     monkeypatch.setattr(module, "_search_optimum", refuse)
-    again = compare(STREET, ["random", "sgwo-im"], seeds=2, budget=45, out=out)
+    again = compare(STREET, parse_methods(["random", "sgwo-im"], 45), seeds=2, out=out)
     assert again.runs == {name: finished.runs[name][:2] for name in ("random", "sgwo-im")}
     assert (out / "runs.jsonl").read_text() == text
 
@@ -141,7 +143,7 @@ def test_a_killed_comparison_continues_after_its_last_whole_line(small, tmp_path
     steps = []
     methods = ["random", "gwo@60", "sgwo-im", "least-squares"]
     again = compare(
-        STREET, methods, seeds=3, budget=45, out=tmp_path, progress=lambda *step: steps.append(step)
+        STREET, parse_methods(methods, 45), seeds=3, out=tmp_path, progress=lambda *step: steps.append(step)
     )
     assert steps == [("comparing", done, 12) for done in range(6, 13)]
     assert pd.DataFrame(again.history()).equals(small[0].history())
@@ -157,7 +159,7 @@ def test_runs_of_another_problem_do_not_count(small):
 
 def test_several_workers_give_the_same_runs(small, tmp_path):
     methods = ["random", "gwo@60"]
-    spread = compare(STREET, methods, seeds=2, budget=45, out=tmp_path, workers=2)
+    spread = compare(STREET, parse_methods(methods, 45), seeds=2, out=tmp_path, workers=2)
     for name in methods:
         assert [run.best for run in spread.runs[name]] == [run.best for run in small[0].runs[name][:2]]
 
@@ -185,7 +187,7 @@ def test_a_failed_run_is_kept_with_its_last_value(tmp_path, monkeypatch):
             self._inner.tell(*evaluation, **more)
 
     monkeypatch.setitem(METHODS, "broken", Broken)
-    finished = compare(STREET, ["broken", "random"], seeds=2, budget=30, out=tmp_path)
+    finished = compare(STREET, parse_methods(["broken", "random"], 30), seeds=2, out=tmp_path)
     late, early = finished.runs["broken"]
     assert finished.failures() == [
         ("broken", 0, "RuntimeError: singular"),
@@ -204,7 +206,7 @@ def test_a_lower_minimum_known_beforehand_is_the_optimum(tmp_path, monkeypatch):
     monkeypatch.setattr(
         module, "_search_optimum", lambda problem: MethodRun("optimum", 0, 0, 1, (1,), (99.0,), 0.0)
     )
-    finished = compare(STREET, ["random"], seeds=1, budget=30, out=tmp_path)
+    finished = compare(STREET, parse_methods(["random"], 30), seeds=1, out=tmp_path)
     assert (finished.optimum, finished.found_by) == (2.97426794, "earlier searches")
 
 
@@ -213,7 +215,7 @@ def test_a_run_below_the_optimum_becomes_the_optimum(tmp_path, monkeypatch):
         module, "_search_optimum", lambda problem: MethodRun("optimum", 0, 0, 1, (1,), (99.0,), 0.0)
     )
     finished = compare(
-        lambda: replace(STREET(), minimum=np.inf), ["random"], seeds=2, budget=30, out=tmp_path
+        lambda: replace(STREET(), minimum=np.inf), parse_methods(["random"], 30), seeds=2, out=tmp_path
     )
     lowest = [run.at(30) for run in finished.runs["random"]]
     assert finished.optimum == min(lowest)
@@ -250,13 +252,16 @@ def test_markdown_has_a_row_for_each_method(small):
         ({"names": ["gwo@-60"]}, "the budget -60 must be"),
         ({"names": ["gwo"], "budget": 10}, "the budget 10 must be"),
         ({"names": []}, "the list is empty"),
-        ({"names": ["gwo"], "seeds": 0}, "seeds = 0: must be 1 to 10,000"),
-        ({"names": ["gwo"], "workers": 0}, "workers = 0"),
+        ({"seeds": 0}, "seeds = 0: must be 1 to 10,000"),
+        ({"workers": 0}, "workers = 0"),
     ],
 )
 def test_impossible_comparisons_are_refused(arguments, message, tmp_path):
+    def compared(names=("gwo",), budget=225, **settings):
+        return compare(STREET, parse_methods(names, budget), **settings, out=tmp_path / "new")
+
     with pytest.raises(InputError, match=message):
-        compare(STREET, **arguments, out=tmp_path / "new")
+        compared(**arguments)
     assert not (tmp_path / "new").exists()
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from calibray.errors import InputError
 from calibray.materials import FIELDS, Material, itu_law, itu_material
-from calibray.parameters import Parameter, Parameters, make_parameter
+from calibray.parameters import Parameter, Parameters, start_value
 from calibray.parameters.laws import CONSTANT_OF_FIELD, LAWS, power_law
 
 BASE = {"walls": Material(5.0, 0.1, 0.3), "soil": Material(3.0, 0.01, 0.5)}
@@ -92,9 +92,9 @@ def test_without_a_frequency_the_law_is_taken_at_the_carrier_of_the_parameters()
     ],
 )
 def test_starts_of_coefficients(name, start, value):
+    assert start_value(name, start, BASE, 4e9, {"walls": CONCRETE}) == value
     bounds = (-0.5, 0.5) if name.endswith("b") else (0.001, 9)
-    made = make_parameter(name, bounds, BASE, 4e9, start, laws={"walls": CONCRETE})
-    assert made.start == value
+    made = Parameter(name, *bounds, value)
     assert made.constant == LAWS_OF[made.field]
 
 
@@ -109,11 +109,11 @@ LAWS_OF = {name: constant for constant, law in LAWS.items() for name in law}
         (lambda: Parameter("walls.itu_b", -20.0, 1.0, 0.0), r"-20\.0 must be a number in \[-10, 10\]"),
         (lambda: Parameter("walls.itu_e", 0.0, 1.0, 0.5), "no field 'itu_e'; did you mean 'itu_"),
         (
-            lambda: make_parameter("walls.thickness", (0.1, 1), BASE, 4e9, "itu:concrete"),
+            lambda: start_value("walls.thickness", "itu:concrete", BASE, 4e9),
             "ITU-R P.2040 gives no thickness",
         ),
         (
-            lambda: make_parameter("walls.itu_a", (1, 9), BASE, 4e9, "itu:concret"),
+            lambda: start_value("walls.itu_a", "itu:concret", BASE, 4e9),
             r"walls\.itu_a: start = 'itu:concret': 'concret' is not a material",
         ),
         (

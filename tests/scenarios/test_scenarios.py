@@ -15,7 +15,7 @@ import pytest
 from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.scenarios import campaign, demo_study_path, district
-from calibray.scenes import Mesh, join_meshes, ply_bytes
+from calibray.scenes import Mesh, join_meshes, ply_bytes, read_scene
 from calibray.study import Study
 from calibray.support.output_files import SIGNATURES
 from calibray.tracing.default_tracer import trace
@@ -40,12 +40,11 @@ def links():
 def replay():
     study = Study.load(demo_study_path())
     paths = trace(
-        study.scene_source,
+        read_scene(study.scene_source, study.scene.frequency, study.overrides),
         study.measurements(),
         frequency=study.scene.frequency,
         tx_antenna=study.antennas.tx,
         rx_antenna=study.antennas.rx,
-        materials=study.overrides,
         **study.trace.record(),
     )
     return Replay(paths, study.parameter_set(paths.materials))

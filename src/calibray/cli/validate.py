@@ -136,7 +136,7 @@ def compare(
     with progress_bars(log()) as progress:
         comparison = run_comparison(
             partial(study_problem, study_file),
-            names, seeds=runs.seeds, budget=runs.budget, out=out, workers=runs.workers, progress=progress,
+            parsed, seeds=runs.seeds, out=out, workers=runs.workers, progress=progress,
         )  # fmt: skip
     write(comparison, out)
     echo(render(table(comparison), optimum_text(comparison)))

@@ -266,10 +266,9 @@ OpenProblem = Callable[[], ComparisonProblem]
 
 def compare(
     open_problem: OpenProblem,
-    names: Sequence[str],
+    methods: Sequence[BudgetedMethod],
     *,
     seeds: int = 25,
-    budget: int = 225,
     out: str | Path,
     workers: int = 1,
     progress: Progress | None = None,
@@ -281,9 +280,8 @@ def compare(
 
     Args:
         open_problem: Makes the problem; picklable for several workers, which call it once each.
-        names: Methods, each with the common budget or its own, as in "gwo@600".
+        methods: Methods with their budgets (`parse_methods`).
         seeds: Number of runs of each method.
-        budget: RT calls of a run.
         out: Folder that keeps the runs.
         workers: Number of processes.
         progress: Called after every run.
@@ -297,7 +295,6 @@ def compare(
     for name, value in (("seeds", seeds), ("workers", workers)):
         if not 1 <= value <= LIMITS[name]:
             raise InputError(f"{name} = {value}: must be 1 to {LIMITS[name]:,}")
-    methods = parse_methods(names, budget)
     check_folder(out)
     problem = open_problem()
     for method in methods:
@@ -318,7 +315,7 @@ def compare(
     for method in methods:
         finished = [file.find(method.key(seed)) for seed in range(seeds)]
         runs[method.name] = tuple(run for run in finished if run is not None)
-    return Comparison(problem.name, methods, runs, *_lowest(problem.minimum, reference, runs))
+    return Comparison(problem.name, tuple(methods), runs, *_lowest(problem.minimum, reference, runs))
 
 
 def parse_methods(names: Sequence[str], budget: int) -> tuple[BudgetedMethod, ...]:

@@ -6,8 +6,8 @@ from calibray.parameters.parameter import (
     fixed_constant,
     is_effect,
     itu_start,
-    make_parameter,
     split_name,
+    start_value,
 )
 from calibray.parameters.priors import NO_PRIOR, LogNormal
 from calibray.parameters.space import Parameters
@@ -21,6 +21,6 @@ __all__ = [
     "fixed_constant",
     "is_effect",
     "itu_start",
-    "make_parameter",
     "split_name",
+    "start_value",
 ]

@@ -166,37 +166,30 @@ def split_name(name: str) -> tuple[str, str]:
     return material, field
 
 
-def make_parameter(
+def start_value(
     name: str,
-    bounds: tuple[float, float],
+    start: float | str | None,
     base: Mapping[str, Material],
     frequency: float,
-    start: float | str | None = None,
-    scale: Scale = "linear",
     laws: Mapping[str, ItuLaw] | None = None,
-) -> Parameter:
-    """Make a parameter of a scene and determine its start value.
+) -> float:
+    """Determine the start value of a scene's parameter, in the field's unit.
 
     Args:
         name: Material and field, as "walls.relative_permittivity".
-        bounds: Lower and upper bound, in the field's unit.
-        base: The scene's materials by name.
-        frequency: Frequency [Hz] of the ITU-R laws.
         start: A value in the field's unit; "itu:concrete" or "itu:concrete@P.2040-1" for the ITU-R value;
             None for the scene's value.
-        scale: "linear" or "log".
+        base: The scene's materials by name.
+        frequency: Frequency [Hz] of the ITU-R laws.
         laws: Laws of materials by name; the constants of other materials do not depend on frequency.
 
-    Returns:
-        The parameter.
-
     Raises:
-        InputError: The scene has no such material, the field has no effect with the material's scattering pattern, or
-            an error of `Parameter` or `itu_material`.
+        InputError: The scene has no such material, the field has no effect with the material's scattering pattern, the
+            start is not finite, or an error of `itu_material`.
 
     Example:
         >>> walls = {"walls": Material(5.0, 0.1, 0.3)}
-        >>> make_parameter("walls.relative_permittivity", (1, 9), walls, 4e9, start="itu:brick").start
+        >>> start_value("walls.relative_permittivity", "itu:brick", walls, 4e9)
         3.91
     """
     material, field = split_name(name)
@@ -207,17 +200,14 @@ def make_parameter(
             f"parameter {name!r} has no effect: the scattering pattern of {material!r} is {pattern!r}"
         )
     if start is None and field in FIELDS:
-        value = float(getattr(base[material], field))
-    elif start is None:
-        law = (laws or {}).get(material) or frequency_independent_law(base[material])
-        value = _coefficient(law, field)
-    elif isinstance(start, str):
-        value = itu_start(name, start, frequency)
-    elif isinstance(start, bool) or not isfinite(start):
+        return float(getattr(base[material], field))
+    if start is None:
+        return _coefficient((laws or {}).get(material) or frequency_independent_law(base[material]), field)
+    if isinstance(start, str):
+        return itu_start(name, start, frequency)
+    if isinstance(start, bool) or not isfinite(start):
         raise InputError(f"{name}: start = {start!r}: must be a finite number or 'itu:NAME'")
-    else:
-        value = float(start)
-    return Parameter(name=name, lower=float(bounds[0]), upper=float(bounds[1]), start=value, scale=scale)
+    return float(start)
 
 
 def itu_start(name: str, start: str, frequency: float) -> float:

@@ -26,7 +26,7 @@ from calibray.fields import path_gains
 from calibray.paths import Kind, Paths
 from calibray.scenarios import demo_study_path
 from calibray.scenarios.district import Building, district, lamp_positions, lamp_posts, scene_objects
-from calibray.scenes import MeshObject, write_scene
+from calibray.scenes import MeshObject, read_scene, write_scene
 from calibray.support.output_files import write_bytes
 from calibray.tracing.default_tracer import trace
 
@@ -259,7 +259,7 @@ def measure(truth: World, seed: int = SEED, links: slice = EVERY) -> NDArray[np.
     """
     ends = replace(truth, tx=truth.tx[links], rx=truth.rx[links])
     with TemporaryDirectory() as folder:
-        scene = write_scene(Path(folder), truth.scene_objects(), truth.materials())
+        scene = read_scene(write_scene(Path(folder), truth.scene_objects(), truth.materials()), FREQUENCY)
         specular, mixed = (
             _powers(
                 trace(scene, ends, frequency=FREQUENCY, tx_antenna=ANTENNA, rx_antenna=ANTENNA, **settings)

@@ -18,7 +18,7 @@ from calibray.engines.kinds.replay import ReplaySection
 from calibray.errors import InputError
 from calibray.materials import ItuLaw, Material
 from calibray.measurements import Measurements
-from calibray.parameters import LogNormal, Parameter, Parameters, is_effect, make_parameter, split_name
+from calibray.parameters import LogNormal, Parameter, Parameters, is_effect, split_name, start_value
 from calibray.parameters.laws import ROUGHNESS, frequency_independent_law
 from calibray.parameters.parameter import check_material
 from calibray.scenes.obstruction import CLUTTER
@@ -251,7 +251,9 @@ class StudyModel(StudyContent, ABC):
             items = tuple(
                 self._effect_parameter(name, base)
                 if is_effect(name)
-                else make_parameter(name, entry.bounds, base, frequency, entry.start, entry.scale, laws)
+                else Parameter(
+                    name, *entry.bounds, start_value(name, entry.start, base, frequency, laws), entry.scale
+                )
                 for name, entry in self.parameters.items()
             )
             all_laws = {name: frequency_independent_law(material) for name, material in base.items()} | dict(

@@ -90,12 +90,11 @@ def trace(
         missing = "measurements, the links" if measurements is None else "frequency, the carrier in Hz"
         raise InputError(f"trace: without a study, give {missing}")
     return default_tracer.trace(
-        scene,
+        scene if isinstance(scene, Scene) else read_scene(scene, frequency, materials),
         measurements,
         frequency=frequency,
         tx_antenna=tx_antenna,
         rx_antenna=rx_antenna,
-        materials=materials,
         progress=progress,
         **settings,
     )

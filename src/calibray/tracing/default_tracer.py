@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any, Final, final
 
 from calibray.errors import InputError
-from calibray.materials import Material
 from calibray.paths import Paths
-from calibray.scenes import Scene, read_scene
+from calibray.scenes import Scene
 from calibray.support.progress import Progress
 from calibray.tracing.protocol import Links, Tracer
 from calibray.tracing.settings import Antenna, TraceSettings, as_antenna
@@ -44,30 +42,23 @@ SIONNA: Final = SionnaFactory()
 
 
 def trace(
-    scene: str | Path | Scene,
+    scene: Scene,
     links: Links,
     *,
     frequency: float,
     tx_antenna: Antenna | Mapping[str, object] | None = None,
     rx_antenna: Antenna | Mapping[str, object] | None = None,
-    materials: Mapping[str, Material | Mapping[str, object]] | None = None,
     progress: Progress | None = None,
     **settings: int | bool,
 ) -> Paths:
-    """Find the paths of every link and compile them; the arguments are those of `calibray.trace` without a study.
+    """Find the paths of every link and compile them; the arguments are those of `calibray.trace` for a scene in memory.
 
     Raises:
-        InputError: The scene, an antenna, a setting or a position cannot be used.
+        InputError: An antenna, a setting or a position cannot be used.
         EngineError: The paths do not fit into memory.
     """
-    tracer = SIONNA(
-        scene if isinstance(scene, Scene) else read_scene(scene, frequency, materials),
-        frequency,
-        _trace_settings(settings),
-        as_antenna(tx_antenna),
-        as_antenna(rx_antenna),
-    )
-    return tracer.trace(links, progress)
+    antennas = as_antenna(tx_antenna), as_antenna(rx_antenna)
+    return SIONNA(scene, frequency, _trace_settings(settings), *antennas).trace(links, progress)
 
 
 def _trace_settings(settings: Mapping[str, Any]) -> TraceSettings:
