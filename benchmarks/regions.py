@@ -33,8 +33,7 @@ import shapely
 import calibray as cb
 from antenna_pose import FREQUENCY, MATERIALS, NOISE_DB, POSITION, district
 from calibray import engines, fields
-from calibray.reporting.diagnostics import diagnostics
-from calibray.reporting.missing_region import missing_region
+from calibray.reporting.diagnostics import diagnostics, missing_region
 from calibray.scenes.regions import Region
 from calibray.study import Setup, Study
 from calibray.study.regions import RegionSection

@@ -12,8 +12,8 @@ import pandas as pd
 
 from calibray import engines
 from calibray.engines import Replay
-from calibray.measurements import links_from_frame
 from calibray.study import Setup, Study
+from link_tables import links_from_frame
 
 TRUTH = {
     "concrete.relative_permittivity": 3.2,

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from calibray.fields import path_gains, path_loss
 from calibray.materials import Material
-from calibray.measurements import links_from_frame
 from calibray.paths import Kind, Paths
 from calibray.paths.chains import Chains
 from calibray.scenes import Scene, read_scene
@@ -23,6 +22,7 @@ from calibray.tracing.antennas import AntennaPattern
 from calibray.tracing.protocol import LinkPositions, Links, Solution, compile_paths, link_positions
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.trace_plan import TracePlan, plan_trace
+from link_tables import links_from_frame
 from small_scenes import write_scene
 
 MIRROR = np.array([1.0, 1.0, -1.0])

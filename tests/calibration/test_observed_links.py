@@ -12,7 +12,6 @@ from calibray.errors import InputError
 from calibray.fields import path_gains
 from calibray.fitting.preliminary_fits import estimate_noise
 from calibray.fitting.problem import Problem
-from calibray.measurements import links_from_frame
 from calibray.measurements.observables import Statistic
 from calibray.reporting import result_tables as tables
 from calibray.reporting.figures import measured_over_modelled
@@ -23,6 +22,7 @@ from calibray.study import Setup, Study
 from calibray.tables import render
 from calibray.uncertainty.remarks import conflict
 from calibray.validation.validate import validate_problem
+from link_tables import links_from_frame
 
 MARBLE = "marble.relative_permittivity"
 SPREAD = {"kind": "rms_delay_spread", "column": "spread_ns", "unit": "ns"}

@@ -13,12 +13,12 @@ from typer.testing import CliRunner
 import calibray as cb
 from calibray.calibration.result import Result
 from calibray.cli.app import app
-from calibray.measurements import links_from_frame
 from calibray.prediction.batches import LOG, announce
 from calibray.prediction.corrections import fill_missing
 from calibray.prediction.map_files import figure
 from calibray.reporting.wording import prediction_text
 from calibray.result import RemarkKind
+from link_tables import links_from_frame
 from small_scenes import block, write_scene
 
 BEHIND = 9

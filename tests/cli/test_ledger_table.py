@@ -1,7 +1,7 @@
 """The table of `calibray ledger`."""
 
 import shown
-from calibray.cli.ledger import calls_table
+from calibray.cli.doctor import calls_table
 from calibray.tables import render
 
 

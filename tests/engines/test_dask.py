@@ -18,8 +18,8 @@ import two_ray
 from calibray import calibrate, coverage_map, engines
 from calibray.engines.cluster.chunks import for_each_chunk
 from calibray.errors import InputError
-from calibray.measurements import links_from_frame
 from calibray.study import Setup
+from link_tables import links_from_frame
 from worker_tasks import doubled
 
 pytestmark = pytest.mark.filterwarnings("default")  # Dask closes sockets late

@@ -17,8 +17,8 @@ import two_ray
 from calibray import calibrate, engines
 from calibray.engines.cluster.chunks import for_each_chunk
 from calibray.errors import EngineError, InputError
-from calibray.measurements import links_from_frame
 from calibray.study import Setup
+from link_tables import links_from_frame
 from worker_tasks import die, doubled, fail, kept_process, made, unchanged
 
 

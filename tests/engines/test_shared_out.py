@@ -22,12 +22,13 @@ from calibray.cli.app import app
 from calibray.engines.cluster.chunks import cut, trace_in_chunks
 from calibray.engines.cluster.workers import InProcess
 from calibray.errors import InputError
-from calibray.measurements import Measurements, PiecedTable, links_from_frame
+from calibray.measurements import Measurements, PiecedTable
 from calibray.prediction import batches
 from calibray.prediction.batches import predict_batches, predict_links
 from calibray.study import Setup
 from calibray.support.output_tables import growing_table
 from calibray.validation.validate import validate
+from link_tables import links_from_frame
 
 OPTIONS = {"starts": 4}
 SECTIONS = {"method": {"name": "least-squares", "options": OPTIONS}, "offset": {"bounds": [-5.0, 5.0]}}

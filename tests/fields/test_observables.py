@@ -220,8 +220,8 @@ def every_constant():
 
 def diffuse_paths():
     from calibray import engines
-    from calibray.measurements import links_from_frame
     from calibray.study import Setup, Study
+    from link_tables import links_from_frame
 
     trace = {"max_depth": 2, "samples": 400, "line_of_sight": False, "diffuse_reflection": True}
     content = planted.content("links.csv", trace=trace)

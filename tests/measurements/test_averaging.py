@@ -8,7 +8,7 @@ import pytest
 
 from calibray.errors import InputError
 from calibray.measurements import Averaging, LinkColumns, Preparation, SourceTable, measured_links
-from calibray.measurements.averaging import average_samples
+from calibray.measurements.reading import average_samples
 
 TX, RX = ("tx_x", "tx_y", "tx_z"), ("rx_x", "rx_y", "rx_z")
 

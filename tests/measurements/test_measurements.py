@@ -14,7 +14,6 @@ from calibray.measurements import (
     Measurements,
     Preparation,
     SourceTable,
-    links_from_frame,
     links_from_table,
     measured_links,
     read_measurements,
@@ -22,6 +21,7 @@ from calibray.measurements import (
     table_files,
 )
 from calibray.measurements.table_files import PiecedTable
+from link_tables import links_from_frame
 
 TABLE = """\
 x,y,z,loss,set,spread

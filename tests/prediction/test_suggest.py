@@ -16,11 +16,11 @@ from calibray.calibration.result import Result
 from calibray.cli.app import app
 from calibray.errors import InputError
 from calibray.fields import path_loss
-from calibray.measurements import links_from_frame
 from calibray.scenes import read_scene
 from calibray.study import Study
 from calibray.tracing.settings import Antenna, TraceSettings
 from changed import changed
+from link_tables import links_from_frame
 from small_scenes import write_scene
 from two_ray import TwoRay
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from calibray.reporting.missing_region import missing_region
+from calibray.reporting.diagnostics import missing_region
 from calibray.scenes.regions import Region
 
 BELT = shapely.box(-42, -90, -30, -10)

@@ -14,13 +14,14 @@ import calibray as cb
 import two_ray
 from calibray.errors import InputError
 from calibray.fields import path_loss
-from calibray.measurements import SourceTable, links_from_frame
+from calibray.measurements import SourceTable
 from calibray.reporting.trust_figures import residuals_by_direction
 from calibray.result.verdict import RemarkKind
 from calibray.result.wording import remark_text
 from calibray.study import Setup, Study
 from calibray.tracing.mounting import stated_jones
 from calibray.tracing.settings import Antenna
+from link_tables import links_from_frame
 from two_ray import COLUMNS, TRUTH, TwoRay
 
 SITES = pd.DataFrame(

@@ -13,13 +13,13 @@ from calibray.calibration.result import Result
 from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.fields import path_loss
-from calibray.measurements import links_from_frame
 from calibray.paths import Kind
 from calibray.reporting.wording import scene_alone_text
 from calibray.scenes.checks import SceneSurfaces
 from calibray.study import Setup, Study
 from calibray.study.facades import FacadeSection, with_facades
 from calibray.study.regions import Place
+from link_tables import links_from_frame
 
 SHOP = "shop.relative_permittivity"
 GROUND_FLOOR = {"shop": {"of": "marble", "storeys": [1, 1], "storey_height": 2.0}}

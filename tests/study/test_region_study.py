@@ -11,13 +11,13 @@ from calibray import engines
 from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.errors import InputError
-from calibray.measurements import links_from_frame
 from calibray.reporting.wording import scene_alone_text
 from calibray.scenes.authoring import make_scene, read_openstreetmap, read_trees
 from calibray.scenes.checks import SceneSurfaces
 from calibray.scenes.obstruction import clutter_loss_db
 from calibray.study import Setup, Study
 from calibray.study.regions import Place, RegionSection, dense_trees, region_effects
+from link_tables import links_from_frame
 from planted_maps import FRAME, write_park
 
 TREES = "region:trees.specific_attenuation"

@@ -10,12 +10,12 @@ import planted
 from calibray.calibration.calibrate import calibrate
 from calibray.engines import Replay
 from calibray.errors import InputError
-from calibray.measurements import links_from_frame
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Kind
 from calibray.reporting.wording import scene_alone_text
 from calibray.study import Setup, Study
 from calibray.study.facades import roughness_effects
+from link_tables import links_from_frame
 
 ROUGH = "marble.roughness_mm"
 PARAMETERS = {name: {"bounds": planted.BOUNDS} for name in planted.TRUTH} | {ROUGH: {"bounds": [0.0, 15.0]}}

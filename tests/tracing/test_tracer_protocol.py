@@ -18,7 +18,6 @@ import calibray as cb
 import planted
 from calibray.errors import InputError
 from calibray.fields import path_loss
-from calibray.measurements import links_from_frame
 from calibray.scenes import Scene, read_scene
 from calibray.study import Setup
 from calibray.support import cache_folder as caching
@@ -27,6 +26,7 @@ from calibray.tracing.antennas import AntennaPattern
 from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.protocol import EnclosedAntennas, Tracer, TracerFactory
 from calibray.tracing.settings import PATTERNS, POLARIZATIONS, Antenna, TraceSettings
+from link_tables import links_from_frame
 from small_scenes import write_scene
 from two_ray import MIRROR, TwoRay
 

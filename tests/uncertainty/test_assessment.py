@@ -15,7 +15,6 @@ from calibray.calibration.result import Result
 from calibray.errors import InputError
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
-from calibray.measurements import links_from_frame
 from calibray.optimizers import LeastSquares
 from calibray.paths import take_links
 from calibray.reporting import result_tables as tables
@@ -26,6 +25,7 @@ from calibray.tables import render
 from calibray.uncertainty.assessment import certainty
 from calibray.validation import variants
 from calibray.validation.validate import validate_problem
+from link_tables import links_from_frame
 
 CENSORED = planted.content("links.csv")["links"] | {
     "quantity": "received_power", "tx_power_dbm": 0.0, "noise_floor_dbm": -100.0, "below_floor": "censor",

@@ -11,7 +11,6 @@ import planted
 from calibray import fields
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
-from calibray.measurements import links_from_frame
 from calibray.optimizers import LeastSquares
 from calibray.parameters import Parameter
 from calibray.result.verdict import Cause
@@ -21,6 +20,7 @@ from calibray.uncertainty import buildings
 from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.buildings import split_replay
 from calibray.uncertainty.joint_model import joint_model
+from link_tables import links_from_frame
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
 CORNERS = np.array([[0, 1, 2], [0, 2, 3]])

@@ -14,7 +14,6 @@ from scipy.stats import t as student
 import planted
 from calibray.engines import Replay
 from calibray.fitting.problem import Problem
-from calibray.measurements import links_from_frame
 from calibray.study import Setup, Study
 from calibray.uncertainty import laplace as tails
 from calibray.uncertainty.noise_models import (
@@ -27,6 +26,7 @@ from calibray.uncertainty.noise_models import (
     noise_models,
 )
 from calibray.uncertainty.residual_correlation import EXACT, shared, whitener
+from link_tables import links_from_frame
 
 RANDOM = np.random.default_rng(1)
 COUNT = 6

@@ -8,12 +8,12 @@ import numpy as np
 
 import planted
 from calibray.fitting.problem import Problem
-from calibray.measurements import links_from_frame
 from calibray.result import Interval, RemarkKind, Verdict
 from calibray.result.wording import remark_text
 from calibray.study import Setup, Study
 from calibray.uncertainty.noise_models import CORRELATED
 from calibray.uncertainty.remarks import departures, outside_interval
+from link_tables import links_from_frame
 
 NAMES = tuple(planted.TRUTH)
 

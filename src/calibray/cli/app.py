@@ -13,9 +13,8 @@ import typer
 from typer.core import TyperGroup
 
 from calibray.cli.console import echo
-from calibray.cli.doctor import cache, doctor
+from calibray.cli.doctor import cache, doctor, ledger
 from calibray.cli.init import init, schema
-from calibray.cli.ledger import ledger
 from calibray.cli.open import open
 from calibray.cli.predict import map, predict, suggest
 from calibray.cli.report import export, report

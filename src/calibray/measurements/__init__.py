@@ -15,7 +15,6 @@ from calibray.measurements.preparation import (
     Track,
 )
 from calibray.measurements.reading import (
-    links_from_frame,
     links_from_table,
     measured_links,
     read_measurements,
@@ -43,7 +42,6 @@ __all__ = [
     "Quantity",
     "SourceTable",
     "Track",
-    "links_from_frame",
     "links_from_table",
     "mask_codes",
     "measured_links",

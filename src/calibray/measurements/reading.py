@@ -1,4 +1,14 @@
-"""From a table to links: read the file, select rows, place them, average or merge, clear buildings, check."""
+"""From a table to links: read the file, select rows, place them, average or merge, clear buildings, check.
+
+Samples are averaged to one row per area or place, in linear power. Along a street, the power fades by several dB within
+a wavelength. Ray tracing from one point does not predict this fading; it predicts the mean power over some tens of
+wavelengths (W. C. Y. Lee, "Estimate of local average power of a mobile radio signal", IEEE Trans. Veh. Technol. 34(1),
+1985: 40 wavelengths, 36 to 50 samples). The mean is taken of powers, not of decibels: for Rayleigh fading, the mean of
+the decibels is 2.5 dB too low.
+
+The logarithm of a mean of few samples is also biased low, by (10 / ln 10) var / (2 n mean^2) to second order (delta
+method): 0.2 dB for ten samples of Rayleigh fading, and zero for a single path.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +22,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.measurements.averaging import average_samples, merge_repeats
+from calibray.measurements import column_names
 from calibray.measurements.links import Measurements
 from calibray.measurements.placement import RX_COLUMNS, TX_COLUMNS, clear_buildings, place_rows
-from calibray.measurements.preparation import LinkColumns, Preparation, Quantity
+from calibray.measurements.preparation import Averaging, LinkColumns, Preparation, Quantity
 from calibray.measurements.selection import select_rows
 from calibray.measurements.source_table import Coordinates, SourceTable
 from calibray.measurements.table_files import read_table
@@ -36,7 +46,7 @@ def read_measurements(
 ) -> Measurements:
     """Read measured links from a CSV, Parquet or Excel file.
 
-    Rows that repeat a link are merged in linear power (see `repeats.merge_repeats`).
+    Rows that repeat a link are merged in linear power (see `merge_repeats`).
 
     Args:
         path: The table: .csv, .parquet or .xlsx.
@@ -81,17 +91,6 @@ def measured_links(
     table = merge_repeats(table, steps, columns)
     table = clear_buildings(table, steps, columns.rx)
     return make_links(table, columns, steps)
-
-
-def links_from_frame(
-    frame: pd.DataFrame, group: str | Sequence[str] | None = None, frequency: str | None = None
-) -> Measurements:
-    """Links without measured values from a table with the columns of positions [m]; see `links_from_table`.
-
-    Raises:
-        InputError: A column is missing, or a position is not finite.
-    """
-    return links_from_table(SourceTable(frame.reset_index(drop=True), source="links"), group, frequency)
 
 
 def links_from_table(
@@ -206,3 +205,198 @@ def _weights(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
             f"{name}: {values[first]:g} must be greater than 0; remove the row with a where filter"
         )
     return values if columns.std is None else 1 / values**2
+
+
+MAX_UNCERTAINTY_DB: Final = 1.0
+"""Largest uncertainty of an average from its samples below the noise floor [dB]; averages with more are left out."""
+
+_AREA: Final = "calibray area"
+
+
+def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
+    """Average the samples of one area, transmitter and group; without averaging, return the table itself.
+
+    A sample below the noise floor has a power between zero and the floor, and counts as half of the floor. Averages
+    whose uncertainty then exceeds `MAX_UNCERTAINTY_DB` are left out, because the samples above the floor are only the
+    strong ones. The steps `averaging`, `keep`, `transmitter` and `noise_floor_dbm` are used. Returns for each average
+    the row of its first sample, with the mean receiver position, the mean value, and the columns `std_db` (standard
+    deviation of the samples [dB], NaN for one sample) and `count`.
+
+    Raises:
+        InputError: A column is missing or not numeric, a time cannot be read, or no average remains.
+
+    Example:
+        >>> rows = pd.DataFrame({"rx_x": [0.0, 1.0], "power": [-80.0, -90.0]})
+        >>> rows[["tx_x", "tx_y", "tx_z", "rx_y", "rx_z"]] = 0.0
+        >>> columns = LinkColumns(("tx_x", "tx_y", "tx_z"), ("rx_x", "rx_y", "rx_z"), "power", "rsrp")
+        >>> steps = Preparation(averaging=Averaging("cell", 5.0))
+        >>> averages = average_samples(SourceTable(rows), steps, columns)
+        >>> averages.frame[["rx_x", "power", "std_db", "count"]].round(3).to_dict("records")
+        [{'rx_x': 0.5, 'power': -82.596, 'std_db': 7.071, 'count': 2}]
+    """
+    averaging = steps.averaging
+    if averaging is None:
+        return table
+    # A gain or power rises with the linear power, a loss falls with it.
+    sign = -1.0 if columns.quantity == "path_loss" else 1.0
+    level = sign * table.numbers(columns.value)
+    rx = [str(name) for name in columns.rx]
+    transmitter = [steps.transmitter] if steps.transmitter in table.frame else []
+    keys = dict.fromkeys([*steps.keep, *transmitter, *map(str, columns.tx)])
+    labels = pd.DataFrame({name: table.column(name) for name in keys})
+    labels[_AREA] = _areas(table, averaging, rx)
+    group = labels.groupby([*keys, _AREA], sort=False, dropna=False).ngroup().to_numpy()
+
+    samples = pd.DataFrame({name: table.numbers(name) for name in rx})
+    # Relative to the strongest sample, so that weak powers do not underflow.
+    samples["power"] = 10 ** ((level - level.max()) / 10)
+    samples["level"] = level
+    samples["below"] = 0.0
+    if steps.noise_floor_dbm is not None:
+        samples["below"] = (level <= steps.noise_floor_dbm).astype(float)
+    groups = samples.groupby(group)
+    mean = groups[[*rx, "power", "below"]].mean()
+    count = groups.size()
+    mean_level = (10 * np.log10(mean["power"]) + level.max()).to_numpy()
+
+    table = table.note("samples averaged", len(table))
+    uncertain = np.zeros(len(mean), dtype=bool)
+    if steps.noise_floor_dbm is not None and samples["below"].any():
+        table = table.note("of them at or below the noise floor", int(samples["below"].sum()))
+        highest = 10 ** (mean_level / 10)  # The samples below the floor count as the whole floor.
+        from_below = mean["below"].to_numpy() * 10 ** (steps.noise_floor_dbm / 10)
+        lowest = np.maximum(highest - from_below, 0.0)
+        uncertain = highest > lowest * 10 ** (MAX_UNCERTAINTY_DB / 10)
+        mean_level = 10 * np.log10(highest - from_below / 2)
+    if averaging.unbiased:
+        bias_db = 5 / np.log(10) * groups["power"].var() / (count * mean["power"] ** 2)
+        mean_level = mean_level + bias_db.fillna(0.0).to_numpy()
+
+    averages = table.select(~pd.Series(group).duplicated().to_numpy()).assign(
+        **{columns.value: sign * mean_level},
+        **{name: mean[name].to_numpy() for name in rx},
+        std_db=groups["level"].std().to_numpy(),
+        count=count.to_numpy(),
+    )
+    averages = averages.keep(~uncertain, "averages too near the noise floor, left out")
+    enough = averages.numbers("count") >= averaging.minimum_count
+    return averages.keep(enough, f"averages of fewer than {averaging.minimum_count} samples, left out")
+
+
+def _areas(table: SourceTable, averaging: Averaging, rx: Sequence[str]) -> NDArray[np.int64]:
+    """Number of the place, cell, stretch or window of every row [rows]; `rx` names the columns of x, y and z [m]."""
+    if averaging.by == "place":
+        positions = np.stack([table.numbers(name) for name in rx], axis=1)
+        return join_positions(positions)
+    if averaging.size is None or not (np.isfinite(averaging.size) and averaging.size > 0):
+        raise InputError(f"average.size = {averaging.size!r}: must be a finite number greater than 0")
+    if averaging.by == "time":
+        elapsed = _elapsed(table, str(averaging.time))
+        return np.floor((elapsed - elapsed.min()) / averaging.size).astype(np.int64)
+    positions = np.stack([table.numbers(name) for name in rx[:2]], axis=1)
+    if averaging.by == "distance":
+        steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        return np.floor(np.cumsum([0.0, *steps]) / averaging.size).astype(np.int64)
+    cells = np.floor(positions / averaging.size).astype(np.int64)
+    return np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _elapsed(table: SourceTable, time: str) -> NDArray[np.float64]:
+    """Times of the rows [rows], [s] from an arbitrary start."""
+    column = table.column(time)
+    if pd.api.types.is_numeric_dtype(column):
+        return table.numbers(time)
+    try:
+        times = pd.to_datetime(column, utc=True, format="ISO8601")
+    except ValueError as error:
+        raise InputError(
+            f"{table.source}, column {time!r}: a time cannot be read ({error}); give ISO 8601"
+        ) from None
+    if times.isna().any():
+        raise InputError(f"{table.source}, column {time!r}: a time is missing; remove the row")
+    return np.asarray((times - times.min()) / pd.Timedelta(seconds=1), dtype=np.float64)
+
+
+SAME_POSITION: Final = 1e-4
+"""Distance [m] per axis up to which positions are equal, as in meshes: coordinates are written with a resolution of a
+millimetre at best, and conversions of coordinates differ by micrometres."""
+
+
+def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
+    """Merge the rows of one link: its first row, with the mean of linear power, and of weights or standard deviations.
+
+    Rows belong to one link if their positions agree within `SAME_POSITION`, and transmitter, groups, carrier,
+    transmitted power and times are equal. Rows at different times stay separate links. A link below the noise floor is
+    not merged with one above it. Receivers inside buildings are moved later: two positions may be moved to the same
+    corner. The steps `keep`, `transmitter`, `noise_floor_dbm` and `averaging` are used; averages merge repeats already.
+
+    Raises:
+        InputError: A column is missing or not numeric.
+
+    Example:
+        >>> rows = pd.DataFrame({"x": [1.0, 1.0, 2.0], "gain_db": [-80.0, -90.0, -85.0]})
+        >>> columns = LinkColumns((0.0, 0.0, 5.0), ("x", 0.0, 1.5), "gain_db", "path_gain")
+        >>> merged = merge_repeats(SourceTable(rows), Preparation(), columns)
+        >>> merged.frame["gain_db"].round(2).tolist(), merged.changes
+        ([-82.6, -85.0], {'rows that repeat a link, merged': 1})
+    """
+    if steps.averaging is not None:
+        return table
+    value = table.numbers(columns.value)
+    positions = np.hstack([table.positions("tx", columns.tx), table.positions("rx", columns.rx)])
+    keys = pd.DataFrame({name: table.column(name) for name in _separating_columns(table, steps, columns)})
+    floor = -np.inf if steps.noise_floor_dbm is None else steps.noise_floor_dbm
+    keys["censored"] = value <= floor
+    group = np.asarray(keys.groupby(list(keys), sort=False, dropna=False).ngroup(), dtype=np.int64)
+    link = join_positions(positions, group)
+    first = ~pd.Series(link).duplicated().to_numpy()
+    if first.all():
+        return table
+    # A gain or power rises with the linear power, a loss falls with it.
+    sign = -1.0 if columns.quantity == "path_loss" else 1.0
+    level = sign * value
+    # Relative to the strongest row of each link, so that equal values stay equal to the last digit.
+    strongest = pd.Series(level).groupby(link).transform("max").to_numpy()
+    mean = pd.Series(10 ** ((level - strongest) / 10)).groupby(link).mean().to_numpy()
+    merged = {columns.value: sign * (strongest[first] + 10 * np.log10(mean))}
+    for name in (columns.weight, columns.std):
+        if isinstance(name, str):
+            merged[name] = pd.Series(table.numbers(name)).groupby(link).mean().to_numpy()
+    return table.note("rows that repeat a link, merged", int((~first).sum())).select(first).assign(**merged)
+
+
+def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkColumns) -> list[str]:
+    """Columns whose values differ between different links at the same positions."""
+    groups: Sequence[str] = [columns.group] if isinstance(columns.group, str) else columns.group or ()
+    names = [*groups, *steps.keep]
+    names += [name for name in (columns.frequency, columns.tx_power_dbm) if isinstance(name, str)]
+    if steps.transmitter in table.frame:
+        names.append(steps.transmitter)
+    names += [str(name) for name in table.frame if column_names.matches(str(name), "time")]
+    return list(dict.fromkeys(names))
+
+
+def join_positions(
+    positions: NDArray[np.float64], group: NDArray[np.int64] | None = None
+) -> NDArray[np.int64]:
+    """Number the places of positions [N, axes], [m], in the order of the first positions [N].
+
+    Positions within `SAME_POSITION` of each other, directly or through others, are one place, unless they are of
+    different groups [N].
+
+    Example:
+        >>> join_positions(np.array([[1.0, 2.0], [1.0, 3.0], [1.0 + 1e-7, 2.0]])).tolist()
+        [0, 1, 0]
+    """
+    place = np.zeros(len(positions), dtype=np.int64) if group is None else group
+    count = 0
+    # Splitting along one axis opens gaps along the others.
+    while len(place) and place.max() + 1 != count:
+        count = place.max() + 1
+        for axis in positions.T:
+            order = np.lexsort((axis, place))
+            # A position that is not a number is never a repeat; it is refused later.
+            starts = (np.diff(place[order]) > 0) | ~(np.diff(axis[order]) <= SAME_POSITION)
+            place = place.copy()
+            place[order] = np.concatenate([[0], np.cumsum(starts)])
+    return pd.factorize(place)[0]

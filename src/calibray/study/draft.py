@@ -32,7 +32,7 @@ from calibray.support.output_files import exists
 from calibray.tracing.gain_table import TWO_CUT_SUFFIXES, read_gain_table
 
 AVERAGING_WAVELENGTHS: Final = 40
-"""Width of the cells over which fading is averaged (Lee 1985; see `calibray.measurements.averaging`)."""
+"""Width of the cells over which fading is averaged (Lee 1985; see `calibray.measurements.reading`)."""
 
 PLACE_SAMPLES: Final = 20
 """Median number of samples at one position above which samples are averaged by position: a stationary scan. The
