@@ -43,7 +43,7 @@ import districts
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, search
 from calibray.optimizers import LeastSquares
-from calibray.tables import Column, Table, numbers, render, render_markdown
+from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.draws import Draws
 from calibray.uncertainty.joint_model import joint_model
@@ -51,6 +51,7 @@ from calibray.uncertainty.noise_models import GAUSSIAN, Marginal, NoiseModel
 from calibray.uncertainty.sequential_monte_carlo import draw_posterior
 from calibray.uncertainty.verdicts import credible_sets
 from districts import District
+from markdown_tables import render_markdown
 
 NOISE_DB = 3.0
 RANGE_M = 60.0

@@ -27,7 +27,8 @@ from calibray.cli.console import log
 from calibray.cli.progress_bars import progress_bars
 from calibray.comparison.comparison import quantile
 from calibray.optimizers import label
-from calibray.tables import Column, Table, numbers, render_markdown
+from calibray.tables import Column, Table, numbers
+from markdown_tables import render_markdown
 from problem_families.family_comparison import FamilyComparison, compare_family, seed_range, tables
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -31,7 +31,7 @@ from calibray.scenarios import demo_study_path
 from calibray.support.figure_style import write
 from calibray.support.output_files import write_text
 from calibray.support.output_tables import write_table
-from calibray.tables import render_markdown
+from markdown_tables import render_markdown
 from problem_families.problems import landscape_problem
 
 ROOT = Path(__file__).resolve().parents[1]

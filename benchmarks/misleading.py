@@ -37,7 +37,8 @@ from calibray.comparison.method_runs import (
     code_fingerprint,
 )
 from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, CheapModel, Constants
-from calibray.tables import Column, Table, numbers, render_markdown
+from calibray.tables import Column, Table, numbers
+from markdown_tables import render_markdown
 from problem_families.family_comparison import seed_range
 from problem_families.problems import planted_problem
 

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.optimizers import label, make
-from calibray.tables import Column, Table, numbers, render_markdown
+from calibray.tables import Column, Table, numbers
+from markdown_tables import render_markdown
 from problem_families.more_wild import MoreWild, problems
 
 RADIUS = 0.005  # of the box, which makes the first trust region a tenth of the starting point, as by default in DFO-LS

@@ -7,8 +7,9 @@ import sys
 
 import pytest
 
-from calibray.tables import Column, Table, numbers, render, render_html, render_markdown, rows_text
+from calibray.tables import Column, Table, numbers, render, render_html, rows_text
 from html_cells import Cells
+from markdown_tables import render_markdown
 
 HOSTILE = '<script>alert("x")</script>&amp;'
 RMSE = Table("RMSE [dB]", (Column("links"), numbers("after", "dB")), (("held out", "0.89"), ("all", "0.55")))

@@ -1,4 +1,4 @@
-"""Tables as data, and their rendering, with sentences, as plain text, HTML and Markdown.
+"""Tables as data, and their rendering, with sentences, as plain text and HTML.
 
 Control characters and markup are escaped, because names come from files. Short forms are for the Python prompt and
 notebooks.
@@ -145,12 +145,6 @@ def render_html(*parts: Table | str) -> str:
     )
 
 
-def render_markdown(table: Table) -> str:
-    """Render a table in Markdown, without a title above it and without a final line break."""
-    rules = ["---" if column.align == "left" else "---:" for column in table.columns]
-    return "\n".join(_markdown_line(line) for line in [table.headings, rules, *table.rows])
-
-
 def rows_text(rows: Sequence[int]) -> str:
     """List rows of a file; if there are many, only the first ones; empty without rows.
 
@@ -242,11 +236,6 @@ def _html_row(table: Table, tag: str, cells: list[str] | tuple[str, ...]) -> str
             for column, cell in zip(table.columns, cells, strict=True)
         )
     )
-
-
-def _markdown_line(cells: Iterable[str]) -> str:
-    escaped = (printable(cell).replace("|", r"\|") for cell in cells)
-    return f"| {' | '.join(escaped)} |"
 
 
 def _fitted(parts: Iterable[Table | str]) -> Iterator[Table | str]:

@@ -19,7 +19,7 @@ from calibray.comparison.method_runs import BudgetedMethod, MethodRun, RunFile, 
 from calibray.errors import InputError
 from calibray.optimizers import METHODS, SGWOIM, RandomSearch
 from calibray.study import Study
-from calibray.tables import render_markdown
+from markdown_tables import render_markdown
 from problem_families.problems import landscape_problem
 
 STREET = partial(landscape_problem, "street")

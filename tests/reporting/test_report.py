@@ -11,9 +11,10 @@ import shown
 from calibray.comparison import comparison
 from calibray.reporting import result_tables
 from calibray.reporting import scene_tables as trace
-from calibray.tables import render, render_markdown
+from calibray.tables import render
 from calibray.tracing.protocol import EnclosedAntennas
 from changed import changed
+from markdown_tables import render_markdown
 
 
 def golden(name: str) -> str:
