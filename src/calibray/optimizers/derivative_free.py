@@ -226,10 +226,8 @@ def _improving(
 ) -> NDArray[np.float64]:
     """A point of the cube in the missing direction that has most room."""
     directions = np.vstack([missing, -missing])
-    with np.errstate(divide="ignore"):
-        room = np.where(
-            directions > 0, (1 - centre) / directions, -centre / np.where(directions < 0, directions, -1)
-        )
+    edge = np.where(directions > 0, 1.0 - centre, centre)
+    room = np.divide(edge, np.abs(directions), out=np.full_like(edge, np.inf), where=directions != 0)
     length = np.minimum(room.min(axis=1), radius)
     return np.clip(centre + length.max() * directions[np.argmax(length)], 0.0, 1.0)
 
