@@ -66,9 +66,11 @@ def prepare(folder: Path, case: Case, mounts: bool) -> None:
         subprocess.run(["mount", "-t", "tmpfs", "-o", DISK, "tmpfs", str(folder / "out")], check=True)
     programs.study_file(folder, PAUSE, case.method, case.options)
     file = folder / "study.toml"
-    trace = "trace = { max_depth = 2, samples = 20_000, line_of_sight = false }"
     text = file.read_text().replace('name = "command"', f'name = "{case.engine}"')
-    file.write_text(text.replace("[parameters]", f"{trace}\n[parameters]"))
+    shallow = "trace = { max_depth = 1, samples = 10_000 }"
+    file.write_text(
+        text.replace(shallow, "trace = { max_depth = 2, samples = 20_000, line_of_sight = false }")
+    )
 
 
 def plan(case: Case, kills: int, calls: int, seconds: float, kinds: tuple[str, ...], seed: int) -> list[Harm]:
