@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 from calibray.errors import InputError
 from calibray.optimizers import LeastSquares
 from calibray.optimizers import least_squares as module
+from calibray.optimizers.derivative_free import improving_point
 from calibray.optimizers.descent import descend
 from calibray.optimizers.least_squares import COMBINATIONS, SPACE, recombine, returns
 from calibray.optimizers.sampling import design
@@ -300,3 +301,21 @@ def test_combinations_keep_a_distance_from_minima_and_from_each_other():
     assert len(points) > 10
     distance = np.linalg.norm(np.concatenate([points, minima])[None] - points[:, None], axis=2)
     assert np.sort(distance, axis=1)[:, 1].min() > SPACE
+
+
+@pytest.mark.parametrize(
+    ("centre", "direction", "expected"),
+    [
+        (
+            [0.1, 0.2],
+            [0.0, 1.0],
+            [0.1, 0.7],
+        ),  # an axis that the direction does not move along does not limit it
+        ([0.1, 0.9], [0.0, 1.0], [0.1, 0.4]),
+        ([1.0, 0.5], [0.6, 0.8], [0.7, 0.1]),  # away from a bound
+        ([0.5, 0.5], [1.0, 0.0], [1.0, 0.5]),
+    ],
+)
+def test_an_improving_point_lies_where_there_is_most_room(centre, direction, expected):
+    point = improving_point(np.array(centre), np.array([direction]), 0.5)
+    assert point == pytest.approx(expected)

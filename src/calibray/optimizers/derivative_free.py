@@ -136,7 +136,7 @@ def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: 
         if missing is None:
             radius *= 0.5
         else:
-            points = yield from evaluated(points, _improving(centre, missing, radius)[None])
+            points = yield from evaluated(points, improving_point(centre, missing, radius)[None])
 
 
 def _spanning(points: _Points, best: int, radius: float) -> tuple[list[int], NDArray[np.float64] | None]:
@@ -221,10 +221,13 @@ def _step(
     return radius * lowest.x, -float(lowest.fun)
 
 
-def _improving(
+def improving_point(
     centre: NDArray[np.float64], missing: NDArray[np.float64], radius: float
 ) -> NDArray[np.float64]:
-    """A point of the cube in the missing direction that has most room."""
+    """The next point of the unit cube [d] for a model around `centre` [d].
+
+    It lies in one of the missing directions [k, d], or against it, where there is most room within the radius.
+    """
     directions = np.vstack([missing, -missing])
     edge = np.where(directions > 0, 1.0 - centre, centre)
     room = np.divide(edge, np.abs(directions), out=np.full_like(edge, np.inf), where=directions != 0)
