@@ -30,8 +30,7 @@ from calibray.scenarios import demo_study_path
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
-from calibray.uncertainty.draws import Draws
-from calibray.uncertainty.sequential_monte_carlo import KEPT, LAST_SWEEPS, SIZE
+from calibray.uncertainty.sequential_monte_carlo import KEPT, Posterior, last_sweeps
 from calibray.uncertainty.verdicts import credible_sets
 from calibray.validation.choice import HeldOutResiduals, fit_prediction_model
 from calibray.validation.validate import validate_problem
@@ -84,7 +83,14 @@ def seeds(problem: Problem, count: int) -> Table:
         shares = (f"{share:.2f}" for share in widths[-1] / (upper - lower))
         agree = "yes" if draws.agree else "no"
         rows.append(
-            (str(seed), f"{spent:.1f}", f"{found.calls:,}", agree, f"{effective(draws):.0f}", *shares)
+            (
+                str(seed),
+                f"{spent:.1f}",
+                f"{found.calls:,}",
+                agree,
+                f"{effective(found.posterior):.0f}",
+                *shares,
+            )
         )
     apart = np.ptp(widths, axis=0) / np.mean(widths, axis=0)
     rows.append(("apart", "", "", "", "", *(f"{share:.0%}".replace("%", " %") for share in apart)))
@@ -95,16 +101,12 @@ def seeds(problem: Problem, count: int) -> Table:
     return Table(study.path.name, columns, tuple(rows))
 
 
-def effective(draws: Draws) -> float:
+def effective(posterior: Posterior) -> float:
     """Independent draws that the draws are worth, for the parameter for which they are worth least."""
-    states = LAST_SWEEPS // KEPT
-    for populations in (2, 4):
-        size = len(draws.point) // (populations * states)
-        if size <= SIZE[1]:
-            break
-    point = draws.point.reshape(populations, states, size, -1)
+    states, size = last_sweeps(posterior.members) // KEPT, posterior.members
+    point = posterior.means.point.reshape(-1, states, size, len(posterior.means.point.T))
     scatter = point.mean(axis=1).var(axis=(0, 1)) / point.var(axis=(0, 1, 2))
-    return populations * size / float(scatter.max())
+    return len(point) * size / float(scatter.max())
 
 
 def main() -> None:

@@ -65,7 +65,7 @@ def _no_lines_of_progress():
 JUDGING_INTERVALS = {"benchmarks", "prediction", "uncertainty", "validation"}
 """Rooms whose tests judge intervals; they draw as much as a user's run."""
 
-FEW = {"SIZE": (64, 64), "POPULATIONS": (2, 4), "SWEEPS": 1, "LAST_SWEEPS": 2}
+FEW = {"SIZE": (64, 64), "POPULATIONS": (2, 4), "SWEEPS": 1, "LAST_SWEEPS": (2, 2)}
 MANY = {name: getattr(sampler, name) for name in FEW}
 
 

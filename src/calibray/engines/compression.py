@@ -166,7 +166,7 @@ def _evaluate_all(
         tables = parameters.constants_of(values, paths.materials).astype(np.float32)
         loss, error = path_losses(plan.program, tables)
         totals.append(10 ** (-np.asarray(loss, dtype=float) / 10))
-        errors.append(error)
+        errors.append(float(error.max()))
     strength = np.zeros(paths.num_paths)
     for candidate, total in zip(candidates[0][:RANKING], totals[0], strict=False):
         table = parameters.constants_of(candidate[None], paths.materials)[0].astype(np.float32)

@@ -188,22 +188,22 @@ class Replay:
 
     def _path_losses(
         self, tables: NDArray[np.floating], values: NDArray[np.floating], count: int
-    ) -> tuple[NDArray[np.floating], float]:
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         if self.effects:
             return fields.path_losses_with_effects(
                 self._program, tables, fields.EffectBatch(self._effects, values), self._combining, count
-            ), 0.0
+            ), fields.WITHOUT_TABLES
         return fields.path_losses(self._program, tables, self._combining, count)
 
     def _path_losses_and_jacobian(
         self, tables: NDArray[np.floating], values: NDArray[np.floating], count: int
-    ) -> tuple[NDArray[np.floating], NDArray[np.floating], float]:
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
         if self.effects:
             effects = fields.EffectBatch(self._effects, values)
             loss, slope, by_effect = fields.path_losses_and_slopes_with_effects(
                 self._program, tables, effects, self._used_columns, self._combining, count
             )
-            return loss, self._by_parameter(slope, by_effect), 0.0
+            return loss, self._by_parameter(slope, by_effect), fields.WITHOUT_TABLES
         loss, slope, error = fields.path_losses_and_slopes(
             self._program, tables, self._used_columns, self._combining, count
         )
@@ -216,8 +216,9 @@ class Replay:
             size = self._batch_size()
             batch = values[start : start + size]
             *answers, table_error = function(*self._arguments(self._base, batch, size), len(batch))
-            if table_error > TABLE_TOLERANCE:
-                self._refine_tables()
+            too_coarse = table_error > TABLE_TOLERANCE
+            if too_coarse.any():
+                self._refine_tables(too_coarse)
                 continue
             batches.append([np.asarray(answer, dtype=float) for answer in answers])
             start += len(batch)
@@ -246,10 +247,10 @@ class Replay:
         intervals = fields.table_intervals(self.paths, tables, TABLE_TOLERANCE)
         return intervals if force or intervals.sum() <= MOST_NODES * self.interactions else None
 
-    def _refine_tables(self) -> None:
-        """Make the tables finer for these and all following candidates, or stop using them at the finest."""
+    def _refine_tables(self, too_coarse: NDArray[np.bool_]) -> None:
+        """Make tables [M, 3] finer for these and all following candidates, or stop using them at the finest."""
         if self._intervals is not None:
-            finer = 2 * self._intervals
+            finer = np.where(too_coarse, 2 * self._intervals, self._intervals)
             self._intervals = finer if finer.max() <= fields.FINEST else None
         self._program = self._compile()
 

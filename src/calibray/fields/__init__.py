@@ -11,6 +11,7 @@ from calibray.fields.coefficient_tables import FINEST, table_intervals
 from calibray.fields.combining import COMBINING, Combining, path_loss_of_gains
 from calibray.fields.effects import DisplacementLoss, Effect, EffectBatch, Effects, ExtraLoss, RoughSurfaces
 from calibray.fields.evaluation import (
+    WITHOUT_TABLES,
     path_gains,
     path_loss,
     path_losses,
@@ -28,6 +29,7 @@ from calibray.fields.program import GroupedProgram, Layout, layout
 __all__ = [
     "COMBINING",
     "FINEST",
+    "WITHOUT_TABLES",
     "Channel",
     "Combining",
     "DisplacementLoss",

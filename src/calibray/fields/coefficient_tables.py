@@ -72,7 +72,7 @@ class TableLayout:
         cosine: Cosine of incidence at every node [N].
         material: Material of every node [N].
         mode: Mode of every node [N].
-        inner: Nodes with at least three others of their row on either side [K].
+        inner: Whether a node has at least three others of its row on either side [N].
     """
 
     cell: tuple[jax.Array, ...]
@@ -153,7 +153,7 @@ def table_layout(
         cosine=jax.device_put(np.maximum(node_cosine, _GRAZING).astype(dtype)),
         material=jax.device_put(material_of_node.astype(np.int32)),
         mode=jax.device_put((rows % len(Mode))[row_of_node].astype(np.int32)),
-        inner=jax.device_put(np.flatnonzero((rank >= _STENCIL) & (rank <= last - _STENCIL)).astype(np.int32)),
+        inner=jax.device_put((rank >= _STENCIL) & (rank <= last - _STENCIL)),
     )
 
 
@@ -198,20 +198,22 @@ def interpolate(tables: CoefficientTables, cell: jax.Array, fraction: jax.Array)
     return (value(0), value(1)), (value(2), value(3))
 
 
-def table_error(tables: CoefficientTables, layout: TableLayout) -> jax.Array:
-    """Upper bound of the interpolation error of any coefficient's real or imaginary part [1].
+def table_error(tables: CoefficientTables, layout: TableLayout, num_materials: int) -> jax.Array:
+    """Upper bound of the interpolation error of any real or imaginary part, by material and mode [M, 3].
 
     Every node is compared with the cubic through the nodes one and three steps away, which has twice the step. The
     error of cubics decreases with the fourth power of the step, so the tables' error is a sixteenth of the largest
     difference. The bound is twice that.
     """
-    value = tables.values[:, :4]
+    value = tables.values[: len(layout.cosine), :4]
 
     def at(step: int) -> jax.Array:
-        return value.at[layout.inner + step].get(mode="promise_in_bounds")
+        return jnp.roll(value, -step, axis=0)
 
     gap = at(0) - 9 / 16 * (at(-1) + at(1)) + 1 / 16 * (at(-3) + at(3))
-    return jnp.abs(gap).max(initial=0.0) / 8
+    error = jnp.where(layout.inner, jnp.abs(gap).max(axis=1), 0.0) / 8
+    row = layout.material * len(Mode) + layout.mode
+    return jnp.zeros(num_materials * len(Mode), error.dtype).at[row].max(error).reshape(num_materials, -1)
 
 
 @jax_settings()

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial, reduce
 from operator import add
-from typing import cast
+from typing import Final, cast
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +48,9 @@ from calibray.fields.program import FormulaArguments, GroupedProgram, layout
 from calibray.fields.propagation import path_fields
 from calibray.materials import Material
 from calibray.paths import Paths
+
+WITHOUT_TABLES: Final = np.zeros((1, 3))
+"""Errors of coefficients that do not come from tables."""
 
 
 @jax_settings()
@@ -133,16 +136,16 @@ def path_losses(
     tables: NDArray[np.floating],
     combining: Combining = POWER,
     count: int | None = None,
-) -> tuple[NDArray[np.floating], float]:
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """Path loss [count, L], [dB], of a batch of candidates with material constants [n, M, 8].
 
-    Path loss is +inf for a link without a path. The second result is the largest error of a tabulated coefficient. Only
-    the first `count` candidates are evaluated. The function is compiled for the number of tables, so that a partly
-    filled batch saves a compilation.
+    Path loss is +inf for a link without a path. The second result is the largest error of a tabulated coefficient by
+    material and mode [M, 3], or zeros. Only the first `count` candidates are evaluated. The function is compiled for
+    the number of tables, so that a partly filled batch saves a compilation.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
-        return np.asarray(_losses_by_formula(program, tables, count, combining))[:count], 0.0
+        return np.asarray(_losses_by_formula(program, tables, count, combining))[:count], WITHOUT_TABLES
     # Tables are looked up where coefficients are used, which is fastest if each is used once.
     single_use = all(set(group.signature) <= {COEFFICIENT} for group in program.groups)
     powers, errors = [], []
@@ -154,8 +157,8 @@ def path_losses(
             responses = _split_by_step_wide(program, response)
             powers.append(_link_power_of_steps(program, responses, combining))
         # Waits for the candidate, so that the intermediate numbers of one at a time are in memory.
-        errors.append(float(_table_error(program, response)))
-    return np.asarray(_decibel(jnp.stack(powers))), float(np.max(errors))
+        errors.append(np.asarray(_table_error(program, response, len(table))))
+    return np.asarray(_decibel(jnp.stack(powers))), np.max(errors, axis=0)
 
 
 @jax_settings()
@@ -165,24 +168,24 @@ def path_losses_and_slopes(
     columns: tuple[int, ...],
     combining: Combining = POWER,
     count: int | None = None,
-) -> tuple[NDArray[np.floating], NDArray[np.floating], float]:
+) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
     """Path loss as in `path_losses`, and its derivatives [count, L, M, columns], [dB] per unit.
 
     The derivatives with respect to the materials' constants in `columns` of the tables are 0 for a link without a path.
-    The third result is the largest error of a tabulated coefficient.
+    The third result is the largest error of a tabulated coefficient by material and mode [M, 3].
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
         loss, slope = _slopes_by_formula(program, tables, count, columns, combining)
-        return np.asarray(loss)[:count], np.asarray(slope)[:count], 0.0
+        return np.asarray(loss)[:count], np.asarray(slope)[:count], WITHOUT_TABLES
     powers, slopes, errors = [], [], []
     for table in tables[:count]:
         response, derivatives = _response_and_derivatives(program, table, columns)
         power, by_step = _power_and_slope(program, _split_by_step_wide(program, response), combining)
         powers.append(power)
         slopes.append(_path_loss_slope(program, power, by_step, derivatives, table.shape[0]))
-        errors.append(float(_table_error(program, response)))
-    return np.asarray(_decibel(jnp.stack(powers))), np.asarray(jnp.stack(slopes)), float(np.max(errors))
+        errors.append(np.asarray(_table_error(program, response, len(table))))
+    return np.asarray(_decibel(jnp.stack(powers))), np.asarray(jnp.stack(slopes)), np.max(errors, axis=0)
 
 
 @jax_settings()
@@ -306,10 +309,10 @@ _power_and_slope = jax.jit(_slope, compiler_options=WIDE)
 _path_loss_slope = jax.jit(_contract, static_argnums=4, compiler_options=WIDE)
 
 
-@jax.jit
-def _table_error(program: GroupedProgram, response: MaterialResponse) -> jax.Array:
+@partial(jax.jit, static_argnums=2)
+def _table_error(program: GroupedProgram, response: MaterialResponse, num_materials: int) -> jax.Array:
     tables = cast(CoefficientTables, response.coefficients)
-    return coefficient_tables.table_error(tables, cast(TableLayout, program.coefficients))
+    return coefficient_tables.table_error(tables, cast(TableLayout, program.coefficients), num_materials)
 
 
 @partial(jax.jit, compiler_options=WIDE)

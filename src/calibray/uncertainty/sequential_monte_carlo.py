@@ -39,8 +39,10 @@ SWEEPS: Final = 4
 """Number of sweeps per step; a sweep moves every member in each way. The share of one of two distant ranges in five
 dimensions then scatters by 0.03 between seeds; with 2 sweeps by 0.08."""
 
-LAST_SWEEPS: Final = 8
-"""Further sweeps at power 1."""
+LAST_SWEEPS: Final = (8, 24)
+"""Smallest and largest number of further sweeps at power 1; more for a population that the budget makes smaller, so
+that it has as many draws. With 8 sweeps of 104 members, widths of intervals differ by up to 13 % between seeds in
+Auckland, and with 16 by up to 8 % (`benchmarks/certainty_cost.py --seeds 3`)."""
 
 KEPT: Final = 2
 """Number of sweeps at power 1 between members that are kept as draws."""
@@ -70,6 +72,7 @@ class Posterior:
         joint: Points of the unit cube of all parameters [n, d + k].
         spread: Between-building spread of every draw [n].
         model: Index of the noise model of every draw [n].
+        members: Number of members of a population.
         replays: Evaluations of path loss that the draws took.
     """
 
@@ -78,6 +81,7 @@ class Posterior:
     joint: NDArray[np.float64]
     spread: NDArray[np.float64]
     model: NDArray[np.int64]
+    members: int
     replays: int = 0
 
 
@@ -89,6 +93,7 @@ def joined(posteriors: Sequence[Posterior]) -> Posterior:
         np.concatenate([each.joint for each in posteriors]),
         np.concatenate([each.spread for each in posteriors]),
         np.concatenate([each.model for each in posteriors]),
+        posteriors[0].members,
         sum(each.replays for each in posteriors),
     )
 
@@ -104,6 +109,17 @@ def population_size(interactions: int, budget: int = BUDGET, models: int = 1) ->
     """
     fewest, most = SIZE[0], max(SIZE[0], SIZE[1] // models)
     return int(np.clip(budget // models // (2 * EVALUATIONS * interactions), fewest, most))
+
+
+def last_sweeps(size: int, models: int = 1) -> int:
+    """Number of sweeps at power 1 of populations of so many members.
+
+    Example:
+        >>> last_sweeps(256), last_sweeps(100), last_sweeps(64), last_sweeps(64, models=8)
+        (8, 20, 24, 8)
+    """
+    largest = max(SIZE[0], SIZE[1] // models)
+    return int(np.clip(LAST_SWEEPS[0] * largest // size, *LAST_SWEEPS))
 
 
 def draw_posterior(
@@ -138,7 +154,8 @@ def draw_posterior(
                 if progress is not None:
                     progress((number % 2 + power) / 2)
 
-            population, evidence = _anneal(model, size, np.random.default_rng([seed, number]), stepped)
+            random, sweeps = np.random.default_rng([seed, number]), last_sweeps(size, models)
+            population, evidence = _anneal(model, size, sweeps, random, stepped)
             populations.append(population)
             evidences.append(evidence)
         half = total // 2
@@ -148,7 +165,7 @@ def draw_posterior(
     # Populations that disagree count alike: the estimates of their evidence are then unreliable.
     share = _weights(np.array(evidences)) if agree else np.full(len(populations), 1.0 / len(populations))
     posterior = _posterior(model, _together(populations), np.repeat(share, members) / members, agree)
-    return replace(posterior, replays=replays)
+    return replace(posterior, members=size, replays=replays)
 
 
 def _apart(size: int) -> float:
@@ -188,13 +205,21 @@ def _posterior(model: JointModel, members: Population, weight: NDArray[np.float6
         members.point,
         members.spread,
         members.model,
+        len(members.spread),
     )
 
 
 def _anneal(
-    model: JointModel, size: int, random: np.random.Generator, stepped: Callable[[float], None]
+    model: JointModel,
+    size: int,
+    last: int,
+    random: np.random.Generator,
+    stepped: Callable[[float], None],
 ) -> tuple[Population, float]:
-    """Members of a population that followed the likelihood's power from 0 to 1, and its log evidence."""
+    """Members of a population that followed the likelihood's power from 0 to 1, and its log evidence.
+
+    They are kept during the `last` sweeps.
+    """
     point = model.draw_prior(size, random)
     deviation = random.standard_normal((size, len(model.parameter_of)))
     models = random.integers(0, len(model.marginal.models), size)
@@ -228,7 +253,7 @@ def _anneal(
         if power == 1.0:
             break
     kept = []
-    for _ in range(LAST_SWEEPS // KEPT):
+    for _ in range(last // KEPT):
         for _ in range(KEPT):
             population, lengths = moves.sweep(population, lengths)
         population = moves.redraw_categories(population)
