@@ -31,9 +31,10 @@ BATCH_INTERACTIONS: Final = 400_000
 MANY: Final = 10_000
 """Number of interactions above which weak paths are left out."""
 
-WEAK: Final = 0.03
-"""Share of a link's power that the omitted paths have together, summed over 16 candidates. On an office floor, half of
-the interactions are left out, and path loss of other candidates changes by 0.01 dB on average."""
+WEAK: Final = 0.1
+"""Share of a link's power that the omitted paths have together, summed over 16 candidates. On an office floor in
+Auckland, 71 % of the interactions are left out, and path loss of posterior draws changes by 0.05 dB (RMS), with errors
+of 5.3 dB. With 0.03, 61 % are left out, and it changes by 0.02 dB."""
 
 
 @dataclass(frozen=True, eq=False)
