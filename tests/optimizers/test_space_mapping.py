@@ -142,21 +142,45 @@ def thick_walls(x: np.ndarray, thickness: np.ndarray) -> np.ndarray:
     return 6.0 * WEIGHT[0] * np.log(x[:, :1]) + 3.0 * ripple.sum(axis=1)
 
 
-def test_input_mappings_start_from_the_likeliest_of_many_trials():
-    """One of hundreds of minima explains the answers, and the first trials are in others."""
-    true = np.array([1.1, 2.3])
+THICK = np.array([1.1, 2.3])
+"""True thicknesses of both walls."""
+
+
+def thick_cheap() -> FunctionModel:
+    """The thick walls with other believed thicknesses; hundreds of minima explain some answers badly."""
     centre = np.log([1.8, 1.6])
     constants = Constants(centre, np.full(2, 0.5), centre - 1.5, centre + 1.5)
-    model = FunctionModel(lambda x, c: thick_walls(x, np.exp(c)), constants)
-    unit = design("sobol", 3, 2, np.random.default_rng(0))
-    residuals = thick_walls(BOX.from_unit(unit), np.tile(true, (3, 1)))
+    return FunctionModel(lambda x, c: thick_walls(x, np.exp(c)), constants)
+
+
+def thick_answers(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the unit cube, and the residuals there with the true thicknesses."""
+    unit = design("sobol", count, 2, np.random.default_rng(0))
+    return unit, thick_walls(BOX.from_unit(unit), np.tile(THICK, (count, 1)))
+
+
+def test_input_mappings_start_from_the_likeliest_of_many_trials():
+    """One of hundreds of minima explains the answers, and the first trials are in others."""
+    model, answers = thick_cheap(), thick_answers(3)
+    centre = model.constants.centre
     trials = centre + 0.5 * np.random.default_rng(1).standard_normal((600, 2))
-    few = correct(UnitModel(model, BOX), (unit, residuals), CLOUD, trials[:FOLLOWED])
-    assert np.abs(np.exp(few.constants) - true).max() > 0.1
-    many = correct(UnitModel(model, BOX), (unit, residuals), CLOUD, trials)
-    assert np.exp(many.constants) == pytest.approx(true, rel=1e-3)
+    few = correct(UnitModel(model, BOX), answers, CLOUD, trials[:FOLLOWED])
+    assert np.abs(np.exp(few.constants) - THICK).max() > 0.1
+    many = correct(UnitModel(model, BOX), answers, CLOUD, trials)
+    assert np.exp(many.constants) == pytest.approx(THICK, rel=1e-3)
     believed, fitted = misfit(many, np.stack([centre, many.constants]))
     assert fitted < believed - 50.0
+
+
+def test_a_search_with_earlier_evaluations_fits_the_constants_from_the_likeliest_draws():
+    unit, residuals = thick_answers(16)
+    search = SpaceMapping(LOWER, UPPER, cheap_model=thick_cheap(), budget=4)
+    search.tell(BOX.from_unit(unit), value(residuals), residuals=residuals)
+    for _ in range(4):
+        x = search.ask()
+        residuals = thick_walls(x, np.tile(THICK, (len(x), 1)))
+        search.tell(x, value(residuals), residuals=residuals)
+    assert np.exp(search.corrected.constants) == pytest.approx(THICK, rel=1e-3)
 
 
 def test_slopes_of_a_corrected_model_equal_finite_differences():

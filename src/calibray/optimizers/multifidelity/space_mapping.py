@@ -75,7 +75,8 @@ TRIALS: Final = 200
 ones."""
 
 TRIED: Final = 10
-"""Number of calls after which an input mapping starts only from the previous one."""
+"""Number of calls of a search after which an input mapping starts only from the previous one. Evaluations told before
+the first call do not count: no input mapping followed them."""
 
 CANDIDATES: Final = 300
 """Number of candidates drawn over the box, and of candidates around the best points."""
@@ -179,7 +180,7 @@ class SpaceMapping(Optimizer):
             else:
                 unit, residuals = merge_repeated(self.box.to_unit(answers.x), answers.errors)
                 self._corrected = correct(
-                    UnitModel(model, self.box), (unit, residuals), cloud, self._trials(model, len(unit)),
+                    UnitModel(model, self.box), (unit, residuals), cloud, self._trials(model, turn),
                     noisy=self.noisy, before=self._corrected,
                 )  # fmt: skip
                 if len(unit) >= JUDGED:
@@ -210,10 +211,10 @@ class SpaceMapping(Optimizer):
             answers = yield surrogate.ask()
             surrogate.tell(answers.x, answers.y, residuals=answers.residuals)
 
-    def _trials(self, model: CheapModel, count: int) -> NDArray[np.float64]:
-        """Constants to try for an input mapping [s, q]."""
+    def _trials(self, model: CheapModel, turn: int) -> NDArray[np.float64]:
+        """Constants to try for the input mapping after `turn` calls [s, q]."""
         prior = model.constants
-        draws = self._rng.standard_normal((TRIALS if count <= TRIED else 0, len(prior.centre)))
+        draws = self._rng.standard_normal((TRIALS if turn <= TRIED else 0, len(prior.centre)))
         return np.vstack([prior.centre, prior.draw(draws)])
 
     def _first(self, model: CheapModel, count: int, turn: int) -> NDArray[np.float64]:
