@@ -15,10 +15,12 @@ for _library in ("OMP", "OPENBLAS", "MKL"):
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
+import jax
 import pytest
 from hypothesis import settings
 
 from calibray.cli import progress_bars as progress
+from calibray.fields import compiled
 from calibray.support import cache_folder as caching
 from calibray.uncertainty import sequential_monte_carlo as sampler
 
@@ -41,9 +43,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 LONGEST = (
-    "test_browser", "test_scenarios", "test_notebooks", "test_walk", "test_fidelity", "test_dask", "test_calibrate",
-    "test_assessment", "test_program_with_rays", "test_tracing", "test_ledger", "test_coefficient_tables",
-    "test_observables", "test_antennas_per_link", "test_unreached_links", "test_suggest", "test_demo",
+    "test_browser", "test_scenarios", "test_notebooks", "test_walk", "test_dask", "test_report_browser",
+    "test_fidelity", "test_calibrate", "test_assessment", "test_tracing", "test_demo", "test_ledger", "test_octave",
+    "test_unreached_links", "test_carriers", "test_program_with_rays", "test_antennas_per_link", "test_observables",
+    "test_pose", "test_suggest", "test_coefficient_tables", "test_derivatives",
 )  # fmt: skip
 """Files that take longest. They run first, so that no worker is left with one of them at the end."""
 
@@ -60,6 +63,16 @@ def _no_lines_of_progress():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(progress, "LINE_INTERVAL", 1e6)
         yield
+
+
+@pytest.fixture(scope="module")
+def compiled_fast() -> Iterator[None]:
+    """XLA optimizes nothing, for tests that evaluate few candidates: compiling takes most of their time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiled, "SMALL", sys.maxsize)
+        jax.config.update("jax_disable_most_optimizations", True)
+        yield
+        jax.config.update("jax_disable_most_optimizations", False)
 
 
 JUDGING_INTERVALS = {"benchmarks", "prediction", "uncertainty", "validation"}

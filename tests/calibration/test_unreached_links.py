@@ -46,6 +46,7 @@ def calibrated(folder: Path, behind: int = BEHIND, **trace: object) -> Result:
         "antennas": {end: {"pattern": "iso", "polarization": "V"} for end in ("tx", "rx")},
         "trace": {"max_depth": 1, "samples": 20_000, **trace},
         "parameters": {"stone.relative_permittivity": {"bounds": [2.0, 12.0]}},
+        "method": {"name": "auto", "options": {"starts": 16}},
     }  # fmt: skip
     return cb.calibrate(cb.Study.from_content(study, folder / "study.toml"))
 
@@ -128,8 +129,17 @@ def test_links_with_a_path_are_predicted_as_without_a_fallback(shadowed: Result)
     assert np.isinf(without.predict(places(HIDDEN)))
 
 
-def test_the_fallback_is_fitted_although_every_link_has_a_path(tmp_path: Path) -> None:
-    result = calibrated(tmp_path, behind=0)
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory) -> tuple[Result, Path]:
+    """A calibration of links that all have a path, and the cache of its traces."""
+    folder = tmp_path_factory.mktemp("seen")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CALIBRAY_CACHE", str(folder / "cache"))
+        return calibrated(folder, behind=0), folder / "cache"
+
+
+def test_the_fallback_is_fitted_although_every_link_has_a_path(seen: tuple[Result, Path]) -> None:
+    result, _ = seen
     assert result.links.has_path.all()
     predictions = result.predict_interval(places(HIDDEN))
     assert predictions.basis[0] == "no path: log-distance, errors of 8 calibration links"
@@ -195,10 +205,10 @@ def test_the_rate_of_the_calibration_gives_the_cost(
 
 
 def test_calibrated_links_and_known_candidates_are_not_traced_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    seen: tuple[Result, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("CALIBRAY_CACHE", str(tmp_path / "cache"))
-    result = calibrated(tmp_path, behind=0)
+    result, cache = seen
+    monkeypatch.setenv("CALIBRAY_CACHE", str(cache))
     assert result.uncertainty.draws
     opened: list[object] = []
     open_tracer = cb.Setup._open_tracer

@@ -32,11 +32,11 @@ def mapping_with_few_rays(setup, *arguments):
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
-    """The experiment; one noise model makes its intervals quick."""
+    """The experiment; one noise model and equal buildings make its intervals quick."""
     out, study = tmp_path_factory.mktemp("demo"), tmp_path_factory.mktemp("study") / "district"
     shutil.copytree(demo_study_path().parent, study)
     with (study / "study.toml").open("a") as file:
-        file.write('\n[noise]\nkind = "gaussian"\nrange_m = 0\n')
+        file.write('\n[noise]\nkind = "gaussian"\nrange_m = 0\nheterogeneity = 0\nconstants_spread = 0\n')
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "demo_study_path", lambda: study / "study.toml")
         patch.setattr(module, "MAPPING_CALLS", 1)  # each is a trace

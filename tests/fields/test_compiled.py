@@ -1,4 +1,4 @@
-"""Both compilations of a program's functions give the same numbers."""
+"""All compilations of a program's functions give the same numbers."""
 
 from __future__ import annotations
 
@@ -8,23 +8,36 @@ import numpy as np
 import pytest
 
 import synthetic
-from calibray.fields import compiled, layout, path_losses_and_slopes
+from calibray.fields import compiled, evaluation, layout, path_losses_and_slopes
+from calibray.fields.combining import POWER
 from calibray.paths import Kind
 
 SEQUENCES = [(Kind.DIFFUSE,), (Kind.REFRACTION, Kind.DIFFUSE)]
+OPTIMIZED = {
+    "xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes": False,
+    "xla_cpu_use_fusion_emitters": True,
+}  # fmt: skip
+"""The options of a user's run; the tests of this room are compiled without optimization (`tests/conftest.py`)."""
 
 
 def test_a_small_program_has_the_numbers_of_a_large_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    paths = synthetic.program(SEQUENCES * 4, seed=8)
+    paths = synthetic.program(SEQUENCES[1:] * 8, seed=8)
     program, table = layout(paths, phases=False).program, paths.material_table()[None]
+    of_tests = path_losses_and_slopes(program, table, (0,))
+    monkeypatch.setattr(compiled, "WIDE", compiled.WIDE | OPTIMIZED)
+    monkeypatch.setattr(compiled, "_QUICK", OPTIMIZED | compiled._QUICK)
+    function = compiled.compiled(evaluation._slopes_by_formula.__wrapped__, static_argnums=3)
     assert compiled.is_small(program)
-    small = path_losses_and_slopes(program, table, (0, 4))
+    small = function(program, table, 1, (0,), POWER)
     monkeypatch.setattr(compiled, "SMALL", 0)
     assert not compiled.is_small(program)
-    large = path_losses_and_slopes(program, table, (0, 4))
-    for one, other in zip(small[:2], large[:2], strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11 * np.abs(other).max())
+    large = function(program, table, 1, (0,), POWER)
+    for answers in zip(small, large, of_tests[:2], strict=True):
+        for other in answers[1:]:
+            np.testing.assert_allclose(answers[0], other, rtol=1e-11, atol=1e-11 * np.abs(other).max())
     assert np.abs(large[1]).max() > 0.1
+    # Otherwise the options would have had no effect.
+    assert any((small[1] != other[1]).any() for other in (large, of_tests))
 
 
 def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,9 +23,15 @@ def of(kind, **limits):
 
 ALL = tuple(of(kind) for kind in KINDS)
 LIMITS = {"dynamic_range_db": 25.0, "floor_db": -95.0, "window": 9e-8}
-LIMITED = tuple(of(kind, **LIMITS) for kind in KINDS)
 BANDWIDTH = 2e8
-BANDED = tuple(of(kind, bandwidth=BANDWIDTH, **LIMITS) for kind in KINDS)
+BY_FORMULA = (
+    "rms_delay_spread", "mean_excess_delay", "round_trip_time", "k_factor", "elevation_spread_arrival", DELAY_BIN,
+    "azimuth_power_departure",
+)  # fmt: skip
+"""One kind for every formula; the others differ by a factor or by the angle that they read."""
+
+LIMITED = tuple(of(kind, **LIMITS) for kind in BY_FORMULA)
+BANDED = tuple(of(kind, bandwidth=BANDWIDTH, **LIMITS) for kind in BY_FORMULA)
 RESOLVED = tuple(Statistic("round_trip_time", path, 25.0, bandwidth=4e7) for path in ("first", "strongest"))
 
 
