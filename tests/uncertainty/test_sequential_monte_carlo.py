@@ -64,6 +64,19 @@ def test_undetermined_means_are_uniform(scale, spread):
     assert posterior.means.agree
 
 
+def test_moves_beyond_the_bounds_are_rejected_without_a_replay():
+    points = []
+
+    def gaps(point, logarithms):
+        points.append(point)
+        return _uninformative(point, logarithms)
+
+    draw_posterior(_model(_parameters(), gaps, 4, buildings=0), seed=6)
+    every = np.concatenate(points)
+    assert len(every) > 1000
+    assert ((every > 0.0) & (every < 1.0)).all()
+
+
 def test_undetermined_means_follow_a_declared_prior():
     prior = LogNormal((0,), (4.0,), (0.1,))
     draws = draw_posterior(_model(_parameters(), _uninformative, 4, priors=prior), seed=3).means

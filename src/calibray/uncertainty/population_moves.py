@@ -154,7 +154,7 @@ class Moves:
         step = np.where(full, 1.0, length) * (population.point[first] - population.point[second])
         point = population.point + moving * (step + JITTER * random.standard_normal((count, width)))
         inside = ((point >= 0.0) & (point <= 1.0)).all(axis=1)
-        proposal = evaluated(self.model, replace(population, point=np.clip(point, 0.0, 1.0)))
+        proposal = self._evaluated_where(inside, population, replace(population, point=point))
         accepted = inside & self._accepts(population, proposal)
         points = _adapted(lengths.points, accepted[~full[:, 0]], 2.0)
         return population.updated(accepted, proposal), replace(lengths, points=points)
@@ -177,7 +177,7 @@ class Moves:
                 log_density = np.log(density).reshape(2, -1)
             log_ratio[rows], point[rows, index] = log_density[0] - log_density[1], value
         inside = ((point >= 0.0) & (point <= 1.0)).all(axis=1)
-        proposal = evaluated(self.model, replace(population, point=np.clip(point, 0.0, 1.0)))
+        proposal = self._evaluated_where(inside, population, replace(population, point=point))
         return population.updated(inside & self._accepts(population, proposal, log_ratio), proposal)
 
     def _move_buildings(self, population: Population, lengths: Lengths) -> tuple[Population, Lengths]:
@@ -257,14 +257,16 @@ class Moves:
     def _evaluated_where(
         self, changed: NDArray[np.bool_], population: Population, proposal: Population
     ) -> Population:
-        """The proposal, evaluated for the members whose path loss changes [n]."""
+        """The proposal, evaluated for the members that need it [n]; the others keep their densities."""
         rows = np.flatnonzero(changed)
         if not len(rows):
             return proposal
         part = evaluated(self.model, proposal.selected(rows))
-        gap, log_likelihood = population.gap.copy(), population.log_likelihood.copy()
-        gap[rows], log_likelihood[rows] = part.gap, part.log_likelihood
-        return replace(proposal, gap=gap, log_likelihood=log_likelihood)
+        gap, log_likelihood, log_prior = (
+            each.copy() for each in (population.gap, population.log_likelihood, population.log_prior)
+        )
+        gap[rows], log_likelihood[rows], log_prior[rows] = part.gap, part.log_likelihood, part.log_prior
+        return replace(proposal, gap=gap, log_likelihood=log_likelihood, log_prior=log_prior)
 
     def _accepts(
         self, population: Population, proposal: Population, log_ratio: float | NDArray[np.float64] = 0.0
