@@ -153,7 +153,7 @@ class Moves:
         full = random.random((count, 1)) < 1 / 3
         step = np.where(full, 1.0, length) * (population.point[first] - population.point[second])
         point = population.point + moving * (step + JITTER * random.standard_normal((count, width)))
-        inside = ((point >= 0.0) & (point <= 1.0)).all(axis=1)
+        inside = np.asarray(((point >= 0.0) & (point <= 1.0)).all(axis=1))
         proposal = self._evaluated_where(inside, population, replace(population, point=point))
         accepted = inside & self._accepts(population, proposal)
         points = _adapted(lengths.points, accepted[~full[:, 0]], 2.0)
@@ -176,7 +176,7 @@ class Moves:
             with np.errstate(divide="ignore"):
                 log_density = np.log(density).reshape(2, -1)
             log_ratio[rows], point[rows, index] = log_density[0] - log_density[1], value
-        inside = ((point >= 0.0) & (point <= 1.0)).all(axis=1)
+        inside = np.asarray(((point >= 0.0) & (point <= 1.0)).all(axis=1))
         proposal = self._evaluated_where(inside, population, replace(population, point=point))
         return population.updated(inside & self._accepts(population, proposal, log_ratio), proposal)
 

@@ -72,8 +72,8 @@ class Posterior:
         joint: Points of the unit cube of all parameters [n, d + k].
         spread: Between-building spread of every draw [n].
         model: Index of the noise model of every draw [n].
-        members: Number of members of a population.
         replays: Evaluations of path loss that the draws took.
+        members: Number of members of a population.
     """
 
     means: Draws
@@ -81,8 +81,8 @@ class Posterior:
     joint: NDArray[np.float64]
     spread: NDArray[np.float64]
     model: NDArray[np.int64]
-    members: int
     replays: int = 0
+    members: int = 0
 
 
 def joined(posteriors: Sequence[Posterior]) -> Posterior:
@@ -93,8 +93,8 @@ def joined(posteriors: Sequence[Posterior]) -> Posterior:
         np.concatenate([each.joint for each in posteriors]),
         np.concatenate([each.spread for each in posteriors]),
         np.concatenate([each.model for each in posteriors]),
-        posteriors[0].members,
         sum(each.replays for each in posteriors),
+        posteriors[0].members,
     )
 
 
@@ -165,7 +165,7 @@ def draw_posterior(
     # Populations that disagree count alike: the estimates of their evidence are then unreliable.
     share = _weights(np.array(evidences)) if agree else np.full(len(populations), 1.0 / len(populations))
     posterior = _posterior(model, _together(populations), np.repeat(share, members) / members, agree)
-    return replace(posterior, members=size, replays=replays)
+    return replace(posterior, replays=replays, members=size)
 
 
 def _apart(size: int) -> float:
@@ -205,7 +205,6 @@ def _posterior(model: JointModel, members: Population, weight: NDArray[np.float6
         members.point,
         members.spread,
         members.model,
-        len(members.spread),
     )
 
 

@@ -75,8 +75,8 @@ TRIALS: Final = 200
 ones."""
 
 TRIED: Final = 10
-"""Number of calls of a search after which an input mapping starts only from the previous one. Evaluations told before
-the first call do not count: no input mapping followed them."""
+"""Number of calls of a search after which an input mapping starts only from the previous one. Earlier evaluations that
+the search starts with do not count: no input mapping followed them."""
 
 CANDIDATES: Final = 300
 """Number of candidates drawn over the box, and of candidates around the best points."""
