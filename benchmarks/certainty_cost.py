@@ -82,16 +82,8 @@ def seeds(problem: Problem, count: int) -> Table:
         ])  # fmt: skip
         shares = (f"{share:.2f}" for share in widths[-1] / (upper - lower))
         agree = "yes" if draws.agree else "no"
-        rows.append(
-            (
-                str(seed),
-                f"{spent:.1f}",
-                f"{found.calls:,}",
-                agree,
-                f"{effective(found.posterior):.0f}",
-                *shares,
-            )
-        )
+        worth = f"{effective(found.posterior):.0f}"
+        rows.append((str(seed), f"{spent:.1f}", f"{found.calls:,}", agree, worth, *shares))
     apart = np.ptp(widths, axis=0) / np.mean(widths, axis=0)
     rows.append(("apart", "", "", "", "", *(f"{share:.0%}".replace("%", " %") for share in apart)))
     columns = (

@@ -32,7 +32,7 @@ def mapping_with_few_rays(setup, *arguments):
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
-    """The experiment; one noise model and equal buildings make its intervals quick."""
+    """The experiment; one noise model, equal buildings and exact constants make its intervals quick."""
     out, study = tmp_path_factory.mktemp("demo"), tmp_path_factory.mktemp("study") / "district"
     shutil.copytree(demo_study_path().parent, study)
     with (study / "study.toml").open("a") as file:

@@ -172,7 +172,7 @@ def path_losses_and_slopes(
     """Path loss as in `path_losses`, and its derivatives [count, L, M, columns], [dB] per unit.
 
     The derivatives with respect to the materials' constants in `columns` of the tables are 0 for a link without a path.
-    The third result is the largest error of a tabulated coefficient by material and mode [M, 3].
+    The third result is the largest error of a tabulated coefficient by material and mode [M, 3], or zeros.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):

@@ -153,11 +153,9 @@ class Moves:
         full = random.random((count, 1)) < 1 / 3
         step = np.where(full, 1.0, length) * (population.point[first] - population.point[second])
         point = population.point + moving * (step + JITTER * random.standard_normal((count, width)))
-        inside = np.asarray(((point >= 0.0) & (point <= 1.0)).all(axis=1))
-        proposal = self._evaluated_where(inside, population, replace(population, point=point))
-        accepted = inside & self._accepts(population, proposal)
+        moved, accepted = self._at_points(population, point)
         points = _adapted(lengths.points, accepted[~full[:, 0]], 2.0)
-        return population.updated(accepted, proposal), replace(lengths, points=points)
+        return moved, replace(lengths, points=points)
 
     def _redraw_coordinate(self, population: Population) -> Population:
         """Redraw one parameter from the population's values of it: Gaussian kernels as wide as their neighbourhood."""
@@ -176,9 +174,16 @@ class Moves:
             with np.errstate(divide="ignore"):
                 log_density = np.log(density).reshape(2, -1)
             log_ratio[rows], point[rows, index] = log_density[0] - log_density[1], value
+        return self._at_points(population, point, log_ratio)[0]
+
+    def _at_points(
+        self, population: Population, point: NDArray[np.float64], log_ratio: float | NDArray[np.float64] = 0.0
+    ) -> tuple[Population, NDArray[np.bool_]]:
+        """The population at proposed points [n, d + k] if accepted [n]; a point beyond the bounds needs no replay."""
         inside = np.asarray(((point >= 0.0) & (point <= 1.0)).all(axis=1))
         proposal = self._evaluated_where(inside, population, replace(population, point=point))
-        return population.updated(inside & self._accepts(population, proposal, log_ratio), proposal)
+        accepted = inside & self._accepts(population, proposal, log_ratio)
+        return population.updated(accepted, proposal), accepted
 
     def _move_buildings(self, population: Population, lengths: Lengths) -> tuple[Population, Lengths]:
         """Redraw one, two or all buildings; sqrt(1 - b^2) z + b xi is standard normal if z and xi are."""
