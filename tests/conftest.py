@@ -21,6 +21,7 @@ from hypothesis import settings
 
 from calibray.cli import progress_bars as progress
 from calibray.fields import compiled
+from calibray.fitting import methods
 from calibray.support import cache_folder as caching
 from calibray.uncertainty import sequential_monte_carlo as sampler
 
@@ -67,16 +68,31 @@ def _no_lines_of_progress():
 
 @pytest.fixture(scope="module")
 def compiled_fast() -> Iterator[None]:
-    """XLA optimizes nothing, for tests that evaluate few candidates: compiling takes most of their time."""
+    """XLA optimizes nothing, for tests that evaluate few candidates: compiling takes most of their time.
+
+    Nor does it in processes that these tests start.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compiled, "SMALL", sys.maxsize)
+        patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
         jax.config.update("jax_disable_most_optimizations", True)
         yield
         jax.config.update("jax_disable_most_optimizations", False)
 
 
-JUDGING_INTERVALS = {"benchmarks", "prediction", "uncertainty", "validation"}
-"""Rooms whose tests judge intervals; they draw as much as a user's run."""
+@pytest.fixture(scope="session", autouse=True)
+def _few_starts() -> Iterator[None]:
+    """An eighth of the starting points of a search; small problems have few minima."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(methods, "STARTS", (16, 64))
+        yield
+
+
+JUDGING_INTERVALS = {
+    "benchmarks", "validation", "test_buildings", "test_censoring", "test_emulator", "test_linear_theory",
+    "test_noise_models", "test_sequential_monte_carlo",
+}  # fmt: skip
+"""Rooms and files whose tests judge intervals; they draw as much as a user's run."""
 
 FEW = {"SIZE": (64, 64), "POPULATIONS": (2, 4), "SWEEPS": 1, "LAST_SWEEPS": (2, 2)}
 MANY = {name: getattr(sampler, name) for name in FEW}
@@ -92,10 +108,11 @@ def _draw(constants: dict[str, object]) -> Iterator[None]:
 @pytest.fixture(scope="module", autouse=True)
 def _few_draws(request: pytest.FixtureRequest) -> Iterator[None]:
     """A tenth of the draws from the posterior, which take most of the time of a small calibration."""
-    yield from _draw(MANY if request.path.parent.name in JUDGING_INTERVALS else FEW)
+    judging = {request.path.parent.name, request.path.stem} & JUDGING_INTERVALS
+    yield from _draw(MANY if judging else FEW)
 
 
 @pytest.fixture
 def all_draws() -> Iterator[None]:
-    """As many draws as a user's run, for a test of intervals in another room."""
+    """As many draws as a user's run, for a test of intervals in another file."""
     yield from _draw(MANY)

@@ -17,7 +17,6 @@ from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.engines import Replay
 from calibray.errors import InputError
-from calibray.fitting import methods
 from calibray.optimizers import METHODS
 from calibray.parameters import Parameter, Parameters
 from calibray.reporting.result_tables import nuisances
@@ -26,14 +25,6 @@ from calibray.tables import render
 
 PAPER_CALLS = {"gwo": 600, "sgwo-im": 225}
 METHOD_NAMES = ("auto", *METHODS)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _few_starts():
-    """An eighth of the starting points of a search; the street has few minima."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(methods, "STARTS", (methods.STARTS[0], 64))
-        yield
 
 
 def run(folder, table: pd.DataFrame, name: str = "auto", seed: int = 0, **sections) -> Result:

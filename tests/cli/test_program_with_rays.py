@@ -16,6 +16,8 @@ from calibray.errors import EngineError, InputError
 from calibray.study.toml_file import study_text
 from commands import run
 
+pytestmark = pytest.mark.usefixtures("compiled_fast")
+
 TRUTH = 7.7
 PROGRAM = """
 import cmath, json, math, sys

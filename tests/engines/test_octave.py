@@ -21,7 +21,10 @@ from calibray.study import Study
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "octave_canyon"
 TRUTH = np.array([[6.4, 15.0]])
-pytestmark = pytest.mark.skipif(shutil.which("octave-cli") is None, reason="GNU Octave is not installed")
+pytestmark = [
+    pytest.mark.usefixtures("compiled_fast"),
+    pytest.mark.skipif(shutil.which("octave-cli") is None, reason="GNU Octave is not installed"),
+]
 
 
 def example(**sections) -> Study:

@@ -107,45 +107,76 @@ def run(program: str, **environment: str) -> str:
 
 def test_importing_and_calling_calibray_changes_nothing_global(tmp_path: Path) -> None:
     search = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
-    assert int(run(GLOBAL_STATE, PYTHONPATH=search, CALIBRAY_CACHE=str(tmp_path))) > 100
+    environment = {
+        "PYTHONPATH": search,
+        "CALIBRAY_CACHE": str(tmp_path),
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+    }
+    assert int(run(GLOBAL_STATE, **environment)) > 100
     assert list((tmp_path / "compiled").iterdir())  # the calls did use the store
 
 
-COMPILED = """
-import json
-from collections import Counter
+FORKED = """
+import os, sys, warnings
 
 import jax
-from jax import monitoring
-
 from calibray.fields import jax_settings
 
-seen = Counter()
-monitoring.register_event_listener(lambda event, **_: seen.update([event.rpartition("/")[2]]))
-with jax_settings():
-    value = float(jax.jit(lambda x: jax.numpy.sin(x) * 3)(2.0))
-inside = seen["cache_hits"], seen["cache_misses"]
-jax.jit(lambda x: jax.numpy.cos(x) * 5)(2.0)
-assert inside == (seen["cache_hits"], seen["cache_misses"]), "a program of the user was kept"
-print(json.dumps([value, *inside]))
+warnings.filterwarnings("ignore", message="os.fork")  # nothing was computed yet
+for step in steps:
+    child = os.fork()
+    if not child:
+        compute(**step)
+        sys.stdout.flush()
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+"""
+
+COMPILED = """
+def compute(damage=False, mode=0o700):
+    import json
+    from collections import Counter
+    from pathlib import Path
+
+    from jax import monitoring
+
+    folder = Path(os.environ["CALIBRAY_CACHE"], "compiled")
+    if damage:
+        for path in folder.iterdir():
+            content = bytearray(path.read_bytes())
+            content[len(content) // 2] ^= 1
+            path.write_bytes(content)
+    if folder.exists():
+        folder.chmod(mode)
+    seen = Counter()
+    monitoring.register_event_listener(lambda event, **_: seen.update([event.rpartition("/")[2]]))
+    with jax_settings():
+        value = float(jax.jit(lambda x: jax.numpy.sin(x) * 3)(2.0))
+    inside = seen["cache_hits"], seen["cache_misses"]
+    jax.jit(lambda x: jax.numpy.cos(x) * 5)(2.0)
+    assert inside == (seen["cache_hits"], seen["cache_misses"]), "a program of the user was kept"
+    print(json.dumps([value, *inside]))
 """
 
 
-def test_a_second_process_compiles_nothing_and_damage_breaks_nothing(tmp_path: Path) -> None:
-    def outcome() -> list[float]:
-        return json.loads(run(COMPILED, CALIBRAY_CACHE=str(tmp_path)))
+def outcomes(*steps: dict[str, object], **environment: str) -> list[list[float]]:
+    """Value, hits and misses of processes that compile the same program one after the other.
 
-    value, hits, misses = outcome()
-    assert (hits, misses > 0) == (0, True)
-    assert outcome() == [value, misses, 0]
-    for path in (tmp_path / "compiled").iterdir():
-        content = bytearray(path.read_bytes())
-        content[len(content) // 2] ^= 1
-        path.write_bytes(content)
-    assert outcome() == [value, 0, misses]
+    They are forked from one process, which imports JAX and computes nothing.
+    """
+    printed = run(f"steps = {steps!r}\n{COMPILED}{FORKED}", **environment)
+    return [json.loads(line) for line in printed.splitlines()]
+
+
+def test_a_second_process_compiles_nothing_and_damage_breaks_nothing(tmp_path: Path) -> None:
     # negative control: others could put code into a folder that they can write
-    (tmp_path / "compiled").chmod(0o777)
-    assert outcome() == [value, 0, 0]
+    steps = {}, {}, {"damage": True}, {"mode": 0o777}
+    (first, second, damaged, refused) = outcomes(*steps, CALIBRAY_CACHE=str(tmp_path))
+    value, hits, misses = first
+    assert (hits, misses > 0) == (0, True)
+    assert second == [value, misses, 0]
+    assert damaged == [value, 0, misses]
+    assert refused == [value, 0, 0]
 
 
 def test_settings_are_those_of_one_thread() -> None:
@@ -171,8 +202,8 @@ def test_settings_are_those_of_one_thread() -> None:
 
 def test_a_cache_that_the_user_named_is_used(tmp_path: Path) -> None:
     named, own = tmp_path / "user", tmp_path / "calibray"
-    run(
-        COMPILED, CALIBRAY_CACHE=str(own), JAX_COMPILATION_CACHE_DIR=str(named),
+    outcomes(
+        {}, CALIBRAY_CACHE=str(own), JAX_COMPILATION_CACHE_DIR=str(named),
         JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS="100",
     )  # fmt: skip
     assert not (own / "compiled").exists() or not list((own / "compiled").iterdir())

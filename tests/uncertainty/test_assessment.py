@@ -30,7 +30,7 @@ from link_tables import links_from_frame
 CENSORED = planted.content("links.csv")["links"] | {
     "quantity": "received_power", "tx_power_dbm": 0.0, "noise_floor_dbm": -100.0, "below_floor": "censor",
 }  # fmt: skip
-STEPS = 31
+STEPS = 21
 """Values per parameter of the grid for an exact posterior."""
 
 EXACT = {"heterogeneity": 0, "constants_spread": 0}
@@ -76,6 +76,7 @@ def test_intervals_come_from_draws_and_have_reasons(result):
     assert f"{result.cost.uncertainty_replays:,} in" in text
 
 
+@pytest.mark.usefixtures("all_draws")
 def test_draws_fit_the_links_about_as_well_as_the_optimum(tmp_path, noisy):
     result = run(tmp_path, noisy, noise=EXACT)
     names = list(result.parameters)
@@ -285,22 +286,20 @@ def test_an_unmeasured_group_gets_the_spread_of_the_others(tmp_path, noisy):
     assert unseen.path_loss_db.to_numpy() == pytest.approx(middle / 2, abs=1e-6)
 
 
+@pytest.mark.usefixtures("all_draws")
 def test_a_well_determined_parameter_is_never_not_identifiable():
     """Against the exact posterior on a grid with known noise; overwhelming noise is the control."""
-    often = np.tile(np.arange(planted.LINKS), 4)
-    links = planted.links().iloc[often].reset_index(drop=True)
-    engine = engines.Replay(take_links(planted.engine().paths, often), planted.engine().parameters)
     study = Study.from_content(planted.content("links.csv", offset={}, noise=EXACT))
-    problem = Problem.of(Setup.open(study, links=links_from_frame(links)), engine)
+    problem = Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
     lower, upper = problem.parameters.search_bounds
     axis = np.linspace(0.0, 1.0, STEPS)
     unit = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     loss = problem.modelled(lower + unit * (upper - lower))
     random = np.random.default_rng(11)
     well = 0
-    for noise_db in (0.3, 0.3, 60.0):
+    for noise_db in (0.1, 30.0):
         truth = lower + random.uniform(0.1, 0.9, 3) * (upper - lower)
-        measured = problem.modelled(truth[None])[0] + noise_db * random.standard_normal(len(often))
+        measured = problem.modelled(truth[None])[0] + noise_db * random.standard_normal(planted.LINKS)
         gap = measured - loss
         gap -= gap.mean(axis=1, keepdims=True)  # The offset has no prior.
         density = np.exp(-0.5 * np.sum(gap**2, axis=1) / noise_db**2).reshape(3 * (STEPS,))
@@ -312,6 +311,6 @@ def test_a_well_determined_parameter_is_never_not_identifiable():
             if held <= 0.1 * STEPS:
                 well += 1
                 assert interval.verdict != "not identifiable"
-            elif noise_db == 60.0:
+            elif noise_db == 30.0:
                 assert interval.verdict == "not identifiable"
-    assert well >= 4
+    assert well >= 2

@@ -148,7 +148,7 @@ def test_means_agree_with_the_closed_form(known, planted):
     parameters, measured = _parameters("log"), _planted(planted)
     spreads, weights = [known], [1.0]
     if known is None:
-        grid = np.linspace(*SPREAD_BOUNDS, 400)
+        grid = np.linspace(*SPREAD_BOUNDS, 80)
         density = np.exp(-grid / MEAN_SPREAD)
         spreads, weights = [0.0, *grid], [ALIKE, *((1 - ALIKE) * density / density.sum())]
     at, share, by_spread = _closed_form(measured, spreads, weights)
