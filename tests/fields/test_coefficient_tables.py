@@ -99,7 +99,7 @@ def test_a_row_has_as_many_intervals_as_it_needs(case: str) -> None:
 def paths() -> Paths:
     """Every kind of interaction that looks coefficients up."""
     sequences = [(Kind.SPECULAR, Kind.REFRACTION), (Kind.DIFFUSE,), (Kind.DIFFRACTION,)]
-    return synthetic.program(sequences * 40, seed=5, materials=synthetic.LAMBERTIAN)
+    return synthetic.program(sequences * 10, seed=5, materials=synthetic.LAMBERTIAN)
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,15 @@
-"""A scene that several files trace."""
+"""What the tests of this room share: they compile fast, and several trace one scene."""
 
 from pathlib import Path
 
 import pytest
 
 from small_scenes import block, write_scene
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_candidates(compiled_fast: None) -> None:
+    """Each trace is evaluated a few times."""
 
 
 @pytest.fixture(scope="session")

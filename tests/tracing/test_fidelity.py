@@ -24,8 +24,6 @@ from calibray.tracing.settings import PATTERNS, POLARIZATIONS, Antenna, TraceSet
 from calibray.tracing.sionna import Tracer
 from fidelity_cases import PATH_BOUND, SCENES, Campaign, changed, compare, difference, run
 
-pytestmark = pytest.mark.usefixtures("compiled_fast")
-
 
 @cache
 def campaign_of(name: str) -> Campaign:

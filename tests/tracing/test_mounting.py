@@ -35,12 +35,12 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 
 @pytest.mark.parametrize("sector", [SECTOR, PANEL])
-def test_ten_random_poses_give_the_path_gains_of_sionna_rt(scene: Scene, sector: Antenna) -> None:
+def test_random_poses_give_the_path_gains_of_sionna_rt(scene: Scene, sector: Antenna) -> None:
     random = np.random.default_rng(3)
     links = LinkPositions(tx=np.array([[-30.0, -20.0, 10.0]]), rx=np.array([[30.0, 15.0, 1.5]]))
     paths = Tracer(scene, FREQUENCY, SETTINGS, Antenna(), Antenna()).trace(links)
     assert paths.num_paths > 3
-    for _ in range(10):
+    for _ in range(3):
         yaw, tilt = random.uniform(-np.pi, np.pi, 2), random.uniform(-0.4, 0.4, 2)
         mounted = mount(
             paths,

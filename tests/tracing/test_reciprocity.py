@@ -29,7 +29,7 @@ BASE, PHONE = (
     Antenna("tr38901", "cross", (0.3, 0.1, 0.2)),
     Antenna("dipole", "VH", (0.2, 0.5, -0.4)),
 )
-SETTINGS = TraceSettings(max_depth=2, samples=50_000, refraction=True)
+SETTINGS = TraceSettings(max_depth=2, samples=20_000, refraction=True)
 
 
 @pytest.fixture(scope="module")
@@ -91,9 +91,7 @@ def test_reflected_and_refracted_paths_equal_those_found_from_the_transmitters(y
 
 def test_diffracted_paths_equal_those_found_from_the_transmitters(yard, monkeypatch):
     """The faces of an edge are exchanged if the other one is illuminated."""
-    edges = yard.with_settings(
-        replace(SETTINGS, refraction=False, diffraction=True, samples=50_000, max_depth=2)
-    )
+    edges = yard.with_settings(replace(SETTINGS, refraction=False, diffraction=True, samples=50_000))
     back, forth = both_ways(edges, monkeypatch)
     assert_equal(back, forth)
     assert (back.paths().kind == Kind.DIFFRACTION).sum() > 60
@@ -107,7 +105,7 @@ def test_many_transmitters_take_as_many_launches_as_many_receivers(yard):
     assert len(order[0]) == there.num_paths == back.num_paths
     one, other = path_gains(there)[order[0]], path_gains(back)[order[1]].transpose(0, 2, 1)
     assert np.abs(one - other).max() < 1e-4 * np.abs(other).max()
-    flat = SimpleNamespace(tx=np.c_[np.arange(688), np.zeros(688), np.ones(688)], rx=np.zeros((688, 3)))
+    flat = SimpleNamespace(tx=np.c_[np.arange(1720), np.zeros(1720), np.ones(1720)], rx=np.zeros((1720, 3)))
     launches = [
         len(yard.plan(SimpleNamespace(tx=tx, rx=rx)).launches)
         for tx, rx in ((flat.tx, flat.rx), (flat.rx, flat.tx))

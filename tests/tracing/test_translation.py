@@ -83,7 +83,7 @@ def write_moved(scene: Path, offset: tuple[float, ...], folder: Path, how: str) 
 
 def trace(case: SimpleNamespace, scene: Path, offset: tuple[float, ...]) -> cb.Paths:
     links = SimpleNamespace(tx=np.tile(case.tx, (len(case.rx), 1)) + offset, rx=np.array(case.rx) + offset)
-    return cb.trace(scene, links, frequency=FREQUENCY, samples=50_000, **case.settings)
+    return cb.trace(scene, links, frequency=FREQUENCY, samples=20_000, **case.settings)
 
 
 @pytest.fixture(scope="module", params=SCENES)

@@ -26,7 +26,9 @@ def refuse(*_: object) -> None:
 
 @pytest.mark.parametrize("engine", ["replay", "retrace"])
 def test_a_study_is_calibrated_with_another_tracer(study: Study, engine: str) -> None:
-    result = cb.calibrate(study.replace(engine=engine), tracer=TwoRay)
+    options = {"starts": 8} if engine == "replay" else {"budget": 6}
+    content = study.replace(engine=engine).content() | {"method": {"name": "auto", "options": options}}
+    result = cb.calibrate(Study.from_content(content, study.path), tracer=TwoRay)
     assert result.parameters["ground.relative_permittivity"] == pytest.approx(
         TRUTH, rel=1e-6 if engine == "replay" else 1e-2
     )
