@@ -2,9 +2,11 @@
 
 # ruff: noqa: E402  (what NumPy reads has to be set before it is imported)
 
+import ctypes
 import os
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 # Matrices of the tests are small, and BLAS threads that wait for each other cost more than they gain. NumPy and SciPy
 # read these when they are imported; subprocesses inherit them.
@@ -44,10 +46,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 LONGEST = (
-    "test_browser", "test_scenarios", "test_notebooks", "test_walk", "test_dask", "test_report_browser",
-    "test_fidelity", "test_calibrate", "test_assessment", "test_tracing", "test_demo", "test_ledger", "test_octave",
-    "test_unreached_links", "test_carriers", "test_program_with_rays", "test_antennas_per_link", "test_observables",
-    "test_pose", "test_suggest", "test_coefficient_tables", "test_derivatives",
+    "test_browser", "test_report_browser", "test_scenarios", "test_fidelity", "test_notebooks", "test_walk",
+    "test_dask", "test_tracing", "test_calibrate", "test_assessment", "test_coefficient_tables", "test_carriers",
+    "test_export", "test_adaptive_sampling", "test_tracer_protocol", "test_demo", "test_comparison", "test_ledger",
+    "test_observables", "test_suggest", "test_derivatives", "test_octave", "test_unreached_links",
+    "test_program_with_rays",
 )  # fmt: skip
 """Files that take longest. They run first, so that no worker is left with one of them at the end."""
 
@@ -78,6 +81,27 @@ def compiled_fast() -> Iterator[None]:
         jax.config.update("jax_disable_most_optimizations", True)
         yield
         jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _narrow_kernels() -> None:
+    """Dr.Jit builds kernels for 4 lanes of any processor with AVX2 if test files import the ray tracer.
+
+    Building takes most of the time of a small trace: with LLVM 19 on a Zen 3 and no kernels on disk, the five tests of
+    `tracing/test_reciprocity.py` take 19 s instead of 37 s. A kernel on disk is for one number of lanes.
+    """
+    if "calibray.tracing.sionna" not in sys.modules:
+        return
+    import drjit
+
+    core = ctypes.CDLL(str(next(Path(drjit.__file__).parent.glob("libdrjit-core.*"))))
+    features = getattr(core, "_Z24jit_llvm_target_featuresv", None)
+    set_target = getattr(core, "_Z19jit_llvm_set_targetPKcS0_j", None)
+    if features is not None and set_target is not None:
+        features.restype = ctypes.c_char_p
+        set_target.argtypes = [ctypes.c_char_p, ctypes.c_char_p, ctypes.c_uint32]
+        if {b"+avx2", b"+fma", b"+bmi2"} <= set((features() or b"").split(b",")):
+            set_target(b"skylake", None, 4)
 
 
 @pytest.fixture(scope="session", autouse=True)
