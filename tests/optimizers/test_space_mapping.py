@@ -7,14 +7,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 from calibray.optimizers import SpaceMapping, VectorSurrogate
 from calibray.optimizers.arguments import Box
 from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, Constants
 from calibray.optimizers.multifidelity.correction import (
     CAPPED,
-    FOLLOWED,
     UNLIKELY,
+    Corrected,
     ErrorRecord,
     UnitModel,
     average,
@@ -22,6 +23,7 @@ from calibray.optimizers.multifidelity.correction import (
     correct,
     misfit,
 )
+from calibray.optimizers.multifidelity.discrepancy import FREEDOM, VARIANCE_SPREAD, scaled_density
 from calibray.optimizers.multifidelity.space_mapping import HELPFUL, error_ratio
 from calibray.optimizers.sampling import design
 
@@ -124,8 +126,9 @@ def test_eight_calls_find_the_minimum_even_with_wrong_constants(thickness):
 def corrected_by(count: int):
     """The cheap model with thickness 1.8 instead of 1.1, corrected by some answers; and starts of its members."""
     unit = design("sobol", count, 2, np.random.default_rng(0))
-    starts = np.log(1.8) + 0.5 * np.random.default_rng(1).standard_normal((16, 1))
-    return correct(UnitModel(cheap(1.8), BOX), (unit, engine(BOX.from_unit(unit))), CLOUD, starts), starts
+    random = np.random.default_rng(1)
+    starts = np.log(1.8) + 0.5 * random.standard_normal((16, 1))
+    return correct(UnitModel(cheap(1.8), BOX), (unit, engine(BOX.from_unit(unit))), CLOUD, random), starts
 
 
 def test_the_constants_are_those_that_explain_the_answers():
@@ -159,17 +162,35 @@ def thick_answers(count: int) -> tuple[np.ndarray, np.ndarray]:
     return unit, thick_walls(BOX.from_unit(unit), np.tile(THICK, (count, 1)))
 
 
-def test_input_mappings_start_from_the_likeliest_of_many_trials():
-    """One of hundreds of minima explains the answers, and the first trials are in others."""
-    model, answers = thick_cheap(), thick_answers(3)
+def test_an_input_mapping_finds_one_of_hundreds_of_minima(monkeypatch):
+    model, answers = thick_cheap(), thick_answers(6)
     centre = model.constants.centre
-    trials = centre + 0.5 * np.random.default_rng(1).standard_normal((600, 2))
-    few = correct(UnitModel(model, BOX), answers, CLOUD, trials[:FOLLOWED])
-    assert np.abs(np.exp(few.constants) - THICK).max() > 0.1
-    many = correct(UnitModel(model, BOX), answers, CLOUD, trials)
-    assert np.exp(many.constants) == pytest.approx(THICK, rel=1e-3)
-    believed, fitted = misfit(many, np.stack([centre, many.constants]))
+
+    def mapped() -> Corrected:
+        return correct(UnitModel(model, BOX), answers, CLOUD, np.random.default_rng(1))
+
+    corrected = mapped()
+    assert np.exp(corrected.constants) == pytest.approx(THICK, rel=1e-3)
+    believed, fitted = misfit(corrected, np.stack([centre, corrected.constants])).value
     assert fitted < believed - 50.0
+    monkeypatch.setattr("calibray.optimizers.multifidelity.correction.TRIALS", 4)
+    assert np.abs(np.exp(mapped().constants) - THICK).max() > 0.1
+
+
+def test_the_scale_of_a_discrepancy_is_the_most_probable_one():
+    """Errors of a hundredth of the expected size are probable, because the expected size may be wrong too."""
+    errors = np.random.default_rng(4).standard_normal((3, 6, 9)) * np.array([0.01, 1.0, 5.0])[:, None, None]
+
+    def density(logarithm: float, rows: np.ndarray) -> float:
+        square = np.sum(rows**2, axis=0) / np.exp(logarithm)
+        links = 0.5 * (FREEDOM + 6) * np.log1p(square / FREEDOM).sum() + 0.5 * rows.size * logarithm
+        return float(links + 0.5 * (logarithm / VARIANCE_SPREAD) ** 2)
+
+    value, scale = scaled_density(errors)
+    for rows, found, factor in zip(errors, value, scale, strict=True):
+        best = minimize_scalar(density, bounds=(-14.0, 6.0), args=(rows,), method="bounded")
+        assert found == pytest.approx(best.fun, rel=1e-2)
+        assert found == pytest.approx(density(np.log(factor), rows))
 
 
 def test_a_search_with_earlier_evaluations_fits_the_constants_from_the_likeliest_draws():
@@ -186,7 +207,7 @@ def test_a_search_with_earlier_evaluations_fits_the_constants_from_the_likeliest
 def test_slopes_of_a_corrected_model_equal_finite_differences():
     unit = design("sobol", 6, 2, np.random.default_rng(3))
     corrected = correct(
-        UnitModel(cheap(1.4), BOX), (unit, engine(BOX.from_unit(unit))), unit, np.zeros((0, 1))
+        UnitModel(cheap(1.4), BOX), (unit, engine(BOX.from_unit(unit))), unit, np.random.default_rng(0)
     )
     point = np.array([[0.4, 0.7]])
     _, slope = corrected.mean_and_slope(point)
@@ -247,17 +268,17 @@ def test_errors_larger_than_predicted_stretch_later_predictions():
 def test_a_cheap_model_is_judged_by_the_median_link():
     unit = design("sobol", 4, 2, np.random.default_rng(0))
     residuals = engine(BOX.from_unit(unit))
-    assert (
-        error_ratio(correct(UnitModel(cheap(1.1), BOX), (unit, residuals), CLOUD, np.zeros((0, 1)))) < HELPFUL
-    )
-    assert (
-        error_ratio(correct(UnitModel(useless(), BOX), (unit, residuals), CLOUD, np.zeros((1, 0)))) > HELPFUL
-    )
     wild = residuals.copy()
     wild[:, :5] = 30.0 * np.random.default_rng(7).standard_normal(
         (4, 5)
     )  # no model predicts these five links
-    assert error_ratio(correct(UnitModel(cheap(1.1), BOX), (unit, wild), CLOUD, np.zeros((0, 1)))) < HELPFUL
+
+    def ratio(model: FunctionModel, answers: np.ndarray) -> float:
+        return error_ratio(correct(UnitModel(model, BOX), (unit, answers), CLOUD, np.random.default_rng(0)))
+
+    assert ratio(cheap(1.1), residuals) < HELPFUL
+    assert ratio(useless(), residuals) > HELPFUL
+    assert ratio(cheap(1.1), wild) < HELPFUL
 
 
 def test_a_useless_cheap_model_costs_three_calls_at_most():

@@ -80,6 +80,10 @@ class Kernel:
             variances = np.log(self.variances / scale**2)
         return np.concatenate([variances, np.log(self.rates), [np.log(self.nugget / scale**2)]])
 
+    def scaled(self, factor: float) -> Kernel:
+        """The kernel with its variances and the nugget multiplied."""
+        return Kernel(factor * self.variances, self.rates, factor * self.nugget)
+
     def covariance(self, a: Inputs, b: Inputs) -> NDArray[np.float64]:
         """Covariance between points a [k] and b [n] without the nugget [k, n]."""
         smooth = matern(self.distance(a, b))

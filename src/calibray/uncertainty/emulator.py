@@ -44,10 +44,6 @@ FUNCTIONS: Final = 8
 MAX_CALLS: Final = 200
 """Largest number of calls that the process interpolates; its matrix is factored about a hundred times."""
 
-TRIALS: Final = 8
-"""Number of starting points of the input mapping, drawn from the prior of the constants, in addition to the declared
-values."""
-
 NEAR: Final = 0.005
 """Distance in the unit cube below which a call is redundant, if there are more than `MAX_CALLS`."""
 
@@ -362,11 +358,8 @@ def _corrected(
     model: ReplayedModel, box: Box, calls: Calls, random: np.random.Generator, noisy: bool
 ) -> Corrected:
     """The replay, corrected by the calls."""
-    constants = model.constants
-    trials = constants.draw(random.standard_normal((TRIALS, len(constants.centre))))
-    trials = np.vstack([constants.centre, trials])
     cloud = design("sobol", CLOUD, box.dimension, random)
-    return correct(UnitModel(model, box), (calls.unit, calls.rows), cloud, trials, noisy=noisy)
+    return correct(UnitModel(model, box), (calls.unit, calls.rows), cloud, random, noisy=noisy)
 
 
 def _replayed(model: ReplayedModel, rows: ResponseRows) -> ReplayedModel | None:

@@ -2,10 +2,15 @@
 
 *Input mapping*: the constants of the cheap model are set to the values that explain the engine's answers best. Errors
 are weighted by the covariance of the discrepancy, which is mostly a common offset. An offset of a link therefore does
-not distort a constant. The constants have a prior around their assumed values. Slabs resonate, so there are many
-minima: the search starts from the likeliest of many draws from that prior. This is implicit space mapping (J. W.
+not distort a constant. The constants have a prior around their assumed values. This is implicit space mapping (J. W.
 Bandler, Q. S. Cheng, N. K. Nikolova, M. A. Ismail, IEEE Trans. Microw. Theory Tech. 52 (2004) 378). *Output mapping*:
-offset, slope and rest by `discrepancy.py`. Both are fitted in turns.
+offset, slope and rest by `discrepancy.py`.
+
+Slabs resonate, so there are many minima. A kernel that was fitted to wrong constants takes their errors for the
+discrepancy, and then prefers these constants. An input mapping therefore proceeds in rounds. A round tries many
+constants, most of which differ from the present ones in one or two places. Each is judged with the scale of the
+discrepancy that suits it best. The shape of the kernel is the fitted one and the prior's in turns. The round descends
+from the likeliest trials and fits the kernel to the best ends. It accepts an end that makes the answers more probable.
 
 A few answers do not determine the constants of a cheap model. Several sets of them explain the answers equally well and
 predict minima at different points, and the lowest of these predictions is the most optimistic one. A corrected model is
@@ -31,14 +36,26 @@ from calibray.optimizers.multifidelity import discrepancy
 from calibray.optimizers.multifidelity.cheap_model import CheapModel, Constants
 from calibray.optimizers.regression import Inputs, Kernel, Process
 
-TURNS: Final = 2
-"""Number of rounds of output and input mapping."""
+ROUNDS: Final = 8
+"""Largest number of rounds of an input mapping."""
+
+GAINED: Final = 1.0
+"""Decrease of the negative log density below which a round has gained nothing."""
+
+IDLE: Final = 2
+"""Number of successive rounds without a gain, one with each kernel, after which an input mapping ends."""
+
+TRIALS: Final = 300
+"""Number of constants tried in a round."""
+
+FOLLOWED: Final = 4
+"""Number of trials, those that explain the answers best, from which a round descends."""
+
+REFITTED: Final = 2
+"""Number of ends of a round to which the kernel is fitted."""
 
 STEPS: Final = 12
 """Number of steps of an input mapping from one starting point."""
-
-FOLLOWED: Final = 8
-"""Number of draws from the prior, those that explain the answers best, from which an input mapping starts."""
 
 CONVERGED: Final = 1e-4
 """Relative decrease of the cost, or step in the unit cube, at which an input mapping has converged."""
@@ -160,11 +177,11 @@ class Corrected:
         process = discrepancy.solve(inputs, answers - cheap, self.discrepancy.kernel)
         return replace(self, residuals=answers, discrepancy=process)
 
-    def with_constants(self, constants: NDArray[np.float64]) -> Corrected:
-        """Other constants [q], with a discrepancy through the same answers and with the same kernel."""
+    def with_constants(self, constants: NDArray[np.float64], kernel: Kernel | None = None) -> Corrected:
+        """Other constants [q], with a discrepancy through the same answers; the kernel stays if None."""
         moved = replace(self, constants=constants)
         cheap, inputs = moved.base(self.unit)
-        process = discrepancy.solve(inputs, self.residuals - cheap, self.discrepancy.kernel)
+        process = discrepancy.solve(inputs, self.residuals - cheap, kernel or self.discrepancy.kernel)
         return replace(moved, discrepancy=process)
 
 
@@ -172,7 +189,7 @@ def correct(
     cheap: UnitModel,
     answers: tuple[NDArray[np.float64], NDArray[np.float64]],
     cloud: NDArray[np.float64],
-    trials: NDArray[np.float64],
+    random: np.random.Generator,
     *,
     noisy: bool = False,
     before: Corrected | None = None,
@@ -180,8 +197,7 @@ def correct(
     """Fit a corrected model to points of the unit cube [n, d] and an engine's answers there [n, m].
 
     The response of the cheap model is measured at the points of `cloud` [k, d]. The input mapping starts from the
-    likeliest of the `trials` [s, q] and from the constants of `before`, the model of fewer points. `noisy` states
-    whether the answers scatter.
+    constants of `before`, the model of fewer points. `noisy` states whether the answers scatter.
     """
     unit, residuals = answers
 
@@ -198,15 +214,26 @@ def correct(
     def guess(corrected: Corrected) -> tuple[Kernel, float]:
         return corrected.discrepancy.kernel, corrected.response.scale
 
-    constants = cheap.constants.centre if before is None else before.constants
-    corrected = with_discrepancy(constants, None if before is None else guess(before))
-    for _ in range(TURNS if len(constants) else 0):
-        constants = _adjusted(corrected, trials)
-        moved = np.abs(constants - corrected.constants).max() > 1e-3 * cheap.constants.spread.max()
-        corrected, trials = with_discrepancy(constants, guess(corrected)), trials[:0]
-        if not moved:
+    if before is None:
+        best = with_discrepancy(cheap.constants.centre, None)
+    else:
+        best = with_discrepancy(before.constants, guess(before))
+    idle = 0
+    for turn in range(ROUNDS if len(best.constants) else 0):
+        process = best.discrepancy
+        kernel = process.kernel if turn % 2 == 0 else discrepancy.expected(unit.shape[1], best.response.scale)
+        ends = _likelier(best.with_constants(best.constants, kernel), random)
+        fitted = [with_discrepancy(constants, guess(best)) for constants in ends]
+        before_it, best = best, min([best, *fitted], key=_own_misfit)
+        idle = idle + 1 if _own_misfit(before_it) - _own_misfit(best) < GAINED else 0
+        if idle == IDLE:
             break
-    return corrected
+    return best
+
+
+def _own_misfit(corrected: Corrected) -> float:
+    """The misfit of a model's constants, with its own kernel."""
+    return float(misfit(corrected, corrected.constants[None]).value[0])
 
 
 def constants_fit(
@@ -243,8 +270,20 @@ def constants_fit(
     return evaluate
 
 
-def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Negative log density [s] of constants [s, q] up to a constant, with a fixed kernel of the discrepancy.
+class Misfit(NamedTuple):
+    """How badly constants explain the answers.
+
+    Attributes:
+        value: Negative log density of the answers and the constants, up to a constant [s].
+        scale: Factor on the variances of the discrepancy that makes the answers most probable [s].
+    """
+
+    value: NDArray[np.float64]
+    scale: NDArray[np.float64]
+
+
+def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> Misfit:
+    """The misfit of constants [s, q], with the shape of the discrepancy's kernel.
 
     The variances of the links are integrated out. A link that the present constants do not explain therefore has full
     weight for other constants.
@@ -253,20 +292,35 @@ def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> NDArray[np.f
     points, (count, links) = corrected.cheap.box.from_unit(corrected.unit), corrected.residuals.shape
     cheap = model.residuals(np.tile(points, (len(constants), 1)), np.repeat(constants, count, axis=0))
     errors = corrected.residuals - cheap.reshape(-1, count, links)
-    rows = np.linalg.inv(corrected.discrepancy.lower) @ errors
+    lower = corrected.discrepancy.lower
+    value, scale = discrepancy.scaled_density(np.linalg.inv(lower) @ errors)
     away = (constants - prior.centre) / prior.spread
-    return discrepancy.negative_log_density(rows) + 0.5 * np.sum(away**2, axis=1)
+    return Misfit(value + links * np.log(np.diag(lower)).sum() + 0.5 * np.sum(away**2, axis=1), scale)
 
 
-def _adjusted(corrected: Corrected, trials: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The constants [q] that explain the answers best, with a fixed kernel of the discrepancy."""
-    prior, present = corrected.cheap.constants, corrected.constants[None]
-    if len(trials):
-        trials = trials[np.argsort(misfit(corrected, trials), kind="stable")[:FOLLOWED]]
-    starts = (np.vstack([present, trials]) - prior.lower) / prior.width
-    ends = descend_all(starts, constants_fit(corrected), STEPS, CONVERGED)
-    candidates = np.vstack([present, prior.lower + ends.unit * prior.width])
-    return candidates[np.argmin(misfit(corrected, candidates))]
+def _likelier(corrected: Corrected, random: np.random.Generator) -> NDArray[np.float64]:
+    """The constants that explain the answers best at the ends of one round, with the kernel of `corrected` [k, q]."""
+    prior, present = corrected.cheap.constants, corrected.constants
+    trials = np.vstack([present, _trials(corrected, random)])
+    tried = misfit(corrected, trials)
+    likeliest = [0, *(1 + np.argsort(tried.value[1:], kind="stable")[:FOLLOWED])]
+    ends = []
+    for trial, scale in zip(trials[likeliest], tried.scale[likeliest], strict=True):
+        fit = constants_fit(
+            corrected.with_constants(trial, corrected.discrepancy.kernel.scaled(float(scale)))
+        )
+        ends.append(descend_all((trial[None] - prior.lower) / prior.width, fit, STEPS, CONVERGED).unit[0])
+    constants = prior.lower + np.array(ends) * prior.width
+    return constants[np.argsort(misfit(corrected, constants).value, kind="stable")[:REFITTED]]
+
+
+def _trials(corrected: Corrected, random: np.random.Generator) -> NDArray[np.float64]:
+    """Constants drawn from their prior [s, q]: one, two or all of them; the others are the present ones."""
+    size = len(corrected.constants)
+    drawn = corrected.cheap.constants.draw(random.standard_normal((TRIALS, size)))
+    one, another = np.eye(size, dtype=bool)[random.integers(0, size, (2, TRIALS))]
+    number = np.arange(TRIALS)[:, None] % 3
+    return np.where(one | (another & (number > 0)) | (number > 1), drawn, corrected.constants)
 
 
 UNLIKELY: Final = 30.0

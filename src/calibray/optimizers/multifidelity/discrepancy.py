@@ -73,9 +73,19 @@ def fit(
     The prior is relative to `scale`, the root mean square of the cheap model's response. `noisy` learns the nugget too.
     `guess` is an additional starting point for the kernel, besides the prior's.
     """
-    d, low = inputs.unit.shape[1], float(np.log(NUGGET))
-    three, rates = np.ones(3), np.ones(d)
-    prior = Prior(
+    likelihood = Likelihood(inputs, values, freedom=FREEDOM)
+    prior = _prior(inputs.unit.shape[1], noisy)
+    return solve(inputs, values, most_probable(likelihood, prior, scale=scale, guess=guess))
+
+
+def expected(dimension: int, scale: float) -> Kernel:
+    """The kernel at the mean of the prior, for a response with the root mean square `scale`."""
+    return Kernel.of(_prior(dimension, noisy=False).mean, scale)
+
+
+def _prior(dimension: int, noisy: bool) -> Prior:
+    three, rates, low = np.ones(3), np.ones(dimension), float(np.log(NUGGET))
+    return Prior(
         mean=np.concatenate([np.log(VARIANCES), -np.log(LENGTH) * rates, [NOISE[0] if noisy else low]]),
         spread=np.concatenate([VARIANCE_SPREAD * three, LENGTH_SPREAD * rates, [NOISE[1]]]),
         lower=np.concatenate([LOG_VARIANCE_BOUNDS[0] * three, LOG_RATE_BOUNDS[0] * rates, [low]]),
@@ -83,8 +93,6 @@ def fit(
             [LOG_VARIANCE_BOUNDS[1] * three, LOG_RATE_BOUNDS[1] * rates, [0.0 if noisy else low]]
         ),
     )
-    likelihood = Likelihood(inputs, values, freedom=FREEDOM)
-    return solve(inputs, values, most_probable(likelihood, prior, scale=scale, guess=guess))
 
 
 def solve(inputs: Inputs, values: NDArray[np.float64], kernel: Kernel) -> Process:
@@ -92,13 +100,25 @@ def solve(inputs: Inputs, values: NDArray[np.float64], kernel: Kernel) -> Proces
     return condition(inputs, values, kernel, freedom=FREEDOM)
 
 
-def negative_log_density(whitened: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Negative log density [...] of discrepancies [..., n, m], a multivariate t, up to a constant.
+SCALINGS: Final = 30
+"""Steps of the fixed-point iteration for the scale of the variances."""
 
-    They are whitened by the inverse of the Cholesky factor of K.
+
+def scaled_density(whitened: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Negative log density [s] of discrepancies [s, n, m] with the most probable scale, and that scale [s].
+
+    They are whitened by the inverse of the Cholesky factor of K. Each residual follows a multivariate t distribution,
+    whose covariance K is multiplied by the scale. The scale has the prior of a variance. Without it, constants that
+    explain the answers much better than the kernel expects would hardly be more probable.
     """
-    count, square = whitened.shape[-2], np.sum(whitened**2, axis=-2)
-    return 0.5 * (FREEDOM + count) * np.log1p(square / FREEDOM).sum(axis=-1)
+    count, links = whitened.shape[-2:]
+    square, scale = np.sum(whitened**2, axis=-2), np.ones(len(whitened))
+    for _ in range(SCALINGS):
+        weight = (FREEDOM + count) / (FREEDOM + square / scale[:, None])
+        scale = np.maximum(np.mean(weight * square, axis=1) / count, NUGGET)
+    density = 0.5 * (FREEDOM + count) * np.log1p(square / scale[:, None] / FREEDOM).sum(axis=1)
+    prior = 0.5 * (np.log(scale) / VARIANCE_SPREAD) ** 2
+    return density + 0.5 * count * links * np.log(scale) + prior, scale
 
 
 COSINES: Final = 256

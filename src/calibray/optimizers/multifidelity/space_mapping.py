@@ -70,14 +70,6 @@ SEARCH_STEPS: Final = 30
 CONVERGED: Final = 1e-6
 """Relative decrease of the cost, or step in the unit cube, at which a local search has converged."""
 
-TRIALS: Final = 200
-"""Number of constants drawn from their prior for each of the first input mappings, which start from the likeliest
-ones."""
-
-TRIED: Final = 10
-"""Number of calls of a search after which an input mapping starts only from the previous one. Earlier evaluations that
-the search starts with do not count: no input mapping followed them."""
-
 CANDIDATES: Final = 300
 """Number of candidates drawn over the box, and of candidates around the best points."""
 
@@ -180,7 +172,7 @@ class SpaceMapping(Optimizer):
             else:
                 unit, residuals = merge_repeated(self.box.to_unit(answers.x), answers.errors)
                 self._corrected = correct(
-                    UnitModel(model, self.box), (unit, residuals), cloud, self._trials(model, turn),
+                    UnitModel(model, self.box), (unit, residuals), cloud, self._rng,
                     noisy=self.noisy, before=self._corrected,
                 )  # fmt: skip
                 if len(unit) >= JUDGED:
@@ -210,12 +202,6 @@ class SpaceMapping(Optimizer):
         while not surrogate.done:
             answers = yield surrogate.ask()
             surrogate.tell(answers.x, answers.y, residuals=answers.residuals)
-
-    def _trials(self, model: CheapModel, turn: int) -> NDArray[np.float64]:
-        """Constants to try for the input mapping after `turn` calls [s, q]."""
-        prior = model.constants
-        draws = self._rng.standard_normal((TRIALS if turn <= TRIED else 0, len(prior.centre)))
-        return np.vstack([prior.centre, prior.draw(draws)])
 
     def _first(self, model: CheapModel, count: int, turn: int) -> NDArray[np.float64]:
         """The lowest minima of the cheap model with its assumed constants, after the first `turn` ones [count, d]."""
