@@ -199,36 +199,46 @@ def correct(
     The response of the cheap model is measured at the points of `cloud` [k, d]. The input mapping starts from the
     constants of `before`, the model of fewer points. `noisy` states whether the answers scatter.
     """
-    unit, residuals = answers
 
-    def with_discrepancy(constants: NDArray[np.float64], guess: tuple[Kernel, float] | None) -> Corrected:
-        response = Response.of(cheap.residuals(cloud, constants), cheap.model.known)
-        base = cheap.residuals(unit, constants)
-        # The kernel's variances are relative to the response, which depends on the constants.
-        kernel = None if guess is None else Kernel.of(guess[0].logarithms(guess[1]), response.scale)
-        process = discrepancy.fit(
-            response.inputs(unit, base), residuals - base, response.scale, noisy=noisy, guess=kernel
-        )
-        return Corrected(cheap, constants, response, residuals, process)
+    def corrected(constants: NDArray[np.float64], guess: Corrected | None) -> Corrected:
+        return with_discrepancy(cheap, constants, answers, cloud, noisy=noisy, guess=guess)
 
-    def guess(corrected: Corrected) -> tuple[Kernel, float]:
-        return corrected.discrepancy.kernel, corrected.response.scale
-
-    if before is None:
-        best = with_discrepancy(cheap.constants.centre, None)
-    else:
-        best = with_discrepancy(before.constants, guess(before))
+    best = corrected(cheap.constants.centre if before is None else before.constants, before)
     idle = 0
     for turn in range(ROUNDS if len(best.constants) else 0):
-        process = best.discrepancy
-        kernel = process.kernel if turn % 2 == 0 else discrepancy.expected(unit.shape[1], best.response.scale)
-        ends = _likelier(best.with_constants(best.constants, kernel), random)
-        fitted = [with_discrepancy(constants, guess(best)) for constants in ends]
-        before_it, best = best, min([best, *fitted], key=_own_misfit)
-        idle = idle + 1 if _own_misfit(before_it) - _own_misfit(best) < GAINED else 0
+        shaped = best
+        if turn % 2:
+            kernel = discrepancy.expected(len(answers[0][0]), best.response.scale, noisy)
+            shaped = best.with_constants(best.constants, kernel)
+        fitted = [corrected(constants, best) for constants in _likelier(shaped, random)]
+        present, best = best, min([best, *fitted], key=_own_misfit)
+        idle = idle + 1 if _own_misfit(present) - _own_misfit(best) < GAINED else 0
         if idle == IDLE:
             break
     return best
+
+
+def with_discrepancy(
+    cheap: UnitModel,
+    constants: NDArray[np.float64],
+    answers: tuple[NDArray[np.float64], NDArray[np.float64]],
+    cloud: NDArray[np.float64],
+    *,
+    noisy: bool = False,
+    guess: Corrected | None = None,
+) -> Corrected:
+    """Fit the discrepancy alone, with known constants [q]; see `correct`. The kernel is also fitted from `guess`."""
+    unit, residuals = answers
+    response = Response.of(cheap.residuals(cloud, constants), cheap.model.known)
+    base = cheap.residuals(unit, constants)
+    kernel = None
+    if (
+        guess is not None
+    ):  # the kernel's variances are relative to the response, which depends on the constants
+        kernel = Kernel.of(guess.discrepancy.kernel.logarithms(guess.response.scale), response.scale)
+    inputs = response.inputs(unit, base)
+    process = discrepancy.fit(inputs, residuals - base, response.scale, noisy=noisy, guess=kernel)
+    return Corrected(cheap, constants, response, residuals, process)
 
 
 def _own_misfit(corrected: Corrected) -> float:

@@ -78,9 +78,9 @@ def fit(
     return solve(inputs, values, most_probable(likelihood, prior, scale=scale, guess=guess))
 
 
-def expected(dimension: int, scale: float) -> Kernel:
+def expected(dimension: int, scale: float, noisy: bool) -> Kernel:
     """The kernel at the mean of the prior, for a response with the root mean square `scale`."""
-    return Kernel.of(_prior(dimension, noisy=False).mean, scale)
+    return Kernel.of(_prior(dimension, noisy).mean, scale)
 
 
 def _prior(dimension: int, noisy: bool) -> Prior:

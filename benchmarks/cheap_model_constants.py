@@ -1,0 +1,90 @@
+"""Constants of a cheap model that an input mapping finds (docs/measurements/expensive-engines.md).
+
+    python benchmarks/cheap_model_constants.py --seeds 1000:1020
+
+An engine answers at points spread over the box and at four points near the optimum. The cheap model has wrong constants
+and lacks some of the engine's features. It is corrected with the believed constants, with those that the input mapping
+finds, and with the true ones. The columns are the negative log density of answers and constants, lower if they are more
+probable, and the root mean square error of predictions near the optimum.
+"""
+
+# ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)
+from __future__ import annotations
+
+import argparse
+import os
+
+for library in ("OMP", "OPENBLAS", "MKL"):
+    os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.optimizers.arguments import Box
+from calibray.optimizers.multifidelity.correction import UnitModel, correct, misfit, with_discrepancy
+from calibray.optimizers.sampling import design
+from cheap_model_errors import optimum
+from problem_families.family import PlantedProblem, problem
+from problem_families.family_comparison import seed_range
+from problem_families.problems import cheap_model
+
+POINTS = (10, 20)
+NEAR, JUDGED, APART = 4, 40, 0.2
+"""Points near the optimum that are fitted, those that are predicted, and their largest distance in the unit cube."""
+
+COLUMNS = (
+    "problem", "parameters", "constants", "answers", "density: believed", "found", "true", "error [dB]: believed",
+    "found", "true",
+)  # fmt: skip
+
+
+def true_constants(planted: PlantedProblem, model: UnitModel) -> NDArray[np.float64]:
+    """The engine's values of the cheap model's constants [q]."""
+    parameters, count = cheap_model(planted).engine.parameters, len(planted.parameters)
+    materials = planted.engine.paths.materials
+    values = [getattr(materials[item.material], item.constant) for item in parameters][count:]
+    searched = parameters.to_search(np.concatenate([parameters.start[:count], values]))[count:]
+    return np.clip(searched, model.constants.lower, model.constants.upper)
+
+
+def rows(kind: str, seed: int) -> None:
+    """Judge one problem and print its rows."""
+    planted = problem(seed, kind)
+    if not planted.differences.wrong_constants:
+        return
+    model = UnitModel(cheap_model(planted), Box.between(planted.lower, planted.upper))
+    best, truth = model.box.to_unit(optimum(planted)[None])[0], true_constants(planted, model)
+    for count in POINTS:
+        random, d = np.random.default_rng(seed), len(best)
+        points = np.clip(best + APART * random.uniform(-1.0, 1.0, (NEAR + JUDGED, d)), 0.0, 1.0)
+        unit = np.vstack([design("sobol", count - NEAR, d, random), points[:NEAR]])
+        residuals = planted.evaluate(model.box.from_unit(unit)).residuals
+        judged = planted.evaluate(model.box.from_unit(points[NEAR:])).residuals
+        cloud = design("sobol", 64, d, random)
+        found = correct(model, (unit, residuals), cloud, random)
+        believed, true = (
+            with_discrepancy(model, constants, (unit, residuals), cloud)
+            for constants in (model.constants.centre, truth)
+        )
+        three = (believed, found, true)
+        density = [misfit(one, one.constants[None]).value[0] for one in three]
+        error = [np.sqrt(np.mean((one.predict(points[NEAR:])[0] - judged) ** 2)) for one in three]
+        cells = [f"{kind} {seed}", d, len(truth), count, *(f"{value:.0f}" for value in density)]
+        print(f"| {' | '.join(map(str, cells + [f'{value:.3f}' for value in error]))} |", flush=True)
+
+
+def main() -> None:
+    """Print the table, row by row."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--family", default="office")
+    parser.add_argument("--seeds", default="1000:1020")
+    chosen = parser.parse_args()
+    print(f"| {' | '.join(COLUMNS)} |\n|{' --- |' * len(COLUMNS)}", flush=True)
+    for seed in seed_range(chosen.seeds):
+        rows(chosen.family, seed)
+
+
+if __name__ == "__main__":
+    main()
