@@ -46,7 +46,10 @@ IDLE: Final = 2
 """Number of successive rounds without a gain, one with each kernel, after which an input mapping ends."""
 
 TRIALS: Final = 300
-"""Number of constants tried in a round."""
+"""Largest number of constants tried in a round."""
+
+COMPARED: Final = 3000
+"""Largest number of these constants times that of the answers with which each is compared."""
 
 FOLLOWED: Final = 4
 """Number of trials, those that explain the answers best, from which a round descends."""
@@ -326,10 +329,10 @@ def _likelier(corrected: Corrected, random: np.random.Generator) -> NDArray[np.f
 
 def _trials(corrected: Corrected, random: np.random.Generator) -> NDArray[np.float64]:
     """Constants drawn from their prior [s, q]: one, two or all of them; the others are the present ones."""
-    size = len(corrected.constants)
-    drawn = corrected.cheap.constants.draw(random.standard_normal((TRIALS, size)))
-    one, another = np.eye(size, dtype=bool)[random.integers(0, size, (2, TRIALS))]
-    number = np.arange(TRIALS)[:, None] % 3
+    size, count = len(corrected.constants), max(FOLLOWED, min(TRIALS, COMPARED // len(corrected.unit)))
+    drawn = corrected.cheap.constants.draw(random.standard_normal((count, size)))
+    one, another = np.eye(size, dtype=bool)[random.integers(0, size, (2, count))]
+    number = np.arange(count)[:, None] % 3
     return np.where(one | (another & (number > 0)) | (number > 1), drawn, corrected.constants)
 
 
