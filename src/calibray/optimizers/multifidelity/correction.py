@@ -36,7 +36,7 @@ from calibray.optimizers.multifidelity import discrepancy
 from calibray.optimizers.multifidelity.cheap_model import CheapModel, Constants
 from calibray.optimizers.regression import Inputs, Kernel, Process
 
-ROUNDS: Final = 8
+ROUNDS: Final = 4
 """Largest number of rounds of an input mapping."""
 
 GAINED: Final = 1.0
