@@ -116,10 +116,10 @@ def last_sweeps(size: int, models: int = 1) -> int:
 
     Example:
         >>> last_sweeps(256), last_sweeps(100), last_sweeps(64), last_sweeps(64, models=8)
-        (8, 21, 24, 8)
+        (8, 20, 24, 8)
     """
     largest = max(SIZE[0], SIZE[1] // models)
-    return int(np.clip(np.ceil(LAST_SWEEPS[0] * largest / size), *LAST_SWEEPS))
+    return int(np.clip(LAST_SWEEPS[0] * largest // size, *LAST_SWEEPS))
 
 
 def draw_posterior(
