@@ -166,8 +166,12 @@ def test_a_discrepancy_follows_a_multivariate_t():
     process = discrepancy.solve(inputs, values, kernel)
     samples = np.stack([process.whitened, 2.0 * process.whitened])
     student = multivariate_t(np.zeros(6), np.eye(6), df=discrepancy.FREEDOM)
-    density = np.array([student.logpdf(sample.T).sum() for sample in samples])
-    assert np.diff(discrepancy.negative_log_density(samples)) == pytest.approx(-np.diff(density))
+    value, scale = discrepancy.scaled_density(samples)
+    density = np.array(
+        [student.logpdf(sample.T / np.sqrt(s)).sum() for sample, s in zip(samples, scale, strict=True)]
+    )
+    of_scale = 0.5 * values.size * np.log(scale) + 0.5 * (np.log(scale) / discrepancy.VARIANCE_SPREAD) ** 2
+    assert np.diff(value - of_scale) == pytest.approx(-np.diff(density))
 
 
 def test_left_out_errors_of_a_discrepancy_equal_a_process_without_the_point():
