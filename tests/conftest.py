@@ -2,11 +2,9 @@
 
 # ruff: noqa: E402  (what NumPy reads has to be set before it is imported)
 
-import ctypes
 import os
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 # Matrices of the tests are small, and BLAS threads that wait for each other cost more than they gain. NumPy and SciPy
 # read these when they are imported; subprocesses inherit them.
@@ -81,27 +79,6 @@ def compiled_fast() -> Iterator[None]:
         jax.config.update("jax_disable_most_optimizations", True)
         yield
         jax.config.update("jax_disable_most_optimizations", False)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _narrow_kernels() -> None:
-    """Dr.Jit builds kernels for 4 lanes of any processor with AVX2 if test files import the ray tracer.
-
-    Building takes most of the time of a small trace: with LLVM 19 on a Zen 3 and no kernels on disk, the five tests of
-    `tracing/test_reciprocity.py` take 19 s instead of 37 s. A kernel on disk is for one number of lanes.
-    """
-    if "calibray.tracing.sionna" not in sys.modules:
-        return
-    import drjit
-
-    core = ctypes.CDLL(str(next(Path(drjit.__file__).parent.glob("libdrjit-core.*"))))
-    features = getattr(core, "_Z24jit_llvm_target_featuresv", None)
-    set_target = getattr(core, "_Z19jit_llvm_set_targetPKcS0_j", None)
-    if features is not None and set_target is not None:
-        features.restype = ctypes.c_char_p
-        set_target.argtypes = [ctypes.c_char_p, ctypes.c_char_p, ctypes.c_uint32]
-        if {b"+avx2", b"+fma", b"+bmi2"} <= set((features() or b"").split(b",")):
-            set_target(b"skylake", None, 4)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -165,7 +165,7 @@ def test_a_discrepancy_follows_a_multivariate_t():
     kernel = Kernel.of(np.array([0.3, -1.0, -0.5, 0.4, 0.9, -3.0]), 0.7)
     process = discrepancy.solve(inputs, values, kernel)
     samples = np.stack([process.whitened, 2.0 * process.whitened])
-    student = multivariate_t(np.zeros(6), np.eye(6), df=discrepancy.FREEDOM)
+    student = multivariate_t(np.zeros(6), np.eye(6), df=discrepancy.FREEDOM)  # pyright: ignore[reportArgumentType]
     value, scale = discrepancy.scaled_density(samples)
     density = np.array(
         [student.logpdf(sample.T / np.sqrt(s)).sum() for sample, s in zip(samples, scale, strict=True)]
