@@ -22,7 +22,7 @@ from calibray.optimizers.multifidelity.correction import (
     correct,
     misfit,
 )
-from calibray.optimizers.multifidelity.discrepancy import FREEDOM, VARIANCE_SPREAD, scaled_density
+from calibray.optimizers.multifidelity.discrepancy import FREEDOM, VARIANCE_SPREAD, expected, scaled_density
 from calibray.optimizers.multifidelity.space_mapping import HELPFUL, error_ratio
 from calibray.optimizers.sampling import design
 
@@ -174,6 +174,23 @@ def test_an_input_mapping_finds_one_of_hundreds_of_minima(monkeypatch):
     assert fitted < believed - 50.0
     monkeypatch.setattr("calibray.optimizers.multifidelity.correction.TRIALS", 4)
     assert np.abs(np.exp(mapped().constants) - THICK).max() > 0.1
+
+
+def test_rounds_that_gain_nothing_end_after_one_with_each_kernel(monkeypatch):
+    kernels = []
+
+    def nothing_likelier(corrected: Corrected, random: np.random.Generator) -> np.ndarray:
+        kernels.append(corrected.discrepancy.kernel)
+        return np.empty((0, 1))
+
+    monkeypatch.setattr("calibray.optimizers.multifidelity.correction._likelier", nothing_likelier)
+    corrected, _ = corrected_by(6)
+    prior = expected(2, corrected.response.scale, noisy=False)
+    assert [kernel.rates.tolist() for kernel in kernels] == [
+        corrected.discrepancy.kernel.rates.tolist(), prior.rates.tolist(),
+    ]  # fmt: skip
+    assert kernels[0].rates != pytest.approx(prior.rates)
+    assert corrected.constants == corrected.cheap.constants.centre
 
 
 def test_the_scale_of_a_discrepancy_is_the_most_probable_one():
