@@ -11,7 +11,6 @@ they are more probable, and the root mean square error of predictions near the o
 # ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)
 from __future__ import annotations
 
-import argparse
 import os
 
 for library in ("OMP", "OPENBLAS", "MKL"):
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 from calibray.optimizers.arguments import Box
 from calibray.optimizers.multifidelity.correction import UnitModel, correct, misfit, with_discrepancy
 from calibray.optimizers.sampling import design
-from cheap_model_errors import optimum
+from cheap_model_errors import optimum, print_table
 from problem_families.family import PlantedProblem, problem
 from problem_families.problems import cheap_model
 
@@ -70,18 +69,5 @@ def rows(kind: str, seed: int) -> None:
         print(f"| {' | '.join(map(str, cells + [f'{value:.3f}' for value in error]))} |", flush=True)
 
 
-def main() -> None:
-    """Print the table, row by row."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--family", default="office")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1000, 1004, 1009, 1013, 1018])
-    chosen = parser.parse_args()
-    print(f"| {' | '.join(COLUMNS)} |\n|{' --- |' * len(COLUMNS)}", flush=True)
-    for seed in chosen.seeds:
-        rows(chosen.family, seed)
-
-
 if __name__ == "__main__":
-    main()
+    print_table(str(__doc__), COLUMNS, rows, [1000, 1004, 1009, 1013, 1018])

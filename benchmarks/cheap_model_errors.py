@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Callable, Sequence
 
 for library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
@@ -70,18 +71,20 @@ def rows(kind: str, seed: int) -> None:
         search.tell(points, told.value, residuals=told.residuals)
 
 
-def main() -> None:
-    """Print the table, row by row."""
+def print_table(
+    description: str, columns: Sequence[str], print_rows: Callable[[str, int], None], seeds: list[int]
+) -> None:
+    """Print a table, row by row, for problems given on the command line; `seeds` are the default."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--family", default="office")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1001, 1003, 1006, 1014, 1018])
+    parser.add_argument("--seeds", type=int, nargs="+", default=seeds)
     chosen = parser.parse_args()
-    print(f"| {' | '.join(COLUMNS)} |\n|{' --- |' * len(COLUMNS)}", flush=True)
+    print(f"| {' | '.join(columns)} |\n|{' --- |' * len(columns)}", flush=True)
     for seed in chosen.seeds:
-        rows(chosen.family, seed)
+        print_rows(chosen.family, seed)
 
 
 if __name__ == "__main__":
-    main()
+    print_table(str(__doc__), COLUMNS, rows, [1001, 1003, 1006, 1014, 1018])

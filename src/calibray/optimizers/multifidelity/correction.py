@@ -46,10 +46,10 @@ IDLE: Final = 2
 """Number of successive rounds without a gain, one with each kernel, after which an input mapping ends."""
 
 TRIALS: Final = 300
-"""Largest number of constants tried in a round."""
+"""Largest number of sets of constants tried in a round."""
 
 COMPARED: Final = 3000
-"""Largest number of these constants times that of the answers with which each is compared."""
+"""Largest number of these sets times that of the answers with which each is compared."""
 
 FOLLOWED: Final = 4
 """Number of trials, those that explain the answers best, from which a round descends."""
@@ -235,9 +235,8 @@ def with_discrepancy(
     response = Response.of(cheap.residuals(cloud, constants), cheap.model.known)
     base = cheap.residuals(unit, constants)
     kernel = None
-    if (
-        guess is not None
-    ):  # the kernel's variances are relative to the response, which depends on the constants
+    if guess is not None:
+        # The kernel's variances are relative to the response, which depends on the constants.
         kernel = Kernel.of(guess.discrepancy.kernel.logarithms(guess.response.scale), response.scale)
     inputs = response.inputs(unit, base)
     process = discrepancy.fit(inputs, residuals - base, response.scale, noisy=noisy, guess=kernel)
