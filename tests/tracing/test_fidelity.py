@@ -6,8 +6,8 @@ replay must follow, and docs/explanation/fidelity.md with it.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -24,20 +24,102 @@ from calibray.tracing.settings import PATTERNS, POLARIZATIONS, Antenna, TraceSet
 from calibray.tracing.sionna import Tracer
 from fidelity_cases import PATH_BOUND, SCENES, Campaign, changed, compare, difference, run
 
+# Sionna's public interface, from its own scene file and its own ITU materials.
 
-@cache
-def campaign_of(name: str) -> Campaign:
-    """A case, traced once for all tests."""
-    return run(SCENES[name])
+LINKS = {
+    "munich": ((8.5, 21, 27), (-15, 30, 1.5), (105, 150, 1.5), 3.5e9, {"max_depth": 2, "refraction": True}),
+    "simple_street_canyon": (
+        (-20, 2, 15), (-8, -8, 1.5), (8, 8, 1.5), 28e9,
+        {"max_depth": 2, "refraction": False, "diffraction": True},
+    ),
+}  # fmt: skip
+SAMPLES = 50_000
 
 
-@pytest.fixture(params=SCENES)
-def campaign(request: pytest.FixtureRequest) -> Campaign:
-    return campaign_of(request.param)
+def links_of(name: str) -> SimpleNamespace:
+    tx, low, high, *_ = LINKS[name]
+    rx = np.random.default_rng(1).uniform(low, high, (6, 3))
+    return SimpleNamespace(tx=np.tile(np.array(tx, dtype=float), (len(rx), 1)), rx=rx)
+
+
+def solve_publicly(name: str) -> sionna.rt.Paths:
+    """Paths found by Sionna's own solver in its own scene."""
+    *_, frequency, switches = LINKS[name]
+    links = links_of(name)
+    scene = sionna.rt.load_scene(getattr(sionna.rt.scene, name))
+    scene.frequency = frequency
+    scene.tx_array = sionna.rt.PlanarArray(num_rows=1, num_cols=1, pattern="dipole", polarization="V")
+    scene.rx_array = sionna.rt.PlanarArray(num_rows=1, num_cols=1, pattern="tr38901", polarization="cross")
+    scene.add(sionna.rt.Transmitter("tx", links.tx[0].tolist()))
+    for index, position in enumerate(links.rx):
+        scene.add(sionna.rt.Receiver(f"rx-{index}", position.tolist()))
+    solver = sionna.rt.PathSolver(deterministic=True)
+    return solver(scene, samples_per_src=SAMPLES, seed=1, **switches)
+
+
+@pytest.mark.parametrize("name", LINKS)
+def test_links_equal_what_sionnas_public_interface_gives(name: str) -> None:
+    *_, frequency, switches = LINKS[name]
+    ours = cb.trace(
+        f"sionna:{name}",
+        links_of(name),
+        frequency=frequency,
+        tx_antenna={"pattern": "dipole"},
+        rx_antenna={"pattern": "tr38901", "polarization": "cross"},
+        samples=SAMPLES,
+        **switches,
+    )
+    theirs = solve_publicly(name)  # after ours, so that one scene is in memory at a time
+    real, imaginary = (part.numpy() for part in theirs.a)  # [receivers, antennas, 1, 1, paths]
+    power = (real**2 + imaginary**2).sum(axis=(1, 2, 3))  # [receivers, paths]
+    np.testing.assert_allclose(cb.path_loss(ours), -10 * np.log10(power.sum(axis=1)), atol=0.01)
+
+    for link in range(ours.num_links):
+        tau = theirs.tau.numpy()[link, 0]
+        there = np.flatnonzero((tau >= 0) & (power[link] > 1e-30))
+        mine = np.flatnonzero(ours.link == link)
+        nearest = mine[np.argmin(np.abs(ours.delay[mine] - tau[there][:, None]), axis=1)]
+        assert len(set(nearest)) == len(there) > 0
+        np.testing.assert_allclose(ours.delay[nearest], tau[there], rtol=1e-6)
+        for angles, zenith, azimuth in (
+            (ours.departure, theirs.theta_t, theirs.phi_t),
+            (ours.arrival, theirs.theta_r, theirs.phi_r),
+        ):
+            other = np.stack([part.numpy()[link, 0][there] for part in (zenith, azimuth)], axis=-1)
+            np.testing.assert_allclose(unit(angles[nearest]), unit(other), atol=1e-4)
+
+
+def unit(angles: np.ndarray) -> np.ndarray:
+    """Directions of zenith and azimuth angles [n, 2]."""
+    zenith, azimuth = angles.T
+    return np.stack(
+        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1
+    )
+
+
+# Path by path, on the paths that Sionna stored.
 
 
 @pytest.fixture(scope="module")
-def street() -> Campaign:
+def campaign_of() -> Iterator[Callable[[str], Campaign]]:
+    """A function that traces a case, and keeps it until another is asked for.
+
+    Dr.Jit compiles the code of all scenes in memory into every kernel, so only one is there at a time.
+    """
+    last: dict[str, Campaign] = {}
+
+    def trace(name: str) -> Campaign:
+        if name not in last:
+            last.clear()
+            last[name] = run(SCENES[name])
+        return last[name]
+
+    yield trace
+    last.clear()
+
+
+@pytest.fixture
+def street(campaign_of: Callable[[str], Campaign]) -> Campaign:
     return campaign_of("simple_street_canyon")
 
 
@@ -46,7 +128,9 @@ def kinds_of(paths: Paths) -> list[tuple[int, ...]]:
     return [tuple(paths.kind[a:b].tolist()) for a, b in zip(paths.first[:-1], paths.first[1:], strict=True)]
 
 
-def test_replay_equals_sionna_as_traced_and_after_changing_all_materials(campaign: Campaign) -> None:
+@pytest.mark.parametrize("name", SCENES)
+def test_replay_equals_sionna_as_traced_and_after_changing_all_materials(campaign_of, name: str) -> None:
+    campaign = campaign_of(name)
     assert campaign.case.kinds <= set(campaign.paths.kind.tolist())  # else the comparison shows nothing
     for materials in (campaign.paths.materials, changed(campaign, 1), changed(campaign, 2)):
         errors = compare(campaign, materials)
@@ -56,7 +140,7 @@ def test_replay_equals_sionna_as_traced_and_after_changing_all_materials(campaig
 
 
 @pytest.mark.parametrize("name", [name for name, case in SCENES.items() if case.exception])
-def test_single_precision_of_sionna_still_needs_the_exception(name: str) -> None:
+def test_single_precision_of_sionna_still_needs_the_exception(campaign_of, name: str) -> None:
     campaign = campaign_of(name)
     thick = {
         name: replace(material, relative_permittivity=6.0, conductivity=0.05, thickness=0.3)
@@ -65,6 +149,12 @@ def test_single_precision_of_sionna_still_needs_the_exception(name: str) -> None
     errors = compare(campaign, thick)
     assert errors.path.max() > PATH_BOUND
     assert errors.within
+
+
+def test_path_loss_is_the_sum_of_the_gains_powers(campaign_of) -> None:
+    paths = campaign_of("simple_wedge").paths
+    power = np.bincount(paths.link, np.abs(path_gains(paths)) ** 2)
+    np.testing.assert_allclose(path_loss(paths), -10 * np.log10(power), rtol=1e-12)
 
 
 def test_replay_follows_the_parameters_of_scattering_patterns(street: Campaign) -> None:
@@ -76,12 +166,6 @@ def test_replay_follows_the_parameters_of_scattering_patterns(street: Campaign) 
     assert errors.within, str(errors)
     unchanged = path_gains(street.paths)
     assert not difference(street, street.trace.path_gains(materials), unchanged, materials).within
-
-
-def test_path_loss_is_the_sum_of_the_gains_powers() -> None:
-    paths = campaign_of("simple_wedge").paths
-    power = np.bincount(paths.link, np.abs(path_gains(paths)) ** 2)
-    np.testing.assert_allclose(path_loss(paths), -10 * np.log10(power), rtol=1e-12)
 
 
 # What follows breaks replay on purpose: the comparison must notice.
@@ -166,83 +250,10 @@ def test_every_pattern_and_polarization_is_compared_at_some_end() -> None:
     assert {antenna.polarization for antenna in ends} == set(POLARIZATIONS)
 
 
-# Sionna's public interface, from its own scene file and its own ITU materials.
-
-LINKS = {
-    "munich": ((8.5, 21, 27), (-15, 30, 1.5), (105, 150, 1.5), 3.5e9, {"max_depth": 2, "refraction": True}),
-    "simple_street_canyon": (
-        (-20, 2, 15), (-8, -8, 1.5), (8, 8, 1.5), 28e9,
-        {"max_depth": 2, "refraction": False, "diffraction": True},
-    ),
-}  # fmt: skip
-SAMPLES = 50_000
-
-
-def links_of(name: str) -> SimpleNamespace:
-    tx, low, high, *_ = LINKS[name]
-    rx = np.random.default_rng(1).uniform(low, high, (6, 3))
-    return SimpleNamespace(tx=np.tile(np.array(tx, dtype=float), (len(rx), 1)), rx=rx)
-
-
-def solve_publicly(name: str) -> sionna.rt.Paths:
-    """Paths found by Sionna's own solver in its own scene."""
-    *_, frequency, switches = LINKS[name]
-    links = links_of(name)
-    scene = sionna.rt.load_scene(getattr(sionna.rt.scene, name))
-    scene.frequency = frequency
-    scene.tx_array = sionna.rt.PlanarArray(num_rows=1, num_cols=1, pattern="dipole", polarization="V")
-    scene.rx_array = sionna.rt.PlanarArray(num_rows=1, num_cols=1, pattern="tr38901", polarization="cross")
-    scene.add(sionna.rt.Transmitter("tx", links.tx[0].tolist()))
-    for index, position in enumerate(links.rx):
-        scene.add(sionna.rt.Receiver(f"rx-{index}", position.tolist()))
-    solver = sionna.rt.PathSolver(deterministic=True)
-    return solver(scene, samples_per_src=SAMPLES, seed=1, **switches)
-
-
-@pytest.mark.parametrize("name", LINKS)
-def test_links_equal_what_sionnas_public_interface_gives(name: str) -> None:
-    *_, frequency, switches = LINKS[name]
-    theirs = solve_publicly(name)
-    ours = cb.trace(
-        f"sionna:{name}",
-        links_of(name),
-        frequency=frequency,
-        tx_antenna={"pattern": "dipole"},
-        rx_antenna={"pattern": "tr38901", "polarization": "cross"},
-        samples=SAMPLES,
-        **switches,
-    )
-    real, imaginary = (part.numpy() for part in theirs.a)  # [receivers, antennas, 1, 1, paths]
-    power = (real**2 + imaginary**2).sum(axis=(1, 2, 3))  # [receivers, paths]
-    np.testing.assert_allclose(cb.path_loss(ours), -10 * np.log10(power.sum(axis=1)), atol=0.01)
-
-    for link in range(ours.num_links):
-        tau = theirs.tau.numpy()[link, 0]
-        there = np.flatnonzero((tau >= 0) & (power[link] > 1e-30))
-        mine = np.flatnonzero(ours.link == link)
-        nearest = mine[np.argmin(np.abs(ours.delay[mine] - tau[there][:, None]), axis=1)]
-        assert len(set(nearest)) == len(there) > 0
-        np.testing.assert_allclose(ours.delay[nearest], tau[there], rtol=1e-6)
-        for angles, zenith, azimuth in (
-            (ours.departure, theirs.theta_t, theirs.phi_t),
-            (ours.arrival, theirs.theta_r, theirs.phi_r),
-        ):
-            other = np.stack([part.numpy()[link, 0][there] for part in (zenith, azimuth)], axis=-1)
-            np.testing.assert_allclose(unit(angles[nearest]), unit(other), atol=1e-4)
-
-
-def unit(angles: np.ndarray) -> np.ndarray:
-    """Directions of zenith and azimuth angles [n, 2]."""
-    zenith, azimuth = angles.T
-    return np.stack(
-        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1
-    )
-
-
 # Known disagreements of Sionna RT 2.2.0 with the theory that it cites. Replay follows Sionna.
 
 
-def test_known_disagreement_of_sionna_2_2_stale_vertices_after_a_diffraction() -> None:
+def test_known_disagreement_of_sionna_2_2_stale_vertices_after_a_diffraction(campaign_of) -> None:
     """s + s' of a path shorter than `max_depth` holds a vertex that is no part of the path.
 
     `FieldCalculator._diffraction_compute_s_s_prime` still adds a segment in the step in which it meets the end

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 import sionna.rt
@@ -21,6 +22,7 @@ from calibray.paths import Paths
 from calibray.scenes import read_scene
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Trace, Tracer
+from calibray.tracing.sionna.buffers import aligned, normals_at, per_interaction
 from calibray.tracing.sionna.solver import HASHES
 from calibray.tracing.trace_plan import lattice_directions
 from small_scenes import block, write_scene
@@ -133,6 +135,21 @@ def test_traced_buffers_keep_nothing_else_in_memory(trace: Trace) -> None:
     buffer = part.buffer
     arrays = [buffer.vertices_x.array, buffer.k_tx.x, buffer.shapes.array, buffer.probs.array]
     assert {array.state for array in arrays} == {dr.VarState.Evaluated}
+
+
+def test_normals_are_read_with_the_same_kernels_however_many(trace: Trace) -> None:
+    """Compiling a kernel takes longer than all that it computes."""
+    kernels = []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        for number in (11, 13):
+            some = trace.buffers[0].buffer.gather(mi.UInt(aligned(np.arange(number), np.uint32)))
+            some.schedule()
+            dr.eval()
+            met = per_interaction(some, "interaction_types")[:, 0] != 0
+            dr.kernel_history_clear()
+            assert normals_at(some, 0, met).shape == (number, 3)
+            kernels.append([kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])])
+    assert kernels[0] == kernels[1] != []
 
 
 def test_the_path_program_records_how_it_was_traced(paths: Paths) -> None:

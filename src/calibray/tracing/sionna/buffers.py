@@ -38,6 +38,13 @@ def to_points(position: NDArray[np.float64]) -> mi.Point3f:
     return points
 
 
+def to_numpy(vectors: Any) -> NDArray[np.float64]:
+    """Convert points or vectors to double precision [n, 3]."""
+    # NumPy would get them from one kernel that computes, interleaves and contains their number.
+    dr.eval(vectors)
+    return np.stack([np.array(axis, dtype=float) for axis in vectors], axis=-1)
+
+
 def to_numpy_complex(value: mi.Complex2f) -> NDArray[np.complex128]:
     """Convert complex numbers to double precision [n]."""
     return np.array(value.real, dtype=float) + 1j * np.array(value.imag, dtype=float)
@@ -58,12 +65,8 @@ def vertices_of(buffer: PathsBuffer) -> NDArray[np.float64]:
 
 def normals_at(buffer: PathsBuffer, step: int, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Read the normals of the surfaces that paths meet at interaction `step` [P, 3]; undefined outside the mask [P]."""
-    normals = buffer.get_primitive_props(mi.UInt(step + 1), True, False, mi.Bool(aligned(mask, np.bool_)))
-    return np.array(normals, dtype=float).T.reshape(-1, 3)
-
-
-# Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
-# pyright: reportGeneralTypeIssues=false, reportCallIssue=false
+    depth, active = dr.opaque(mi.UInt, step + 1), mi.Bool(aligned(mask, np.bool_))
+    return to_numpy(buffer.get_primitive_props(depth, True, False, active))
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,7 @@ def reverse(buffer: PathsBuffer, sources: mi.Point3f) -> PathsBuffer:
     # Sionna does not type the wedges; they are None unless diffraction was asked for.
     wedges: Any = reversed_buffer.diffracting_wedges
     if wedges is not None:
-        start = np.array(sources, dtype=float).T[np.array(reversed_buffer.source_indices, dtype=np.int64)]
+        start = to_numpy(sources)[np.array(reversed_buffer.source_indices, dtype=np.int64)]
         kind = per_interaction(reversed_buffer, "interaction_types")
         wedges.swap_faces(mi.Bool(aligned(_zero_face_is_dark(reversed_buffer, kind, start), np.bool_)))
         at_edge = kind == Kind.DIFFRACTION
@@ -164,5 +167,5 @@ def _zero_face_is_dark(
         # Mirror image: s - 2 ((s - v) . n) n, with v a point of the plane and n its normal.
         image -= 2 * np.sum((image - vertex[:, step]) * normal, axis=1)[:, None] * normal
     wedges: Any = buffer.diffracting_wedges
-    edge_origin, zero_normal = (np.array(part, dtype=float).T for part in (wedges.o, wedges.n0))
+    edge_origin, zero_normal = to_numpy(wedges.o), to_numpy(wedges.n0)
     return np.sum((edge_origin - image) * zero_normal, axis=1) > 0

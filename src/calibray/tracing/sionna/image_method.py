@@ -30,7 +30,7 @@ from sionna.rt.utils import first_order_diffraction_point
 
 from calibray.errors import InputError
 from calibray.paths import Kind
-from calibray.tracing.sionna.buffers import aligned, per_interaction
+from calibray.tracing.sionna.buffers import aligned, per_interaction, to_numpy
 from calibray.tracing.sionna.scene import shape_ids
 
 SAME_PLANE: Final = 2e-3
@@ -246,9 +246,7 @@ def unfold_sequences(sequences: PathsBuffer, source: NDArray[np.float64], meshes
     wedges: Any = sequences.diffracting_wedges
     if wedges is not None:
         has_edge = (kind == Kind.DIFFRACTION).any(axis=1)
-        origin, direction = (
-            np.array(part, dtype=float).T * has_edge[:, None] for part in (wedges.o, wedges.e_hat)
-        )
+        origin, direction = (to_numpy(part) * has_edge[:, None] for part in (wedges.o, wedges.e_hat))
         edges = Edges(origin, direction, np.array(wedges.length, dtype=float) * has_edge)
     return unfold(source, kind, meshes.triangles_of(sequences), meshes.surfaces, edges)
 

@@ -41,6 +41,7 @@ from calibray.tracing.sionna.buffers import (
     drop_empty_entries,
     normals_at,
     per_interaction,
+    to_numpy,
     to_numpy_complex,
     to_points,
     vertices_of,
@@ -253,7 +254,7 @@ class Solver:
                 # Sionna's own lengths, so that replay follows its known error in them (docs/explanation/fidelity.md).
                 after, before = self._calculate_fields._diffraction_compute_s_s_prime(buffer, source, target)
                 wedges: Any = buffer.diffracting_wedges
-                edge, normal_n = (np.array(part, dtype=float).T for part in (wedges.e_hat, wedges.nn))
+                edge, normal_n = to_numpy(wedges.e_hat), to_numpy(wedges.nn)
                 edge_lengths = np.stack([np.array(before, dtype=float), np.array(after, dtype=float)], axis=1)
         return Chains(
             source=ends.tx[traced.link],
