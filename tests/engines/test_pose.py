@@ -14,7 +14,7 @@ from calibray.fields import path_loss
 from calibray.measurements.observables import Statistic
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Paths
-from calibray.tracing.mounting import Mounting, Pose, mount
+from calibray.tracing.antennas import Mounting, Pose, mount
 from calibray.tracing.settings import Antenna
 
 pytestmark = pytest.mark.usefixtures("compiled_fast")

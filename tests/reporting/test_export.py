@@ -30,7 +30,7 @@ from calibray.scenes import export_scene, read_scene
 from calibray.tracing.protocol import LinkPositions
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
-from calibray.tracing.sionna.exported import verify_export
+from calibray.tracing.sionna.live_scene import verify_export
 from changed import changed
 from small_scenes import block, write_scene
 

@@ -1,6 +1,6 @@
 """The plan of a scene with the antennas."""
 
-from calibray.reporting.position_plot import draw_positions
+from calibray.reporting.link_map import draw_positions
 from calibray.scenes.authoring import make_scene
 from planted_maps import L_SHAPE, footprints
 

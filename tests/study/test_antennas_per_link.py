@@ -19,7 +19,7 @@ from calibray.reporting.trust_figures import residuals_by_direction
 from calibray.result.verdict import RemarkKind
 from calibray.result.wording import remark_text
 from calibray.study import Setup, Study
-from calibray.tracing.mounting import stated_jones
+from calibray.tracing.antennas import stated_jones
 from calibray.tracing.settings import Antenna
 from link_tables import links_from_frame
 from two_ray import COLUMNS, TRUTH, TwoRay

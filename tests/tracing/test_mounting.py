@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from calibray.errors import InputError
 from calibray.fields import path_gains
 from calibray.scenes import Scene, read_scene
-from calibray.tracing.antennas import AntennaPattern
-from calibray.tracing.mounting import Mounting, Pose, jones_vectors, mount, wave_basis
+from calibray.tracing.antennas import AntennaPattern, Mounting, Pose, jones_vectors, mount, wave_basis
 from calibray.tracing.protocol import LinkPositions
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer

@@ -18,8 +18,7 @@ import trimesh
 from axe_playwright_python.sync_playwright import Axe
 
 from calibray.scenes import read_scene, read_triangles
-from calibray.window.desk import RADIUS, solid
-from calibray.window.folder import StudyFolder
+from calibray.window.desk import RADIUS, StudyFolder, solid
 from window_server import CHROMIUM, SIZES, add, finished, launched, opened, press, served, step
 
 pytestmark = pytest.mark.skipif(not CHROMIUM, reason="needs chromium; apt-get install chromium")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from calibray.errors import InputError
-from calibray.window.folder import StudyFolder
+from calibray.window.desk import StudyFolder
 
 STUDY = """version = 1
 

@@ -19,7 +19,7 @@ from calibray.paths import Kind, Paths
 from calibray.result.verdict import Remark, RemarkKind, Value
 from calibray.study import Setup, Study
 from calibray.support.progress import Progress
-from calibray.tracing.mounting import EVERY, POSE
+from calibray.tracing.antennas import EVERY, POSE
 
 DENSE: Final = 20_000_000
 """Number of entries of a nuisance's design up to which leverage is computed; the dense matrix then takes 160 MB."""

@@ -14,13 +14,11 @@ from typer.core import TyperGroup
 
 from calibray.cli.console import echo
 from calibray.cli.doctor import cache, doctor, ledger
-from calibray.cli.init import init, schema
-from calibray.cli.open import open
+from calibray.cli.init import init, open, schema
 from calibray.cli.predict import map, predict, suggest
 from calibray.cli.report import export, report
-from calibray.cli.run import demo, run
+from calibray.cli.run import demo, run, trace
 from calibray.cli.scene import scene
-from calibray.cli.trace import trace
 from calibray.cli.validate import compare, validate
 from calibray.errors import EngineError, InputError
 from calibray.support.interruption import INTERRUPTED, ensure_interruption

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calibray.cli.console import Overwrite, echo, log
+from calibray.cli.progress_bars import progress_bars
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -43,7 +44,6 @@ def doctor(
 
 def _machine() -> None:
     """Check the machine."""
-    from calibray.cli.progress_bars import progress_bars
     from calibray.doctor import examine
     from calibray.tables import render
 
@@ -57,8 +57,6 @@ def _machine() -> None:
 
 def _scene(subject: str, plot: Path | None, overwrite: bool) -> None:
     """Check a scene, or the scene of a study."""
-    from calibray.cli.progress_bars import progress_bars
-
     with progress_bars(log()) as progress:
         from calibray.reporting import scene_tables
         from calibray.scenes.checks import check_scene
@@ -79,7 +77,7 @@ def _scene(subject: str, plot: Path | None, overwrite: bool) -> None:
 
 def _draw(study: Study, plot: Path, overwrite: bool) -> None:
     """Draw a study's antennas over its scene."""
-    from calibray.reporting.position_plot import save_positions
+    from calibray.reporting.link_map import save_positions
 
     links = study.measurements()
     save_positions(plot, study.scene_source, links.tx, links.rx, study.files(), overwrite)

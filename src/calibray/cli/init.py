@@ -1,4 +1,4 @@
-"""`calibray init` drafts a study from a scene and a table of links; `calibray schema` prints the schema of studies."""
+"""`calibray init`, `schema` and `open`: draft a study, print the schema of studies, open a study's folder."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import echo, log, with_groups
+from calibray.cli.console import echo, log, warn, with_groups
+from calibray.cli.progress_bars import progress_bars
 from calibray.errors import InputError
 
 
@@ -59,8 +60,6 @@ def init(
     ] = False,
 ) -> None:
     """Draft a study from a scene and a table of links, and list its assumptions with their reasons."""
-    from calibray.cli.console import warn
-    from calibray.cli.progress_bars import progress_bars
     from calibray.support.output_files import check_file, write_text
 
     if out.exists() or out.is_symlink():
@@ -68,7 +67,7 @@ def init(
     inputs = [links, *(file for file in (known.transmitters, known.track) if file)]
     check_file(out, inputs)
     with progress_bars(log()) as progress:
-        from calibray.reporting.position_plot import save_positions
+        from calibray.reporting.link_map import save_positions
         from calibray.reporting.scene_tables import assumptions, warning_lines
         from calibray.study.draft import Given, schema_text
         from calibray.study.draft import draft as draft_study
@@ -119,3 +118,38 @@ def schema() -> None:
     from calibray.study.draft import schema_text
 
     echo(schema_text(), nl=False)
+
+
+def open(
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER", help="Folder of the study; it is created if it does not exist."),
+    ] = Path(),
+    port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="Port; 0 for a free one.")] = 0,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Only print the address.")] = False,
+) -> None:
+    """Open a study's folder in the browser, from a map and measurements to predictions without a terminal.
+
+    The page is served on this machine only, at an address with a token. Ctrl-C ends the server, but not commands in
+    progress.
+
+    Raises:
+        InputError: NiceGUI is not installed, or the folder or the port cannot be used.
+    """
+    import webbrowser
+    from importlib.util import find_spec
+
+    from calibray.support.output_files import check_folder
+
+    if find_spec("nicegui") is None:
+        raise InputError("nicegui is not installed; run pip install 'calibray[window]'")
+    check_folder(folder).mkdir(parents=True, exist_ok=True)
+
+    from calibray.window.server import serve
+
+    def opened(address: str) -> None:
+        echo(address)
+        if not no_browser:
+            webbrowser.open(address)
+
+    serve(folder.resolve(), port, opened)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import typer
 
 from calibray.cli.console import Permissions, Pool, ResultFolder, echo, log, print_costs, with_groups
+from calibray.cli.progress_bars import progress_bars
 from calibray.errors import InputError
 from calibray.support.messages import shortened
 from calibray.tables import Column, Table, numbers
@@ -66,8 +67,6 @@ def predict(
 
     The column basis names the model of each prediction: the log-distance model for links without a path.
     """
-    from calibray.cli.progress_bars import progress_bars
-
     with progress_bars(log()) as progress:
         import numpy as np
         import pandas as pd
@@ -193,8 +192,6 @@ def suggest(
     permissions: Permissions,
 ) -> None:
     """Suggest where to measure next: the candidate links that are expected to narrow the intervals most."""
-    from calibray.cli.progress_bars import progress_bars
-
     with progress_bars(log()) as progress:
         from calibray.calibration.result import Result
         from calibray.measurements.table_files import read_table
@@ -328,8 +325,6 @@ def map(
 
     For cells without a path, the log-distance model predicts; the map hatches these cells.
     """
-    from calibray.cli.progress_bars import progress_bars
-
     target = out or folder
     with progress_bars(log()) as progress:
         import numpy as np

@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from threading import Event, Lock, Thread
-from typing import Final
-
-from rich import progress as rich_progress
-from rich.console import Console
+from typing import TYPE_CHECKING, Final
 
 from calibray.support import interruption
 from calibray.support.progress import Progress
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 LINE_INTERVAL: Final = 4.0
 """Time between two lines without a terminal [s]; shorter work prints no line."""
@@ -40,6 +40,9 @@ def progress_bars(console: Console, every: float | None = None) -> Iterator[Prog
 
 @contextmanager
 def _bars(console: Console) -> Iterator[Progress]:
+    # Rich is imported on first use, so that `--version` and `--help` do not load it.
+    from rich import progress as rich_progress
+
     columns = (
         rich_progress.SpinnerColumn(),
         rich_progress.TextColumn("{task.description:<12}"),

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from calibray.cli.console import Overwrite, ResultFolder, echo, log
+from calibray.cli.progress_bars import progress_bars
 
 
 def report(
@@ -22,8 +23,6 @@ def report(
     overwrite: Overwrite = False,
 ) -> None:
     """Write a result as one HTML file: summary, values, figures, map, and the scene in 3-D."""
-    from calibray.cli.progress_bars import progress_bars
-
     with progress_bars(log()) as progress:
         from calibray.calibration.result import Result
         from calibray.reporting.page import FIGURES, FILE

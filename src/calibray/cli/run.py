@@ -1,4 +1,4 @@
-"""`calibray run`: calibrate a study."""
+"""`calibray run`, `demo` and `trace`: calibrate a study, or only trace its links."""
 
 from __future__ import annotations
 
@@ -9,10 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, StudyFile, echo, log, with_groups
+from calibray.cli.console import Overwrite, Pool, StudyFile, echo, log, warn, with_groups
+from calibray.cli.progress_bars import progress_bars
+from calibray.errors import InputError
 
 if TYPE_CHECKING:
     from calibray.calibration.result import Result
+    from calibray.paths import Paths
+    from calibray.study import Setup
+    from calibray.support.progress import Progress
+    from calibray.tracing.convergence import Convergence
 
 
 @dataclass(frozen=True)
@@ -73,13 +79,10 @@ def run(
     output: Output,
 ) -> None:
     """Calibrate a study, print the result, and write it with the calibrated scene and a report."""
-    from calibray.cli.progress_bars import progress_bars
-
     try:
         # Importing libraries and reading the scene take seconds as well, so the progress starts here.
         with progress_bars(log()) as progress:
             from calibray.calibration.calibrate import calibrate
-            from calibray.cli.console import warn
             from calibray.engines import open_workers
             from calibray.fitting.methods import check_method
             from calibray.reporting import result_tables as tables
@@ -130,8 +133,6 @@ def _kept_text(out: Path) -> str:
 
 def _write_report(result: Result, out: Path, output: Output) -> list[str]:
     """Write the report next to the result; a failure is only a warning, because the result is already saved."""
-    from calibray.cli.progress_bars import progress_bars
-
     try:
         from calibray.reporting import page
 
@@ -166,8 +167,6 @@ def demo(
     overwrite: Overwrite = False,
 ) -> None:
     """Run the experiment of the paper in the demo district: tables, figures and a report."""
-    from calibray.cli.progress_bars import progress_bars
-
     with progress_bars(log()) as progress:
         from calibray.comparison.demo import FILES, run_demo, write_demo
         from calibray.support.output_files import check_outputs
@@ -180,3 +179,78 @@ def demo(
     echo(render(*finished.tables()) + "\n")
     echo(f"Written to {out}: {', '.join(FILES)}, and a folder for each method", err=True)
     echo(f"Report: {page}")
+
+
+@with_groups
+def trace(
+    study_file: StudyFile,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="FILE", help="HDF5 file for the paths.")
+    ] = None,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check",
+            help="Trace again with twice the samples and another seed, and show the changes. If the samples are "
+            "'auto', show the changes caused by the last round of rays.",
+        ),
+    ] = False,
+    *,
+    pool: Pool,
+    overwrite: Overwrite = False,
+) -> None:
+    """Trace the links of a study and store the paths, or check whether there are enough rays."""
+    with progress_bars(log()) as progress:
+        from calibray.engines import open_workers
+        from calibray.engines.cluster.chunks import stated_chunk_size, trace_in_chunks
+        from calibray.engines.cluster.workers import InProcess
+        from calibray.reporting import scene_tables
+        from calibray.study import Study
+        from calibray.support.output_files import check_file
+        from calibray.tables import render
+
+        study = Study.load(study_file)
+        if out is None and not check:
+            raise InputError("trace: give -o FILE to store the paths, --check to check them, or both")
+        if out is not None:
+            check_file(out, study.files(), overwrite)
+        setup = study.opened()
+        links, trace_again = setup.links, check and not study.trace.adaptive
+        with open_workers(pool.workers, pool.scheduler) as workers:
+            if workers is None and stated_chunk_size(setup) is None:
+                paths, change = _trace(setup, out, overwrite, trace_again, progress)
+            else:
+                paths, change = trace_in_chunks(
+                    setup, workers or InProcess(), check=trace_again, progress=progress
+                )
+                if out is not None:
+                    paths.save(out, overwrite)
+    echo(render(scene_tables.overview(paths, links.row, setup.enclosed)))
+    if check and study.trace.adaptive:
+        echo("\n" + scene_tables.last_round(paths.settings, study.fidelity.tolerance_db))
+    if change is not None:
+        echo("\n" + render(*scene_tables.convergence(change, links.row, study.fidelity.tolerance_db)))
+    if out is not None:
+        echo(f"Written to {out}", err=True)
+
+
+def _trace(
+    setup: Setup, out: Path | None, overwrite: bool, trace_again: bool, progress: Progress
+) -> tuple[Paths, Convergence | None]:
+    """Trace all links together, store the paths, and trace again as a check if requested."""
+    from functools import partial
+
+    from calibray.fields import path_loss
+    from calibray.support.progress import with_stage
+    from calibray.tracing import convergence
+
+    study, links, tracer = setup.study, setup.links, setup.tracer
+    if announcement := tracer.plan(links).announcement(len(links)):
+        echo(announcement, err=True)
+    paths = tracer.trace(links, progress)
+    if out is not None:
+        paths.save(out, overwrite)
+    if not trace_again:
+        return paths, None
+    loss = partial(path_loss, combining=study.objective.combining, bandwidth=study.scene.bandwidth)
+    return paths, convergence.check(tracer, links, paths, loss, with_stage(progress, "checking"))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from calibray.cli.console import Overwrite, echo, log, with_groups
+from calibray.cli.progress_bars import progress_bars
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -213,7 +214,6 @@ def plan(
     options: PlanOptions,
 ) -> None:
     """Make a scene from a floor plan, with one sheet per wall, door and window."""
-    from calibray.cli.progress_bars import progress_bars
     from calibray.scenes.authoring import LIDS, SCENE_FILES, make_plan_scene, read_plan
     from calibray.support.output_files import check_outputs
 
@@ -239,7 +239,6 @@ def _make(read: Callable[[], tuple[Footprints, Frame, Trees | None]], out: Path,
     """Make a scene from the buildings and trees that `read` returns with their frame, and print its contents."""
     import numpy as np
 
-    from calibray.cli.progress_bars import progress_bars
     from calibray.scenes.authoring import Palette, Windows, lower_origin, make_scene, read_terrain
 
     with progress_bars(log()) as progress:

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from calibray.cli.console import Overwrite, Pool, StudyFile, echo, log, with_groups
+from calibray.cli.progress_bars import progress_bars
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,6 @@ def validate(
     overwrite: Overwrite = False,
 ) -> None:
     """Calibrate without each block of links in turn, and compare models on the held-out block."""
-    from calibray.cli.progress_bars import progress_bars
-
     with progress_bars(log()) as progress:
         from calibray.engines import open_workers
         from calibray.result.files import VALIDATION_FILE, write_validation
@@ -117,7 +116,6 @@ def compare(
 
     from functools import partial
 
-    from calibray.cli.progress_bars import progress_bars
     from calibray.comparison.comparison import FILES, optimum_text, parse_methods, table, write
     from calibray.comparison.comparison import compare as run_comparison
     from calibray.comparison.method_runs import study_problem

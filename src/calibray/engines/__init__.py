@@ -8,7 +8,7 @@
 - `Recorded` adds a `Ledger` to the last two, so that no RT call is paid for twice.
 
 One RT call is a run of one candidate over all links. Calls are counted here, where the engine runs. `engines.kinds`
-defines the engine sections of a study file and is imported with the study; the engines are loaded when used.
+defines the engine sections of a study file and is imported with the study; what needs JAX is loaded when used.
 """
 
 from typing import TYPE_CHECKING
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from calibray.engines.cluster.workers import Workers as Workers
     from calibray.engines.cluster.workers import open_workers as open_workers
     from calibray.engines.compression import compress as compress
-    from calibray.engines.external.command import Command as Command
     from calibray.engines.external.exchange import Request as Request
+    from calibray.engines.kinds.command import Command as Command
+    from calibray.engines.kinds.retrace import Retrace as Retrace
     from calibray.engines.ledger.database import LedgerEntry as LedgerEntry
     from calibray.engines.ledger.database import key as key
     from calibray.engines.ledger.ledger import LEDGER_FILE as LEDGER_FILE
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
     from calibray.engines.protocol import check_candidates as check_candidates
     from calibray.engines.replay import Replay as Replay
     from calibray.engines.replay import ReplayCarriers as ReplayCarriers
-    from calibray.engines.retrace import Retrace as Retrace
     from calibray.engines.section import OpenedStudy as OpenedStudy
     from calibray.engines.section import RadioSettings as RadioSettings
 
@@ -51,7 +51,7 @@ __all__, __getattr__, __dir__ = lazy_attributes(
         "cluster.chunks": "ChunkedReplay",
         "cluster.workers": "InProcess Workers open_workers",
         "compression": "compress",
-        "external.command": "Command",
+        "kinds.command": "Command",
         "external.exchange": "Request",
         "ledger.database": "LedgerEntry key",
         "ledger.ledger": "LEDGER_FILE Ledger open_ledger",
@@ -59,7 +59,7 @@ __all__, __getattr__, __dir__ = lazy_attributes(
         "make_engine": "fingerprint make",
         "protocol": "PATH_LOSS Answer Answering Chunked Differentiable Engine Observable check_candidates",
         "replay": "Replay ReplayCarriers",
-        "retrace": "Retrace",
+        "kinds.retrace": "Retrace",
         "section": "OpenedStudy RadioSettings",
     },
 )

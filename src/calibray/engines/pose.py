@@ -17,10 +17,10 @@ from calibray.fields import GroupedProgram
 from calibray.fields.arithmetic import cosine_and_sine, materialize
 from calibray.parameters import Parameter
 from calibray.paths import Paths
-from calibray.tracing.antennas import AntennaPattern
-from calibray.tracing.mounting import (
+from calibray.tracing.antennas import (
     FIELDS,
     POSE,
+    AntennaPattern,
     Mounting,
     Pose,
     antenna_response,

@@ -31,7 +31,7 @@ from calibray.fitting.search import least_squares
 from calibray.study import Study
 from calibray.study.mounting import estimated_fields, with_spreads
 from calibray.support.progress import Progress
-from calibray.tracing.mounting import NEW, POSE
+from calibray.tracing.antennas import NEW, POSE
 
 MARGIN: Final = 8.0
 """Required distance of a predicted path loss from the noise floor, in standard deviations of the links' errors.

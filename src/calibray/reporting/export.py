@@ -111,7 +111,7 @@ def _verify(scene: Scene, result: Record, target: Path, links: Survey) -> None:
     """Load the written scene in the same way as the user, and compare it with the calibrated one."""
     # Sionna RT takes seconds to import.
     from calibray.tracing.sionna import Tracer
-    from calibray.tracing.sionna.exported import verify_export
+    from calibray.tracing.sionna.live_scene import verify_export
 
     study = result.study
     few = np.unique(np.linspace(0, len(links.tx) - 1, VERIFIED_LINKS).astype(int))

@@ -31,8 +31,7 @@ from calibray.support.figure_style import (
     styled,
 )
 from calibray.support.messages import shortened
-from calibray.tracing.antennas import AntennaPattern
-from calibray.tracing.mounting import Mounting, Pose, jones_vectors, wave_basis
+from calibray.tracing.antennas import AntennaPattern, Mounting, Pose, jones_vectors, wave_basis
 from calibray.validation.validation import Validation
 
 PARAMETERS: Final = 12

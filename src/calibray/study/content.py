@@ -32,7 +32,7 @@ from calibray.study.regions import PREFIX, RegionSection
 from calibray.study.sections import AntennasSection, LinksSection, MaterialSection, SceneSection, TraceSection
 from calibray.support.messages import did_you_mean
 from calibray.support.strict_models import Section, Text, dotted
-from calibray.tracing.mounting import EVERY, POSE, turns
+from calibray.tracing.antennas import EVERY, POSE, turns
 
 VERSION: Final = 1
 """The version of the study file that this module reads."""

@@ -20,7 +20,7 @@ from calibray.parameters import Parameter, Parameters
 from calibray.paths import Paths, take_links
 from calibray.paths.selection import concatenate
 from calibray.support.messages import did_you_mean
-from calibray.tracing.mounting import EVERY, NEW, POSE, Mounting, concerned
+from calibray.tracing.antennas import EVERY, NEW, POSE, Mounting, concerned
 
 if TYPE_CHECKING:
     from calibray.fields import DisplacementLoss, Effects

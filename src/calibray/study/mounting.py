@@ -16,8 +16,7 @@ from calibray.paths.chains import zenith_azimuth
 from calibray.study.model import StudyModel
 from calibray.study.sections import MountingSection
 from calibray.support.messages import did_you_mean
-from calibray.tracing.antennas import AntennaPattern
-from calibray.tracing.mounting import EVERY, NEW, POSE, Mounting, Pose, stated_jones, turns
+from calibray.tracing.antennas import EVERY, NEW, POSE, AntennaPattern, Mounting, Pose, stated_jones, turns
 from calibray.tracing.settings import Antenna
 
 if TYPE_CHECKING:

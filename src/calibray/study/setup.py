@@ -50,8 +50,8 @@ from calibray.study.row_steps import scene_place, study_links, study_regions
 from calibray.study.sections import AntennasSection
 from calibray.support.progress import Progress
 from calibray.tracing import cache
+from calibray.tracing.antennas import POSE, Mounting, mount
 from calibray.tracing.default_tracer import SIONNA
-from calibray.tracing.mounting import POSE, Mounting, mount
 from calibray.tracing.protocol import EnclosedAntennas, Tracer, TracerFactory
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.trace_plan import LONG_TRACE_SECONDS

@@ -3,6 +3,9 @@
 Each is a separate process with three files in `.calibray-window`: `0001.json` describes the command, `0001.log`
 contains its output, and `0001.exit` its exit status. A command without exit status and without process died; the same
 command resumes.
+
+`python -m calibray.window.jobs` runs one command and records how it ended, in its own session, so that it outlives the
+server. Ctrl-C is passed to the command, which keeps finished work.
 """
 
 from __future__ import annotations
@@ -84,7 +87,7 @@ class Jobs:
             self._folder.mkdir(exist_ok=True)
             number = max((job.number for job in self.list()), default=0) + 1
             stem = self._folder / f"{number:04d}"
-            arguments = [sys.executable, "-m", "calibray.window.runner", f"{stem}.exit", *words]
+            arguments = [sys.executable, "-m", "calibray.window.jobs", f"{stem}.exit", *words]
             # The command writes while it runs; an exclusive file follows no link and replaces nothing.
             with os.fdopen(os.open(f"{stem}.log", os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as log:
                 child = subprocess.Popen(
@@ -210,3 +213,16 @@ def stages(log: str) -> list[Stage]:
         latest.pop(name, None)
         latest[name] = Stage(name, share, int(seconds), int(left) if left else None, value or "")
     return list(latest.values())
+
+
+def main() -> None:
+    """Run the command given after the file for the exit status."""
+    # A handler, unlike SIG_IGN, is not inherited by the command.
+    signal.signal(signal.SIGINT, lambda *_: None)
+    _, status_file, *words = sys.argv
+    ended = subprocess.run([sys.executable, "-m", "calibray", *words], stdin=subprocess.DEVNULL, check=False)
+    write_text(Path(status_file), f"{ended.returncode}\n")
+
+
+if __name__ == "__main__":
+    main()

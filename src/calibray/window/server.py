@@ -17,8 +17,7 @@ from fastapi.responses import FileResponse, JSONResponse, Response
 from nicegui import run, ui
 
 from calibray.errors import InputError
-from calibray.window.desk import Desk, findings, plan
-from calibray.window.folder import StudyFolder
+from calibray.window.desk import Desk, StudyFolder, findings, plan
 from calibray.window.page import build
 
 ASSETS = Path(__file__).parent / "assets"

@@ -1,19 +1,31 @@
-"""Command: an external program computes path loss for every candidate."""
+"""Command: an external program computes path loss for every candidate, one after the other or in parallel."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self, final
+import logging
+import shlex
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from dataclasses import replace
+from threading import Event
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal, Self, final
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from calibray.engines.external.exchange import Request
+from calibray.engines.external.program import POLL, ExternalProgram, Outcome
+from calibray.engines.protocol import Answer, Responses, check_candidates, gather, gather_responses
 from calibray.engines.section import EngineSection, OpenedStudy
-from calibray.errors import InputError
+from calibray.errors import EngineError, InputError
+from calibray.measurements.observables import Statistic
+from calibray.support.messages import printable
 from calibray.support.progress import Progress
 from calibray.support.strict_models import Text
 
 if TYPE_CHECKING:
     from calibray.engines.cluster.workers import Workers
-    from calibray.engines.external.command import Command
     from calibray.paths import Paths
 
 
@@ -59,10 +71,163 @@ class CommandSection(EngineSection):
         self, study: OpenedStudy, paths: Paths | None, progress: Progress | None, workers: Workers | None
     ) -> Command:
         """The program over a study's links; see `EngineSection.open`."""
-        from calibray.engines.external.command import Command
-        from calibray.engines.external.program import ExternalProgram
-
         folder = study.source.resolve().parent
         program = ExternalProgram(self.command, folder, self.timeout, self.retries, self.format, self.rays)
         executor = None if workers is None else workers.executor()
         return Command(program, study, self.give_up_after, executor, progress)
+
+
+_LOG: Final = logging.getLogger(__name__)
+
+
+@final
+class Command:
+    """An external program, called once for every candidate.
+
+    If all attempts of a call fail, only this candidate is lost: its links count as links without a path. If every
+    candidate of the first batch fails, or many successive calls fail, the run ends, because the program must be at
+    fault.
+
+    Args:
+        program: How the program is called.
+        study: The opened study.
+        give_up_after: Number of successive failed calls after which the run ends.
+        executor: Executor for the calls of a batch; if None, one call runs after the other.
+        progress: Called with "running" after every candidate of a batch.
+    """
+
+    def __init__(
+        self,
+        program: ExternalProgram,
+        study: OpenedStudy,
+        give_up_after: int,
+        executor: Executor | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        links = study.links
+        self.parameters, self.materials, self.calls = study.parameters, dict(study.scene.materials), 0
+        self.num_links = len(links)
+        self._program, self._carriers, self._source = program, study.carriers, study.source
+        self._study = study
+        self._blank_request = Request(study.radio, links.tx, links.rx, link_frequency=links.frequency)
+        self._executor, self._progress = executor, progress
+        self._successive_failures, self._give_up_after = 0, give_up_after
+
+    def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Path loss of every link for candidates, as the program answers; see `Answering`."""
+        first = not self.calls
+        values = check_candidates(candidates, len(self.parameters))
+        return gather(self.answers(values), (len(values), self.num_links), first)
+
+    def respond(
+        self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
+    ) -> Responses:
+        """Path loss and further observables of every link, as the program answers; see `Observing.respond`.
+
+        Raises:
+            InputError: The program does not compute these observables, or derivatives are requested.
+        """
+        first = not self.calls
+        values = check_candidates(candidates, len(self.parameters))
+        if derivatives or wanted != tuple(each.statistic for each in self._study.radio.observables):
+            raise InputError(
+                f"{self._source}: the program answers only the study's [observables], without derivatives"
+            )
+        return gather_responses(self.answers(values), (len(values), self.num_links), len(wanted), first)
+
+    def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
+        """Answer candidates, each as soon as its call ends; see `Answering.answers`."""
+        if not self.calls:
+            # A study comes from somebody: whoever starts it sees what runs on this machine.
+            _LOG.warning(
+                "%s runs a program in %s: %s", printable(str(self._source)), printable(str(self._program.folder)),
+                printable(shlex.join(self._program.words)),
+            )  # fmt: skip
+        stop = stop or Event()
+        requests = [self._request(candidate) for candidate in candidates]
+        executor = self._executor
+        outcomes = (
+            self._sequential(requests, stop) if executor is None else self._parallel(requests, stop, executor)
+        )
+        for done, (index, raw) in enumerate(outcomes, start=1):
+            outcome = self._with_path_loss(raw) if raw.rays and self._program.rays else raw
+            self.calls += 1
+            if self._progress is not None:
+                self._progress("running", done, len(requests))
+            failure = self._describe(requests[index], outcome.failure) if outcome.failure else ""
+            yield Answer(index, outcome.path_loss_db, outcome.seconds, failure, outcome.rays)
+            self._successive_failures = self._successive_failures + 1 if failure else 0
+            if self._successive_failures >= self._give_up_after:
+                raise EngineError(
+                    f"{failure}; so did the {self._successive_failures - 1} calls before it. All answers are in the "
+                    "ledger: correct the program, remove the failures with `calibray ledger DIR --forget-failed`, and "
+                    "start again"
+                )
+
+    def _with_path_loss(self, outcome: Outcome) -> Outcome:
+        """The outcome with the path loss of its rays, or with the error in them."""
+        from calibray.engines.rays.export import Export
+
+        try:
+            return replace(outcome, path_loss_db=Export.of(self._study, outcome.rays).path_loss_db)
+        except InputError as error:
+            return replace(outcome, failure=str(error), rays=b"")
+
+    def _sequential(self, requests: list[Request], stop: Event) -> Iterator[tuple[int, Outcome]]:
+        for index, request in enumerate(requests):
+            if stop.is_set():
+                return
+            yield index, self._program.run(request)
+
+    def _parallel(
+        self, requests: list[Request], stop: Event, executor: Executor
+    ) -> Iterator[tuple[int, Outcome]]:
+        # An event reaches threads only; programs on other machines run until they end or exceed their time limit.
+        local_stop = stop if isinstance(executor, ThreadPoolExecutor) else None
+        futures = {
+            executor.submit(self._program.run, request, local_stop): index
+            for index, request in enumerate(requests)
+        }
+        pending, interruption = set(futures), None
+        try:
+            while pending and not stop.is_set():
+                for future in wait(pending, POLL, FIRST_COMPLETED).done:
+                    outcome = self._outcome(future)
+                    pending.remove(future)
+                    yield futures[future], outcome
+        except (Exception, KeyboardInterrupt) as error:
+            interruption = error
+        finally:
+            stop.set()
+            for future in pending:
+                future.cancel()
+        # Calls that have ended by now were paid for: their answers are given before the run ends.
+        for future in wait(pending, None if local_stop else 0).done:
+            if not future.cancelled() and not future.exception():
+                yield futures[future], future.result()
+        if interruption is not None:
+            raise interruption
+
+    def _outcome(self, future: Future[Outcome]) -> Outcome:
+        try:
+            return future.result()
+        except EngineError:
+            raise
+        except Exception as error:  # a worker that dies loses its candidates, not the whole batch
+            no_path = np.full(self.num_links, np.inf)
+            return Outcome(no_path, 0.0, f"was lost with its worker ({type(error).__name__}: {error})")
+
+    def _request(self, candidate: NDArray[np.float64]) -> Request:
+        return replace(
+            self._blank_request,
+            materials=self.parameters.materials(candidate, self.materials),
+            parameters=dict(zip(self.parameters.names, candidate.tolist(), strict=True)),
+            carriers={
+                frequency: self.parameters.materials(candidate, base, frequency)
+                for frequency, base in self._carriers.items()
+            },
+        )
+
+    def _describe(self, request: Request, failure: str) -> str:
+        values = ", ".join(f"{name} = {value:.6g}" for name, value in request.parameters.items())
+        return f"{self._source}: engine.command `{shlex.join(self._program.words)}` at {values}: {failure}"

@@ -11,8 +11,7 @@ from typing import Any
 from nicegui import run, ui
 
 from calibray.errors import InputError
-from calibray.window.desk import Desk
-from calibray.window.folder import STUDY, TABLES
+from calibray.window.desk import STUDY, TABLES, Desk
 from calibray.window.steps.scene import upload
 
 SECTIONS = ("scene", "links", "antennas", "trace", "offset")

@@ -6,8 +6,7 @@ import re
 
 from nicegui import ui
 
-from calibray.window.desk import Desk
-from calibray.window.folder import STUDY
+from calibray.window.desk import STUDY, Desk
 from calibray.window.jobs import Job
 
 RUNS_SHOWN = 20

@@ -8,8 +8,7 @@ from typing import Final
 from nicegui import events, ui
 
 from calibray.materials import DEFAULT_REVISION, ITU_MATERIALS
-from calibray.window.desk import Desk
-from calibray.window.folder import LARGEST, MAPS
+from calibray.window.desk import LARGEST, MAPS, Desk
 
 ITU: Final = [name for name in ITU_MATERIALS[DEFAULT_REVISION] if name != "vacuum"]
 COMMANDS: Final = {".osm": "osm", ".pbf": "osm", ".csv": "plan", ".dxf": "plan"}
