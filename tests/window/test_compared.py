@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calibray.result.held_out import HeldOutErrors
-from calibray.window.steps import result
+from calibray.window.result_steps import better, changes
 
 LINKS, BLOCKS = 200, 4
 
@@ -36,15 +36,15 @@ def results(monkeypatch, tmp_path):
         model = SimpleNamespace(model=SimpleNamespace(name="calibrated"))
         return {"held_out": planted[folder.name], "prediction": model}
 
-    monkeypatch.setattr(result, "read", read)
+    monkeypatch.setattr("calibray.window.result_steps.read", read)
     return planted, tmp_path
 
 
 def test_the_result_of_less_error_in_the_blocks_predicts_better_in_either_order(results):
     planted, folder = results
     planted.update(old=held_out(6.0, 1), new=held_out(2.0, 2))
-    said = result.better("old", "new", folder)
-    assert said.partition(";")[0] == result.better("new", "old", folder).partition(";")[0]
+    said = better("old", "new", folder)
+    assert said.partition(";")[0] == better("new", "old", folder).partition(";")[0]
     assert said.startswith("new predicts better than old: RMSE ")
     assert "on 200 held-out links" in said
     assert said.endswith("lower in 4 of 4 blocks of old.")
@@ -53,23 +53,23 @@ def test_the_result_of_less_error_in_the_blocks_predicts_better_in_either_order(
 def test_equal_errors_are_not_called_better(results):
     planted, folder = results
     planted.update(old=held_out(3.0, 1), new=held_out(3.0, 2))
-    assert "predicts not clearly better" in result.better("old", "new", folder)
+    assert "predicts not clearly better" in better("old", "new", folder)
 
 
 def test_results_without_links_in_common_are_not_compared(results):
     planted, folder = results
     planted.update(old=held_out(3.0, 1), new=None)
-    assert result.better("old", "new", folder).startswith("new: not validated")
+    assert better("old", "new", folder).startswith("new: not validated")
     other = held_out(3.0, 2)
     planted["new"] = replace(other, measured_db=other.measured_db + 1)
-    assert "on other links" in result.better("old", "new", folder)
+    assert "on other links" in better("old", "new", folder)
     planted["old"] = replace(other, block=np.where(other.block < 2, other.block, -1))
     planted["new"] = replace(other, block=np.where(other.block < 2, -1, other.block))
-    assert "no held-out link in common" in result.better("old", "new", folder)
+    assert "no held-out link in common" in better("old", "new", folder)
 
 
 def test_the_changes_of_a_study_are_its_settings_that_differ():
     first = {"scene": {"frequency": 2e9}, "trace": {"max_depth": 3}, "links": {"tx": [0, 0, 9]}}
     second = {"scene": {"frequency": 2e9}, "trace": {"max_depth": 5}, "links": {"tx": [0, 0, 9]}, "seed": 1}
-    assert result.changes([first, second]) == {"trace.max_depth": [3, 5], "seed": [None, 1]}
-    assert result.changes([first, first]) == {}
+    assert changes([first, second]) == {"trace.max_depth": [3, 5], "seed": [None, 1]}
+    assert changes([first, first]) == {}

@@ -12,16 +12,16 @@ from nicegui import events, run, ui
 
 from calibray.window.desk import RADIUS, Desk, Solid, solid
 from calibray.window.jobs import Stage, stages
-from calibray.window.steps import measurements, parameters, prediction, result, scene
-from calibray.window.steps import run as run_step
+from calibray.window.result_steps import show_prediction, show_result, show_run
+from calibray.window.study_steps import findings, show_measurements, show_parameters, show_scene
 
 STEPS: Final = (
-    ("Map or plan", scene.show),
-    ("Measurements", measurements.show),
-    ("Parameters", parameters.show),
-    ("Run", run_step.show),
-    ("Result", result.show),
-    ("Predict and use", prediction.show),
+    ("Map or plan", show_scene),
+    ("Measurements", show_measurements),
+    ("Parameters", show_parameters),
+    ("Run", show_run),
+    ("Result", show_result),
+    ("Predict and use", show_prediction),
 )
 HEAD: Final = '<link rel="stylesheet" href="/window/window.css"><script src="/window/plan.js" defer></script>'
 
@@ -68,7 +68,7 @@ def build(desk: Desk) -> None:
     def picked(event: events.GenericEventArguments) -> None:
         desk.point = float(event.args["x"]), float(event.args["y"])
         place.set_text(f"Chosen place: x {desk.point[0]:.1f} m, y {desk.point[1]:.1f} m")
-        prediction.show.refresh()
+        show_prediction.refresh()
 
     def area_drawn(event: events.GenericEventArguments) -> None:
         west, south, east, north = (
@@ -76,16 +76,16 @@ def build(desk: Desk) -> None:
         )
         desk.area = west, south, east, north
         place.set_text(f"Chosen area: {east - west:.0f} m by {north - south:.0f} m")
-        prediction.show.refresh()
+        show_prediction.refresh()
 
     def loaded(event: events.GenericEventArguments) -> None:
         data: dict[str, Any] = event.args
         desk.transmitters = data["transmitters"]
-        prediction.show.refresh()
+        show_prediction.refresh()
 
     def examined(event: events.GenericEventArguments) -> None:
         desk.findings = event.args["findings"]
-        measurements.findings.refresh()
+        findings.refresh()
 
     desk.refresh = refresh
     ui.timer(0.1, reload_map, once=True)

@@ -1,0 +1,309 @@
+"""The steps of the page from a map to a study: the scene, the measurements, the parameters."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from nicegui import events, run, ui
+
+from calibray.errors import InputError
+from calibray.materials import DEFAULT_REVISION, ITU_MATERIALS
+from calibray.window.desk import LARGEST, MAPS, STUDY, TABLES, Desk
+
+ITU: Final = [name for name in ITU_MATERIALS[DEFAULT_REVISION] if name != "vacuum"]
+COMMANDS: Final = {".osm": "osm", ".pbf": "osm", ".csv": "plan", ".dxf": "plan"}
+"""How files are converted to scenes; files of other kinds may be footprints or plans."""
+
+
+def upload(desk: Desk, label: str) -> None:
+    """Take files into the folder."""
+
+    async def take(event: events.UploadEventArguments) -> None:
+        with desk.messages():
+            target = desk.folder.check_upload(event.file.name)
+            target.parent.mkdir(exist_ok=True)
+            await event.file.save(target)
+            ui.notify(f"Added: {target.name}", type="positive")
+        # The list of files changes when all of them have come.
+        ui.timer(0.3, desk.refresh, once=True)
+
+    button = ui.button(label).props("outline")
+    ui.label("Or drop files here:").classes("quiet")
+    files = ui.upload(on_upload=take, multiple=True, auto_upload=True, max_file_size=LARGEST).classes("wide")
+    # The header of Quasar's uploader, which is hidden, has buttons without names.
+    button.on("click", js_handler=f"() => getElement({files.id}).pickFiles()")
+
+
+@ui.refreshable
+def show_scene(desk: Desk) -> None:
+    """Draw the step of the scene: a map, footprints or a floor plan is converted, or a scene is chosen."""
+    upload(desk, "Add maps, plans, scenes, height models")
+    sources, terrain = desk.folder.files(MAPS), desk.folder.files((".tif", ".tiff"))
+    if sources:
+        with ui.row():
+            source = ui.select(sources, label="Map, footprints or plan", value=_likely_map(sources)).classes(
+                "wide"
+            )
+            kind = ui.select(["osm", "footprints", "plan"], label="Kind", value=_kind(source.value))
+            source.on_value_change(lambda event: kind.set_value(_kind(event.value)))
+        with ui.expansion("Settings of the scene").classes("wide"), ui.row():
+            height = ui.input("Height: a column, or metres", value="3")
+            wall = ui.select(ITU, label="Walls (ITU-R P.2040)", value="concrete")
+            thickness = ui.number("Thickness of walls [m]", value=0.3, min=0.001, max=10, step=0.01)
+            ground = ui.select(ITU, label="Ground", value="concrete")
+            unit = ui.number("Unit of a plan [m]", value=1.0, min=1e-6)
+            relief = ui.select(["", *terrain], label="Height model of the ground", value="")
+            apart = ui.switch("One mesh per building")
+
+        def make() -> None:
+            words: list[object] = ["scene", kind.value, source.value, "--out", "scene"]
+            if kind.value == "plan":
+                words += ["--unit", unit.value]
+                words += [f"--height={height.value}"] if _is_number(height.value) else []
+            else:
+                words += ["--wall", f"{wall.value}:{thickness.value}", "--ground", f"{ground.value}:1.0"]
+                words += ["--terrain", relief.value] if relief.value else []
+                words += ["--per-building"] if apart.value else []
+            if kind.value == "footprints":
+                words += [f"--height={height.value}"]
+            desk.scene = "scene/scene.xml"
+            desk.start(words)
+
+        ui.button("Make the scene", on_click=make)
+    scenes = desk.folder.scenes()
+    if desk.scene not in scenes:
+        desk.scene = scenes[0] if scenes else None
+    if scenes:
+
+        def choose(event: events.ValueChangeEventArguments) -> None:
+            desk.scene = event.value
+            desk.refresh()
+
+        ui.select(scenes, label="Scene", value=desk.scene, on_change=choose).classes("wide")
+
+
+def _likely_map(sources: list[str]) -> str:
+    """The file that is most likely a map; tables are seldom plans."""
+    ranked = sorted(sources, key=lambda name: (name.endswith(".csv"), "plan" not in name.lower()))
+    return ranked[0]
+
+
+def _kind(source: str) -> str:
+    return COMMANDS.get(Path(source).suffix.lower(), "plan" if "plan" in source.lower() else "footprints")
+
+
+def _is_number(text: str | None) -> bool:
+    try:
+        float(text or "")
+    except ValueError:
+        return False
+    return True
+
+
+SECTIONS = ("scene", "links", "antennas", "trace", "offset")
+"""Sections with assumptions that this step shows; parameters have their own step."""
+
+
+@ui.refreshable
+def show_measurements(desk: Desk) -> None:
+    """Draw the step of the measurements: tables of links become a drafted study, whose assumptions can be changed."""
+    upload(desk, "Add tables, tracks")
+    if desk.folder.study_file.is_file():
+        _assumptions(desk)
+        findings(desk)
+        with ui.expansion("The study file").classes("wide"):
+            ui.label(desk.folder.text()).classes("log")
+        return
+    tables, tracks = desk.folder.files(TABLES), desk.folder.files((".gpx",))
+    if not tables:
+        ui.label("Add a table of measured links: CSV, Excel or Parquet.").classes("quiet")
+        return
+    with ui.row():
+        links = ui.select(tables, label="Table of links", value=_likely_links(tables)).classes("wide")
+        sites = ui.select(["", *tables], label="Table of transmitters", value=_sites(tables)).classes("wide")
+        track = ui.select(["", *tracks], label="Track", value=tracks[0] if tracks else "").classes("wide")
+        frequency = ui.input("Carrier frequency [Hz]", placeholder="3.5e9, unless a column has it")
+        tx = ui.input("Transmitter x,y,z [m]", placeholder="unless a table has it")
+
+    def draft() -> None:
+        if desk.scene is None:
+            ui.notify("Make or add a scene first.", type="negative")
+            return
+        words: list[object] = ["init", desk.scene, links.value, "--out", STUDY]
+        options = {
+            "--transmitters": sites.value, "--track": track.value, "--frequency": frequency.value, "--tx": tx.value
+        }  # fmt: skip
+        # One word each, so that a negative x is not taken for an option.
+        words += [f"{option}={value}" for option, value in options.items() if value]
+        desk.start(words)
+
+    ui.button("Draft the study", on_click=draft)
+
+
+@ui.refreshable
+def findings(desk: Desk) -> None:
+    """Suspicions about the links, which are orange on the map."""
+    for finding in desk.findings:
+        ui.label(finding).classes("warning").props("role=note")
+
+
+def _assumptions(desk: Desk) -> None:
+    content, reasons = desk.folder.content(), desk.folder.reasons()
+    columns = _columns(desk, content)
+    edits: list[tuple[str, str, Callable[[], Any]]] = []
+    for section in SECTIONS:
+        table = content.get(section)
+        if not isinstance(table, dict) or not table:
+            continue
+        with ui.expansion(section, value=section == "links").classes("wide"):
+            if section in reasons:
+                ui.label(reasons[section]).classes("quiet")
+            for key, value in table.items():
+                with ui.element("div").classes("setting"):
+                    edits.append((section, key, _control(key, value, columns)))
+                    if reason := reasons.get(f"{section}.{key}"):
+                        ui.label(reason).classes("quiet")
+
+    async def save() -> None:
+        with desk.messages():
+            for section, key, read in edits:
+                content[section][key] = read()
+            await run.io_bound(desk.folder.save, content)
+            ui.notify("Saved", type="positive")
+            desk.refresh()
+
+    def again() -> None:
+        with desk.messages():
+            desk.folder.set_aside()
+            desk.refresh()
+
+    with ui.row():
+        ui.button("Save changes", on_click=save)
+        ui.button("Draft again", on_click=again).props("outline").tooltip(
+            "Keeps this study under another name"
+        )
+
+
+def _control(key: str, value: Any, columns: list[str]) -> Callable[[], Any]:
+    """A control for a value of the study, and a function that reads it."""
+    if isinstance(value, bool):
+        switch = ui.switch(key, value=value)
+        return lambda: switch.value
+    if isinstance(value, str) and value in columns:
+        select = ui.select(columns, label=key, value=value).classes("wide")
+        return lambda: select.value
+    if isinstance(value, str):
+        text = ui.input(key, value=value).classes("wide")
+        return lambda: text.value
+    shown = ui.input(key, value=_toml(value)).classes("wide")
+
+    def read() -> Any:
+        try:
+            return tomllib.loads(f"value = {shown.value}")["value"]
+        except ValueError as error:
+            raise InputError(
+                f"{key} = {shown.value}: is not a value ({error}); put texts in quotes"
+            ) from None
+
+    return read
+
+
+def _toml(value: Any) -> str:
+    """A value in the form of the study file."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{json.dumps(key)} = {_toml(part)}" for key, part in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _columns(desk: Desk, content: dict[str, Any]) -> list[str]:
+    """The columns of the table of links."""
+    from calibray.measurements import read_table
+
+    try:
+        return [str(name) for name in read_table(desk.folder.path / str(content["links"]["file"])).frame]
+    except (InputError, KeyError, TypeError, OSError):
+        return []
+
+
+def _likely_links(tables: list[str]) -> str:
+    """The table that most likely contains the links."""
+    return min(tables, key=lambda name: (_is_sites(name), "plan" in name.lower(), Path(name).suffix))
+
+
+def _sites(tables: list[str]) -> str:
+    return next((name for name in tables if _is_sites(name)), "")
+
+
+def _is_sites(name: str) -> bool:
+    words = ("cell", "site", "mast", "access", "transmitter", "station")
+    return any(word in name.lower() for word in words)
+
+
+@ui.refreshable
+def show_parameters(desk: Desk) -> None:
+    """Draw the step of the parameters: what is calibrated, within which bounds, and with which prior."""
+    content = desk.folder.content()
+    parameters = content.get("parameters")
+    if not isinstance(parameters, dict):
+        ui.label("Draft the study first.").classes("quiet")
+        return
+    edits = {name: _entry(name, entry) for name, entry in parameters.items() if isinstance(entry, dict)}
+
+    async def save() -> None:
+        with desk.messages():
+            kept = {name: read() for name, read in edits.items()}
+            changed = {name: entry for name, entry in kept.items() if entry is not None}
+            await run.io_bound(desk.folder.save, {**content, "parameters": changed})
+            ui.notify("Saved", type="positive")
+            desk.refresh()
+
+    ui.button("Save parameters", on_click=save)
+
+
+def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | None]:
+    """The controls of a parameter, and a function that reads its entry; None if it is not calibrated."""
+    low, high = (float(bound) for bound in entry.get("bounds", [1.5, 15.0]))
+    prior = entry.get("prior", {})
+    with ui.element("fieldset"):
+        with ui.element("legend"):
+            ui.label(name)
+        with ui.row():
+            chosen = ui.switch("Calibrate", value=True)
+            lower = ui.number("Lowest", value=low, format="%.6g")
+            upper = ui.number("Highest", value=high, format="%.6g")
+            itu = ui.select(["", *ITU], label="Prior: ITU-R P.2040", value=_known(prior.get("itu")))
+            spread = ui.number(
+                "Spread of the prior", value=prior.get("spread", 0.3), min=0.01, max=10, step=0.05
+            )
+        if entry.get("scale") != "log":
+            with ui.row():
+                for bound, which in ((lower, "lowest"), (upper, "highest")):
+                    slider = ui.slider(min=0, max=max(2 * high, 20.0), step=0.1).bind_value(bound)
+                    slider.classes("bound").props(f'label aria-label="{_safe(name)} {which}, slider"')
+
+    def read() -> dict[str, Any] | None:
+        if not chosen.value:
+            return None
+        changed = {**entry, "bounds": [lower.value, upper.value]}
+        if itu.value:
+            changed["prior"] = {"itu": itu.value, "spread": spread.value}
+        elif "itu" in prior:
+            del changed["prior"]
+        return changed
+
+    return read
+
+
+def _known(name: object) -> str:
+    return name if isinstance(name, str) and name in ITU else ""
+
+
+def _safe(name: str) -> str:
+    """A name for a property, whose syntax has quotes."""
+    return "".join(letter for letter in name if letter.isalnum() or letter in " ._-")
