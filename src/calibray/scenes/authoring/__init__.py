@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from calibray.scenes.authoring.floor_plan_scene import LIDS as LIDS
     from calibray.scenes.authoring.floor_plan_scene import WALL_THICKNESS as WALL_THICKNESS
     from calibray.scenes.authoring.floor_plan_scene import make_plan_scene as make_plan_scene
-    from calibray.scenes.authoring.footprint_files import FootprintColumns as FootprintColumns
-    from calibray.scenes.authoring.footprint_files import read_footprints as read_footprints
-    from calibray.scenes.authoring.footprint_files import read_openstreetmap as read_openstreetmap
     from calibray.scenes.authoring.footprints import WIDEST as WIDEST
+    from calibray.scenes.authoring.footprints import FootprintColumns as FootprintColumns
     from calibray.scenes.authoring.footprints import Footprints as Footprints
     from calibray.scenes.authoring.footprints import HeightRule as HeightRule
     from calibray.scenes.authoring.footprints import HeightSource as HeightSource
     from calibray.scenes.authoring.footprints import clean_footprints as clean_footprints
+    from calibray.scenes.authoring.footprints import read_footprints as read_footprints
+    from calibray.scenes.authoring.footprints import read_openstreetmap as read_openstreetmap
     from calibray.scenes.authoring.made_scene import SCENE_FILES as SCENE_FILES
     from calibray.scenes.authoring.made_scene import MadeScene as MadeScene
     from calibray.scenes.authoring.made_scene import Palette as Palette
@@ -43,8 +43,8 @@ __all__, __getattr__, __dir__ = lazy_attributes(
         "extrusion": "Windows",
         "floor_plan": "Segment read_plan",
         "floor_plan_scene": "LIDS WALL_THICKNESS make_plan_scene",
-        "footprint_files": "FootprintColumns read_footprints read_openstreetmap",
-        "footprints": "WIDEST Footprints HeightRule HeightSource clean_footprints",
+        "footprints": "WIDEST FootprintColumns Footprints HeightRule HeightSource clean_footprints read_footprints "
+        "read_openstreetmap",
         "made_scene": "SCENE_FILES MadeScene Palette SurfaceMaterial material_name",
         "terrain": "Terrain lower_origin read_terrain",
         "trees": "TREES_FILE Trees read_trees",
