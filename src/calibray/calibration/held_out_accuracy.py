@@ -19,6 +19,7 @@ from calibray.fitting.search import Trail
 from calibray.result.held_out import FittedTerm, Model, PredictionModel
 from calibray.result.record import Accuracy
 from calibray.scenes.obstruction import OUT_OF_SIGHT
+from calibray.study.calibration_sections import DEFAULT_BLOCKS
 from calibray.validation.baselines import has_obstruction, log_distance, obstructed, without_scene
 from calibray.validation.choice import HeldOutResiduals, fitted_terms, quantiles
 from calibray.validation.held_out_statistics import (
@@ -30,7 +31,6 @@ from calibray.validation.held_out_statistics import (
     spatial_blocks,
     two_levels,
 )
-from calibray.validation.validate import DEFAULT_BLOCKS
 from calibray.validation.validation import Validation
 from calibray.validation.variants import add_nuisance, initial_objective
 

@@ -23,7 +23,7 @@ from scipy.stats import qmc
 
 from calibray.engines.replay import TABLE_TOLERANCE
 from calibray.errors import InputError
-from calibray.fields import layout, path_losses, path_powers
+from calibray.fields import FINEST, layout, path_losses, path_powers
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take
 
@@ -62,8 +62,7 @@ BATCH_POWERS: Final = 400_000_000
 """Largest number of powers, paths times candidates, in memory at once."""
 
 FIRST_INTERVALS: Final = 512
-LAST_INTERVALS: Final = 65536
-"""First and largest number of intervals of a table of coefficients."""
+"""First number of intervals of a table of coefficients."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERAN
     candidates = _candidate_sets(parameters)
     intervals = FIRST_INTERVALS
     totals, strength, table_error = _evaluate_all(paths, parameters, candidates, intervals)
-    while table_error > TABLE_TOLERANCE and intervals < LAST_INTERVALS:
+    while table_error > TABLE_TOLERANCE and intervals < FINEST:
         intervals *= 2
         totals, strength, table_error = _evaluate_all(paths, parameters, candidates, intervals)
     pool = _pool(paths, strength)

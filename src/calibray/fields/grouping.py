@@ -29,7 +29,7 @@ DIFFRACTION: Final = "d"
 _LETTERS: Final = ("?", COEFFICIENT, SCATTERING, DIFFRACTION)
 """Letters by the numbers of `_numbers`."""
 
-_COEFFICIENT_NUMBER: Final = 1
+_COEFFICIENT_NUMBER: Final = _LETTERS.index(COEFFICIENT)
 
 Step = tuple[str, NDArray[np.int64]]
 """A letter, and the interactions of a group's n paths: [n], or [k, n] for a run of k, with -1 where a path has none."""

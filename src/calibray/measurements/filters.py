@@ -34,7 +34,7 @@ MAX_PARTS: Final = 2_000
 MAX_DEPTH: Final = 50
 """Largest depth to which the parts of a filter may be nested."""
 
-_MAX_INTEGER: Final = 2**63 - 1
+_MAX_INTEGER: Final = int(np.iinfo(np.int64).max)
 
 _Value = pd.Series | bool | int | float | str
 _Item = TypeVar("_Item")

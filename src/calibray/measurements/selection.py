@@ -14,10 +14,7 @@ from calibray.errors import InputError
 from calibray.measurements.placement import join_track
 from calibray.measurements.preparation import Preparation
 from calibray.measurements.source_table import SourceTable
-from calibray.support.messages import did_you_mean, shortened
-
-NAMED: Final = 20
-"""Largest number of missing transmitters that a message names."""
+from calibray.support.messages import MAX_LISTED, did_you_mean, shortened
 
 
 def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> SourceTable:
@@ -158,8 +155,8 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
     lacking = np.array([label not in index_of_label for label in compared_of_link])
     if lacking.any():
         unknown = table.frame.loc[lacking, key].unique().tolist()
-        cells = ", ".join(map(repr, unknown[:NAMED]))
-        more = f" and {len(unknown) - NAMED} more" if len(unknown) > NAMED else ""
+        cells = ", ".join(map(repr, unknown[:MAX_LISTED]))
+        more = f" and {len(unknown) - MAX_LISTED} more" if len(unknown) > MAX_LISTED else ""
         raise InputError(
             f"{table.source}: {transmitters.source} lacks {cells}{more}, the {key} of {lacking.sum()} of {len(table)} "
             f"rows; {did_you_mean(str(unknown[0]), labels)}; add them, or remove their rows with links.where, as in "

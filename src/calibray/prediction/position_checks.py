@@ -10,14 +10,12 @@ from numpy.typing import NDArray
 
 from calibray.result.record import Record
 from calibray.scenes import Triangles, read_triangles
+from calibray.scenes.checks.positions import CLEARANCE
 from calibray.study import Setup
 
 BEYOND: Final = "beyond the scene"
 UNDER: Final = "under the ground"
 INSIDE: Final = "inside a building"
-
-CLEARANCE: Final = 0.05
-"""Height above an antenna beyond which a surface counts as above it [m]."""
 
 PAIRS: Final = 5_000_000
 """Number of triangle-point pairs that are compared at a time; each pair needs about 100 bytes."""

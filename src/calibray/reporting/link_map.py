@@ -21,9 +21,8 @@ from calibray.support.figure_style import BLUE, FAINT, LINE, ORANGE, dress, styl
 from calibray.support.output_files import check_file, replacing
 
 WIDTH: Final = 1000
-"""Width of the map in its own units."""
+"""Width of the map, and its largest height, in its own units."""
 
-MOST_HEIGHT: Final = 1000
 LEAST_ASPECT: Final = 0.45
 """Smallest ratio of height to width, so that links along a street do not make a thin strip."""
 
@@ -84,7 +83,7 @@ def lay_out(ends: NDArray[np.float64], triangles: Triangles | None) -> Plan:
     low, high = ends.min(axis=0), ends.max(axis=0)
     extent = np.maximum((high - low) * (1 + 2 * MARGIN), LEAST_EXTENT)
     extent[1] = max(extent[1], LEAST_ASPECT * extent[0])
-    extent[0] = max(extent[0], extent[1] * WIDTH / MOST_HEIGHT)
+    extent[0] = max(extent[0], extent[1])
     middle = (low + high) / 2
     west, north = middle[0] - extent[0] / 2, middle[1] + extent[1] / 2
     scale = WIDTH / extent[0]

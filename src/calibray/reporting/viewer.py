@@ -29,7 +29,7 @@ INTERACTIONS: Final = 400_000
 TRIANGLES: Final = 250_000
 """Largest number of triangles that are drawn, the largest first."""
 
-STEPS: Final = 65_535
+STEPS: Final = np.iinfo(np.uint16).max
 
 
 @dataclass(frozen=True, eq=False)

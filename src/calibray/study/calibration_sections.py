@@ -238,6 +238,13 @@ class NoiseSection(Section):
         return self
 
 
+DEFAULT_BLOCKS: Final = 4
+"""Number of spatial blocks, each held out in turn, of a drafted study and of a validation that states none."""
+
+MOST_BLOCKS: Final = 100
+"""Largest number of spatial blocks: each needs a calibration."""
+
+
 class HoldoutSection(Section):
     """``[holdout]``: links that are not used for calibration but for validation; chosen in one of three ways.
 
@@ -248,7 +255,7 @@ class HoldoutSection(Section):
     """
 
     where: Text | None = None
-    blocks: Annotated[int, Field(ge=2, le=100)] | None = None
+    blocks: Annotated[int, Field(ge=2, le=MOST_BLOCKS)] | None = None
     by: Text | None = None
 
     @model_validator(mode="after")

@@ -22,6 +22,7 @@ from calibray.measurements.transmitter_columns import find_powers, plain_name
 from calibray.scenes import Scene, read_frame, read_scene
 from calibray.scenes.authoring import TREES_FILE
 from calibray.scenes.checks import count_crossings
+from calibray.study.calibration_sections import DEFAULT_BLOCKS
 from calibray.study.content import BUNDLED, VERSION
 from calibray.study.draft_links import Assumption, Given, LinksDraft
 from calibray.study.link_checks import CELL_SHARE, LINKS_PER_UNKNOWN, count_unknowns
@@ -169,10 +170,6 @@ MOST_MATERIALS: Final = 6
 """Largest number of materials that are calibrated; links seldom identify more."""
 
 
-BLOCKS: Final = 4
-"""Number of blocks that are held out in turn, the default of `calibray validate`."""
-
-
 @dataclass(frozen=True)
 class Draft:
     """A drafted study.
@@ -240,11 +237,11 @@ def _hold_out_blocks(links: LinksDraft, content: dict[str, Any]) -> None:
     study = Study.from_content(content, links.target)
     measured = study.measurements()
     places = len(np.unique(measured.rx[:, :2], axis=0))
-    if count_unknowns(study, measured) or places < BLOCKS * LINKS_PER_UNKNOWN:
+    if count_unknowns(study, measured) or places < DEFAULT_BLOCKS * LINKS_PER_UNKNOWN:
         return
-    content["holdout"] = {"blocks": BLOCKS}
+    content["holdout"] = {"blocks": DEFAULT_BLOCKS}
     reason = "each block of neighbours is predicted from the others; predictions use the model with the lowest error"
-    links.assume("holdout.blocks", BLOCKS, reason)
+    links.assume("holdout.blocks", DEFAULT_BLOCKS, reason)
 
 
 def _indoors(links: LinksDraft) -> bool:

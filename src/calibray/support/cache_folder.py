@@ -22,7 +22,7 @@ CACHE_VARIABLE: Final = "CALIBRAY_CACHE"
 COMPILED_BYTES: Final = 512 * 2**20
 """Size limit of compiled programs [bytes]."""
 _NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
-_DIGEST_BYTES: Final = 32
+_DIGEST_BYTES: Final = hashlib.sha256().digest_size
 """Bytes of the SHA-256 at the start of each entry."""
 _PRUNED_AT: Final = 16
 """The size of all entries is checked once per this number of written entries: with 7,000 entries it takes 0.08 s, as

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Final
 
-INTERRUPTED: Final = 130
+INTERRUPTED: Final = 128 + signal.SIGINT
 """Exit status after Ctrl-C: 128 plus the number of the signal, as in shells."""
 
 GRACE: Final = 1.0

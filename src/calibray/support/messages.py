@@ -10,7 +10,7 @@ from typing import Final
 MAX_LENGTH: Final = 80
 """Number of characters above which a value is shortened in a message."""
 MAX_LISTED: Final = 20
-"""Number of names above which a message does not list them all."""
+"""Number of names, or of errors, above which a message does not list them all."""
 MAX_COMPARED: Final = 2_000
 """Largest number of names with which a misspelled one is compared."""
 

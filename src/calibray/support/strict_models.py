@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final, Union, get_args, get_origin
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from calibray.errors import InputError
-from calibray.support.messages import did_you_mean, shortened
+from calibray.support.messages import MAX_LISTED, did_you_mean, shortened
 
 CLOSED: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 """No unknown keys, no type conversions, only finite numbers."""
@@ -23,9 +23,6 @@ class Section(BaseModel):
 
     model_config = CLOSED | ConfigDict(frozen=True)
 
-
-MOST_ERRORS: Final = 20
-"""Number of errors that are listed; further errors are only counted."""
 
 _UNKNOWN: Final = ("extra_forbidden", "unexpected_keyword_argument")
 
@@ -82,7 +79,7 @@ def explain(
             line = text if text.startswith(key) else f"{key}{_shown(path, content)}: {text}"
         # A value that matches none of several types has one error per type; the first is enough.
         lines.setdefault(key, line)
-    listed = list(lines.values())[:MOST_ERRORS]
+    listed = list(lines.values())[:MAX_LISTED]
     if len(lines) > len(listed):
         listed.append(f"and {len(lines) - len(listed)} more errors of this kind; correct these first")
     return InputError("\n".join(f"{source}: {line}" for line in listed))

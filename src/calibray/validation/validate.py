@@ -20,6 +20,7 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.ray_mapping import maps_rays, search_rays
 from calibray.result.held_out import Model
 from calibray.study import Setup, Study
+from calibray.study.calibration_sections import DEFAULT_BLOCKS, MOST_BLOCKS
 from calibray.study.model import StudyModel
 from calibray.support.progress import Progress
 from calibray.tracing.default_tracer import SIONNA
@@ -28,12 +29,6 @@ from calibray.validation.baselines import has_obstruction, kriging, log_distance
 from calibray.validation.held_out_statistics import MODELS, held_out_gaps, observable_errors, spatial_blocks
 from calibray.validation.validation import Validation
 from calibray.validation.variants import NO_MINIMA, add_nuisance, fit_variants
-
-DEFAULT_BLOCKS: Final = 4
-"""Number of spatial blocks if the study states none."""
-
-MOST_BLOCKS: Final = 100
-"""Largest number of spatial blocks, as in a study."""
 
 TX: Final = "tx"
 """Name of the transmitter's position as a label, if the table has no such column."""

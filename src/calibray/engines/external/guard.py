@@ -29,7 +29,7 @@ import psutil
 
 HEAD, TAIL = 500, 1500  # bytes that are kept from the start and the end of an output
 KILL_TIME = 5.0  # how long to go on killing [s]
-POLL = 0.5  # interval between checks that Calibray is still alive [s]
+POLL = 0.5  # interval between checks that Calibray is still alive and, in Calibray, whether to stop [s]
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 
 

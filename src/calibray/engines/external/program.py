@@ -23,12 +23,12 @@ import psutil
 from numpy.typing import NDArray
 
 from calibray.engines.external.exchange import Request, Unusable, read_answer, read_rays
+from calibray.engines.external.guard import KILL_TIME, POLL
 from calibray.engines.process_owner import ProcessOwner
 from calibray.errors import EngineError, InputError
 
 PLACEHOLDERS: Final = ("{request}", "{response}")
-POLL: Final = 0.5  # interval at which a waiting thread checks whether to stop [s]
-GUARD_WAIT: Final = 10.0  # longest wait for a guard that kills its program [s]; twice its own limit
+GUARD_WAIT: Final = 2 * KILL_TIME  # longest wait for a guard that kills its program [s]
 PREFIX: Final = "calibray-call-"  # of the temporary folders of calls
 OWNER_FILE: Final = "owner.json"
 

@@ -39,7 +39,7 @@ _CLAIMS: Final = """CREATE TABLE IF NOT EXISTS claims (
     PRIMARY KEY (problem, candidate)) WITHOUT ROWID"""
 EXPIRY: Final = 300.0  # time without a renewal after which a claim ends, as the observer measures it [s]
 SKEW: Final = 86_400.0  # largest difference between the clocks of two machines [s]; older claims end at once
-RENEWAL: Final = 60.0  # interval between renewals [s]
+RENEWAL: Final = EXPIRY / 5  # interval between renewals [s]; a few may fail
 RELEASE_WAIT: Final = 500  # longest wait of `release` for other writers [ms]
 _active_runs: set[str] = set()  # the runs of this process
 _observed: dict[tuple[str, bytes, str], tuple[float, float]] = {}

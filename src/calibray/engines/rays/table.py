@@ -24,6 +24,7 @@ from calibray.paths import Kind
 from calibray.support.messages import did_you_mean, shortened
 from calibray.support.output_files import check_file, exists, replacing, write_text
 from calibray.support.output_tables import write_table
+from calibray.tracing.settings import RANGES
 
 TYPES: Final = {
     "reflection": Kind.SPECULAR,
@@ -36,8 +37,8 @@ TYPES: Final = {
 ENDS: Final = ("transmitter", "receiver")
 """Values of `type` of the first and the last point of a path."""
 
-MOST_POINTS: Final = 102
-"""Largest number of points of a path: `trace.max_depth` allows 100 interactions."""
+MOST_POINTS: Final = RANGES["max_depth"][1] + 2
+"""Largest number of points of a path: the most interactions of a trace, and both ends."""
 
 POWER_ZERO_DB: Final = -10_000.0
 """Level in place of -inf [dB]: its power is 0 in double precision."""

@@ -18,6 +18,7 @@ from calibray.measurements.column_names import LENGTH_UNITS, find_length_unit, w
 from calibray.measurements.delimited_text import parse_text, read_text
 from calibray.scenes.authoring.footprints import HIGHEST, WIDEST
 from calibray.scenes.authoring.geodata import read_features
+from calibray.scenes.meshes import MILLIMETRE
 from calibray.support.lazy_imports import library
 from calibray.support.messages import did_you_mean, first_line, shortened
 from calibray.support.output_files import exists
@@ -25,7 +26,6 @@ from calibray.support.output_files import exists
 OPENINGS: Final = frozenset({"door", "window"})
 """Types that replace the wall on which they are drawn."""
 
-SHORTEST: Final = 0.001  # length of a segment [m]
 VECTOR_SUFFIXES: Final = (".dxf", ".geojson", ".json", ".gpkg", ".shp", ".fgb", ".gdb")
 """Extensions of vector files; any other file is read as CSV."""
 
@@ -118,7 +118,7 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[
         extent = height - bottom if np.isnan(extent) else extent
         sides = [(tuple(a), tuple(b)) for part in parts for a, b in pairwise((part * unit).tolist())]
         # The last point of an outline may stand there twice.
-        sides = [(a, b) for a, b in sides if np.hypot(b[0] - a[0], b[1] - a[1]) >= SHORTEST]
+        sides = [(a, b) for a, b in sides if np.hypot(b[0] - a[0], b[1] - a[1]) >= MILLIMETRE]
         if not sides or extent <= 0 or thickness <= 0:
             raise InputError(
                 f"{row}: its length, height and thickness must be greater than 0; correct or remove it"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from calibray.scenes.meshes import MeshObject
+from calibray.scenes.meshes import MILLIMETRE, MeshObject
 from calibray.scenes.scene import ITU_NAMES
 from calibray.scenes.scene_file import find_scene
 from calibray.scenes.shapes import COARSE, TOO_COARSE
@@ -25,7 +25,6 @@ Severity = Literal["error", "warning", "note"]
 LARGEST: Final = 50_000.0
 """Extent above which a scene is probably not in metres about a local origin [m]."""
 
-_SAME: Final = 0.001  # corners closer than this count as one position [m]
 _FLAT: Final = 1e-10  # a face of less area counts as empty [m^2]
 
 
@@ -206,7 +205,7 @@ def _scale_findings(low: NDArray[np.float64], high: NDArray[np.float64]) -> Iter
 def count_faults(item: MeshObject) -> MeshFaults:
     """Count the faults of a mesh."""
     mesh = item.mesh
-    _, position = np.unique(np.rint(mesh.vertices / _SAME).astype(np.int64), axis=0, return_inverse=True)
+    _, position = np.unique(np.rint(mesh.vertices / MILLIMETRE).astype(np.int64), axis=0, return_inverse=True)
     by_position = position.reshape(-1)[mesh.faces]
     sides = mesh.vertices[mesh.faces[:, 1:]] - mesh.vertices[mesh.faces[:, :1]]
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2
@@ -277,7 +276,7 @@ def _open_above(
     _, edge, uses = _edges(by_position)
     is_open = (uses == 1)[edge].reshape(-1, 3)
     height = vertices[faces][:, :, 2]
-    above = np.maximum(height, np.roll(height, -1, axis=1)) > lowest[:, None] + 2 * _SAME
+    above = np.maximum(height, np.roll(height, -1, axis=1)) > lowest[:, None] + 2 * MILLIMETRE
     return (is_open & above).sum(axis=1)
 
 
