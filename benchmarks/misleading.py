@@ -34,12 +34,11 @@ from calibray.comparison.method_runs import (
     ComparisonProblem,
     MethodRun,
     RunFile,
-    code_fingerprint,
 )
 from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, CheapModel, Constants
 from calibray.tables import Column, Table, numbers
 from markdown_tables import render_markdown
-from problem_families.family_comparison import seed_range
+from problem_families.family_comparison import method_fingerprint, seed_range
 from problem_families.problems import planted_problem
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -237,7 +236,7 @@ def main() -> None:
             for name in runs:
                 store = RunFile(
                     chosen.runs / "runs.jsonl",
-                    f"{problem.fingerprint}-{code_fingerprint('space-mapping')}-{name}",
+                    f"{problem.fingerprint}-{method_fingerprint('space-mapping')}-{name}",
                 )
                 for repeat in range(chosen.repeats):
                     kept = store.find(method.key(repeat))

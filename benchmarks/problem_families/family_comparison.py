@@ -6,6 +6,8 @@ calls, is a data profile: J. J. Moré, S. M. Wild, SIAM J. Optim. 20 (2009) 172.
 
 from __future__ import annotations
 
+import hashlib
+import re
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import nullcontext
@@ -19,6 +21,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from calibray import optimizers
 from calibray.comparison.comparison import parse_methods, quantile
 from calibray.comparison.method_runs import (
     LIMITS,
@@ -26,7 +29,6 @@ from calibray.comparison.method_runs import (
     ComparisonProblem,
     MethodRun,
     RunFile,
-    code_fingerprint,
 )
 from calibray.errors import InputError
 from calibray.optimizers import METHODS, label
@@ -201,6 +203,27 @@ def seed_range(text: str) -> range:
     return seeds
 
 
+def method_fingerprint(method: str) -> str:
+    """Digest of the code of a method: its module and all optimizer modules that it imports."""
+    folder = Path(optimizers.__file__).parent
+    files: set[Path] = set()
+    waiting = [METHODS[method].__module__]
+    while waiting:
+        file = folder.joinpath(*waiting.pop().split(".")[2:]).with_suffix(".py")
+        if file.is_file() and file not in files:
+            files.add(file)
+            text = file.read_text("utf-8")
+            waiting += re.findall(r"^from (calibray\.optimizers\.[\w.]+) import", text, re.MULTILINE)
+            for package, names in re.findall(
+                r"^from (calibray\.optimizers[\w.]*) import (\w+)$", text, re.MULTILINE
+            ):
+                waiting.append(f"{package}.{names}")
+    digest = hashlib.sha256()
+    for path in sorted(files):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
 def compare_family(
     kind: str,
     seeds: Sequence[int],
@@ -271,7 +294,7 @@ def compare_family(
                 "no problem of these seeds has a cheap model with such constants; use other seeds"
             )
         files = {
-            (seed, method.method): RunFile(path, f"{problem.fingerprint}-{code_fingerprint(method.method)}")
+            (seed, method.method): RunFile(path, f"{problem.fingerprint}-{method_fingerprint(method.method)}")
             for seed, problem in ready.items()
             for method in methods
         }

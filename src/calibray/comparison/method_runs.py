@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 import time
 from bisect import bisect_right
 from collections.abc import Callable
@@ -279,25 +278,9 @@ class RunFile:
 
 
 @cache
-def code_fingerprint(method: str | None = None) -> str:
-    """Digest of the code of the optimizers; runs of different code are not comparable.
-
-    With a method, only its module and all optimizer modules that it imports are digested.
-    """
-    folder = Path(optimizers.__file__).parent
-    files = set(folder.rglob("*.py")) if method is None else set()
-    waiting = [] if method is None else [METHODS[method].__module__]
-    while waiting:
-        file = folder.joinpath(*waiting.pop().split(".")[2:]).with_suffix(".py")
-        if file.is_file() and file not in files:
-            files.add(file)
-            text = file.read_text("utf-8")
-            waiting += re.findall(r"^from (calibray\.optimizers\.[\w.]+) import", text, re.MULTILINE)
-            for package, names in re.findall(
-                r"^from (calibray\.optimizers[\w.]*) import (\w+)$", text, re.MULTILINE
-            ):
-                waiting.append(f"{package}.{names}")
+def code_fingerprint() -> str:
+    """Digest of the code of the optimizers; runs of different code are not comparable."""
     digest = hashlib.sha256()
-    for path in sorted(files):
+    for path in sorted(Path(optimizers.__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]

@@ -241,8 +241,9 @@ def _student(freedom: NDArray[np.float64], constant: NDArray[np.float64]) -> Tai
 
 
 @cache
-def gross(share: float = GROSS_SHARE, times: float = GROSS_RATIO) -> Tail:
+def gross() -> Tail:
     """Gaussian errors with a share of gross errors, whose standard deviation is larger by a factor."""
+    share, times = GROSS_SHARE, GROSS_RATIO
     ratio, fall = share / (1.0 - share) / times, 0.5 * (1.0 - 1.0 / times**2)
     constant = float(np.log1p(-share) - 0.5 * np.log(2 * np.pi))
 

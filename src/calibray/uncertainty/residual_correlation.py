@@ -159,13 +159,13 @@ def shared_errors(errors: NDArray[np.float64], position: NDArray[np.float64]) ->
 
 
 def variogram(
-    errors: NDArray[np.float64], position: NDArray[np.float64], bins: int = 8
+    errors: NDArray[np.float64], position: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Empirical variogram: half the mean squared difference of errors over the distance between links.
 
     A rising variogram indicates correlated errors [m], [dB], and a flat one indicates independent errors. Positions
-    [m, k], [m], are those of the receivers or of both ends. The result is the mean distance [k], [m], the semivariance
-    [k], [dB^2], and the number of pairs [k] of classes with about equal numbers of pairs.
+    [m, k], [m], are those of the receivers or of both ends. The result is the mean distance [8], [m], the semivariance
+    [8], [dB^2], and the number of pairs [8] of classes with about equal numbers of pairs; fewer if pairs are few.
     """
     chosen = evenly_spaced(len(errors), MOST_LINKS)
     distance, half = pdist(position[chosen]), 0.5 * pdist(errors[chosen, None], "sqeuclidean")
@@ -173,7 +173,7 @@ def variogram(
         near = distance <= max(np.median(distance), distance.max() / 2)
         distance, half = distance[near], half[near]
     order = np.argsort(distance, kind="stable")
-    parts = [part for part in np.array_split(order, bins) if len(part)]
+    parts = [part for part in np.array_split(order, 8) if len(part)]
     return (
         np.array([distance[part].mean() for part in parts]),
         np.array([half[part].mean() for part in parts]),
