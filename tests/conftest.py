@@ -82,6 +82,18 @@ def compiled_fast() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def _same_kernels(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Scenes share the ray tracer's kernels, if test files import it."""
+    kept = None
+    if "calibray.tracing.sionna" in sys.modules:
+        from kernels import last_of_many
+
+        kept = last_of_many(tmp_path_factory.mktemp("kernels"))
+    yield
+    del kept
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _few_starts() -> Iterator[None]:
     """An eighth of the starting points of a search; small problems have few minima."""
     with pytest.MonkeyPatch.context() as patch:
