@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibray.comparison.method_runs import ComparisonProblem
+from calibray.engines import Replay
 from calibray.fitting.cheap_replay import ReplayedModel, with_constants
 from calibray.fitting.problem import Evaluation
 from calibray.measurements.observables import Statistic
 from problem_families import landscapes
 from problem_families.family import PlantedProblem, problem
-from problem_families.numpy_replay import NumpyReplay
 
 
 def landscape_problem(name: str) -> ComparisonProblem:
@@ -113,6 +114,11 @@ class PlantedRows:
 
 def cheap_model(planted: PlantedProblem) -> ReplayedModel:
     """The cheap model of a planted problem, with its believed constants."""
+    return ReplayedModel(_compiled(planted), len(planted.parameters), PlantedRows(planted))
+
+
+@lru_cache(maxsize=1)
+def _compiled(planted: PlantedProblem) -> Replay:
+    """The replay of a cheap model, which the runs of one problem compile once."""
     paths = planted.cheap.paths
-    engine = NumpyReplay(paths, with_constants(planted.parameters, paths.materials))
-    return ReplayedModel(engine, len(planted.parameters), PlantedRows(planted))
+    return Replay(paths, with_constants(planted.parameters, paths.materials))
