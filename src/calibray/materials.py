@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.support.messages import did_you_mean
 
+FREQUENCIES: Final = (1e6, 1e12)
+"""Range of carriers [Hz]; a value outside was probably stated in MHz or GHz."""
+
 FIELDS: Final = (
     "relative_permittivity",
     "conductivity",

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from calibray.fitting.nuisance import CONSTANT
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
+from calibray.measurements import FEW
 from calibray.result.held_out import FittedTerm, Model, PredictionModel
 from calibray.result.record import Accuracy
 from calibray.scenes.obstruction import OUT_OF_SIGHT
@@ -33,10 +34,6 @@ from calibray.validation.held_out_statistics import (
 )
 from calibray.validation.validation import Validation
 from calibray.validation.variants import add_nuisance, initial_objective
-
-FEWEST_HELD_OUT: Final = 8
-"""Number of held-out links, or of links without a path, that is needed to compute errors; with fewer, the errors of the
-fit are used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +116,7 @@ def _choice(
     }
     finite = np.isfinite(np.stack(list(errors.values()))).all(axis=0)
     errors, count = {name: values[finite] for name, values in errors.items()}, int(finite.sum())
-    if count >= FEWEST_HELD_OUT:
+    if count >= FEW:
         name = choose(errors, setup.links.rx[judged][finite])
         rms_db, basis = float(np.sqrt(np.mean(errors[name] ** 2))), f"errors of {count} links held out"
         basis = basis if name == Model.CALIBRATED else f"{name}, {basis}"
@@ -210,13 +207,13 @@ def fit_fallback(
     for excluded in (links.censored, problem.faint):
         usable = usable if excluded is None else usable & ~excluded
     count = int(usable.sum())
-    if count >= FEWEST_HELD_OUT:
+    if count >= FEW:
         mean_db = float(residuals[usable].mean())
         terms += (FittedTerm(WITHOUT_PATH, CONSTANT, "", {"": mean_db}),)
         # The error of each link if the mean is that of the others.
         errors = (residuals[usable] - mean_db) * count / (count - 1)
         basis = f"errors of {count} links without a path"
-    elif len(held_out_db) >= FEWEST_HELD_OUT:
+    elif len(held_out_db) >= FEW:
         errors = held_out_db
     else:
         counted = objective.weight > 0

@@ -18,6 +18,7 @@ from calibray.materials import Material
 from calibray.paths import Kind, Paths
 from calibray.result.verdict import Remark, RemarkKind, Value
 from calibray.study import Setup, Study
+from calibray.study.link_checks import LINKS_PER_UNKNOWN
 from calibray.support.progress import Progress
 from calibray.tracing.antennas import EVERY, POSE
 
@@ -180,8 +181,8 @@ def _reached(setup: Setup, sample: NDArray[np.int64], change: dict[str, Any]) ->
     return len(np.unique(paths.link))
 
 
-FEWEST_OF_TRANSMITTER: Final = 10
-"""Number of links per transmitter needed to test its direction: five for each of two angles."""
+FEWEST_OF_TRANSMITTER: Final = 2 * LINKS_PER_UNKNOWN
+"""Number of links per transmitter needed to test its direction, which has two angles."""
 
 MOST: Final = 50
 """Number of transmitters that are tested, those with the most links: each takes three derivatives of all links."""

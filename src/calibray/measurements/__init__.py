@@ -3,7 +3,7 @@
 `reading.measured_links` is the pipeline from the rows of a table to `Measurements`.
 """
 
-from calibray.measurements.links import FREQUENCIES, MIN_DISTANCE, Measurements
+from calibray.measurements.links import FEW, FREQUENCIES, MIN_DISTANCE, Measurements
 from calibray.measurements.placement import RX_COLUMNS, TRACK_COLUMNS, TX_COLUMNS
 from calibray.measurements.preparation import (
     Averaging,
@@ -27,6 +27,7 @@ LINK_COLUMNS = (*TX_COLUMNS, *RX_COLUMNS)
 """The columns [m] of a table of links without measured values."""
 
 __all__ = [
+    "FEW",
     "FREQUENCIES",
     "LINK_COLUMNS",
     "MIN_DISTANCE",

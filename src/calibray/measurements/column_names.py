@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from calibray.errors import InputError
-from calibray.measurements.links import FREQUENCIES
+from calibray.materials import FREQUENCIES
 from calibray.measurements.preparation import Quantity
 from calibray.measurements.selection import without_codes
 from calibray.measurements.source_table import SourceTable

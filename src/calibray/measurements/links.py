@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
+from calibray.materials import FREQUENCIES
 from calibray.measurements.source_table import SourceTable
 from calibray.support.messages import shortened
 from calibray.tables import Column, Table, hertz, named, short_html, short_text
@@ -17,8 +18,8 @@ from calibray.tables import Column, Table, hertz, named, short_html, short_text
 MIN_DISTANCE: Final = 1e-3
 """Distance [m] between transmitter and receiver below which they coincide, so that no path loss is defined."""
 
-FREQUENCIES: Final = (1e6, 1e12)
-"""Range of carriers [Hz]; a value outside was probably stated in MHz or GHz."""
+FEW: Final = 8
+"""Number of links below which their errors say little: no trend, no noise model, no error of predictions."""
 
 MAX_CARRIERS: Final = 32
 """Largest number of carriers; a column with more values probably contains another quantity."""

@@ -24,15 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.materials import FIELDS
+from calibray.materials import FIELDS, FREQUENCIES
 from calibray.paths.interactions import Kind
 from calibray.support.output_files import PATH_SEAL, replacing
 
 FORMAT: Final = "calibray/paths"
 FORMAT_VERSION: Final = 1
-
-_FREQUENCIES: Final = (1e6, 1e12)
-"""Range of the carrier frequency [Hz]."""
 
 _SETTING: Final = "setting_"
 """Prefix of the attributes that record how the paths were traced."""
@@ -145,7 +142,7 @@ def read(file: h5py.File) -> Content:
     if (version := _attribute(file, "version")) != FORMAT_VERSION:
         raise InputError(f"has version {version} of the format, must be {FORMAT_VERSION}; trace again")
     frequency = _attribute(file, "frequency_hz")
-    lower, upper = _FREQUENCIES
+    lower, upper = FREQUENCIES
     if isinstance(frequency, str | bool | np.bool_) or not lower <= float(frequency) <= upper:
         fault = _damaged(f"frequency_hz = {frequency!r}, must lie in {lower:g} to {upper:g} Hz")
         raise fault

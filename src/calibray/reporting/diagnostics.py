@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from calibray.measurements import FEW
 from calibray.reporting.link_survey import POSITION_COLUMNS, measured_quantity, residual
 from calibray.result.record import Record
 from calibray.scenes.obstruction import OUT_OF_SIGHT
@@ -31,9 +32,6 @@ CLASSES: Final = 6
 MOST_UNKNOWNS: Final = 300
 """Largest number of unknowns whose draws are compared pair by pair."""
 
-
-FEWEST: Final = 8
-"""Smallest number of links for which trends are tested, and that must cross a missing region."""
 
 STREETS: Final = 12
 """Most groups of neighbouring receivers."""
@@ -93,7 +91,7 @@ def link_distance(links: pd.DataFrame) -> NDArray[np.float64] | None:
 def _by_distance(result: Record) -> pd.DataFrame:
     links, residuals = calibration_links(result)
     distance = link_distance(links)
-    if distance is None or len(residuals) < FEWEST:
+    if distance is None or len(residuals) < FEW:
         return pd.DataFrame()
     classes = np.array_split(np.argsort(distance, kind="stable"), min(CLASSES, len(residuals) // 4))
     return pd.DataFrame(
@@ -120,12 +118,12 @@ def _by(result: Record, column: str) -> pd.DataFrame:
 def _by_obstruction(result: Record) -> pd.DataFrame:
     """Links in sight, and classes of links out of sight by the length of the straight line below roofs."""
     links, residuals = calibration_links(result)
-    if not {OUT_OF_SIGHT, "obstruction_m"} <= set(links.columns) or len(residuals) < FEWEST:
+    if not {OUT_OF_SIGHT, "obstruction_m"} <= set(links.columns) or len(residuals) < FEW:
         return pd.DataFrame()
     blocked, length = links[OUT_OF_SIGHT].to_numpy(float) > 0, links["obstruction_m"].to_numpy(float)
     order = np.flatnonzero(blocked)[np.argsort(length[blocked], kind="stable")]
     # Indoors nothing lies below a roof, so there is only one class.
-    count = min(CLASSES, len(order) // FEWEST) if length[blocked].max(initial=0.0) >= 1.0 else 1
+    count = min(CLASSES, len(order) // FEW) if length[blocked].max(initial=0.0) >= 1.0 else 1
     classes = [np.flatnonzero(~blocked), *np.array_split(order, max(count, 1))]
     return pd.DataFrame(
         [
@@ -145,10 +143,10 @@ def _by_street(result: Record) -> pd.DataFrame:
     """Groups of neighbouring receivers, named by the position of their centre."""
     links, residuals = calibration_links(result)
     ends = _ends(links)
-    if ends is None or len(residuals) < 2 * FEWEST:
+    if ends is None or len(residuals) < 2 * FEW:
         return pd.DataFrame()
     place = ends[1][:, :2]
-    street = spatial_blocks(place, min(STREETS, len(residuals) // FEWEST))
+    street = spatial_blocks(place, min(STREETS, len(residuals) // FEW))
     middles = [place[street == number].mean(axis=0) for number in range(street.max() + 1)]
     return pd.DataFrame(
         [
@@ -234,7 +232,7 @@ def _scaled_draws(result: Record, name: str) -> NDArray[np.float64]:
 def _neighbours(result: Record) -> pd.DataFrame:
     links, residuals = calibration_links(result)
     ends = _ends(links)
-    if ends is None or len(residuals) < FEWEST:
+    if ends is None or len(residuals) < FEW:
         return pd.DataFrame()
     # Distance in six dimensions: links of two transmitters to the same receiver are not neighbours.
     distance, semivariance, pairs = variogram(residuals, np.hstack(ends))
@@ -382,7 +380,7 @@ def missing_region(
     return replace(
         best,
         chance=float(np.median(chance)) / square,
-        significant=bool(best.share * square > chance.max()) and best.links >= FEWEST,
+        significant=bool(best.share * square > chance.max()) and best.links >= FEW,
     )
 
 

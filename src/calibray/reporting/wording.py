@@ -7,7 +7,8 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from calibray.reporting.diagnostics import FEWEST, calibration_links, diagnostics, link_distance
+from calibray.measurements import FEW
+from calibray.reporting.diagnostics import calibration_links, diagnostics, link_distance
 from calibray.result.held_out import HeldOutErrors, Model
 from calibray.result.record import Record
 from calibray.support.messages import percent
@@ -165,7 +166,7 @@ def _power_text(tables: dict[str, pd.DataFrame]) -> str:
 def _distance_text(result: Record) -> str:
     links, residuals = calibration_links(result)
     distance = link_distance(links)
-    if distance is None or len(residuals) < FEWEST or np.ptp(distance) == 0:
+    if distance is None or len(residuals) < FEW or np.ptp(distance) == 0:
         return ""
     decades = np.log10(distance) - np.log10(distance).mean()
     slope = float(decades @ residuals / (decades @ decades))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from calibray.errors import InputError
-from calibray.measurements import Measurements
+from calibray.measurements import FEW, Measurements
 from calibray.measurements.column_names import words
 from calibray.scenes.checks import Finding, SceneSurfaces
 from calibray.study.model import StudyModel
@@ -29,9 +29,6 @@ BELOW_FREE_SPACE_DB: Final = 6.0
 
 FAR: Final = 10.0
 """Distance from the scene, in scene sizes, at which links cannot belong to it."""
-
-MIN_LINKS: Final = 8
-"""Number of links below which shares of links are not meaningful."""
 
 CELL_SHARE: Final = 0.05
 """Largest width of the areas over which samples are averaged, as a share of the scene's shorter side."""
@@ -159,7 +156,7 @@ def _misplaced(overhead: SceneSurfaces, rx: NDArray[np.float64]) -> int:
 
 def _better_turn(overhead: SceneSurfaces, rx: NDArray[np.float64], wrong: int) -> tuple[str, int] | None:
     """Rotations of the axes after which at most a quarter of the receivers are misplaced, and the number of these."""
-    if len(rx) < MIN_LINKS or wrong < 0.15 * len(rx):
+    if len(rx) < FEW or wrong < 0.15 * len(rx):
         return None
     misplaced = {name: _misplaced(overhead, turn(rx)) for name, turn in _TURNS.items()}
     fewest = min(misplaced.values())
@@ -211,7 +208,7 @@ def _angles(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str]]
             problem = f"antennas.{name}.orientation = {list(antenna.orientation)} is more than a full turn"
             yield problem, "give radians, not degrees"
         gain = _horizontal_gain(antenna)
-        if gain is None or len(links) < MIN_LINKS or not links.measured:
+        if gain is None or len(links) < FEW or not links.measured:
             continue
         # A compass bearing counts from north clockwise; yaw counts from east counter-clockwise.
         compass = np.pi / 2 - yaw

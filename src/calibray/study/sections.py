@@ -8,8 +8,8 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 from pydantic.dataclasses import dataclass as checked
 
 from calibray.errors import InputError
-from calibray.materials import Material
-from calibray.measurements import FREQUENCIES, Quantity
+from calibray.materials import FREQUENCIES, Material
+from calibray.measurements import Quantity
 from calibray.support.strict_models import CLOSED, Section, Text
 from calibray.tracing.settings import Antenna, TraceSettings
 

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from calibray.fitting.nuisance import CONSTANT
 from calibray.fitting.problem import Problem
+from calibray.measurements import FEW
 from calibray.parameters import LogNormal, Parameter, Parameters, fixed_constant, split_name
 from calibray.uncertainty.buildings import can_split, split_replay
 from calibray.uncertainty.noise_models import HEAVY, Marginal, excess_db, noise_models
@@ -82,10 +83,6 @@ class QuadraticForms:
                 log_density[rows] = constant - exponent * np.log(np.maximum(value, 1e-300))
         return log_density + np.log([other.weight for other in models])[model]
 
-
-FEWEST: Final = 8
-"""Number of links below which only independent Gaussian noise is tried; fewer links cannot distinguish other noise
-models."""
 
 FIXED_FIELDS: Final = ("thickness", "conductivity", "scattering_coefficient")
 """Constants that come from the scene if they are not parameters."""
@@ -237,7 +234,7 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
     at_bound = (coefficients <= nuisance.lower) | (coefficients >= nuisance.upper)
     design = nuisance.design[counted].toarray() if nuisance.terms else np.zeros((len(counted), 0))
     used = objective.determined & ~at_bound
-    few = len(counted) < FEWEST
+    few = len(counted) < FEW
     # With correlated errors, the probability of censoring is an integral over all censored links.
     uncorrelated = few or bool(censored.any())
     out_of_sight = not uncorrelated and section.range_m == "auto"
