@@ -44,7 +44,7 @@ MOST_STARTS: Final = 2
 NEW_STARTS: Final = (1, 4)
 """Number of additional starting points, if minima of the same variant over more links are known, and if not.
 
-With four known minima and four additional points, the errors of held-out links of both campaigns are the same to 0.001 dB.
+With four known minima and four additional points, errors of held-out links are the same to 0.001 dB in both campaigns.
 """
 
 MOST_NEW_STARTS: Final = 128
@@ -120,9 +120,7 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
     return problems
 
 
-def find_minima(
-    problem: Problem, starts: NDArray[np.float64], new_starts: int
-) -> NDArray[np.float64]:
+def find_minima(problem: Problem, starts: NDArray[np.float64], new_starts: int) -> NDArray[np.float64]:
     """Find minima of a problem by local searches.
 
     Args:
