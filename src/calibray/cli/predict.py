@@ -221,7 +221,7 @@ def suggest(
 
 def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
     """Positions of suggestions, and the gain expected from each together with those above it, as tables."""
-    from calibray.prediction.position_checks import POSITION_COLUMNS
+    from calibray.measurements.placement import POSITION_COLUMNS
 
     grouped = ["group"] if "group" in suggestions else []
     columns = (

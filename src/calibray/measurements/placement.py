@@ -124,6 +124,9 @@ TX_COLUMNS: Final = ("tx_x", "tx_y", "tx_z")
 RX_COLUMNS: Final = ("rx_x", "rx_y", "rx_z")
 """The columns of receiver positions in the scene's frame [m]."""
 
+POSITION_COLUMNS: Final = (*TX_COLUMNS, *RX_COLUMNS)
+"""The columns of the positions of both ends."""
+
 
 def place_rows(
     table: SourceTable, steps: Preparation, tx: Coordinates, rx: Coordinates

@@ -19,6 +19,7 @@ from calibray.engines.cluster.workers import Workers
 from calibray.errors import InputError
 from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE
 from calibray.measurements import MIN_DISTANCE
+from calibray.measurements.placement import TX_COLUMNS
 from calibray.prediction.batches import announce, batch_size, predict_links
 from calibray.prediction.map_files import CoverageMap
 from calibray.prediction.observables import observable_columns
@@ -136,7 +137,7 @@ def _transmitter(result: Record, tx: Sequence[float] | None) -> NDArray[np.float
         if position.shape != (3,) or not np.isfinite(position).all():
             raise InputError(f"tx = {list(tx)}: must be x, y and z, three finite numbers [m]")
         return position
-    names = ["tx_x", "tx_y", "tx_z"]
+    names = list(TX_COLUMNS)
     positions = (
         np.unique(result.links[names].to_numpy(float), axis=0) if set(names) <= set(result.links) else []
     )
@@ -161,7 +162,7 @@ def _column_values(
     study, values = result.study, dict(columns)
     per = study.offset.per if study.offset is not None else None
     if isinstance(per, str) and per not in values and {"group", "tx_x"} <= set(result.links):
-        distance = np.abs(result.links[["tx_x", "tx_y", "tx_z"]].to_numpy(float) - tx).max(axis=1)
+        distance = np.abs(result.links[list(TX_COLUMNS)].to_numpy(float) - tx).max(axis=1)
         groups = set(result.links["group"].astype(str).to_numpy()[distance < MIN_DISTANCE])
         if len(groups) == 1:
             values[per] = groups.pop()

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.measurements.placement import POSITION_COLUMNS
 from calibray.result.record import Record
 from calibray.scenes import Triangles, read_triangles
 from calibray.scenes.checks.positions import CLEARANCE
@@ -19,9 +20,6 @@ INSIDE: Final = "inside a building"
 
 PAIRS: Final = 5_000_000
 """Number of triangle-point pairs that are compared at a time; each pair needs about 100 bytes."""
-
-POSITION_COLUMNS: Final = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
-"""Columns of a table of links with the positions of both ends [m]."""
 
 
 def remarks(result: Record, setup: Setup) -> NDArray[np.str_]:

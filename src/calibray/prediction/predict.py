@@ -16,6 +16,7 @@ from calibray.engines.kinds.replay import replay
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements, SourceTable
+from calibray.measurements.placement import POSITION_COLUMNS
 from calibray.parameters import fixed_constant, split_name
 from calibray.prediction.corrections import (
     calibration_residuals,
@@ -25,7 +26,7 @@ from calibray.prediction.corrections import (
     nuisance_shift,
 )
 from calibray.prediction.observables import Replayed, as_measured, further_observables
-from calibray.prediction.position_checks import POSITION_COLUMNS, remarks
+from calibray.prediction.position_checks import remarks
 from calibray.result.held_out import Model, PredictionModel
 from calibray.result.record import Record
 from calibray.scenes.obstruction import CLUSTER, OUT_OF_SIGHT

@@ -15,6 +15,7 @@ from calibray.errors import InputError
 from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, Term
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.measurements import Measurements
+from calibray.measurements.placement import POSITION_COLUMNS
 from calibray.prediction.batches import announce
 from calibray.prediction.experiment_design import (
     UNIFORM_INFORMATION,
@@ -25,7 +26,6 @@ from calibray.prediction.experiment_design import (
     initial_range_probability,
 )
 from calibray.prediction.observables import Worth, worth_measuring
-from calibray.prediction.position_checks import POSITION_COLUMNS
 from calibray.prediction.predict import as_links, check_inputs, traced_materials, with_constants
 from calibray.result.record import Record
 from calibray.study import Setup

@@ -20,7 +20,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.measurements import FEW
-from calibray.reporting.link_survey import POSITION_COLUMNS, measured_quantity, residual
+from calibray.measurements.placement import POSITION_COLUMNS
+from calibray.reporting.link_survey import measured_quantity, residual
 from calibray.result.record import Record
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.uncertainty.residual_correlation import variogram

@@ -10,9 +10,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
+from calibray.measurements.placement import POSITION_COLUMNS
 from calibray.result.record import Record
-
-POSITION_COLUMNS = tuple(f"{end}_{axis}" for end in ("tx", "rx") for axis in "xyz")
 
 
 @dataclass(frozen=True, eq=False)
