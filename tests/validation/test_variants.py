@@ -1,6 +1,9 @@
-"""Variants of a model: the offset of each transmitter and that of links out of sight."""
+"""Variants of a model: offsets of transmitters and of links out of sight, and starting points of searches."""
 
 from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -9,7 +12,9 @@ import pytest
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import Objective
 from calibray.measurements import Measurements, SourceTable
+from calibray.result.held_out import Model
 from calibray.scenes.obstruction import OUT_OF_SIGHT
+from calibray.validation import variants
 from calibray.validation.variants import TX_OFFSET, with_offsets
 
 COUNT = 120
@@ -65,3 +70,24 @@ def test_without_groups_and_obstruction_there_is_no_such_variant() -> None:
     table, tx, _ = links(out_of_sight=False)
     grouped = make_term(table, "offset", labels=tx.astype(str))
     assert with_offsets(Objective(plain.measured, plain.weight, Nuisance(COUNT, (grouped,))), table) is None
+
+
+@pytest.mark.parametrize(("searches", "additional"), [(16, 1), (32, 2), (512, 4)])
+def test_a_large_program_has_fewer_additional_starts(
+    monkeypatch: pytest.MonkeyPatch, searches: int, additional: int
+) -> None:
+    used: list[int] = []
+
+    def without_search(problem: object, starts: np.ndarray, new_starts: int) -> np.ndarray:
+        used.append(new_starts)
+        return starts
+
+    known = np.zeros((1, 2))
+    monkeypatch.setattr(variants, "local_searches", lambda _: searches)
+    monkeypatch.setattr(variants, "find_minima", without_search)
+    monkeypatch.setattr(variants, "variants", lambda part, best: {Model.CALIBRATED: part, Model.SLOPE: part})
+    part: Any = SimpleNamespace(engine=None)
+    variants.fit_variants(part, {Model.CALIBRATED: known})
+    variants.fit_variants(part, {Model.CALIBRATED: known, Model.SLOPE: known})
+    # A variant without minima over more links starts from those of the study's own model, and gets all.
+    assert used == [additional, 4, additional, additional]
