@@ -38,4 +38,4 @@ def last_of_many(folder: Path) -> tuple[Any, Any]:
 
 
 def _last(objects: Iterable[Any], pointer: Callable[[Any], Any]) -> Any:
-    return max(objects, key=lambda each: np.array(dr.reinterpret_array(mi.UInt, pointer(each))).item())
+    return max(objects, key=lambda item: np.array(dr.reinterpret_array(mi.UInt, pointer(item))).item())
