@@ -14,7 +14,6 @@ import ctypes
 import json
 import os
 import selectors
-import shutil
 import signal
 import subprocess
 import sys
@@ -24,8 +23,6 @@ from contextlib import suppress
 # Without `site`, the guard starts in half the time; LIBRARIES is the folder that Calibray has psutil from.
 if __name__ == "__main__":
     sys.path.append(sys.argv[1])
-
-import psutil
 
 HEAD, TAIL = 500, 1500  # bytes that are kept from the start and the end of an output
 KILL_TIME = 5.0  # how long to go on killing [s]
@@ -130,11 +127,17 @@ def _listen(process: subprocess.Popen, deadline: float, signals: int, outputs: d
 
 def _kill_tree(process: subprocess.Popen) -> None:
     """Kill the program's group, and then all descendants of this process until none is left."""
+    adopts = sys.platform == "linux"
+    if adopts:
+        _kill_group(process)
+        if process.returncode is not None and not _has_child():
+            return
+    import psutil  # takes half of the guard's processor time, and few programs leave processes behind
+
     guard, deadline = psutil.Process(), time.monotonic() + KILL_TIME
     descendants = guard.children(recursive=True)
-    with suppress(ProcessLookupError, PermissionError, subprocess.TimeoutExpired):
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait(KILL_TIME)
+    if not adopts:
+        _kill_group(process)
     while descendants and time.monotonic() < deadline:
         for descendant in descendants:
             with suppress(psutil.Error):
@@ -142,6 +145,21 @@ def _kill_tree(process: subprocess.Popen) -> None:
         psutil.wait_procs(descendants, timeout=0.01)
         # A process may have started others meanwhile, and this process has adopted the children of those killed.
         descendants = guard.children(recursive=True)
+
+
+def _kill_group(process: subprocess.Popen) -> None:
+    with suppress(ProcessLookupError, PermissionError, subprocess.TimeoutExpired):
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait(KILL_TIME)
+
+
+def _has_child() -> bool:
+    """Whether this process has a child, after those that have ended are reaped."""
+    with suppress(ChildProcessError):
+        while os.waitpid(-1, os.WNOHANG)[0]:
+            pass
+        return True
+    return False
 
 
 def _drain(reader: int, output: Output) -> None:
@@ -156,6 +174,8 @@ if __name__ == "__main__":
     _, _, time_limit, folder, *command = sys.argv
     report = main(float(time_limit), command)
     if report["ended"] == "stopped":
+        import shutil
+
         shutil.rmtree(folder, ignore_errors=True)
     try:
         sys.stdout.write(json.dumps(report))
