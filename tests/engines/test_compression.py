@@ -18,6 +18,14 @@ from calibray.paths import Kind, Paths, take
 TOLERANCE_DB = 0.01
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _few_rounds():
+    """Candidates of two checks, of which these links need one; those of six take most of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("calibray.engines.compression.ROUNDS", 2)
+        yield
+
+
 @pytest.fixture(scope="module")
 def paths() -> Paths:
     sequences = [
@@ -26,7 +34,7 @@ def paths() -> Paths:
         (Kind.SPECULAR, Kind.DIFFUSE),
         (Kind.DIFFUSE, Kind.SPECULAR),
     ]
-    many = synthetic.program(sequences * 500, seed=1, links=3)
+    many = synthetic.program(sequences * 500, seed=1, links=3, materials=synthetic.LAMBERTIAN)
     lonely = np.flatnonzero(many.link == 2)[MIN_PATHS // 2 :]  # the last link keeps few paths
     return take(many, np.setdiff1d(np.arange(many.num_paths), lonely))
 
@@ -85,7 +93,7 @@ def test_without_weights_the_same_paths_would_not_do(paths, parameters, compress
 
 
 def test_a_link_that_scatters_nothing_at_some_candidate_has_no_path_there(parameters) -> None:
-    only = synthetic.program([(Kind.DIFFUSE,)] * 400, seed=2, links=1)
+    only = synthetic.program([(Kind.DIFFUSE,)] * 400, seed=2, links=1, materials=synthetic.LAMBERTIAN)
     only = replace(only, material=np.full(400, list(only.materials).index("ground"), dtype=np.int32))
     few = compress(only, parameters, TOLERANCE_DB).paths
     loss = Replay(few, parameters).path_loss(np.array([[4.0, 4.0, 0.0], [4.0, 4.0, 0.5]]))

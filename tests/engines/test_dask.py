@@ -23,6 +23,7 @@ from link_tables import links_from_frame
 from worker_tasks import doubled
 
 pytestmark = pytest.mark.filterwarnings("default")  # Dask closes sockets late
+FEW = {"method": {"name": "least-squares", "options": {"starts": 4}}}
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +62,7 @@ def test_a_worker_that_is_killed_costs_no_call(tmp_path, cluster):
 
 
 def test_blocks_on_workers_give_what_one_process_gives_though_one_is_killed(tmp_path, cluster):
-    few = {"method": {"name": "least-squares", "options": {"starts": 4}}, "offset": {"bounds": [-5.0, 5.0]}}
+    few = {**FEW, "offset": {"bounds": [-5.0, 5.0]}}
     parted = {**few, "engine": {"name": "replay", "chunk_links": 15}}
     killed: list[int] = []
 
@@ -84,8 +85,13 @@ def test_blocks_on_workers_give_what_one_process_gives_though_one_is_killed(tmp_
     assert found.links["after_db"].to_numpy() == pytest.approx(whole.links["after_db"].to_numpy(), rel=1e-9)
 
 
-def test_maps_of_workers_are_those_of_one_process(tmp_path, cluster):
-    result = calibrate(two_ray.study(tmp_path, engine={"name": "replay", "chunk_links": 10}))
+def test_maps_of_workers_are_those_of_one_process(tmp_path, cluster, monkeypatch):
+    study = two_ray.study(tmp_path, **FEW, engine={"name": "replay", "chunk_links": 16})
+    result = calibrate(Setup.open(study, two_ray.TwoRay))
+    monkeypatch.setattr(
+        "calibray.prediction.coverage_map.open_for_links",
+        lambda result, links, allow_changed_inputs: Setup.open(result.study, two_ray.TwoRay, links),
+    )
     where = {"tx": (0.0, 0.0, 10.0), "bounds": (20.0, -10.0, 80.0, 10.0), "cell": 5.0}
     alone = coverage_map(result, **where)
     with engines.open_workers(scheduler=cluster.scheduler_address) as workers:
