@@ -21,6 +21,8 @@ from calibray.study import Study
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "octave_canyon"
 TRUTH = np.array([[6.4, 15.0]])
+FEW_RAYS = {"samples": 20_000}  # find every path of the street
+EXACT = {"kind": "gaussian", "range_m": 0, "heterogeneity": 0, "constants_spread": 0}
 pytestmark = [
     pytest.mark.usefixtures("compiled_fast"),
     pytest.mark.skipif(shutil.which("octave-cli") is None, reason="GNU Octave is not installed"),
@@ -30,7 +32,7 @@ pytestmark = [
 def example(**sections) -> Study:
     """The example's study; sections given replace its own."""
     study = Study.load(EXAMPLE / "study.toml")
-    return Study.from_content(study.content() | sections, study.path)
+    return Study.from_content(study.content() | {"trace": {"max_depth": 1, **FEW_RAYS}} | sections, study.path)
 
 
 @pytest.mark.parametrize("combining", ["power", "coherent"])
@@ -49,7 +51,7 @@ def test_the_links_are_simulated_with_the_values_that_the_readme_names():
 
 
 def test_a_calibration_on_the_program_ends(tmp_path):
-    study = example(method={"name": "random", "options": {"budget": 6}})
+    study = example(method={"name": "random", "options": {"budget": 6}}, noise=EXACT)
     with engines.open_workers(2) as workers:
         result = calibrate(study, out=tmp_path, workers=workers)
     assert result.rt_calls == 6
@@ -60,12 +62,12 @@ def test_a_simpler_program_is_calibrated_by_space_mapping_in_six_calls():
     """The optimum is that of the replay with one reflection and surfaces of one face, which is the program's model."""
     study = Study.load(EXAMPLE / "simple.toml")
     content = study.content()
-    method = content["method"] | {"options": {"budget": 6}}
-    mapped = calibrate(Study.from_content(content | {"method": method}, study.path))
+    content |= {"method": content["method"] | {"options": {"budget": 6}}, "noise": EXACT}
+    mapped = calibrate(Study.from_content(content | {"trace": {"max_depth": 2, **FEW_RAYS}}, study.path))
     assert mapped.rt_calls == 6
     same = {
         "materials": {name: {"thickness": 100.0} for name in ("walls", "ground")},
-        "trace": {"max_depth": 1},
+        "trace": {"max_depth": 1, **FEW_RAYS},
         "engine": {"name": "replay"},
         "method": {"name": "random", "options": {"budget": 1}},
     }
