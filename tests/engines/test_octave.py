@@ -32,7 +32,9 @@ pytestmark = [
 def example(**sections) -> Study:
     """The example's study; sections given replace its own."""
     study = Study.load(EXAMPLE / "study.toml")
-    return Study.from_content(study.content() | {"trace": {"max_depth": 1, **FEW_RAYS}} | sections, study.path)
+    return Study.from_content(
+        study.content() | {"trace": {"max_depth": 1, **FEW_RAYS}} | sections, study.path
+    )
 
 
 @pytest.mark.parametrize("combining", ["power", "coherent"])

@@ -216,7 +216,7 @@ def test_any_name_of_a_material_or_an_object_is_exported_as_one_that_sionna_load
 
 def verify(scene, target):
     links = LinkPositions(np.array([[0.0, 0, 2.0]]), np.array([[2.0, 1.0, 1.5]]))
-    tracer = Tracer(scene, 2e9, TraceSettings(), Antenna(), Antenna())
+    tracer = Tracer(scene, 2e9, TraceSettings(samples=10_000), Antenna(), Antenna())
     verify_export(tracer, scene.materials, target, links)
 
 
