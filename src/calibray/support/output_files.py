@@ -284,12 +284,12 @@ def _sign(partial: Path, path: Path) -> None:
 
 def _remove_unfinished(path: Path) -> None:
     """Remove unfinished files of processes that were killed while they wrote this file."""
-    for partial in path.parent.iterdir():
-        if not partial.name.startswith(path.name):
-            continue
-        match = _UNFINISHED.fullmatch(partial.name.removeprefix(path.name))
+    final = path.name
+    for name in os.listdir(path.parent):  # a scene's folder has thousands of names, so no path is made of each
+        match = _UNFINISHED.fullmatch(name.removeprefix(final)) if name.startswith(final) else None
         if match is None:
             continue
+        partial = path.with_name(name)
         try:
             status = partial.lstat()
             if stat.S_ISREG(status.st_mode) and time.time() - status.st_mtime > STALE_SECONDS:
