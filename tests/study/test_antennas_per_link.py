@@ -24,8 +24,6 @@ from calibray.tracing.settings import Antenna
 from link_tables import links_from_frame
 from two_ray import COLUMNS, TRUTH, TwoRay
 
-pytestmark = pytest.mark.usefixtures("compiled_fast")
-
 SITES = pd.DataFrame(
     {
         "transmitter": ["north", "east", "omni"],

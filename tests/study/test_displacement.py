@@ -18,8 +18,6 @@ from calibray.study import Setup, Study
 from calibray.study.displacement import cubics, reached
 from two_ray import COLUMNS, TwoRay
 
-pytestmark = pytest.mark.usefixtures("compiled_fast")
-
 GROUND = "ground.relative_permittivity"
 TRUTH = {"tx:A.height": 5.0, "rx:phone.dx": 6.0, "rx:phone.dy": -4.0}
 BOUNDS = {"tx:A.height": [-8, 8], "tx:B.height": [-8, 8], "rx:phone.dx": [-10, 10], "rx:phone.dy": [-10, 10]}

@@ -152,6 +152,18 @@ def test_normals_are_read_with_the_same_kernels_however_many(trace: Trace) -> No
     assert kernels[0] == kernels[1] != []
 
 
+def test_a_few_more_receivers_need_no_further_kernel(canyon: Tracer) -> None:
+    kernels = []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        for number in (5, 7):
+            rx = np.random.default_rng(number).uniform((-8, -8, 1.5), (8, 8, 2.5), (number, 3))
+            dr.kernel_history_clear()
+            found = canyon.find_paths(links(MAST, rx))
+            assert set(found.link()) == set(range(number))
+            kernels.append({kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])})
+    assert kernels[0] == kernels[1] != set()
+
+
 def test_the_path_program_records_how_it_was_traced(paths: Paths) -> None:
     expected = {**TraceSettings(**MIXED).record(), "scene": CANYON, "sionna_rt": sionna.rt.__version__}
     assert paths.settings == expected

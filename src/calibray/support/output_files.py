@@ -285,7 +285,9 @@ def _sign(partial: Path, path: Path) -> None:
 def _remove_unfinished(path: Path) -> None:
     """Remove unfinished files of processes that were killed while they wrote this file."""
     final = path.name
-    for name in os.listdir(path.parent):  # a scene's folder has thousands of names, so no path is made of each
+    for name in os.listdir(
+        path.parent
+    ):  # a scene's folder has thousands of names, so no path is made of each
         match = _UNFINISHED.fullmatch(name.removeprefix(final)) if name.startswith(final) else None
         if match is None:
             continue

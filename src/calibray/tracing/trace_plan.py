@@ -33,6 +33,8 @@ LANES_PER_SECOND: Final = 3e7
 """Number of lanes that two processor cores trace per second, to estimate the duration of a trace."""
 ADAPTIVE_SECONDS: Final = 3.0
 """Approximate duration on two cores for one transmitter if rays are added in rounds [s]."""
+SMALL_LAUNCH: Final = 5_000_000
+"""Largest number of lanes of a small launch, which finds some thousand candidates at most and takes 0.4 s at most."""
 POINT_TOLERANCE: Final = 0.01
 """Interaction points closer than this are equal; points of different paths seldom are [m]."""
 
@@ -189,6 +191,22 @@ def lattice_directions(first: int, count: int, samples: int) -> NDArray[np.float
     n = np.arange(first, first + count)
     golden_ratio = (1 + np.sqrt(5)) / 2
     return np.stack([np.modf(n / golden_ratio)[0], n / (samples - 1)])
+
+
+def pad_receivers(position: NDArray[np.float64], lanes_per_receiver: int) -> NDArray[np.float64]:
+    """Repeat the last receiver [n, 3], so that launches have few different numbers of receivers.
+
+    The tracer compiles its code for each number, which takes 1 to 3 s. The number becomes a power of two, or a multiple
+    of the largest power of two with which a launch is small.
+
+    Example:
+        >>> [len(pad_receivers(np.zeros((n, 3)), 1_000_000)) for n in (1, 2, 3, 4, 5, 6)]
+        [1, 2, 4, 4, 8, 8]
+    """
+    step = 1
+    while step < len(position) and 2 * step * lanes_per_receiver <= SMALL_LAUNCH:
+        step *= 2
+    return np.pad(position, ((0, -len(position) % step), (0, 0)), mode="edge")
 
 
 def find_repeats(

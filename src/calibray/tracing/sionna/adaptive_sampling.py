@@ -248,7 +248,7 @@ class _SourceSearch:
         source, target = to_points(self._launch.source[None]), to_points(self._targets)
         if self._backwards:
             candidates, source, target = reverse(candidates, target), target, source
-        self._solver.compute_geometry(candidates, source, target)
+        self._solver.compute_geometry(candidates, source, target, len(self._targets))
         end: Any = candidates.source_indices if self._backwards else candidates.target_indices
         return TracedBuffer(candidates, source, target, self._launch.links[np.array(end, dtype=np.int64)])
 

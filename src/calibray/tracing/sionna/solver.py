@@ -47,15 +47,13 @@ from calibray.tracing.sionna.buffers import (
     vertices_of,
 )
 from calibray.tracing.sionna.scene import antenna_patterns, load_scene, scattering_pattern, shape_ids
+from calibray.tracing.trace_plan import SMALL_LAUNCH
 
 HASHES: Final = (16_777_213, 67_108_859)
 """Number of entries of Sionna's table of hashes in small and in large launches. Sionna drops candidates whose hashes
 collide. Of 31,430 candidates of a launch to 25 receivers, it drops 1,067 with its own million entries, 36 with 16
 million, and 4 with 67 million, which take 0.5 GB and 0.3 s per launch. The numbers are primes, because the lowest bits
 of its hashes vary least."""
-SMALL_LAUNCH: Final = 5_000_000
-"""Largest number of lanes of a small launch, which finds some thousand candidates at most."""
-
 SCALAR_CONSTANTS: Final = (
     "relative_permittivity",
     "conductivity",
@@ -186,8 +184,13 @@ class Solver:
         buffer.detach_geometry()
         return drop_empty_entries(buffer)
 
-    def compute_geometry(self, buffer: PathsBuffer, source: mi.Point3f, target: mi.Point3f) -> None:
-        """Compute the exact geometry of candidates by the method of images, in place; drop those that are not paths."""
+    def compute_geometry(
+        self, buffer: PathsBuffer, source: mi.Point3f, target: mi.Point3f, num_ends: int
+    ) -> None:
+        """Compute the exact geometry of candidates by the method of images, in place.
+
+        Candidates that are not paths are dropped, as are those beyond the first `num_ends` sources or targets.
+        """
         if not buffer.buffer_size:
             return
         self._apply_image_method(
@@ -198,6 +201,8 @@ class Solver:
             diffraction=self.settings.diffraction,
             diffraction_lit_region=self.settings.diffraction_lit_region,
         )
+        limit = dr.opaque(mi.UInt, num_ends)
+        buffer.valid &= (buffer.source_indices < limit) & (buffer.target_indices < limit)
         buffer.discard_invalid()
         buffer.schedule()
         # Evaluated at once: pending results would keep all candidates and the whole buffer in memory.

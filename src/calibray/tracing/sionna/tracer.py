@@ -35,6 +35,7 @@ from calibray.tracing.trace_plan import (
     Launch,
     TracePlan,
     lattice_directions,
+    pad_receivers,
     paths_that_fit,
     plan_trace,
     starts_at_receivers,
@@ -221,11 +222,12 @@ class Tracer:
             buffer_size=BUFFER,
             max_paths=max_paths,
         )
-        source, target = to_points(launch.source[None]), to_points(targets)
+        source = to_points(launch.source[None])
+        target = to_points(pad_receivers(targets, launch.rays * settings.max_depth))
         buffer = self.solver.find_candidates(self.solver.mitsuba_scene, source, target, rays)
         if backwards:
             buffer, source, target = reverse(buffer, target), target, source
-        self.solver.compute_geometry(buffer, source, target)
+        self.solver.compute_geometry(buffer, source, target, len(targets))
         end = buffer.source_indices if backwards else buffer.target_indices
         return TracedBuffer(buffer, source, target, launch.links[np.array(end, dtype=np.int64)])
 
