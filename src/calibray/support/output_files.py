@@ -285,13 +285,16 @@ def _sign(partial: Path, path: Path) -> None:
 def _remove_unfinished(path: Path) -> None:
     """Remove unfinished files of processes that were killed while they wrote this file."""
     final = path.name
-    for name in os.listdir(
+    with os.scandir(
         path.parent
-    ):  # a scene's folder has thousands of names, so no path is made of each
-        match = _UNFINISHED.fullmatch(name.removeprefix(final)) if name.startswith(final) else None
-        if match is None:
-            continue
-        partial = path.with_name(name)
+    ) as entries:  # a scene's folder has thousands, and making a path of each takes long
+        unfinished = [
+            (path.with_name(entry.name), match)
+            for entry in entries
+            if entry.name.startswith(final)
+            and (match := _UNFINISHED.fullmatch(entry.name.removeprefix(final)))
+        ]
+    for partial, match in unfinished:
         try:
             status = partial.lstat()
             if stat.S_ISREG(status.st_mode) and time.time() - status.st_mtime > STALE_SECONDS:
