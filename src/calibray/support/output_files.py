@@ -285,9 +285,8 @@ def _sign(partial: Path, path: Path) -> None:
 def _remove_unfinished(path: Path) -> None:
     """Remove unfinished files of processes that were killed while they wrote this file."""
     final = path.name
-    with os.scandir(
-        path.parent
-    ) as entries:  # a scene's folder has thousands, and making a path of each takes long
+    # A scene's folder has thousands of files, and a path of each takes long to make.
+    with os.scandir(path.parent) as entries:
         unfinished = [
             (path.with_name(entry.name), match)
             for entry in entries
