@@ -95,8 +95,7 @@ SCENES: dict[str, Case] = {
     ),
     "box_one_screen": Case(
         "sionna:box_one_screen", 3.5e9, (-3, -2, 2), (1, -4, 1), (4, 4, 3),
-        {"max_depth": 2, "refraction": True, "diffraction": True, "edge_diffraction": True},
-        frozenset(Kind) - {Kind.DIFFUSE},
+        {"max_depth": 2, **MIXED},
     ),
     "floor_wall": Case(
         "sionna:floor_wall", 3.5e9, (-1.5, 0.3, 1.5), (0.5, -1.5, 0.5), (1.8, 1.5, 2),
@@ -109,7 +108,8 @@ SCENES: dict[str, Case] = {
     ),
     "simple_wedge, in its shadow": Case(
         "sionna:simple_wedge", 1e9, (-5, -10, 0), (2, 1, -2), (15, 8, 2),
-        {"max_depth": 1, "diffraction": True, "diffraction_lit_region": False}, frozenset({Kind.DIFFRACTION}),
+        {"max_depth": 2, "refraction": True, "diffraction": True, "diffraction_lit_region": False},
+        frozenset({Kind.DIFFRACTION}),
     ),
     "coastal_district": Case(
         str(demo_study_path().with_name("scene") / "scene.xml"), 4e9, (-381.5, 140, 4), (-384, 180, 4), (-376, 420, 4),

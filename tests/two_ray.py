@@ -114,7 +114,7 @@ def study(folder: Path, links: int = 30, noise_db: float = 0.0, free: int = 1, *
         "links": {"file": "links.csv", "tx": COLUMNS[:3], "rx": COLUMNS[3:], "value": "path_loss_db"},
         "antennas": {"tx": dipole, "rx": dipole},
         "objective": {"combining": "coherent"},
-        "trace": {"max_depth": 1, "samples": 10_000},  # for Sionna RT
+        "trace": {"max_depth": 1, "samples": 20_000},  # for Sionna RT
         "parameters": {name: {"bounds": bounds} for name, bounds in list(BOUNDS.items())[:free]},
         "noise": {"kind": "gaussian", "range_m": 0, "heterogeneity": 0, "constants_spread": 0},
         **sections,

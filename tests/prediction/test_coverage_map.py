@@ -41,7 +41,7 @@ def folder(tmp_path_factory) -> Path:
     shutil.copytree(GOLDEN / "result", study / "out")
     file = study / "out" / "result.json"
     stored = json.loads(file.read_text()) | {"study_file": str(study / "study.toml")}
-    stored["study"]["trace"] |= {"max_depth": 1, "diffraction": False, "samples": 4000}
+    stored["study"]["trace"] |= {"max_depth": 1, "diffraction": False, "samples": 20_000}
     file.write_text(json.dumps(stored))
     return study / "out"
 

@@ -73,7 +73,7 @@ def test_sound_meshes_are_read_and_reflect(tmp_path: Path, encoding: str) -> Non
     file = write_scene(tmp_path, FLOOR)
     (tmp_path / "meshes" / "floor.ply").write_bytes(encode(encoding))
     links = SimpleNamespace(tx=np.array([[0.0, 0, 3]]), rx=np.array([[4.0, 0, 2]]))
-    assert cb.trace(file, links, frequency=2e9, max_depth=1, samples=1000).num_paths == 2
+    assert cb.trace(file, links, frequency=2e9, max_depth=1, samples=20_000).num_paths == 2
 
 
 def test_written_meshes_are_read_again(tmp_path: Path) -> None:
@@ -152,11 +152,11 @@ def test_every_type_of_a_ply_file_is_read_and_reflects(tmp_path: Path, encoding:
         np.testing.assert_array_equal(read_mesh(file, "ply").vertices, corners, name)
     # The tracer compares bounds and area with what Mitsuba holds.
     links = SimpleNamespace(tx=np.array([[1.0, 1, 3]]), rx=np.array([[5.0, 4, 2]]))
-    cb.trace(scene, links, frequency=2e9, max_depth=1, samples=1000)
+    cb.trace(scene, links, frequency=2e9, max_depth=1, samples=20_000)
     # Alone in a scene, so that no other mesh reflects instead.
     alone = write_scene(tmp_path / "alone", {"tile": tile})
     (tmp_path / "alone" / "meshes" / "tile.ply").write_bytes(files["vertex-int"])
-    assert cb.trace(alone, links, frequency=2e9, max_depth=1, samples=1000).num_paths == 2
+    assert cb.trace(alone, links, frequency=2e9, max_depth=1, samples=20_000).num_paths == 2
 
 
 def test_a_surface_that_mitsuba_holds_differently_is_refused(tmp_path: Path) -> None:

@@ -248,7 +248,7 @@ def test_a_frequency_outside_the_itu_range_needs_constants(tmp_path: Path, frequ
     scene = read_scene(file, frequency, given)
     assert scene.materials["stone"] == Material(6.0, 0.2, 0.1)
     links = SimpleNamespace(tx=np.array([[0.0, 0, 3]]), rx=np.array([[4.0, 0, 2]]))
-    paths = cb.trace(scene, links, frequency=frequency, max_depth=1, samples=1000)
+    paths = cb.trace(scene, links, frequency=frequency, max_depth=1, samples=20_000)
     assert paths.num_paths == 2
 
 

@@ -106,7 +106,7 @@ def paths_per_link(scene) -> np.ndarray:
     rx = [(*tuple(step * ALONG - 6 * ACROSS), 1.5) for step in range(2, 118, 8)]
     tx = [(*tuple(60 * ALONG - 9 * ACROSS), 4.0)] * len(rx)
     links = SimpleNamespace(tx=np.array(tx), rx=np.array(rx))
-    return np.bincount(cb.trace(scene, links, frequency=3.5e9, max_depth=1, samples=100_000).link)
+    return np.bincount(cb.trace(scene, links, frequency=3.5e9, max_depth=1, samples=20_000).link)
 
 
 def test_a_row_of_houses_reflects_once(tmp_path, monkeypatch):

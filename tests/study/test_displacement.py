@@ -58,7 +58,7 @@ def study(folder: Path, file: str, bounds: dict[str, list[float]] | None = None,
             "file": file, "tx": COLUMNS[:3], "rx": COLUMNS[3:], "value": "path_loss_db", "device": "device",
         },
         "antennas": {"tx": {"pattern": "dipole"}, "rx": {"pattern": "dipole"}},
-        "trace": {"max_depth": 1, "samples": 10_000},  # for Sionna RT, which traces predictions
+        "trace": {"max_depth": 1, "samples": 20_000},  # for Sionna RT, which traces predictions
         "parameters": {GROUND: {"bounds": [1.5, 15.0]}}
         | {name: {"bounds": each} for name, each in (BOUNDS if bounds is None else bounds).items()},
         "noise": {"kind": "gaussian", "range_m": 0},

@@ -33,7 +33,7 @@ LINKS = {
         {"max_depth": 2, "refraction": False, "diffraction": True},
     ),
 }  # fmt: skip
-SAMPLES = 50_000
+SAMPLES = 20_000
 
 
 def links_of(name: str) -> SimpleNamespace:

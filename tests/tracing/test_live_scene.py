@@ -54,7 +54,7 @@ def study(measured: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> cb.
         street(),
         measured,
         tmp_path_factory.mktemp("study"),
-        trace={"max_depth": 2, "samples": 50_000},
+        trace={"max_depth": 2, "samples": 20_000},
         parameters={f"{name}.relative_permittivity": {"bounds": [1.5, 15.0]} for name in PLANTED},
     )
 

@@ -42,7 +42,7 @@ LINKS = SimpleNamespace(
     tx=np.tile([0.0, 0.0, 10.0], (40, 1)), rx=np.stack([DISTANCE, 0.3 * DISTANCE, np.full(40, 1.5)], axis=1)
 )
 COHERENT = partial(path_loss, combining="coherent")
-SETTINGS = TraceSettings(max_depth=1, samples=10_000)
+SETTINGS = TraceSettings(max_depth=1, samples=20_000)
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def test_any_tracer_tells_progress_launches_and_points_below_the_ground(plane: S
 def test_convergence_is_checked_of_any_tracer(plane: Scene) -> None:
     tracer = open_with(TwoRay, plane)
     found = convergence.check(tracer, LINKS, tracer.trace(LINKS), COHERENT)
-    assert found.samples == 10_000
+    assert found.samples == SETTINGS.samples
     assert found.converged(0.0)
 
 

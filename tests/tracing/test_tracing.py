@@ -31,7 +31,7 @@ FREQUENCY = 3.5e9
 CANYON = "sionna:simple_street_canyon"
 MAST = [-20.0, 2, 15]
 MIXED = {
-    "max_depth": 2, "samples": 10_000, "refraction": True, "diffraction": True, "edge_diffraction": True,
+    "max_depth": 2, "samples": 20_000, "refraction": True, "diffraction": True, "edge_diffraction": True,
     "diffuse_reflection": True,
 }  # fmt: skip
 ROUGH = {
@@ -241,7 +241,7 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Tracer:
     ground = [[(-40.0, -40.0, 0.0), (40.0, -40.0, 0.0), (40.0, 40.0, 0.0), (-40.0, 40.0, 0.0)]]
     houses = {"closed": block((-5, -5, 0), (5, 5, 8)), "open": block((12, -4, 0), (20, 4, 6))[1:]}
     file = write_scene(tmp_path_factory.mktemp("house"), {"ground": ground, **houses})
-    settings = TraceSettings(max_depth=1, samples=5000)
+    settings = TraceSettings(max_depth=1, samples=20_000)
     return Tracer(read_scene(file, FREQUENCY), FREQUENCY, settings, Antenna(), Antenna())
 
 
@@ -277,7 +277,7 @@ def test_direct_paths_alone_and_excluded(house: Tracer) -> None:
     assert direct.num_interactions == 0
     assert direct.link.tolist() == [0]  # the second is behind the house
     indirect = cb.trace(
-        house.scene, ends, frequency=FREQUENCY, max_depth=1, samples=5000, line_of_sight=False
+        house.scene, ends, frequency=FREQUENCY, max_depth=1, samples=20_000, line_of_sight=False
     )
     assert (np.diff(indirect.first) == 1).all()
     assert indirect.num_paths > 0
