@@ -9,6 +9,7 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from calibray.cli.app import app
+from calibray.uncertainty import sequential_monte_carlo as sampler
 
 SCENE = """<scene version="2.1.0">
   <bsdf type="itu-radio-material" id="mat-walls"><string name="type" value="brick"/></bsdf>
@@ -57,6 +58,13 @@ def run(*arguments: object) -> Result:
         Exit status, stdout and stderr.
     """
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def few_draws() -> str:
+    """Lines of Python with which a process draws as little from the posterior as this one."""
+    names = ("SIZE", "POPULATIONS", "SWEEPS", "LAST_SWEEPS")
+    lines = [f"sampler.{name} = {getattr(sampler, name)!r}" for name in names]
+    return "\n".join(["from calibray.uncertainty import sequential_monte_carlo as sampler", *lines])
 
 
 def write_wall_study(folder: Path) -> Path:

@@ -15,7 +15,7 @@ from calibray.calibration.result import Result
 from calibray.engines import Ledger
 from calibray.engines.ledger.database import LedgerEntry, key
 from calibray.tracing.llvm import PATH_VARIABLE
-from commands import write_study
+from commands import few_draws, write_study
 
 
 @pytest.fixture
@@ -30,7 +30,10 @@ def calibray(tmp_path):
     }
 
     def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "calibray", *map(str, arguments)]
+        # Only a calibration draws, and the code for it takes long to import.
+        code = "from calibray.cli import main; main()"
+        code = f"{few_draws()}\n{code}" if arguments[0] == "run" else code
+        command = [sys.executable, "-c", code, *map(str, arguments)]
         return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
     return run

@@ -11,7 +11,7 @@ from pathlib import Path
 from threading import Timer
 
 import programs
-from commands import write_study
+from commands import few_draws, write_study
 
 TOWN = Path(__file__).parents[2] / "examples" / "bring_your_own" / "town.osm"
 LONGEST = 10.0
@@ -55,7 +55,8 @@ def redirected(folder: Path, slow: list[str], *words: object) -> tuple[int, dict
     Returns:
         Exit status, duration of each slow step by its lines [s], and the output.
     """
-    code = "\n".join([SLOW, PRELUDE, *(f"slow({function!r})" for function in slow), "main()"])
+    draws = [few_draws()] if words[0] == "run" else []
+    code = "\n".join([SLOW, *draws, PRELUDE, *(f"slow({function!r})" for function in slow), "main()"])
     lines: Counter[str] = Counter()
     printed = []
     with subprocess.Popen(
