@@ -42,7 +42,7 @@ package: setup
 	tools/check_package.sh $(BIN)/python
 
 # What builds the pages is checked too, against the packages that it calls.
-lint: $(VENV)/.lint $(VENV)/.docs
+lint: $(VENV)/.checks
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
@@ -64,7 +64,7 @@ docs: setup site
 	$(BIN)/python tools/run_docs.py
 
 # Fails on a link that leads nowhere; nothing is fetched, and the pages load nothing from elsewhere.
-site: $(VENV)/.docs
+site: $(VENV)/.checks
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # The stamps keep a second run from installing again unless the packages asked for have changed.
@@ -74,10 +74,6 @@ $(VENV)/.installed: pyproject.toml requirements.lock
 	$(PIP_INSTALL) --editable '.[test]'
 	@touch $@
 
-$(VENV)/.docs: $(VENV)/.installed
-	$(PIP_INSTALL) --editable '.[docs]'
-	@touch $@
-
-$(VENV)/.lint: $(VENV)/.installed
-	$(PIP_INSTALL) --editable '.[lint]'
+$(VENV)/.checks: $(VENV)/.installed
+	$(PIP_INSTALL) --editable '.[docs,lint]'
 	@touch $@
