@@ -5,10 +5,11 @@ Everything is measured in one run on one machine, in processor seconds, so that 
     python benchmarks/launches.py            # a few minutes
     python benchmarks/launches.py --full     # 4 million rays on the demo district and 10,000 receivers as well
 
-Three comparisons: the demo district, whose paths 1 million rays do not all find; receivers in the streets of Munich on
+Four comparisons: the demo district, whose paths 1 million rays do not all find; receivers in the streets of Munich on
 one transmitter, traced with a million rays (the default) and with "auto"; and a flat-like case, many transmitters and
-few receivers, and its mirror image. Each trace is run once before, so that no compiling is measured, but for the
-demo district, where the first run is printed too.
+few receivers, and its mirror image; and traces to numbers of receivers that occur for the first time, with a number of
+rays for which no kernel was compiled. Each other trace is run once before, so that no compiling is measured, but for
+the demo district, where the first run is printed too.
 """
 
 from __future__ import annotations
@@ -136,6 +137,22 @@ def mirrored(many: int, few: int) -> None:
     tracer.starts_at_receivers = forced
 
 
+def first_launches(numbers: tuple[int, ...]) -> None:
+    """Traces to numbers of receivers, in this order, whose kernels are not on disk because no run had as many rays."""
+    settings = TraceSettings(
+        max_depth=2, samples=20_000 + time.time_ns() % 10_000, refraction=True, diffraction=True
+    )
+    at = Tracer(
+        read_scene("sionna:simple_street_canyon", FREQUENCY), FREQUENCY, settings, Antenna(), Antenna()
+    )
+    rx = np.random.default_rng(6).uniform((-8, -8, 1.5), (8, 8, 2.5), (max(numbers), 3))
+    print("\nStreet canyon with refraction and diffraction, compiling\n")
+    row("receivers", "processor [s]")
+    for number in numbers:
+        _, seconds = timed(lambda number=number: at.trace(links(np.array([[-20.0, 2.0, 15.0]]), rx[:number])))
+        row(f"{number}", f"{seconds:.2f}")
+
+
 def main() -> None:
     """Measure and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -145,6 +162,7 @@ def main() -> None:
     demo((MILLION, 4 * MILLION) if options.full else (MILLION,))
     streets(*((10_000, 40) if options.full else (2_000, 20)))
     mirrored(300, 3)
+    first_launches((5, 6, 7, 8, 12, 15))
 
 
 if __name__ == "__main__":
