@@ -198,7 +198,7 @@ class Result(Record):
         """Set the calibrated materials in a `sionna.rt.Scene` in memory, at the study's carrier.
 
         Raises:
-            InputError: It is not a scene of Sionna RT, or lacks a material.
+            InputError: The object is not a scene of Sionna RT, or the scene lacks a material.
         """
         from calibray.tracing.sionna.live_scene import apply_materials
 

@@ -232,7 +232,7 @@ def find_antenna_names(frame: pd.DataFrame, known: Iterable[str] = ()) -> str | 
 
 
 def plain_name(label: object) -> str:
-    """An antenna's name without case, punctuation and file extension.
+    """An antenna's name in lower case, without punctuation and file extension.
 
     Example:
         >>> plain_name("80010677_0824 X-CO.MSI") == plain_name("80010677 0824_x_co")

@@ -54,8 +54,8 @@ REACHED: Final = 0.9
 """Share of the held-out links that lie within the reach of the others."""
 
 AVERAGE_LINKS: Final = 8
-"""Number of links with the mean square error of all links that are added to those out of sight, because a few links
-contain little information about errors."""
+"""Weight of the mean square error of all links in that of links out of sight, as a number of links. A few links out of
+sight contain little information about errors."""
 
 FEWEST_FOR_RANKS: Final = 40
 """Number of errors from which an interval is read off their ranks; with fewer, Student's t is assumed."""

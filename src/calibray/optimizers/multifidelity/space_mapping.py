@@ -291,9 +291,9 @@ class SpaceMapping(Optimizer):
 
 
 def error_ratio(corrected: Corrected) -> float:
-    """Squared errors of points predicted from all other points, with the cheap model over without it.
+    """Squared error with the cheap model over that without it, for the median link.
 
-    The ratio of the median link, from three points or more; the cheap model helps below 1.
+    Each of at least three points is predicted from all others. The cheap model helps if the ratio is below 1.
     """
     residuals = corrected.residuals
     scale = max(float(residuals.std(axis=0).max()), 1e-12)

@@ -87,7 +87,7 @@ def apply_materials(scene: object, materials: Mapping[str, Material]) -> None:
     """Set the constants of a scene's materials by name.
 
     Raises:
-        InputError: It is not a scene of Sionna RT, or lacks a material; nothing is set then.
+        InputError: The object is not a scene of Sionna RT, or the scene lacks a material; nothing is set then.
     """
     live = _checked(scene)
     for name in materials:
