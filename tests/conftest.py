@@ -67,12 +67,21 @@ def _no_lines_of_progress():
         yield
 
 
-@pytest.fixture(scope="module")
-def compiled_fast() -> Iterator[None]:
-    """XLA optimizes nothing, for tests that evaluate few candidates: compiling takes most of their time.
+FEW_CANDIDATES = {
+    "fields", "prediction", "study", "tracing",
+    "test_carriers", "test_chunks", "test_dask", "test_demo", "test_local_workers", "test_notebooks", "test_observable",
+    "test_octave", "test_pose", "test_program_with_rays", "test_ray_mapping", "test_rays", "test_shared_out",
+    "test_unreached_links",
+}  # fmt: skip
+"""Rooms and files whose tests evaluate few candidates, so that compiling takes most of their time."""
 
-    Nor does it in processes that these tests start.
-    """
+
+@pytest.fixture(scope="module", autouse=True)
+def _compiled_fast(request: pytest.FixtureRequest) -> Iterator[None]:
+    """XLA optimizes nothing if few candidates are evaluated, nor does it in processes that these tests start."""
+    if not {request.path.parent.name, request.path.stem} & FEW_CANDIDATES:
+        yield
+        return
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compiled, "SMALL", sys.maxsize)
         patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")

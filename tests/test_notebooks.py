@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 
-pytestmark = pytest.mark.usefixtures("compiled_fast")
-
 NOTEBOOKS = Path(__file__).parents[1] / "examples" / "notebooks"
 
 

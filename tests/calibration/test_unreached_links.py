@@ -21,8 +21,6 @@ from calibray.result import RemarkKind
 from link_tables import links_from_frame
 from small_scenes import block, write_scene
 
-pytestmark = pytest.mark.usefixtures("compiled_fast")
-
 BEHIND = 9
 SHADOW_DB = 25.0
 

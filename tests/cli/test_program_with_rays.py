@@ -18,8 +18,6 @@ from calibray.fitting import ray_mapping
 from calibray.study.toml_file import study_text
 from commands import run
 
-pytestmark = pytest.mark.usefixtures("compiled_fast")
-
 TRUTH = 7.7
 PROGRAM = """
 import cmath, json, math, sys

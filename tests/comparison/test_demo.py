@@ -20,8 +20,6 @@ from calibray.scenarios import demo_study_path
 from calibray.study import Setup, Study
 from changed import changed
 
-pytestmark = pytest.mark.usefixtures("compiled_fast")
-
 space_mapping = module._space_mapping
 
 

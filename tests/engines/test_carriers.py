@@ -29,8 +29,6 @@ from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
 from small_scenes import block, write_scene
 
-pytestmark = pytest.mark.usefixtures("compiled_fast")
-
 CARRIERS = (3.5e9, 10e9, 28e9)
 ROUGH = {"walls": {"scattering_coefficient": 0.3, "xpd_coefficient": 0.2}}
 BSDF = "".join(

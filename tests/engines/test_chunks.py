@@ -21,8 +21,6 @@ from calibray.fitting.problem import Problem
 from calibray.measurements import Measurements
 from calibray.study import Setup
 
-pytestmark = pytest.mark.usefixtures("compiled_fast")
-
 VARIANTS = {
     "plain": {},
     "offset": {"offset": {"bounds": [-10.0, 10.0]}},

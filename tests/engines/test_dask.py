@@ -27,7 +27,7 @@ FEW = {"method": {"name": "least-squares", "options": {"starts": 4}}}
 
 
 @pytest.fixture(scope="module")
-def cluster(tmp_path_factory, compiled_fast):
+def cluster(tmp_path_factory, _compiled_fast):
     """Two worker processes and their scheduler, with a cache of their own; a worker that dies is replaced."""
     options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "processes": True}
     with pytest.MonkeyPatch.context() as patch:

@@ -21,8 +21,6 @@ from calibray.study import Setup
 from link_tables import links_from_frame
 from worker_tasks import die, doubled, fail, kept_process, made, unchanged
 
-pytestmark = pytest.mark.usefixtures("compiled_fast")
-
 
 def listening_sockets() -> list[str]:
     """Sockets of this process and its children that others could connect to, as lines of /proc/net."""

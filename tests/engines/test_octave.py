@@ -23,10 +23,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "octave_canyon"
 TRUTH = np.array([[6.4, 15.0]])
 FEW_RAYS = {"samples": 20_000}  # find every path of the street
 EXACT = {"kind": "gaussian", "range_m": 0, "heterogeneity": 0, "constants_spread": 0}
-pytestmark = [
-    pytest.mark.usefixtures("compiled_fast"),
-    pytest.mark.skipif(shutil.which("octave-cli") is None, reason="GNU Octave is not installed"),
-]
+pytestmark = pytest.mark.skipif(shutil.which("octave-cli") is None, reason="GNU Octave is not installed")
 
 
 def example(**sections) -> Study:

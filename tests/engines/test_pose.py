@@ -17,8 +17,6 @@ from calibray.paths import Paths
 from calibray.tracing.antennas import Mounting, Pose, mount
 from calibray.tracing.settings import Antenna
 
-pytestmark = pytest.mark.usefixtures("compiled_fast")
-
 NAMES = ("tx:a.azimuth", "tx:a.downtilt", "tx:b.gain", "tx:*.azimuth")
 ANTENNAS = (
     Antenna("tr38901", "cross", rows=4, columns=2, spacing=(0.5, 0.7)),

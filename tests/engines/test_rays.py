@@ -25,8 +25,6 @@ from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
 from small_scenes import CONCRETE, block, write_scene
 
-pytestmark = pytest.mark.usefixtures("compiled_fast")
-
 FREQUENCY = 3.5e9
 ANTENNAS = (Antenna("dipole"), Antenna("iso", "VH"))
 LINKS = SimpleNamespace(

@@ -30,8 +30,6 @@ from calibray.support.output_tables import growing_table
 from calibray.validation.validate import validate
 from link_tables import links_from_frame
 
-pytestmark = pytest.mark.usefixtures("compiled_fast")
-
 OPTIONS = {"starts": 4}
 SECTIONS = {"method": {"name": "least-squares", "options": OPTIONS}, "offset": {"bounds": [-5.0, 5.0]}}
 PARTED = {**SECTIONS, "engine": {"name": "replay", "chunk_links": 7}}

@@ -8,6 +8,6 @@ from calibray.fields import jax_settings
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _jax_settings(compiled_fast: None) -> Iterator[None]:
+def _jax_settings(_compiled_fast: None) -> Iterator[None]:
     with jax_settings():
         yield

@@ -22,6 +22,11 @@ def _jax_settings() -> None:
     """Unlike other tests of this room, these begin under the user's settings."""
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _compiled_fast() -> None:
+    """They compile under the user's settings too."""
+
+
 GLOBAL_STATE = """
 import locale, logging, os, random, signal, sys, warnings
 from importlib import import_module

@@ -14,8 +14,6 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
 from calibray.study import Setup
 
-pytestmark = pytest.mark.usefixtures("compiled_fast")
-
 
 def delay_spread(engine, candidates):
     """RMS delay spread of every link [n, L], [ns]."""

@@ -24,8 +24,6 @@ from calibray.paths.chains import spherical_basis
 from calibray.study import Setup
 from calibray.tracing.settings import Antenna
 
-pytestmark = pytest.mark.usefixtures("compiled_fast")
-
 TRUTH = 7.7
 
 

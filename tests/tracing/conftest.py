@@ -1,15 +1,10 @@
-"""What the tests of this room share: they compile fast, and several trace one scene."""
+"""A scene that several tests of this room trace."""
 
 from pathlib import Path
 
 import pytest
 
 from small_scenes import block, write_scene
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _few_candidates(compiled_fast: None) -> None:
-    """Each trace is evaluated a few times."""
 
 
 @pytest.fixture(scope="session")
