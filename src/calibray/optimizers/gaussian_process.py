@@ -13,6 +13,7 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import erfcx
+from scipy.stats import norm
 
 from calibray.optimizers.arguments import Box, whole
 from calibray.optimizers.evaluations import Archive, merge_repeated
@@ -112,8 +113,6 @@ def log_shape(z: NDArray[np.float64]) -> NDArray[np.float64]:
         >>> log_shape(np.array([0.0, -1e6])).round(3).tolist()
         [-0.919, -500000000028.55]
     """
-    from scipy.stats import norm
-
     high, low = np.maximum(z, -1.0), np.minimum(z, -1.0)
     # phi(z) + z Phi(z) = phi(z) (1 + z Phi(z) / phi(z)), whose second factor tends to 1 / z^2
     ratio = 1.0 + low * np.sqrt(np.pi / 2.0) * erfcx(-low / np.sqrt(2.0))

@@ -46,6 +46,7 @@ from typing import ClassVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import RBFInterpolator
 from scipy.spatial.distance import pdist
 
 from calibray.errors import InputError
@@ -312,8 +313,6 @@ def predict(archive: Archive, candidates: NDArray[np.float64], kernel: str = "cu
     """
     if not np.isfinite(archive.best.y):
         return np.zeros(len(candidates))
-    from scipy.interpolate import RBFInterpolator
-
     evaluated = archive.imputed(archive.all())
     x, y = merge_repeated(archive.box.to_unit(evaluated.x), evaluated.y)
     if kernel == "gaussian":

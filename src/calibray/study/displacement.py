@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 
 from calibray.errors import InputError
 from calibray.measurements import Measurements
@@ -222,8 +223,6 @@ def cubics(knots: NDArray[np.float64], change_db: NDArray[np.float64]) -> NDArra
 
     They do not overshoot where paths appear or vanish between two positions (Fritsch and Carlson 1980).
     """
-    from scipy.interpolate import PchipInterpolator
-
     coefficients = np.empty((4, len(knots) - 1, knots.shape[1]))
     # SciPy wants the same knots for all columns; links of a group have the same ones.
     distinct, group = np.unique(knots, axis=1, return_inverse=True)
