@@ -162,7 +162,8 @@ def test_only_tables_that_are_too_coarse_are_refined() -> None:
     sequences = [(Kind.SPECULAR,), (Kind.REFRACTION,)] * 20
     paths = synthetic.program(sequences, seed=5, materials=synthetic.LAMBERTIAN, frequency=FREQUENCY)
     parameters = Parameters((Parameter("glass.thickness", 0.005, 0.02, start=0.009),))
-    engine = Replay(paths, parameters, computation=Computation(np.float64, True))
+    tables = Computation(np.float64, True)
+    engine = Replay(paths, parameters, computation=tables)
     exact = Replay(paths, parameters, computation=Computation(np.float64, False))
     before, glass = engine._intervals, list(paths.materials).index("glass")
     thick = np.array([[0.5]])  # far beyond the bounds from which the tables were made
@@ -172,6 +173,13 @@ def test_only_tables_that_are_too_coarse_are_refined() -> None:
     finer = engine._intervals > before
     assert finer[glass].any()
     assert not np.delete(finer, glass, axis=0).any()
+    # Within a batch, candidates before it keep the coarse tables, and those from it on use the refined ones.
+    coarse, refined = (Replay(paths, parameters, computation=tables) for _ in range(2))
+    batch = np.array([[0.007], [0.5], [0.018]])
+    first, answers = coarse.path_loss(batch[:1]), refined.path_loss(batch)
+    np.testing.assert_array_equal(answers[:1], first)
+    np.testing.assert_array_equal(answers[1:], refined.path_loss(batch)[1:])
+    assert not np.array_equal(refined.path_loss(batch[:1]), first)
 
 
 def test_large_programs_are_tabulated_without_padding(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -217,11 +217,12 @@ class Replay:
             batch = values[start : start + size]
             *answers, table_error = function(*self._arguments(self._base, batch, size), len(batch))
             too_coarse = table_error > TABLE_TOLERANCE
-            if too_coarse.any():
-                self._refine_tables(too_coarse)
-                continue
-            batches.append([np.asarray(answer, dtype=float) for answer in answers])
-            start += len(batch)
+            refused = np.flatnonzero(too_coarse.any(axis=(1, 2)))
+            done = refused[0] if len(refused) else len(batch)
+            batches.append([np.asarray(answer[:done], dtype=float) for answer in answers])
+            start += done
+            if len(refused):
+                self._refine_tables(too_coarse[done])
         self.calls += len(values)
         return tuple(np.concatenate(column) for column in zip(*batches, strict=True))
 
@@ -260,9 +261,7 @@ class Replay:
         return plan.program
 
     def _batch_size(self) -> int:
-        """Candidates in one call: a power of two within the limits, or one if tables are filled for each candidate."""
-        if self._intervals is not None:
-            return 1
+        """Candidates in one call: a power of two within the limits."""
         per_candidate = self.paths.num_links * len(self.materials) * len(self._used_columns)
         most = max(MOST_DERIVATIVES // max(per_candidate, 1), 1)
         return min(self._batch, 1 << most.bit_length() - 1)

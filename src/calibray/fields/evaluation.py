@@ -11,7 +11,7 @@ propagates the fields and computes the power; it reads every constant once and w
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial, reduce
 from operator import add
 from typing import Final, cast
@@ -49,8 +49,8 @@ from calibray.fields.propagation import path_fields
 from calibray.materials import Material
 from calibray.paths import Paths
 
-WITHOUT_TABLES: Final = np.zeros((1, 3))
-"""Errors of coefficients that do not come from tables."""
+WITHOUT_TABLES: Final = np.zeros((1, 1, 3))
+"""Errors of coefficients that do not come from tables, for any number of candidates."""
 
 
 @jax_settings()
@@ -140,8 +140,8 @@ def path_losses(
     """Path loss [count, L], [dB], of a batch of candidates with material constants [n, M, 8].
 
     Path loss is +inf for a link without a path. The second result is the largest error of a tabulated coefficient by
-    material and mode [M, 3], or zeros. Only the first `count` candidates are evaluated. The function is compiled for
-    the number of tables, so that a partly filled batch saves a compilation.
+    candidate, material and mode [count, M, 3], or zeros. Only the first `count` candidates are evaluated. The function
+    is compiled for the number of tables, so that a partly filled batch saves a compilation.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
@@ -158,7 +158,7 @@ def path_losses(
             powers.append(_link_power_of_steps(program, responses, combining))
         # Waits for the candidate, so that the intermediate numbers of one at a time are in memory.
         errors.append(np.asarray(_table_error(program, response, len(table))))
-    return np.asarray(_decibel(jnp.stack(powers))), np.max(errors, axis=0)
+    return _stacked_losses(powers, len(tables)), np.stack(errors)
 
 
 @jax_settings()
@@ -172,7 +172,8 @@ def path_losses_and_slopes(
     """Path loss as in `path_losses`, and its derivatives [count, L, M, columns], [dB] per unit.
 
     The derivatives with respect to the materials' constants in `columns` of the tables are 0 for a link without a path.
-    The third result is the largest error of a tabulated coefficient by material and mode [M, 3], or zeros.
+    The third result is the largest error of a tabulated coefficient by candidate, material and mode [count, M, 3], or
+    zeros.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
@@ -185,7 +186,15 @@ def path_losses_and_slopes(
         powers.append(power)
         slopes.append(_path_loss_slope(program, power, by_step, derivatives, table.shape[0]))
         errors.append(np.asarray(_table_error(program, response, len(table))))
-    return np.asarray(_decibel(jnp.stack(powers))), np.asarray(jnp.stack(slopes)), np.max(errors, axis=0)
+    return _stacked_losses(powers, len(tables)), np.stack(slopes), np.stack(errors)
+
+
+def _stacked_losses(powers: Sequence[jax.Array], size: int) -> NDArray[np.floating]:
+    """Path loss [n, L], [dB], from the powers of n candidates; compiled for `size` candidates."""
+    stacked = np.stack(powers)
+    padded = np.zeros((size, stacked.shape[1]), stacked.dtype)
+    padded[: len(stacked)] = stacked
+    return np.asarray(_decibel(padded))[: len(stacked)]
 
 
 @jax_settings()
