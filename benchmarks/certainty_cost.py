@@ -7,8 +7,8 @@
 With `--seeds`, only the draws, from several seeds: their time, the widths of the 90 % sets, and how many independent
 draws they are worth. Members of a population are counted by how much the mean over a member's kept states scatters.
 
-Processor seconds of this process and replays, on the study's own paths, compiled before anything is timed. The script
-fails where all of it together costs more than ten times the calibration.
+Processor seconds of this process, seconds by the clock, and replays, on the study's own paths, compiled before anything
+is timed. The script fails where all of it together costs more than ten times the calibration.
 """
 
 from __future__ import annotations
@@ -39,14 +39,15 @@ LIMIT = 10.0
 LEVEL = 0.9
 
 
-def costs(problem: Problem) -> dict[str, tuple[float, int]]:
-    """Processor seconds and replays of each part."""
-    found: dict[str, tuple[float, int]] = {}
+def costs(problem: Problem) -> dict[str, tuple[float, float, int]]:
+    """Processor seconds, seconds by the clock and replays of each part."""
+    found: dict[str, tuple[float, float, int]] = {}
 
     def timed(name: str, work: Callable, *given):
-        started, calls = time.process_time(), problem.engine.calls
+        started, clock, calls = time.process_time(), time.perf_counter(), problem.engine.calls
         result = work(*given)
-        found[name] = time.process_time() - started, problem.engine.calls - calls
+        spent = time.process_time() - started, time.perf_counter() - clock
+        found[name] = *spent, problem.engine.calls - calls
         return result
 
     for _ in range(2):  # the first compiles
@@ -107,7 +108,9 @@ def main() -> None:
     parser.add_argument("studies", nargs="*", default=[str(demo_study_path())], help="study files")
     parser.add_argument("--seeds", type=int, default=0, help="seeds of draws to compare; 0 for the costs")
     options, expensive = parser.parse_args(), False
-    columns = (Column("part"), numbers("processor", "s"), numbers("replays"), numbers("ratio"))
+    columns = (
+        Column("part"), numbers("processor", "s"), numbers("clock", "s"), numbers("replays"), numbers("ratio"),
+    )  # fmt: skip
     for file in options.studies:
         setup = Study.load(file).opened()
         if options.seeds:
@@ -116,10 +119,10 @@ def main() -> None:
         found = costs(Problem.of(setup, engines.make(setup)))
         own = found["calibration"][0]
         rows = [
-            (name, f"{spent:.1f}", f"{calls:,}", f"{spent / own:.2f}")
-            for name, (spent, calls) in found.items()
+            (name, f"{spent:.1f}", f"{clock:.1f}", f"{calls:,}", f"{spent / own:.2f}")
+            for name, (spent, clock, calls) in found.items()
         ]
-        others = sum(spent for name, (spent, _) in found.items() if name != "calibration") / own
+        others = sum(spent for name, (spent, *_) in found.items() if name != "calibration") / own
         print(
             render(
                 Table(setup.study.path.name, columns, tuple(rows)),
