@@ -6,7 +6,7 @@ Everything is measured in one run on one machine, in processor seconds, so that 
     python benchmarks/launches.py --full     # 4 million rays on the demo district and 10,000 receivers as well
 
 Four comparisons: the demo district, whose paths 1 million rays do not all find; receivers in the streets of Munich on
-one transmitter, traced with a million rays (the default) and with "auto"; and a flat-like case, many transmitters and
+one transmitter, traced with a million rays (the default) and with "auto"; a flat-like case, many transmitters and
 few receivers, and its mirror image; and traces to numbers of receivers that occur for the first time, with a number of
 rays for which no kernel was compiled. Each other trace is run once before, so that no compiling is measured, but for
 the demo district, where the first run is printed too.

@@ -60,10 +60,14 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
+def numbers_of_draws() -> dict[str, object]:
+    """The constants that say how much this process draws from the posterior."""
+    return {name: getattr(sampler, name) for name in ("SIZE", "POPULATIONS", "SWEEPS", "LAST_SWEEPS")}
+
+
 def few_draws() -> str:
     """Lines of Python with which a process draws as little from the posterior as this one."""
-    names = ("SIZE", "POPULATIONS", "SWEEPS", "LAST_SWEEPS")
-    lines = [f"sampler.{name} = {getattr(sampler, name)!r}" for name in names]
+    lines = [f"sampler.{name} = {value!r}" for name, value in numbers_of_draws().items()]
     return "\n".join(["from calibray.uncertainty import sequential_monte_carlo as sampler", *lines])
 
 

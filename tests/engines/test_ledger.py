@@ -24,7 +24,7 @@ from calibray.engines.ledger.database import LedgerEntry, key
 from calibray.errors import EngineError, InputError
 from calibray.parameters import Parameter, Parameters
 from calibray.study import Study
-from calibray.uncertainty import sequential_monte_carlo as sampler
+from commands import numbers_of_draws
 
 CANDIDATES = np.array([[3.0, 4.0, 5.0], [2.0, 9.0, 1.5], [3.0, 4.0, 5.0]])
 PARAMETERS = Parameters(tuple(Parameter(name, 1.0, 12.0, 5.0) for name in planted.TRUTH))
@@ -158,8 +158,7 @@ def test_two_runs_write_to_one_ledger_at_once(tmp_path):
 @pytest.fixture(scope="module")
 def runner():
     """A process that runs studies, with as few draws as this one."""
-    few = {name: getattr(sampler, name) for name in ("SIZE", "POPULATIONS", "SWEEPS", "LAST_SWEEPS")}
-    with restarts.open_runner(few) as runner:
+    with restarts.open_runner(numbers_of_draws()) as runner:
         yield runner
 
 

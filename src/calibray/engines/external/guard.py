@@ -127,6 +127,7 @@ def _listen(process: subprocess.Popen, deadline: float, signals: int, outputs: d
 
 def _kill_tree(process: subprocess.Popen) -> None:
     """Kill the program's group, and then all descendants of this process until none is left."""
+    # Here the guard adopts orphans; elsewhere they are found only if they are listed before their parent ends.
     adopts = sys.platform == "linux"
     if adopts:
         _kill_group(process)

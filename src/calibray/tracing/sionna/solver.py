@@ -149,9 +149,8 @@ class Solver:
             EngineError: The candidates do not fit into memory.
         """
         settings, size = self.settings, rays.buffer_size
-        num_targets = dr.width(targets)
         # At most one candidate per ray, interaction and target, and the direct paths.
-        most = (rays.count * settings.max_depth + 1) * num_targets + 2
+        most = (rays.count * settings.max_depth + 1) * dr.width(targets) + 2
         while True:
             with _ray_directions(rays.directions), _hash_table(HASHES[most > SMALL_LAUNCH]):
                 buffer = self._generate_candidates(
@@ -173,8 +172,9 @@ class Solver:
             dr.eval()
             num_candidates = int(np.array(buffer.paths_counter).item())
             if num_candidates > rays.max_paths:
+                num_receivers = len(np.unique(to_numpy(targets), axis=0))  # without those that are repeated
                 raise EngineError(
-                    f"more paths than fit into memory, with {num_targets} receivers at once; "
+                    f"more paths than fit into memory, with {num_receivers} receivers at once; "
                     "lower trace.samples or trace.max_depth, or trace fewer links at once"
                 )
             if num_candidates < size - 1:
@@ -185,11 +185,12 @@ class Solver:
         return drop_empty_entries(buffer)
 
     def compute_geometry(
-        self, buffer: PathsBuffer, source: mi.Point3f, target: mi.Point3f, num_ends: int
+        self, buffer: PathsBuffer, source: mi.Point3f, target: mi.Point3f, num_receivers: int
     ) -> None:
         """Compute the exact geometry of candidates by the method of images, in place.
 
-        Candidates that are not paths are dropped, as are those beyond the first `num_ends` sources or targets.
+        Candidates that are not paths are dropped, as are those of receivers that `pad_receivers` has added after the
+        first `num_receivers`, which are targets, or sources of reversed candidates.
         """
         if not buffer.buffer_size:
             return
@@ -201,7 +202,7 @@ class Solver:
             diffraction=self.settings.diffraction,
             diffraction_lit_region=self.settings.diffraction_lit_region,
         )
-        limit = dr.opaque(mi.UInt, num_ends)
+        limit = dr.opaque(mi.UInt, num_receivers)
         buffer.valid &= (buffer.source_indices < limit) & (buffer.target_indices < limit)
         buffer.discard_invalid()
         buffer.schedule()
