@@ -166,6 +166,10 @@ def test_predictions_have_the_calibrated_height_at_exact_receivers(folder: Path,
     exact = path_loss(Setup.open(study(folder, "true.csv", {}), tracer=TwoRay).trace())
     predicted = result.predict(stated)
     assert np.sqrt(np.mean((predicted - exact) ** 2)) < 0.5
+    # negative control: with the stated mast, predictions are worse
+    stated.to_csv(folder / "stated-masts.csv", index=False)
+    uncorrected = path_loss(Setup.open(study(folder, "stated-masts.csv", {}), tracer=TwoRay).trace())
+    assert np.sqrt(np.mean((uncorrected - exact) ** 2)) > 1.0
 
 
 @pytest.mark.parametrize(
