@@ -150,14 +150,14 @@ def path_losses(
     single_use = all(set(group.signature) <= {COEFFICIENT} for group in program.groups)
     powers, errors = [], []
     for table in tables[:count]:
-        response = _material_response(program, table)
+        response, error = _response_and_error(program, table)
         if single_use:
-            powers.append(_link_power(program, response, combining))
+            power = _link_power(program, response, combining)
         else:
-            responses = _split_by_step_wide(program, response)
-            powers.append(_link_power_of_steps(program, responses, combining))
+            power = _link_power_of_steps(program, _split_by_step_wide(program, response), combining)
         # Waits for the candidate, so that the intermediate numbers of one at a time are in memory.
-        errors.append(np.asarray(_table_error(program, response, len(table))))
+        powers.append(np.asarray(power))
+        errors.append(error)
     return _stacked_losses(powers, len(tables)), np.stack(errors)
 
 
@@ -181,15 +181,15 @@ def path_losses_and_slopes(
         return np.asarray(loss)[:count], np.asarray(slope)[:count], WITHOUT_TABLES
     powers, slopes, errors = [], [], []
     for table in tables[:count]:
-        response, derivatives = _response_and_derivatives(program, table, columns)
+        response, derivatives, error = _response_derivatives_and_error(program, table, columns)
         power, by_step = _power_and_slope(program, _split_by_step_wide(program, response), combining)
         powers.append(power)
-        slopes.append(_path_loss_slope(program, power, by_step, derivatives, table.shape[0]))
-        errors.append(np.asarray(_table_error(program, response, len(table))))
+        slopes.append(np.asarray(_path_loss_slope(program, power, by_step, derivatives, len(table))))
+        errors.append(error)
     return _stacked_losses(powers, len(tables)), np.stack(slopes), np.stack(errors)
 
 
-def _stacked_losses(powers: Sequence[jax.Array], size: int) -> NDArray[np.floating]:
+def _stacked_losses(powers: Sequence[ArrayLike], size: int) -> NDArray[np.floating]:
     """Path loss [n, L], [dB], from the powers of n candidates; compiled for `size` candidates."""
     stacked = np.stack(powers)
     padded = np.zeros((size, stacked.shape[1]), stacked.dtype)
@@ -310,7 +310,6 @@ _material_response = jax.jit(material_response)
 # The functions of `path_powers` have no compiler options, because a user may compile them as part of another function.
 _split_by_step = jax.jit(split_by_step)
 _split_by_step_wide = jax.jit(split_by_step, compiler_options=WIDE)
-_response_and_derivatives = jax.jit(response_and_derivatives, static_argnums=2)
 _gains = compiled(program_gains)
 _path_powers = jax.jit(lambda program, responses: path_power(path_fields(program, responses)))
 _link_power_of_steps = jax.jit(_power, compiler_options=WIDE)
@@ -318,7 +317,20 @@ _power_and_slope = jax.jit(_slope, compiler_options=WIDE)
 _path_loss_slope = jax.jit(_contract, static_argnums=4, compiler_options=WIDE)
 
 
-@partial(jax.jit, static_argnums=2)
+@partial(jax.jit, compiler_options=WIDE)
+def _response_and_error(program: GroupedProgram, table: jax.Array) -> tuple[MaterialResponse, jax.Array]:
+    response = material_response(program, table)
+    return response, _table_error(program, response, len(table))
+
+
+@partial(jax.jit, static_argnums=2, compiler_options=WIDE)
+def _response_derivatives_and_error(
+    program: GroupedProgram, table: jax.Array, columns: tuple[int, ...]
+) -> tuple[MaterialResponse, tuple[MaterialResponse, ...], jax.Array]:
+    response, derivatives = response_and_derivatives(program, table, columns)
+    return response, derivatives, _table_error(program, response, len(table))
+
+
 def _table_error(program: GroupedProgram, response: MaterialResponse, num_materials: int) -> jax.Array:
     tables = cast(CoefficientTables, response.coefficients)
     return coefficient_tables.table_error(tables, cast(TableLayout, program.coefficients), num_materials)
