@@ -30,7 +30,7 @@ from calibray.scenarios import demo_study_path
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
-from calibray.uncertainty.sequential_monte_carlo import KEPT, Posterior, last_sweeps
+from calibray.uncertainty.sequential_monte_carlo import Posterior
 from calibray.uncertainty.verdicts import credible_sets
 from calibray.validation.choice import HeldOutResiduals, fit_prediction_model
 from calibray.validation.validate import validate_problem
@@ -96,10 +96,10 @@ def seeds(problem: Problem, count: int) -> Table:
 
 def effective(posterior: Posterior) -> float:
     """Independent draws that the draws are worth, for the parameter for which they are worth least."""
-    states, size = last_sweeps(posterior.members) // KEPT, posterior.members
-    point = posterior.means.point.reshape(-1, states, size, len(posterior.means.point.T))
+    populations, states, size = posterior.shape
+    point = posterior.means.point.reshape(populations, states, size, -1)
     scatter = point.mean(axis=1).var(axis=(0, 1)) / point.var(axis=(0, 1, 2))
-    return len(point) * size / float(scatter.max())
+    return populations * size / float(scatter.max())
 
 
 def main() -> None:

@@ -151,8 +151,21 @@ def run(
         share = reference.weights(problem, model)
         distance = [_distance(unit[:, k], draws.weight, reference.point[:, k], share) for k in range(width)]
         line |= {"distance": distance, "effective": float(1 / np.sum(share**2))}
+        line["mass"] = _masses(unit, draws.weight, reference.point, share)
         line["reference inside"] = _inside(reference.point, share, truth)
     return line
+
+
+def _masses(
+    unit: np.ndarray, weight: np.ndarray, point: np.ndarray, share: np.ndarray
+) -> list[tuple[float, int]]:
+    """Share of the reference in the credible set of each parameter, and the number of the set's pieces."""
+    masses = []
+    for k in range(unit.shape[1]):
+        pieces = credible_sets(unit[:, k], weight, 0.0, 1.0, [LEVEL])[0]
+        mass = sum(share[(point[:, k] >= low) & (point[:, k] <= high)].sum() for low, high in pieces)
+        masses.append((float(mass), len(pieces)))
+    return masses
 
 
 def _inside(unit: np.ndarray, weight: np.ndarray, truth: np.ndarray) -> list[bool]:
@@ -209,19 +222,23 @@ def summary(lines: list[dict[str, Any]]) -> Table:
     """Coverage and distance from the reference by parameter."""
     columns = (
         Column("parameter"), numbers("runs"), numbers("in 90 % set"), numbers("mean rank"),
-        numbers("in that of the reference"), numbers("distance from reference, mean"), numbers("largest"),
+        numbers("in that of the reference"), numbers("share of the reference in the set"), numbers("pieces"),
+        numbers("distance from reference, mean"), numbers("largest"),
     )  # fmt: skip
     rows = []
     for name in dict.fromkeys(name for line in lines for name in line["names"]):
         mine = [(line, line["names"].index(name)) for line in lines if name in line["names"]]
-        distance = [line["distance"][k] for line, k in mine if line.get("effective", 0.0) > EFFECTIVE]
+        judged = [(line, k) for line, k in mine if line.get("effective", 0.0) > EFFECTIVE]
+        shares = ["-"] * 5
+        if judged:
+            inside = np.mean([line["reference inside"][k] for line, k in judged])
+            mass, pieces = np.mean([line["mass"][k] for line, k in judged], axis=0)
+            distance = [line["distance"][k] for line, k in judged]
+            shares = [f"{inside:.2f}", f"{mass:.3f}", f"{pieces:.2f}"]
+            shares += [f"{np.mean(distance):.3f}", f"{np.max(distance):.3f}"]
         rows.append((
             name, str(len(mine)), f"{np.mean([line['inside'][k] for line, k in mine]):.2f}",
-            f"{np.mean([line['rank'][k] for line, k in mine]):.2f}",
-            f"{np.mean(inside):.2f}" if (inside := [
-                line["reference inside"][k] for line, k in mine if line.get("effective", 0.0) > EFFECTIVE
-            ]) else "-",
-            f"{np.mean(distance):.3f}" if distance else "-", f"{np.max(distance):.3f}" if distance else "-",
+            f"{np.mean([line['rank'][k] for line, k in mine]):.2f}", *shares,
         ))  # fmt: skip
     seconds = np.mean([line["seconds"] for line in lines])
     agree = np.mean([line["agree"] for line in lines])

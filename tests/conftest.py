@@ -114,10 +114,10 @@ JUDGING_INTERVALS = {
     "benchmarks", "validation", "test_buildings", "test_censoring", "test_emulator", "test_linear_theory",
     "test_noise_models", "test_sequential_monte_carlo",
 }  # fmt: skip
-"""Rooms and files whose tests judge intervals; they draw as much as a user's run."""
+"""Rooms and files whose tests judge intervals; they draw as much as a user's run, but for its last sweeps."""
 
 FEW = {"SIZE": (64, 64), "POPULATIONS": (2, 4), "SWEEPS": 1, "LAST_SWEEPS": (2, 2)}
-MANY = {name: getattr(sampler, name) for name in FEW}
+MANY = {name: getattr(sampler, name) for name in FEW} | {"LAST_SWEEPS": (8, 8)}
 
 
 def _draw(constants: dict[str, object]) -> Iterator[None]:
@@ -136,5 +136,5 @@ def _few_draws(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.fixture
 def all_draws() -> Iterator[None]:
-    """As many draws as a user's run, for a test of intervals in another file."""
+    """As many draws as in the tests that judge intervals, for a test in another file."""
     yield from _draw(MANY)

@@ -310,16 +310,18 @@ def test_more_populations_are_drawn_while_their_halves_disagree(monkeypatch, int
     assert len(draws.weight) == pairs * len(draw_posterior(model, seed=1).means.weight)
 
 
-def test_a_population_that_the_budget_makes_smaller_moves_longer():
-    small, large = (
+def test_members_move_longer_where_draws_are_few_or_cheap(monkeypatch):
+    monkeypatch.setattr(module, "LAST_SWEEPS", (8, 48))
+    small, large, cheap = (
         draw_posterior(
             _model(_parameters(), _uninformative, 4, buildings=0, interactions=interactions), seed=1
         )
-        for interactions in (LARGE, 1)
+        for interactions in (LARGE, 20_000, 1)
     )
     # Without longer moves, it would have a quarter of the draws.
-    assert 4 * small.members == large.members
+    assert 4 * small.shape[2] == large.shape[2] == cheap.shape[2]
     assert len(small.joint) >= 0.7 * len(large.joint)
+    assert len(cheap.joint) >= 5 * len(large.joint)
 
 
 def test_each_step_leaves_half_of_the_members_effective():
