@@ -162,7 +162,7 @@ def _masses(
     """Share of the reference in the credible set of each parameter, and the number of the set's pieces."""
     masses = []
     for k in range(unit.shape[1]):
-        pieces = credible_sets(unit[:, k], weight, 0.0, 1.0, [LEVEL])[0]
+        pieces = _set(unit[:, k], weight)
         mass = sum(share[(point[:, k] >= low) & (point[:, k] <= high)].sum() for low, high in pieces)
         masses.append((float(mass), len(pieces)))
     return masses
@@ -171,9 +171,13 @@ def _masses(
 def _inside(unit: np.ndarray, weight: np.ndarray, truth: np.ndarray) -> list[bool]:
     """Whether the credible set of each parameter contains the truth."""
     return [
-        any(low <= truth[k] <= high for low, high in credible_sets(unit[:, k], weight, 0.0, 1.0, [LEVEL])[0])
-        for k in range(unit.shape[1])
+        any(low <= truth[k] <= high for low, high in _set(unit[:, k], weight)) for k in range(unit.shape[1])
     ]
+
+
+def _set(unit: np.ndarray, weight: np.ndarray) -> tuple[tuple[float, float], ...]:
+    """Pieces of the credible set of a parameter."""
+    return credible_sets(unit, weight, 0.0, 1.0, [LEVEL])[0]
 
 
 def _distance(one: np.ndarray, weight: np.ndarray, other: np.ndarray, share: np.ndarray) -> float:

@@ -115,7 +115,7 @@ def population_size(interactions: int, budget: int = BUDGET, models: int = 1) ->
 
 
 def last_sweeps(interactions: int, budget: int = BUDGET, models: int = 1) -> int:
-    """Number of sweeps at power 1 of these populations.
+    """Number of sweeps at power 1 of each population; arguments as for `population_size`.
 
     Example:
         >>> last_sweeps(1_000), last_sweeps(8_000), last_sweeps(50_000), last_sweeps(1_000, models=8)
@@ -139,7 +139,8 @@ def draw_posterior(
     `progress` is called with the share of the work done after every step. The budget is the number of interactions that
     may be evaluated; it is shared if the draws of several models are pooled.
     """
-    size, sweeps = (of(model.interactions, budget, models) for of in (population_size, last_sweeps))
+    size = population_size(model.interactions, budget, models)
+    sweeps = last_sweeps(model.interactions, budget, models)
     replays, budget = 0, budget // models
 
     def counted(points: NDArray[np.float64], logarithms: NDArray[np.float64]) -> NDArray[np.float64]:
