@@ -34,10 +34,9 @@ import make_hill as hill  # noqa: E402
 import make_town as town  # noqa: E402
 
 from calibray import engines  # noqa: E402
-from calibray.fitting.methods import choose  # noqa: E402
 from calibray.fitting.preliminary_fits import leave_out_near_floor  # noqa: E402
 from calibray.fitting.problem import Problem  # noqa: E402
-from calibray.fitting.search import search  # noqa: E402
+from calibray.fitting.search import choose, search  # noqa: E402
 from calibray.measurements import (  # noqa: E402
     Averaging,
     LinkColumns,

@@ -23,9 +23,8 @@ from dataclasses import replace
 import numpy as np
 
 from calibray import engines
-from calibray.fitting.methods import choose
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import search
+from calibray.fitting.search import choose, search
 from calibray.result.held_out import Model
 from calibray.scenarios import demo_study_path
 from calibray.study import Study

@@ -33,9 +33,8 @@ from calibray.engines import ChunkedReplay, InProcess, Workers
 from calibray.engines.cluster.chunks import chunk_size, cut, seconds_to_trace
 from calibray.engines.cluster.dask_workers import DaskWorkers
 from calibray.engines.kinds.replay import trace_and_replay
-from calibray.fitting.methods import choose
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import search
+from calibray.fitting.search import choose, search
 from calibray.study import Setup, Study
 
 MASTS = np.array([[8.5, 21.0, 27.0], [45.0, 90.0, 40.0]])  # [m]

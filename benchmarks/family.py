@@ -23,8 +23,7 @@ for library in (
 ):  # read when NumPy is loaded; one core a run, here and in the workers
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
-from calibray.cli.console import log
-from calibray.cli.progress_bars import progress_bars
+from calibray.cli.console import log, progress_bars
 from calibray.comparison.comparison import quantile
 from calibray.optimizers import label
 from calibray.tables import Column, Table, numbers

@@ -23,8 +23,7 @@ for library in (
 ):  # read when NumPy is loaded; one core a run, here and in the workers
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
-from calibray.cli.console import log
-from calibray.cli.progress_bars import progress_bars
+from calibray.cli.console import log, progress_bars
 from calibray.comparison.comparison import compare, figure, parse_methods, table
 from calibray.comparison.method_runs import ComparisonProblem, study_problem
 from calibray.scenarios import demo_study_path

@@ -26,8 +26,7 @@ for library in ("OMP", "OPENBLAS", "MKL"):
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.cli.console import log
-from calibray.cli.progress_bars import progress_bars
+from calibray.cli.console import log, progress_bars
 from calibray.comparison.comparison import quantile
 from calibray.comparison.method_runs import (
     BudgetedMethod,

@@ -35,10 +35,9 @@ from antenna_pose import POSITION, district
 from calibray import engines
 from calibray.engines import Replay
 from calibray.engines.kinds.replay import replay
-from calibray.fitting.methods import choose
 from calibray.fitting.preliminary_fits import estimate_noise
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import search
+from calibray.fitting.search import choose, search
 from calibray.measurements.observables import Statistic
 from calibray.result.verdict import Remark, RemarkKind
 from calibray.scenes import Mesh, MeshObject, write_scene

@@ -69,10 +69,9 @@ def once(name: str) -> dict[str, object]:
     from jax import monitoring
 
     from calibray.engines.kinds.replay import replay
-    from calibray.fitting.methods import choose
     from calibray.fitting.preliminary_fits import estimate_noise
     from calibray.fitting.problem import Problem
-    from calibray.fitting.search import search
+    from calibray.fitting.search import choose, search
     from calibray.study import Setup, Study
     from calibray.uncertainty.assessment import certainty
 
@@ -104,9 +103,8 @@ def once(name: str) -> dict[str, object]:
 def seeds(name: str) -> dict[str, object]:
     """The optimum and the evaluations of `auto` from other seeds, and of all 512 starts from the first of them."""
     from calibray.engines.kinds.replay import replay
-    from calibray.fitting.methods import choose
     from calibray.fitting.problem import Problem
-    from calibray.fitting.search import rounds, search
+    from calibray.fitting.search import choose, rounds, search
     from calibray.optimizers import LeastSquares, least_squares
     from calibray.study import Setup, Study
 

@@ -19,9 +19,9 @@ import jax
 import pytest
 from hypothesis import settings
 
-from calibray.cli import progress_bars as progress
+from calibray.cli import console
 from calibray.fields import compiled
-from calibray.fitting import methods
+from calibray.fitting import search
 from calibray.support import cache_folder as caching
 from calibray.uncertainty import sequential_monte_carlo as sampler
 
@@ -63,7 +63,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def _no_lines_of_progress():
     """No lines of progress on stderr, however busy the machine is."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(progress, "LINE_INTERVAL", 1e6)
+        patch.setattr(console, "LINE_INTERVAL", 1e6)
         yield
 
 
@@ -106,7 +106,7 @@ def _same_kernels(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 def _few_starts() -> Iterator[None]:
     """An eighth of the starting points of a search; small problems have few minima."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(methods, "STARTS", (16, 64))
+        patch.setattr(search, "STARTS", (16, 64))
         yield
 
 

@@ -15,7 +15,7 @@ from rich.console import Console
 import planted
 import programs
 from calibray.calibration.result import Result
-from calibray.cli.progress_bars import progress_bars
+from calibray.cli.console import progress_bars
 from calibray.paths import Paths
 from calibray.reporting import result_tables
 from calibray.result import FILES

@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 import programs
 from calibray import calibrate
 from calibray.cli.app import app
-from calibray.cli.progress_bars import progress_bars
+from calibray.cli.console import progress_bars
 from calibray.engines import open_ledger
 from calibray.errors import EngineError
 from calibray.study import Study

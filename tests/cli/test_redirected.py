@@ -30,10 +30,10 @@ def last(name):
         time.sleep(0.005)
 """
 PRELUDE = """
-from calibray.cli import main, progress_bars
+from calibray.cli import console, main
 
-print("every", progress_bars.LINE_INTERVAL, flush=True)
-progress_bars.LINE_INTERVAL = 0.02
+print("every", console.LINE_INTERVAL, flush=True)
+console.LINE_INTERVAL = 0.02
 
 def slow(function):
     home, _, name = function.rpartition(".")

@@ -15,10 +15,9 @@ from calibray.calibration.calibrate import calibrate
 from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.fitting.cheap_replay import ProblemRows, ReplayedModel, make_cheap_replay, with_constants
-from calibray.fitting.methods import choose
 from calibray.fitting.nuisance import Nuisance
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import rounds
+from calibray.fitting.search import choose, rounds
 from calibray.materials import Material
 from calibray.optimizers import LeastSquares
 from calibray.parameters import Parameter, Parameters

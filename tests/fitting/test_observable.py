@@ -9,9 +9,8 @@ import planted
 from calibray.engines.protocol import PATH_LOSS, Observable
 from calibray.errors import InputError
 from calibray.fields.channel import channel_statistics
-from calibray.fitting.methods import choose
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import search
+from calibray.fitting.search import choose, search
 from calibray.study import Setup
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from calibray.cli.progress_bars import line
+from calibray.cli.console import line
 from calibray.window.jobs import Stage, stages
 
 

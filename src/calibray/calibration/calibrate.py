@@ -17,11 +17,10 @@ from calibray.engines.protocol import Answering, Engine
 from calibray.engines.rays.export import Exporting
 from calibray.fitting.cheap_replay import CheapReplay, make_cheap_replay
 from calibray.fitting.fidelity_loop import retrace
-from calibray.fitting.methods import check_fit, check_method, choose
 from calibray.fitting.preliminary_fits import estimate_noise, estimate_spreads, leave_out_near_floor
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_mapping import maps_rays, search_rays
-from calibray.fitting.search import search
+from calibray.fitting.search import check_fit, check_method, choose, search
 from calibray.result.files import FILES
 from calibray.result.held_out import Model
 from calibray.study import Setup, Study

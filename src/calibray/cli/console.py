@@ -1,17 +1,25 @@
-"""The console for messages, and arguments that several commands share."""
+"""The console for messages and progress, and arguments that several commands share.
+
+Progress is shown as bars on a terminal, and as plain lines every few seconds elsewhere.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache, wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from threading import Event, Lock, Thread
+from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
 
 import typer
 
 from calibray.errors import InputError
+from calibray.support import interruption
+from calibray.support.progress import Progress
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -149,3 +157,126 @@ def warn(study: Study, links: Measurements) -> None:
         raise
     if findings:
         echo(warning_lines(findings), err=True)
+
+
+LINE_INTERVAL: Final = 4.0
+"""Time between two lines without a terminal [s]; shorter work prints no line."""
+
+STARTING: Final = "starting"
+"""The stage shown before the first stage with a count: reading, importing, compiling."""
+
+
+@contextmanager
+def progress_bars(console: Console, every: float | None = None) -> Iterator[Progress]:
+    """Show progress by stage: bars on a terminal, otherwise lines at least `every` seconds apart.
+
+    Yields a function of the stage, the amount done and the total (None if unknown).
+    """
+    display = _bars(console) if console.is_terminal else _lines(console, every or LINE_INTERVAL)
+    with display as report, interruption.ensure_interruption():
+
+        def progress(stage: str, done: int, total: int | None) -> None:
+            interruption.raise_pending_interruption()
+            report(stage, done, total)
+
+        yield progress
+
+
+@contextmanager
+def _bars(console: Console) -> Iterator[Progress]:
+    # Rich is imported on first use, so that `--version` and `--help` do not load it.
+    from rich import progress as rich_progress
+
+    columns = (
+        rich_progress.SpinnerColumn(),
+        rich_progress.TextColumn("{task.description:<12}"),
+        rich_progress.BarColumn(),
+        rich_progress.MofNCompleteColumn(),
+        rich_progress.TimeElapsedColumn(),
+        rich_progress.TextColumn("left:"),
+        rich_progress.TimeRemainingColumn(),
+    )
+    with rich_progress.Progress(
+        *columns,
+        console=console,
+        transient=True,
+        # [s]; a launch of rays can take longer than the 30 s over which Rich averages by default.
+        speed_estimate_period=3600.0,
+    ) as bars:
+        tasks = {STARTING: bars.add_task(STARTING, total=1)}
+
+        def report(stage: str, done: int, total: int | None) -> None:
+            if STARTING in tasks:
+                bars.remove_task(tasks.pop(STARTING))
+            # Without a total and with nothing done, the stage is a single step.
+            shown_total = 1 if total is None and not done else total
+            name = stage.partition(": ")[0]
+            if name not in tasks:
+                tasks[name] = bars.add_task(stage, total=shown_total, completed=done)
+            bars.update(tasks[name], description=stage, completed=done, total=shown_total)
+
+        yield report
+
+
+@dataclass
+class _State:
+    """The current stage and how much of it is done."""
+
+    stage: str = STARTING
+    done: int = 0
+    total: int | None = None
+    since: float = field(default_factory=time.monotonic)
+    lock: Lock = field(default_factory=Lock)
+
+    def report(self, stage: str, done: int, total: int | None) -> None:
+        with self.lock:
+            name = stage.partition(": ")[0]
+            if name != self.stage.partition(": ")[0] or done < self.done:
+                self.since = time.monotonic()
+            self.stage, self.done, self.total = stage, done, total
+
+    def line(self) -> str:
+        with self.lock:
+            return line(self.stage, self.done, self.total, time.monotonic() - self.since)
+
+
+@contextmanager
+def _lines(console: Console, every: float) -> Iterator[Progress]:
+    """Prints lines from a separate thread, so that they also appear while the work reports nothing."""
+    state, finished = _State(), Event()
+
+    def print_lines() -> None:
+        while not finished.wait(every):
+            console.print(state.line(), soft_wrap=True, markup=False)
+
+    printer = Thread(target=print_lines, name="progress", daemon=True)
+    printer.start()
+    try:
+        yield state.report
+    finally:
+        finished.set()
+        printer.join()
+
+
+def line(stage: str, done: int, total: int | None, seconds: float) -> str:
+    """Stage, share, rate, time and remaining time as one line, as far as they are known.
+
+    Example:
+        >>> line("tracing", 30, 120, 15.0)
+        'tracing 30/120, 25 %, 2/s, 15 s, about 45 s left'
+        >>> line("starting", 0, None, 5.0)
+        'starting, 5 s'
+        >>> line("calibrating: best RMSE 3.10 dB", 50, 100, 5.0)
+        'calibrating 50/100, 50 %, 10/s, 5 s, about 5 s left, best RMSE 3.10 dB'
+    """
+    name, _, detail = stage.partition(": ")
+    parts = [name if total is None and not done else f"{name} {done}" + (f"/{total}" if total else "")]
+    if total:
+        parts.append(f"{done / total:.0%}".replace("%", " %"))
+    rate = done / seconds if seconds > 0 else 0.0
+    if done:
+        parts.append(f"{rate:.3g}/s")
+    parts.append(f"{seconds:.0f} s")
+    if total and rate and done < total:
+        parts.append(f"about {(total - done) / rate:.0f} s left")
+    return ", ".join([*parts, detail] if detail else parts)

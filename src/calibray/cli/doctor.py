@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, echo, log
-from calibray.cli.progress_bars import progress_bars
+from calibray.cli.console import Overwrite, echo, log, progress_bars
 from calibray.errors import InputError
 
 if TYPE_CHECKING:

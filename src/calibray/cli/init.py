@@ -8,8 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import echo, log, warn, with_groups
-from calibray.cli.progress_bars import progress_bars
+from calibray.cli.console import echo, log, progress_bars, warn, with_groups
 from calibray.errors import InputError
 
 

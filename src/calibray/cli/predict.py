@@ -12,8 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
-from calibray.cli.console import Permissions, Pool, ResultFolder, echo, log, print_costs, with_groups
-from calibray.cli.progress_bars import progress_bars
+from calibray.cli.console import (
+    Permissions,
+    Pool,
+    ResultFolder,
+    echo,
+    log,
+    print_costs,
+    progress_bars,
+    with_groups,
+)
 from calibray.errors import InputError
 from calibray.support.messages import shortened
 from calibray.tables import Column, Table, numbers

@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, ResultFolder, echo, log
-from calibray.cli.progress_bars import progress_bars
+from calibray.cli.console import Overwrite, ResultFolder, echo, log, progress_bars
 
 
 def report(

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, Pool, StudyFile, echo, log, warn, with_groups
-from calibray.cli.progress_bars import progress_bars
+from calibray.cli.console import Overwrite, Pool, StudyFile, echo, log, progress_bars, warn, with_groups
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -84,7 +83,7 @@ def run(
         with progress_bars(log()) as progress:
             from calibray.calibration.calibrate import calibrate
             from calibray.engines import open_workers
-            from calibray.fitting.methods import check_method
+            from calibray.fitting.search import check_method
             from calibray.reporting import result_tables as tables
             from calibray.result import FILES
             from calibray.study import Study

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from calibray.cli.console import Overwrite, echo, log, with_groups
-from calibray.cli.progress_bars import progress_bars
+from calibray.cli.console import Overwrite, echo, log, progress_bars, with_groups
 from calibray.errors import InputError
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, Pool, StudyFile, echo, log, with_groups
-from calibray.cli.progress_bars import progress_bars
+from calibray.cli.console import Overwrite, Pool, StudyFile, echo, log, progress_bars, with_groups
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from calibray import engines, optimizers
 from calibray.engines.make_engine import fingerprint
 from calibray.errors import InputError
-from calibray.fitting.methods import local_searches
 from calibray.fitting.preliminary_fits import estimate_noise
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import Evaluate, rounds
+from calibray.fitting.search import Evaluate, local_searches, rounds
 from calibray.optimizers import METHODS, Optimizer
 from calibray.optimizers.multifidelity.cheap_model import CheapModel
 from calibray.study import Setup, Study

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from calibray.engines.kinds.replay import replay
 from calibray.engines.protocol import PATH_LOSS, Observing, Responses
 from calibray.errors import EngineError, InputError
-from calibray.fitting.methods import AUTO
 from calibray.fitting.problem import Problem
+from calibray.fitting.search import AUTO
 from calibray.materials import Material
 from calibray.measurements.observables import Statistic
 from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, Constants

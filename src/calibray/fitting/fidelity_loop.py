@@ -12,10 +12,9 @@ from scipy.stats import chi2
 from calibray.engines.kinds.replay import ReplaySection, replay
 from calibray.engines.protocol import Chunked
 from calibray.fields import DisplacementLoss
-from calibray.fitting.methods import AUTO, choose
 from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import Trail, search
+from calibray.fitting.search import AUTO, Trail, choose, search
 from calibray.study.displacement import displaces
 from calibray.support.progress import Progress, with_stage
 

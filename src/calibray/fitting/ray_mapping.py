@@ -22,11 +22,10 @@ from numpy.typing import NDArray
 
 from calibray.engines.rays.export import Export, Exporting
 from calibray.engines.replay import Replay
-from calibray.fitting.methods import AUTO, local_searches
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_fit import Understanding, common, understand
 from calibray.fitting.ray_model import Call, RayModel
-from calibray.fitting.search import Trail, least_squares
+from calibray.fitting.search import AUTO, Trail, least_squares, local_searches
 from calibray.optimizers.sampling import design
 from calibray.result.verdict import Remark, RemarkKind
 from calibray.study import Setup

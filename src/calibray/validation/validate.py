@@ -14,10 +14,10 @@ from calibray.engines.cluster.workers import Workers
 from calibray.engines.protocol import Answering
 from calibray.engines.rays.export import Exporting
 from calibray.errors import EngineError, InputError
-from calibray.fitting.methods import AUTO
 from calibray.fitting.preliminary_fits import estimate_noise, leave_out_near_floor
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_mapping import maps_rays, search_rays
+from calibray.fitting.search import AUTO
 from calibray.result.held_out import Model
 from calibray.study import Setup, Study
 from calibray.study.calibration_sections import DEFAULT_BLOCKS, MOST_BLOCKS

@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.protocol import Differentiable
-from calibray.fitting.methods import STARTS, local_searches
 from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE, Nuisance, make_term, transmitters
 from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import rounds
+from calibray.fitting.search import STARTS, local_searches, rounds
 from calibray.measurements import Measurements
 from calibray.optimizers import LeastSquares
 from calibray.optimizers.least_squares import CATCH_UP, NEARER

@@ -39,7 +39,7 @@ _LINE: Final = re.compile(
     r"(?P<name>[A-Za-z][^,/]*?)(?: (?P<done>\d+)(?:/(?P<total>\d+))?)?(?:, \d+ %)?(?:, [\d.e+-]+/s)?"
     r", (?P<seconds>\d+) s(?:, about (?P<left>\d+) s left)?(?:, (?P<found>.+))?"
 )
-"""A line of progress in a log (`calibray.cli.progress_bars.line`)."""
+"""A line of progress in a log (`calibray.cli.console.line`)."""
 
 
 @dataclass(frozen=True)
