@@ -19,9 +19,9 @@ from calibray.fitting.problem import Problem
 from calibray.materials import Material, itu_material
 from calibray.paths import Paths
 from calibray.scenarios import demo_study_path
-from calibray.scenarios.district import Building, building_meshes, district
 from calibray.scenes import Mesh, MeshObject, join_meshes, write_scene
 from calibray.study import Setup, Study
+from coastal_district import Building, building_meshes, district
 
 DEVELOPMENT = tuple(f"district-{seed}" for seed in (100, 101, 102, 103, 104, 105, 106, 107, 108, 109))
 """Districts to develop on."""

@@ -37,10 +37,10 @@ from calibray import engines
 from calibray.fitting.problem import Problem
 from calibray.prediction.experiment_design import Beliefs, Errors, choose_candidates
 from calibray.scenarios import demo_study_path
-from calibray.scenarios.district import AVENUES, STREETS, district, scene_objects
 from calibray.scenes import write_scene
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers, render
+from coastal_district import AVENUES, STREETS, district, scene_objects
 
 NOISE_DB = 3.0
 MEASURED, MORE = 20, 5

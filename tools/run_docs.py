@@ -29,11 +29,14 @@ from pyogrio import raw as pyogrio_raw
 from rasterio.transform import from_bounds
 
 import calibray as cb
-from calibray.scenarios.district import Building, building_meshes
 from calibray.scenes import Mesh, MeshObject, join_meshes, write_scene
 from calibray.study import Setup, Study
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT / "benchmarks"))
+
+from coastal_district import Building, building_meshes  # noqa: E402
+
 EXAMPLES = ROOT / "examples"
 TOWN = EXAMPLES / "bring_your_own"
 CALIBRAY = Path(sys.executable).with_name("calibray")

@@ -11,9 +11,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.scenarios.district import Layout, district, scene_objects
 from calibray.scenes import write_scene
 from calibray.scenes.authoring import Segment, SurfaceMaterial, make_plan_scene
+from coastal_district import Layout, district, scene_objects
 
 Range = tuple[float, float]
 

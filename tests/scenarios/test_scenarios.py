@@ -12,9 +12,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import coastal_district as district
+import demo_campaign as campaign
 from calibray.engines import Replay
 from calibray.errors import InputError
-from calibray.scenarios import campaign, demo_study_path, district
+from calibray.scenarios import demo_study_path
 from calibray.scenes import Mesh, join_meshes, ply_bytes
 from calibray.study import Study
 from calibray.support.output_files import SIGNATURES

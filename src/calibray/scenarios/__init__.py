@@ -1,7 +1,6 @@
 """The demo: a coastal high-rise district like that of the paper, and a simulated measurement campaign.
 
-`district` builds streets and buildings, `world` plants the true constants, and `campaign` measures the links and
-writes the files. `python -m calibray.scenarios FOLDER` generates them again; `coastal_district/` contains them.
+`coastal_district/` contains its files. In the repository, `python benchmarks/demo_campaign.py FOLDER` makes them again.
 """
 
 from pathlib import Path

@@ -1,4 +1,6 @@
-"""The simulated measurement campaign: tracing and sounding the true world, and writing the files of a study.
+"""The demo's simulated measurement campaign: trace and sound the true world, and write the files of a study.
+
+    python benchmarks/demo_campaign.py FOLDER
 
 The channel sounder turns paths into a path loss averaged over noisy snapshots. The paper's sounder sends a PN9 sequence
 of 511 chips over 200 MHz and records 100 impulse responses at every position (section III). Here a snapshot is a power
@@ -13,6 +15,7 @@ calibration can therefore at best find the means over the buildings, and residua
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,10 +28,10 @@ from calibray.errors import InputError
 from calibray.fields import path_gains
 from calibray.paths import Kind, Paths
 from calibray.scenarios import demo_study_path
-from calibray.scenarios.district import Building, district, lamp_positions, lamp_posts, scene_objects
 from calibray.scenes import MeshObject, read_scene, write_scene
 from calibray.support.output_files import write_bytes
 from calibray.tracing.default_tracer import trace
+from coastal_district import Building, district, lamp_positions, lamp_posts, scene_objects
 
 SEED: Final = 1
 FREQUENCY: Final = 4e9  # [Hz]
@@ -334,3 +337,7 @@ def _powers(paths: Paths) -> NDArray[np.float64]:
     owner = np.repeat(np.arange(paths.num_paths), np.diff(paths.first))
     diffuse = np.bincount(owner, paths.kind == Kind.DIFFUSE, paths.num_paths).astype(np.float64)
     return np.stack([paths.link.astype(np.float64), np.abs(path_gains(paths)) ** 2, paths.delay, diffuse])
+
+
+if __name__ == "__main__":
+    generate(Path(sys.argv[1]))
