@@ -10,6 +10,7 @@ import ast
 import runpy
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -61,10 +62,21 @@ def test_a_lost_test_is_found(source, file, lost):
 SOURCES = TESTS.parent / "src" / "calibray"
 
 
-def test_no_files_import_each_other():
+@pytest.fixture(scope="module")
+def structure() -> dict[str, Any]:
+    """What the tool that measures the structure defines."""
+    return runpy.run_path(str(TESTS.parent / "tools" / "structure.py"))
+
+
+@pytest.fixture(scope="module")
+def trees(structure) -> dict[str, ast.Module]:
+    """The syntax tree of every module."""
+    return structure["modules"](SOURCES)
+
+
+def test_no_files_import_each_other(structure, trees):
     """Imports inside functions and for type checking count, which import-linter leaves out."""
-    structure = runpy.run_path(str(TESTS.parent / "tools" / "structure.py"))
-    graph = structure["dependencies"](structure["modules"](SOURCES))
+    graph = structure["dependencies"](trees)
     assert len(graph) > 200
     assert structure["circles"](graph) == []
     assert structure["circles"]({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
@@ -83,10 +95,10 @@ PRIVATE = (
 """Where files are written otherwise: the writer itself, exchange in private folders, and SQLite."""
 
 
-def foreign_writes(source: str) -> list[int]:
+def foreign_writes(tree: ast.Module) -> list[int]:
     """Lines that write a file by its final name, or a table without marking formulas."""
     lines = []
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(tree):
         if not isinstance(node, ast.Call):
             continue
         function = node.func
@@ -102,11 +114,9 @@ def foreign_writes(source: str) -> list[int]:
     return lines
 
 
-def test_files_are_written_in_one_way():
+def test_files_are_written_in_one_way(trees):
     """All goes through `support.output_files` and `output_tables`: no link followed, no foreign file replaced."""
-    written = {
-        str(path.relative_to(SOURCES)): foreign_writes(path.read_text()) for path in SOURCES.rglob("*.py")
-    }
+    written = {name: foreign_writes(tree) for name, tree in trees.items()}
     assert {name: lines for name, lines in written.items() if lines and not name.startswith(PRIVATE)} == {}
 
 
@@ -126,7 +136,7 @@ def test_files_are_written_in_one_way():
     ],
 )
 def test_a_foreign_write_is_noticed(source, count):
-    assert len(foreign_writes(source)) == count
+    assert len(foreign_writes(ast.parse(source))) == count
 
 
 def test_commands_print_in_one_way():
