@@ -8,7 +8,6 @@ Statistics 26, 1997).
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
@@ -285,13 +284,13 @@ NEGLIGIBLE: Final = 1e-6
 
 
 class Explained(NamedTuple):
-    """The best rectangle of a size.
+    """The best rectangle of a width.
 
     Attributes:
         explained: Sum of squares that it explains.
         attenuation: Its attenuation [dB/m].
         cells: Its corners, counted in cells [2, 2].
-        chance: Sum of squares that the best rectangle of this size explains for residuals in random order [k - 1].
+        chance: Sum of squares that the best rectangle of this width explains for residuals in random order [k - 1].
     """
 
     explained: float
@@ -361,7 +360,7 @@ def missing_region(
     for height in HEIGHTS:
         length = _lengths(tx, rx, corner, cell, lowest + height)
         inside = length - basis @ (basis.T @ length)
-        rectangles = list(_rectangles(orders @ inside, inside.T @ inside))
+        rectangles = list(_rectangles(inside.T @ orders.T, inside.T @ inside))
         chance = np.maximum(chance, np.max([rectangle.chance for rectangle in rectangles], axis=0))
         top = max(rectangles, key=lambda rectangle: rectangle.explained)
         if top.explained / square > (0.0 if best is None else best.share):
@@ -407,33 +406,37 @@ def _lengths(
 
 
 def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> Iterator[Explained]:
-    """The best rectangle of the grid, size by size.
+    """The best rectangle of the grid, width by width.
 
     Args:
-        moments: Products of residuals and the columns of the cells, with the residuals in order first [k, cells].
+        moments: Products of residuals and the columns of the cells, with the residuals in order first [cells, k].
         products: Products of the columns of the cells [cells, cells].
     """
-    moment = _summed(moments.reshape(-1, GRID, GRID), (1, 2))
+    moment = _summed(moments.reshape(GRID, GRID, -1), (0, 1))
     total = _summed(products.reshape((GRID,) * 4), (0, 1, 2, 3))
     largest = float(np.max(np.diagonal(products), initial=0.0))
+    south, north = np.triu_indices(GRID + 1, 1)
     for columns in range(1, GRID + 1):
-        for rows in range(1, GRID + 1):
-            x, y = np.ogrid[: GRID + 1 - columns, : GRID + 1 - rows]
-            corners = ((x + columns, y + rows, 1), (x, y + rows, -1), (x + columns, y, -1), (x, y, 1))
-            square = np.zeros((GRID + 1 - columns, GRID + 1 - rows))
-            for (u, v, one), (s, t, other) in itertools.product(corners, corners):
-                square += one * other * total[u, v, s, t]
-            product = moment[:, columns:, rows:] - moment[:, :-columns, rows:]
-            product -= moment[:, columns:, :-rows] - moment[:, :-columns, :-rows]
-            used = square > NEGLIGIBLE * largest
-            np.maximum(product, 0.0, out=product)
-            explained = product**2 * np.where(used, 1.0 / np.where(used, square, 1.0), 0.0)
-            west, south = np.unravel_index(np.argmax(explained[0]), square.shape)
-            cells = np.array([[west, south], [west + columns, south + rows]])
-            attenuation = float(product[0, west, south] / square[west, south]) if used[west, south] else 0.0
-            yield Explained(
-                float(explained[0, west, south]), attenuation, cells, explained[1:].max(axis=(1, 2))
-            )
+        west = np.arange(GRID + 1 - columns)
+        east = west + columns
+        strip = total[east, :, east] - total[east, :, west] - total[west, :, east] + total[west, :, west]
+        square = (
+            strip[:, north, north] - strip[:, north, south] - strip[:, south, north] + strip[:, south, south]
+        )
+        band = moment[columns:] - moment[:-columns]
+        used = square > NEGLIGIBLE * largest
+        root = np.where(used, 1.0 / np.sqrt(np.where(used, square, 1.0)), 0.0)
+        loss = band[:, north]
+        loss -= band[:, south]
+        loss *= root[..., None]
+        at, rows = np.unravel_index(np.argmax(loss[..., 0]), root.shape)
+        explained = np.maximum(loss.max(axis=(0, 1)), 0.0) ** 2
+        yield Explained(
+            float(explained[0]),
+            float(max(loss[at, rows, 0], 0.0) * root[at, rows]),
+            np.array([[west[at], south[rows]], [east[at], north[rows]]]),
+            explained[1:],
+        )
 
 
 def _summed(values: NDArray[np.float64], axes: Sequence[int]) -> NDArray[np.float64]:
