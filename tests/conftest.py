@@ -2,6 +2,7 @@
 
 # ruff: noqa: E402  (what NumPy reads has to be set before it is imported)
 
+import gc
 import os
 import sys
 from collections.abc import Iterator
@@ -51,6 +52,11 @@ LONGEST = (
     "test_program_with_rays",
 )  # fmt: skip
 """Files that take longest. They run first, so that no worker is left with one of them at the end."""
+
+
+def pytest_collection_finish() -> None:
+    """The garbage collector need not go through imported modules, which stay: a million objects."""
+    gc.freeze()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -107,6 +113,14 @@ def _few_starts() -> Iterator[None]:
     """An eighth of the starting points of a search; small problems have few minima."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(search, "STARTS", (16, 64))
+        yield
+
+
+@pytest.fixture(scope="module")
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Tests of a file share their traces; nothing is taken from the user's cache or left there."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(caching.CACHE_VARIABLE, str(tmp_path_factory.mktemp("cache")))
         yield
 
 

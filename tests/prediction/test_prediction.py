@@ -24,12 +24,9 @@ from calibray.uncertainty.residual_correlation import shared_errors
 from calibray.validation.held_out_statistics import FEWEST_FOR_RANKS, interval_half_width, two_levels
 from changed import changed
 
+pytestmark = pytest.mark.usefixtures("own_cache")
+
 FIELD = ResidualField(range_m=20.0, shared_db=3.0, own_db=1.0)
-
-
-@pytest.fixture(autouse=True)
-def _no_cache(monkeypatch):
-    monkeypatch.setenv("CALIBRAY_CACHE", "")
 
 
 @pytest.fixture(scope="module")
@@ -42,10 +39,8 @@ def received(tmp_path_factory) -> Result:
         "quantity": "received_power", "tx_power_dbm": "sent_dbm",
     }  # fmt: skip
     method = {"name": "auto", "options": {"starts": 16}}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CALIBRAY_CACHE", "")
-        plan = planted.study(tmp_path_factory.mktemp("received"), table, links=links, method=method)
-        return calibrate(plan, engine=planted.engine())
+    plan = planted.study(tmp_path_factory.mktemp("received"), table, links=links, method=method)
+    return calibrate(plan, engine=planted.engine())
 
 
 def test_received_power_is_predicted_in_the_measured_quantity(received):

@@ -34,25 +34,25 @@ from calibray.tracing.sionna.live_scene import verify_export
 from changed import changed
 from small_scenes import block, write_scene
 
+pytestmark = pytest.mark.usefixtures("own_cache")
+
 LIMIT_DB = 0.05
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A study calibrated on the street canyon, with an offset per half and dipoles, and its result in `out`."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CALIBRAY_CACHE", "")
-        target = tmp_path_factory.mktemp("study")
-        table = planted.campaign(noise_db=0.3, blocked=True)
-        study = planted.study(
-            target,
-            table.assign(path_loss_db=table.path_loss_db.where(np.isfinite(table.path_loss_db), 110.0)),
-            offset={"per": "half"},
-            antennas={"tx": {"pattern": "dipole", "polarization": "V", "orientation": [0.0, 0.2, 0.0]}},
-            method={"name": "auto", "options": {"starts": 4, "iterations": 10}},
-        )
-        cb.calibrate(study, out=target / "out")
-        return target
+    target = tmp_path_factory.mktemp("study")
+    table = planted.campaign(noise_db=0.3, blocked=True)
+    study = planted.study(
+        target,
+        table.assign(path_loss_db=table.path_loss_db.where(np.isfinite(table.path_loss_db), 110.0)),
+        offset={"per": "half"},
+        antennas={"tx": {"pattern": "dipole", "polarization": "V", "orientation": [0.0, 0.2, 0.0]}},
+        method={"name": "auto", "options": {"starts": 4, "iterations": 10}},
+    )
+    cb.calibrate(study, out=target / "out")
+    return target
 
 
 def test_plain_sionna_gives_the_reported_path_loss(folder, tmp_path):
@@ -81,7 +81,6 @@ def test_the_reported_path_loss_is_that_of_paths_sampled_with_the_calibrated_mat
     tmp_path, monkeypatch, capsys
 ):
     """Few rays through walls: which paths are found depends on the materials of the trace."""
-    monkeypatch.setenv("CALIBRAY_CACHE", "")
     study = planted.study(
         tmp_path,
         planted.campaign(),

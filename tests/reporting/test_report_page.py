@@ -33,6 +33,8 @@ from calibray.uncertainty.verdicts import Interval
 from changed import changed
 from small_scenes import block, write_scene
 
+pytestmark = pytest.mark.usefixtures("own_cache")
+
 SECTIONS = {
     "summary", "values", "validation", "figures", "residuals", "links-map", "scene", "diagnostics", "study",
 }  # fmt: skip
@@ -82,20 +84,18 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def result(tmp_path_factory) -> Result:
     """A calibration with an offset per half, held-out links, a link without a path, and a hostile group name."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CALIBRAY_CACHE", "")
-        table = planted.campaign(noise_db=0.3, blocked=True)
-        study = planted.study(
-            tmp_path_factory.mktemp("study"),
-            table.assign(
-                path_loss_db=table.path_loss_db.where(np.isfinite(table.path_loss_db), 110.0),
-                half=table.half.map({"west": HOSTILE, "east": "east"}),
-            ),
-            offset={"per": "half"},
-            holdout={"where": "rx_x > 10"},
-            method={"name": "auto", "options": {"starts": 4, "iterations": 10}},
-        )
-        return cb.calibrate(study)
+    table = planted.campaign(noise_db=0.3, blocked=True)
+    study = planted.study(
+        tmp_path_factory.mktemp("study"),
+        table.assign(
+            path_loss_db=table.path_loss_db.where(np.isfinite(table.path_loss_db), 110.0),
+            half=table.half.map({"west": HOSTILE, "east": "east"}),
+        ),
+        offset={"per": "half"},
+        holdout={"where": "rx_x > 10"},
+        method={"name": "auto", "options": {"starts": 4, "iterations": 10}},
+    )
+    return cb.calibrate(study)
 
 
 @pytest.fixture(scope="module")
@@ -267,8 +267,7 @@ def test_positions_missing_in_the_result_come_from_the_study(written, result, tm
     assert links.group.tolist() == survey(result).group.tolist()
 
 
-def test_inputs_that_cannot_be_read_any_more_are_listed(written, result, monkeypatch, tmp_path):
-    monkeypatch.setenv("CALIBRAY_CACHE", "")
+def test_inputs_that_cannot_be_read_any_more_are_listed(written, result, tmp_path):
     gone = Result.load(written)
     content = gone.study.content()
     content["links"]["file"], content["scene"]["file"] = "absent.csv", "absent.xml"
@@ -425,8 +424,7 @@ def test_the_grid_rounds_positions_to_its_step():
     assert grid.step < 0.04
 
 
-def test_links_contain_received_power_with_its_sign(tmp_path, monkeypatch):
-    monkeypatch.setenv("CALIBRAY_CACHE", "")
+def test_links_contain_received_power_with_its_sign(tmp_path):
     table = planted.campaign(noise_db=0.3)
     power = table.assign(power_dbm=30.0 - table.path_loss_db).drop(columns="path_loss_db")
     sections = planted.content("links.csv")["links"] | {
@@ -450,7 +448,6 @@ def test_a_failing_report_does_not_lose_the_result(written, monkeypatch, tmp_pat
 
     study = Result.load(written).study
     (tmp_path / "links.csv").write_text((study.path.parent / "links.csv").read_text())
-    monkeypatch.setenv("CALIBRAY_CACHE", "")
     monkeypatch.setattr(reports, "page", None)
 
     def calibrate(*_, out, **__):

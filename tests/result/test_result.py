@@ -20,15 +20,9 @@ from calibray.study import Study
 from calibray.support.output_files import SIGNATURES
 from small_scenes import write_scene
 
+pytestmark = pytest.mark.usefixtures("own_cache")
+
 OFFSETS = {"west": -3.0, "east": 6.0}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _no_cache():
-    """Nothing is taken from, or left in, the user's cache of traces."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CALIBRAY_CACHE", "")
-        yield
 
 
 @pytest.fixture(scope="module")
