@@ -293,7 +293,6 @@ from types import SimpleNamespace
 from typing import Any
 import numpy as np
 from calibray.tracing import llvm
-llvm.cuda_device_count = lambda: {devices}
 import calibray as cb
 
 class Reached:
@@ -302,18 +301,19 @@ class Reached:
             raise SystemExit("reached the ray tracer")
 
 sys.meta_path.insert(0, Reached())
-try:
-    links = SimpleNamespace(tx=np.array([[0.0, 0, 1]]), rx=np.array([[1.0, 0, 1]]))
-    cb.trace("sionna:box", links, frequency=1e9)
-except cb.errors.InputError as error:
-    raise SystemExit(f"refused: {{error}}")
+links = SimpleNamespace(tx=np.array([[0.0, 0, 1]]), rx=np.array([[1.0, 0, 1]]))
+for devices in (0, 1):
+    llvm.cuda_device_count = lambda: devices
+    try:
+        cb.trace("sionna:box", links, frequency=1e9)
+    except (cb.errors.InputError, SystemExit) as end:
+        print(end)
 """
 
 
-@pytest.mark.parametrize(
-    ("devices", "end"), [(1, "reached the ray tracer"), (0, "refused: DRJIT_LIBLLVM_PATH")]
-)
-def test_a_machine_without_a_usable_llvm_traces_on_its_gpu_alone(devices: int, end: str) -> None:
+def test_a_machine_without_a_usable_llvm_traces_on_its_gpu_alone() -> None:
     """What a GPU is found by is put in place; what is imported before Dr.Jit is the package's own."""
-    run = python("import calibray.errors\n" + TRACE.format(devices=devices))
-    assert run.stderr.strip().splitlines()[-1].startswith(end), run.stderr
+    run = python(TRACE)
+    refused, reached = run.stdout.strip().splitlines()
+    assert refused.startswith("DRJIT_LIBLLVM_PATH"), run.stderr
+    assert reached == "reached the ray tracer", run.stderr
