@@ -46,7 +46,7 @@ def calibrated(folder: Path, behind: int = BEHIND, **trace: object) -> Result:
         "antennas": {end: {"pattern": "iso", "polarization": "V"} for end in ("tx", "rx")},
         "trace": {"max_depth": 1, "samples": 20_000, **trace},
         "parameters": {"stone.relative_permittivity": {"bounds": [2.0, 12.0]}},
-        "method": {"name": "auto", "options": {"starts": 16}},
+        "noise": {"kind": "gaussian", "range_m": 0, "heterogeneity": 0, "constants_spread": 0},
     }  # fmt: skip
     return cb.calibrate(cb.Study.from_content(study, folder / "study.toml"))
 

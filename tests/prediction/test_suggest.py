@@ -74,6 +74,7 @@ def study(folder: Path) -> Study:
         "objective": {"combining": "coherent"},
         "offset": {"per": "site"},
         "parameters": {NAME: {"bounds": [1.5, 15.0]}},
+        "noise": {"kind": "gaussian", "range_m": 0, "heterogeneity": 0, "constants_spread": 0},
     }
     return Study.from_content(content, folder / "study.toml")
 

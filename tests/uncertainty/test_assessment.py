@@ -27,26 +27,18 @@ from calibray.validation import variants
 from calibray.validation.validate import validate_problem
 from link_tables import links_from_frame
 
+pytestmark = pytest.mark.usefixtures("own_cache")
+
 CENSORED = planted.content("links.csv")["links"] | {
     "quantity": "received_power", "tx_power_dbm": 0.0, "noise_floor_dbm": -100.0, "below_floor": "censor",
 }  # fmt: skip
 STEPS = 21
 """Values per parameter of the grid for an exact posterior."""
 
-EXACT = {"heterogeneity": 0, "constants_spread": 0}
-"""Equal buildings, and constants that the scene gives exactly."""
-
-FEW = {"name": "auto", "options": {"starts": 64}}
 MARBLE = "marble.relative_permittivity"
 
 
-@pytest.fixture(autouse=True)
-def _no_cache(monkeypatch):
-    monkeypatch.setenv("CALIBRAY_CACHE", "")
-
-
 def run(folder, table: pd.DataFrame, **sections) -> Result:
-    sections = {"method": FEW, **sections}
     return calibrate(planted.study(folder, table, **sections), engine=planted.engine())
 
 
@@ -58,9 +50,7 @@ def noisy() -> pd.DataFrame:
 @pytest.fixture(scope="module")
 def result(tmp_path_factory, noisy) -> Result:
     """A calibration with noise, which compares all noise models."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CALIBRAY_CACHE", "")
-        return run(tmp_path_factory.mktemp("plain"), noisy, noise=None)
+    return run(tmp_path_factory.mktemp("plain"), noisy, noise=None)
 
 
 def test_intervals_come_from_draws_and_have_reasons(result):
@@ -78,7 +68,7 @@ def test_intervals_come_from_draws_and_have_reasons(result):
 
 @pytest.mark.usefixtures("all_draws")
 def test_draws_fit_the_links_about_as_well_as_the_optimum(tmp_path, noisy):
-    result = run(tmp_path, noisy, noise=EXACT)
+    result = run(tmp_path, noisy)
     names = list(result.parameters)
     points = np.stack([result.uncertainty.draws[name] for name in names], axis=1)
     measured = result.links.measured_db.to_numpy()
@@ -162,7 +152,7 @@ def test_the_noise_must_be_declared_if_it_cannot_be_estimated(tmp_path, noisy):
         name: {"bounds": planted.BOUNDS, "prior": {"value": 4.0, "spread": 0.3}} for name in planted.TRUTH
     }
     table = noisy.head(3)
-    study = planted.study(tmp_path, table, parameters=entry, method=FEW)
+    study = planted.study(tmp_path, table, parameters=entry)
     few = engines.Replay(take_links(planted.engine().paths, np.arange(3)), planted.engine().parameters)
     with pytest.raises(InputError, match=r"noise\.std_db: is required"):
         calibrate(study, engine=few)
@@ -289,7 +279,7 @@ def test_an_unmeasured_group_gets_the_spread_of_the_others(tmp_path, noisy):
 @pytest.mark.usefixtures("all_draws")
 def test_a_well_determined_parameter_is_never_not_identifiable():
     """Against the exact posterior on a grid with known noise; overwhelming noise is the control."""
-    study = Study.from_content(planted.content("links.csv", offset={}, noise=EXACT))
+    study = Study.from_content(planted.content("links.csv", offset={}))
     problem = Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
     lower, upper = problem.parameters.search_bounds
     axis = np.linspace(0.0, 1.0, STEPS)
