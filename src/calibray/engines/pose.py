@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from types import SimpleNamespace
 from typing import Any, Final
@@ -44,11 +44,7 @@ XP: Final = SimpleNamespace(
 """`jax.numpy` with functions that XLA vectorizes on CPU."""
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["basis", "axis", "pose", "mounted", "of_antenna", "transmitter", "weights"],
-    meta_fields=["antennas"],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class PoseError:
     """Transmit antennas whose direction or gain differs from the stated one; P paths, M poses, e parameters.
@@ -72,7 +68,7 @@ class PoseError:
     of_antenna: tuple[Any, ...]
     transmitter: Any
     weights: Any
-    antennas: tuple[Antenna, ...]
+    antennas: tuple[Antenna, ...] = field(metadata={"static": True})
 
     def ordered(self, order: NDArray[np.int64]) -> PoseError:
         """See `Effect.ordered`."""

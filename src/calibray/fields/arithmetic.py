@@ -10,8 +10,7 @@ to one segment, and only the remainder of every segment is scattered.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
 from typing import Final, TypeVar
 
 import jax
@@ -128,7 +127,7 @@ BLOCK: Final = 32
 """Numbers in a block."""
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["order", "segment"], meta_fields=["blocks", "count"])
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Segments:
     """The segments of an array of numbers.
@@ -142,8 +141,8 @@ class Segments:
 
     order: jax.Array | None
     segment: jax.Array
-    blocks: int
-    count: int
+    blocks: int = field(metadata={"static": True})
+    count: int = field(metadata={"static": True})
 
 
 def make_segments(segment: NDArray[np.integer], count: int) -> Segments:

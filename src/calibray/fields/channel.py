@@ -25,11 +25,7 @@ from calibray.materials import Material
 from calibray.paths import Paths
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["mean_delay", "delay_spread", "k_factor_db", "departure_spread", "arrival_spread"],
-    meta_fields=[],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ChannelStatistics:
     """Second-order statistics of every link; NaN for a link without a path.

@@ -57,11 +57,7 @@ _STENCIL: Final = 3
 """Nodes on either side that `table_error` needs."""
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["cell", "fraction", "cosine", "material", "mode", "inner"],
-    meta_fields=[],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TableLayout:
     """The position of each coefficient in the tables. The rows of all pairs of material and mode follow one another.
@@ -83,7 +79,7 @@ class TableLayout:
     inner: jax.Array
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["values"], meta_fields=[])
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class CoefficientTables:
     """Tables of coefficients. The numbers of a cell are adjacent, so that a look-up reads one or two cache lines.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
@@ -19,7 +19,7 @@ COMBINING: Final = ("power", "coherent", "band")
 """Names of the ways of combining paths."""
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["nodes"], meta_fields=["kind"])
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Combining:
     """How the paths of a link combine.
@@ -30,7 +30,7 @@ class Combining:
         nodes: For "band": frequencies relative to the carrier [Hz] and weights [2, q]; otherwise None.
     """
 
-    kind: str = "power"
+    kind: str = field(default="power", metadata={"static": True})
     nodes: NDArray[np.float64] | None = None
 
     @classmethod

@@ -6,8 +6,8 @@ by the materials) is evaluated on the changed program.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import partial, reduce
+from dataclasses import dataclass, field, replace
+from functools import reduce
 from typing import NamedTuple, Protocol
 
 import jax
@@ -60,9 +60,7 @@ def with_antenna_fields(program: GroupedProgram, fields: list[AntennaFields]) ->
     return replace(program, groups=tuple(replace(group, tx=tx, rx=rx) for group, (tx, rx) in pairs))
 
 
-@partial(
-    jax.tree_util.register_dataclass, data_fields=["length", "maximum_db"], meta_fields=["index", "fixed"]
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class ExtraLoss:
     """Loss of paths through regions such as woodland: it saturates with the length of the path in them.
@@ -77,8 +75,8 @@ class ExtraLoss:
 
     length: jax.Array | NDArray[np.float64]
     maximum_db: float
-    index: int | None
-    fixed: float = 0.0
+    index: int | None = field(metadata={"static": True})
+    fixed: float = field(default=0.0, metadata={"static": True})
 
     def ordered(self, order: NDArray[np.int64]) -> ExtraLoss:
         """See `Effect.ordered`."""
@@ -92,7 +90,7 @@ class ExtraLoss:
         return scaled(program, jnp.exp(-np.log(10) / 20 * loss_db))
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["exponent", "fixed"], meta_fields=["index"])
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class RoughSurfaces:
     """Loss of specular reflections on M rough materials: Rayleigh's roughness factor.
@@ -106,7 +104,7 @@ class RoughSurfaces:
 
     exponent: jax.Array | NDArray[np.float64]
     fixed: jax.Array | NDArray[np.float64]
-    index: tuple[int | None, ...]
+    index: tuple[int | None, ...] = field(metadata={"static": True})
 
     def ordered(self, order: NDArray[np.int64]) -> RoughSurfaces:
         """See `Effect.ordered`."""
@@ -125,11 +123,7 @@ class RoughSurfaces:
         return scaled(program, jnp.exp(-jnp.asarray(self.exponent) @ heights**2))
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["link", "group", "weights", "origin", "knots", "coefficients"],
-    meta_fields=[],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class DisplacementLoss:
     """Change of path loss by displacements of G groups of links along K axes, a cubic between each two of N knots.

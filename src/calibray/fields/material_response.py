@@ -31,11 +31,7 @@ GroupResponse = tuple[tuple[Coefficients, ...], tuple[tuple[jax.Array, jax.Array
 """The coefficients at every step of a group (at a diffraction two), and both amplitudes at every diffuse reflection."""
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["coefficients", "co_polarized", "cross_polarized"],
-    meta_fields=[],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MaterialResponse:
     """Everything that the fields need from the materials.

@@ -9,7 +9,7 @@ within about 2 dB of the limit. `docs/measurements/observables.md` shows the err
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Final
 
@@ -51,7 +51,7 @@ TAPS: Final = 4
 0.05 % of the power, and the highest is 31 dB down."""
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["delay", "link", "index", "share"], meta_fields=[])
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Taps:
     """The T taps of all links in which a receiver of limited bandwidth resolves P paths.
@@ -110,11 +110,7 @@ def hann_pulse(time: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(inside, np.where(near, 0.5, np.sinc(time) / divisor) ** 2, 0.0)
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["program", "effects", "base", "departure", "arrival", "taps"],
-    meta_fields=["cells", "of_effects", "wanted"],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Channel:
     """Paths, and what a receiver measures of them for values of d parameters.
@@ -136,10 +132,10 @@ class Channel:
     base: NDArray[np.float64]
     departure: NDArray[np.float64]
     arrival: NDArray[np.float64]
-    cells: tuple[tuple[int, int, int], ...]
-    of_effects: tuple[int, ...]
+    cells: tuple[tuple[int, int, int], ...] = field(metadata={"static": True})
+    of_effects: tuple[int, ...] = field(metadata={"static": True})
     taps: tuple[Taps, ...] = ()
-    wanted: tuple[Statistic, ...] = ()
+    wanted: tuple[Statistic, ...] = field(default=(), metadata={"static": True})
 
     @jax_settings()
     def measuring(self, wanted: tuple[Statistic, ...]) -> Channel:

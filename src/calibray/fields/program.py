@@ -10,8 +10,7 @@ program, shorter runs of reflections and transmissions are therefore padded, so 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
 from typing import Final
 
 import jax
@@ -38,11 +37,7 @@ PADDED: Final = 50_000
 """Largest number of interactions at which a program with tables is padded."""
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["tx", "rx", "rotation", "turn", "wedge"],
-    meta_fields=["signature", "size"],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Group:
     """Paths with the same sequence of interactions: n paths, T transmit and R receive ports.
@@ -62,15 +57,11 @@ class Group:
     rotation: tuple[jax.Array, ...]
     turn: tuple
     wedge: tuple
-    signature: str
-    size: int
+    signature: str = field(metadata={"static": True})
+    size: int = field(metadata={"static": True})
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["material", "cosine", "transmitted", "unreduced", "blank"],
-    meta_fields=["shapes", "lines", "any_transmitted"],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class FormulaArguments:
     """Arguments of the slab formula at K positions, in the order in which the groups' steps use the coefficients.
@@ -95,23 +86,12 @@ class FormulaArguments:
     transmitted: jax.Array
     unreduced: jax.Array
     blank: jax.Array | None
-    shapes: tuple[tuple[int, ...], ...]
-    lines: tuple[tuple[int, ...], ...]
-    any_transmitted: bool
+    shapes: tuple[tuple[int, ...], ...] = field(metadata={"static": True})
+    lines: tuple[tuple[int, ...], ...] = field(metadata={"static": True})
+    any_transmitted: bool = field(metadata={"static": True})
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=[
-        "material",
-        "solid_angle",
-        "cos_scattered",
-        "cos_incidence",
-        "cos_specular",
-        "cos_backward",
-    ],
-    meta_fields=["patterns"],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class DiffuseArguments:
     """Arguments of the scattering patterns of D diffuse interactions, in the order in which groups use them.
@@ -133,23 +113,10 @@ class DiffuseArguments:
     cos_incidence: jax.Array
     cos_specular: jax.Array
     cos_backward: jax.Array
-    patterns: tuple[str, ...]
+    patterns: tuple[str, ...] = field(metadata={"static": True})
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=[
-        "groups",
-        "by_link",
-        "link",
-        "delay",
-        "wavelength",
-        "coefficients",
-        "diffuse",
-        "by_material",
-    ],
-    meta_fields=[],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class GroupedProgram:
     """A path program laid out for evaluation: P paths, J coefficients, D diffuse interactions, M materials.
