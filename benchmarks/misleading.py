@@ -34,7 +34,7 @@ from calibray.comparison.method_runs import (
     MethodRun,
     RunFile,
 )
-from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, CheapModel, Constants
+from calibray.optimizers.protocol import CheapAnswer, CheapModel, Constants
 from calibray.tables import Column, Table, numbers
 from markdown_tables import render_markdown
 from problem_families.family_comparison import method_fingerprint, seed_range

@@ -10,7 +10,6 @@ import pytest
 
 from calibray.optimizers import SpaceMapping, VectorSurrogate
 from calibray.optimizers.arguments import Box
-from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, Constants
 from calibray.optimizers.multifidelity.correction import (
     CAPPED,
     UNLIKELY,
@@ -24,6 +23,7 @@ from calibray.optimizers.multifidelity.correction import (
 )
 from calibray.optimizers.multifidelity.discrepancy import FREEDOM, VARIANCE_SPREAD, expected, scaled_density
 from calibray.optimizers.multifidelity.space_mapping import HELPFUL, error_ratio
+from calibray.optimizers.protocol import CheapAnswer, Constants
 from calibray.optimizers.sampling import design
 
 LOWER, UPPER = np.array([1.5, 1.5]), np.array([12.0, 9.0])

@@ -23,7 +23,7 @@ from calibray.fitting.preliminary_fits import estimate_noise
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Evaluate, local_searches, rounds
 from calibray.optimizers import METHODS, Optimizer
-from calibray.optimizers.multifidelity.cheap_model import CheapModel
+from calibray.optimizers.protocol import CheapModel
 from calibray.study import Setup, Study
 from calibray.support.output_files import append_text, exists
 

@@ -8,33 +8,22 @@ settings (`calibray.fields.jax_settings`); importing the package does not change
 """
 
 from calibray.fields.coefficient_tables import FINEST, table_intervals
-from calibray.fields.combining import COMBINING, Combining, path_loss_of_gains
-from calibray.fields.effects import DisplacementLoss, Effect, EffectBatch, Effects, ExtraLoss, RoughSurfaces
+from calibray.fields.effects import DisplacementLoss, Effects, ExtraLoss, RoughSurfaces
 from calibray.fields.evaluation import (
-    WITHOUT_TABLES,
     path_gains,
     path_loss,
     path_losses,
     path_losses_and_slopes,
-    path_losses_and_slopes_with_effects,
-    path_losses_with_effects,
     path_powers,
     program_gains,
     program_path_loss,
 )
 from calibray.fields.jax_context import jax_settings
-from calibray.fields.observables import Channel, link_responses, link_responses_and_slopes
 from calibray.fields.program import GroupedProgram, Layout, layout
 
 __all__ = [
-    "COMBINING",
     "FINEST",
-    "WITHOUT_TABLES",
-    "Channel",
-    "Combining",
     "DisplacementLoss",
-    "Effect",
-    "EffectBatch",
     "Effects",
     "ExtraLoss",
     "GroupedProgram",
@@ -42,15 +31,10 @@ __all__ = [
     "RoughSurfaces",
     "jax_settings",
     "layout",
-    "link_responses",
-    "link_responses_and_slopes",
     "path_gains",
     "path_loss",
-    "path_loss_of_gains",
     "path_losses",
     "path_losses_and_slopes",
-    "path_losses_and_slopes_with_effects",
-    "path_losses_with_effects",
     "path_powers",
     "program_gains",
     "program_path_loss",

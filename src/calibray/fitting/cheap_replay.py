@@ -21,7 +21,7 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import AUTO
 from calibray.materials import Material
 from calibray.measurements.observables import Statistic
-from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, Constants
+from calibray.optimizers.protocol import CheapAnswer, Constants
 from calibray.parameters import Parameter, Parameters
 from calibray.parameters.laws import PARAMETER_BOUNDS
 from calibray.result.verdict import Remark, RemarkKind

@@ -17,7 +17,7 @@ from calibray.engines.protocol import Differentiable, Engine
 from calibray.errors import InputError
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.optimizers import METHODS, LeastSquares, Optimizer
-from calibray.optimizers.multifidelity.cheap_model import CheapModel
+from calibray.optimizers.protocol import CheapModel
 from calibray.parameters import Parameters
 from calibray.study import Setup
 from calibray.study.model import StudyModel

@@ -3,7 +3,7 @@
 `reading.measured_links` is the pipeline from the rows of a table to `Measurements`.
 """
 
-from calibray.measurements.links import FEW, FREQUENCIES, MIN_DISTANCE, Measurements
+from calibray.measurements.links import FEW, MIN_DISTANCE, Measurements
 from calibray.measurements.placement import RX_COLUMNS, TRACK_COLUMNS, TX_COLUMNS
 from calibray.measurements.preparation import (
     Averaging,
@@ -20,7 +20,7 @@ from calibray.measurements.reading import (
     read_measurements,
 )
 from calibray.measurements.selection import mask_codes, melt, select_rows
-from calibray.measurements.source_table import Coordinates, SourceTable
+from calibray.measurements.source_table import SourceTable
 from calibray.measurements.table_files import PiecedTable, read_table
 
 LINK_COLUMNS = (*TX_COLUMNS, *RX_COLUMNS)
@@ -28,12 +28,10 @@ LINK_COLUMNS = (*TX_COLUMNS, *RX_COLUMNS)
 
 __all__ = [
     "FEW",
-    "FREQUENCIES",
     "LINK_COLUMNS",
     "MIN_DISTANCE",
     "TRACK_COLUMNS",
     "Averaging",
-    "Coordinates",
     "Ground",
     "LinkColumns",
     "Measurements",

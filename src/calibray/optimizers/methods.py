@@ -16,9 +16,8 @@ from calibray.optimizers.gaussian_process import GaussianProcess
 from calibray.optimizers.grey_wolf import GWO, SGWOIM
 from calibray.optimizers.least_squares import LeastSquares
 from calibray.optimizers.libraries import CMAES, DFOLS, DifferentialEvolution
-from calibray.optimizers.multifidelity.cheap_model import CheapModel
 from calibray.optimizers.multifidelity.space_mapping import SpaceMapping
-from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.protocol import CheapModel, Optimizer
 from calibray.optimizers.sampling import LatinHypercube, RandomSearch, Sobol
 from calibray.optimizers.vector_surrogate import VectorSurrogate
 from calibray.support.messages import did_you_mean

@@ -9,13 +9,12 @@ from calibray.scenes.export import export_scene
 from calibray.scenes.meshes import Mesh, MeshObject, join_meshes, ply_bytes, read_mesh
 from calibray.scenes.scene import (
     Scene,
-    SceneObject,
     check_material_name,
     has_copied_meshes,
     read_scene,
     xml_with_copied_meshes,
 )
-from calibray.scenes.scene_file import find_scene, read_frame, write_scene
+from calibray.scenes.scene_file import read_frame, write_scene
 from calibray.scenes.shapes import COARSE, SurfaceSize
 from calibray.scenes.triangles import Triangles, ground_heights, read_meshes, read_triangles
 
@@ -24,13 +23,11 @@ __all__ = [
     "Mesh",
     "MeshObject",
     "Scene",
-    "SceneObject",
     "SurfaceSize",
     "Triangles",
     "building_numbers",
     "check_material_name",
     "export_scene",
-    "find_scene",
     "ground_heights",
     "has_copied_meshes",
     "join_meshes",

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from calibray.optimizers.arguments import Box
 from calibray.optimizers.descent import Residuals, descend_all
 from calibray.optimizers.multifidelity import discrepancy
-from calibray.optimizers.multifidelity.cheap_model import CheapModel, Constants
+from calibray.optimizers.protocol import CheapModel, Constants
 from calibray.optimizers.regression import Inputs, Kernel, Process
 
 ROUNDS: Final = 4

@@ -37,7 +37,6 @@ from calibray.optimizers.arguments import Box, whole
 from calibray.optimizers.descent import Residuals, descend_all, distinct
 from calibray.optimizers.evaluations import Archive, Evaluations, Objective, merge_repeated, root_mean_square
 from calibray.optimizers.multifidelity import discrepancy
-from calibray.optimizers.multifidelity.cheap_model import CheapModel
 from calibray.optimizers.multifidelity.correction import (
     Averaged,
     Corrected,
@@ -46,7 +45,7 @@ from calibray.optimizers.multifidelity.correction import (
     average,
     correct,
 )
-from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, Session
+from calibray.optimizers.protocol import AS_GIVEN, CheapModel, Optimizer, Schedule, Search, Session
 from calibray.optimizers.regression import Inputs
 from calibray.optimizers.sampling import design, distance_to_nearest, draw_around
 from calibray.optimizers.vector_surrogate import VectorSurrogate, improvement

@@ -150,7 +150,7 @@ class Tracer:
         return other
 
     def plan(self, links: Links) -> TracePlan:
-        """Plan the launches of a trace in the local frame; see `calibray.tracing.Tracer.plan`."""
+        """Plan the launches of a trace in the local frame; see `calibray.tracing.protocol.Tracer.plan`."""
         tx, rx = link_positions(links)
         sources = rx if starts_at_receivers(tx, rx, self.settings) else tx
         return plan_trace(sources - self.solver.origin, self.settings, LANES, BUFFER)
@@ -159,7 +159,7 @@ class Tracer:
     def trace(
         self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None
     ) -> Paths:
-        """Find the paths of every link and compile them; see `calibray.tracing.Tracer.trace`."""
+        """Find the paths of every link and compile them; see `calibray.tracing.protocol.Tracer.trace`."""
         paths = self.find_paths(links, progress, materials).paths()
         # Dr.Jit keeps freed buffers for its next kernel: 1.7 GB after a trace of a million rays.
         dr.flush_malloc_cache()
