@@ -34,6 +34,9 @@ FIELDS: Final = (
 )
 """The numeric fields of a `Material`, in the order of the columns of a constants matrix."""
 
+SCALAR_CONSTANTS: Final = FIELDS[:5]
+"""The fields that Sionna's scene files contain, and its materials as single-precision numbers."""
+
 
 @dataclass(frozen=True)
 class Bound:

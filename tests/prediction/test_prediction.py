@@ -16,10 +16,10 @@ from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.cli.app import app
 from calibray.prediction.corrections import calibration_residuals, krige_residuals
-from calibray.prediction.position_checks import locate
 from calibray.prediction.suggestion import suggest
 from calibray.result.held_out import BlockErrors, ResidualField
 from calibray.scenes import Triangles
+from calibray.scenes.checks.positions import locate
 from calibray.uncertainty.residual_correlation import shared_errors
 from calibray.validation.held_out_statistics import FEWEST_FOR_RANKS, interval_half_width, two_levels
 from changed import changed

@@ -10,7 +10,6 @@ import shapely
 import trimesh
 
 from calibray.errors import InputError
-from calibray.prediction.position_checks import locate
 from calibray.scenes import buildings, read_frame, read_scene, read_triangles
 from calibray.scenes.authoring import Palette, SurfaceMaterial, Terrain, Windows, make_scene
 from calibray.scenes.authoring.extrusion import (
@@ -23,6 +22,7 @@ from calibray.scenes.authoring.extrusion import (
     split_overlaps,
 )
 from calibray.scenes.authoring.terrain import make_level_ground
+from calibray.scenes.checks.positions import locate
 from calibray.scenes.meshes import MILLIMETRE, weld
 from planted_maps import FRAME, L_SHAPE, footprints
 

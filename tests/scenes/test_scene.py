@@ -14,10 +14,9 @@ import sionna.rt
 
 import calibray as cb
 from calibray.errors import InputError
-from calibray.materials import ITU_MATERIALS, Material, itu_material
+from calibray.materials import ITU_MATERIALS, SCALAR_CONSTANTS, Material, itu_material
 from calibray.scenes import export_scene, read_scene
 from calibray.support.output_files import SIGNATURES
-from calibray.tracing.sionna import SCALAR_CONSTANTS
 from small_scenes import CONCRETE, block, write_scene
 
 SCENES = Path(sionna.rt.__file__).parent / "scenes"

@@ -10,7 +10,7 @@ import pytest
 
 from calibray.coordinates import Frame
 from calibray.errors import InputError
-from calibray.measurements import LINK_COLUMNS, SourceTable
+from calibray.measurements import POSITION_COLUMNS, SourceTable
 from calibray.scenes.authoring import Footprints, make_scene
 from calibray.study import Study, row_steps
 
@@ -109,7 +109,7 @@ def test_positions_to_predict_at_are_read_as_measured_ones(folder, monkeypatch):
     assert links.group[:3].tolist() == ["a p1", "a p2", "b p1"]
     assert not links.measured
     # Columns in metres take precedence.
-    metres = log.assign(**{name: k + 1.0 for k, name in enumerate(LINK_COLUMNS)})
+    metres = log.assign(**{name: k + 1.0 for k, name in enumerate(POSITION_COLUMNS)})
     assert plan.places(SourceTable(metres)).rx[3].tolist() == [4.0, 5.0, 6.0]
     with pytest.raises(InputError, match=r"new\.csv.*no column 'site'"):
         plan.places(SourceTable(log.drop(columns="site"), source="new.csv"))
@@ -195,7 +195,9 @@ def test_tables_for_prediction_are_read_like_the_measured_one(folder, tmp_path):
 
 def test_the_results_own_table_names_groups_and_carriers(folder):
     plan = study(folder, frequency="carrier")
-    table = pd.DataFrame(dict(zip(LINK_COLUMNS, (0.0, 0.0, 20.0, 5.0, 20.0, 1.5), strict=True)), index=[0])
+    table = pd.DataFrame(
+        dict(zip(POSITION_COLUMNS, (0.0, 0.0, 20.0, 5.0, 20.0, 1.5), strict=True)), index=[0]
+    )
     links = plan.places(SourceTable(table.assign(group="a p1", frequency=28e9)))
     assert links.group.tolist() == ["a p1"]
     assert links.frequency.tolist() == [28e9]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, cast
+from typing import Final, cast
 
 import numpy as np
 import pandas as pd
@@ -27,7 +27,7 @@ from calibray.fitting.fidelity_loop import largest_gap
 from calibray.fitting.nuisance import OFFSET
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
-from calibray.measurements import Measurements
+from calibray.measurements import Measurements, position_columns
 from calibray.paths import Paths
 from calibray.prediction.corrections import calibration_residuals, fill_missing
 from calibray.prediction.observables import MOST_DRAWS
@@ -125,7 +125,9 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             "retrace_gap_db": np.nan if gap_db is None else gap_db,
             **({} if problem.faint is None else {"faint": problem.faint}),
             **({} if links.censored is None else {"censored": links.censored}),
-            **_positions(links),
+            **position_columns(links.tx, links.rx),
+            **({} if links.group is None else {"group": links.group}),
+            **({} if links.frequency is None else {"frequency": links.frequency}),
             **_obstruction(setup),
             **({"offset_only_db": nuisance_only} if fitted else {}),
             **diagnostics.columns,
@@ -248,18 +250,6 @@ def _nuisance(problem: Problem, coefficients: NDArray[np.float64]) -> Nuisance:
     ]
     centres = {term.name: term.centre for term in objective.nuisance.terms if term.centre}
     return Nuisance(by_term, centres, tuple(without_path))
-
-
-def _positions(links: Measurements) -> dict[str, NDArray[Any]]:
-    """Positions of both ends of the links [m], their group and carrier [Hz], as columns."""
-    ends = {
-        f"{end}_{axis}": position[:, k]
-        for end, position in (("tx", links.tx), ("rx", links.rx))
-        for k, axis in enumerate("xyz")
-    }
-    group = {} if links.group is None else {"group": links.group}
-    carrier = {} if links.frequency is None else {"frequency": links.frequency}
-    return ends | group | carrier
 
 
 def _obstruction(setup: Setup) -> dict[str, NDArray[np.float64]]:

@@ -3,49 +3,25 @@
 `reading.measured_links` is the pipeline from the rows of a table to `Measurements`.
 """
 
-from calibray.measurements.links import FEW, MIN_DISTANCE, Measurements
-from calibray.measurements.placement import RX_COLUMNS, TRACK_COLUMNS, TX_COLUMNS
-from calibray.measurements.preparation import (
-    Averaging,
-    Ground,
-    LinkColumns,
-    MoveOutside,
-    Preparation,
-    Quantity,
-    Track,
-)
-from calibray.measurements.reading import (
-    links_from_table,
-    measured_links,
-    read_measurements,
-)
-from calibray.measurements.selection import mask_codes, melt, select_rows
-from calibray.measurements.source_table import SourceTable
-from calibray.measurements.table_files import PiecedTable, read_table
-
-LINK_COLUMNS = (*TX_COLUMNS, *RX_COLUMNS)
-"""The columns [m] of a table of links without measured values."""
-
-__all__ = [
-    "FEW",
-    "LINK_COLUMNS",
-    "MIN_DISTANCE",
-    "TRACK_COLUMNS",
-    "Averaging",
-    "Ground",
-    "LinkColumns",
-    "Measurements",
-    "MoveOutside",
-    "PiecedTable",
-    "Preparation",
-    "Quantity",
-    "SourceTable",
-    "Track",
-    "links_from_table",
-    "mask_codes",
-    "measured_links",
-    "melt",
-    "read_measurements",
-    "read_table",
-    "select_rows",
-]
+from calibray.measurements.links import FEW as FEW
+from calibray.measurements.links import MIN_DISTANCE as MIN_DISTANCE
+from calibray.measurements.links import Measurements as Measurements
+from calibray.measurements.placement import POSITION_COLUMNS as POSITION_COLUMNS
+from calibray.measurements.placement import TRACK_COLUMNS as TRACK_COLUMNS
+from calibray.measurements.placement import position_columns as position_columns
+from calibray.measurements.preparation import Averaging as Averaging
+from calibray.measurements.preparation import Ground as Ground
+from calibray.measurements.preparation import LinkColumns as LinkColumns
+from calibray.measurements.preparation import MoveOutside as MoveOutside
+from calibray.measurements.preparation import Preparation as Preparation
+from calibray.measurements.preparation import Quantity as Quantity
+from calibray.measurements.preparation import Track as Track
+from calibray.measurements.reading import links_from_table as links_from_table
+from calibray.measurements.reading import measured_links as measured_links
+from calibray.measurements.reading import read_measurements as read_measurements
+from calibray.measurements.selection import mask_codes as mask_codes
+from calibray.measurements.selection import melt as melt
+from calibray.measurements.selection import select_rows as select_rows
+from calibray.measurements.source_table import SourceTable as SourceTable
+from calibray.measurements.table_files import PiecedTable as PiecedTable
+from calibray.measurements.table_files import read_table as read_table

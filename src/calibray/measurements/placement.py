@@ -125,7 +125,13 @@ RX_COLUMNS: Final = ("rx_x", "rx_y", "rx_z")
 """The columns of receiver positions in the scene's frame [m]."""
 
 POSITION_COLUMNS: Final = (*TX_COLUMNS, *RX_COLUMNS)
-"""The columns of the positions of both ends."""
+"""The columns of the positions of both ends [m]."""
+
+
+def position_columns(tx: NDArray[np.float64], rx: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """The columns `POSITION_COLUMNS` of links with ends [n, 3], [m]; one transmitter [3] serves all links."""
+    ends = np.hstack([np.broadcast_to(tx, rx.shape), rx])
+    return dict(zip(POSITION_COLUMNS, ends.T, strict=True))
 
 
 def place_rows(
@@ -142,11 +148,7 @@ def place_rows(
     if steps.is_filter_only:
         return table, tx, rx
     tx_position, rx_position = _positions(table, steps, "tx", tx), _positions(table, steps, "rx", rx)
-    placed = table.assign(
-        **dict(zip(TX_COLUMNS, tx_position.T, strict=True)),
-        **dict(zip(RX_COLUMNS, rx_position.T, strict=True)),
-    )
-    return placed, TX_COLUMNS, RX_COLUMNS
+    return table.assign(**position_columns(tx_position, rx_position)), TX_COLUMNS, RX_COLUMNS
 
 
 def _positions(

@@ -1,26 +1,12 @@
 """Parameters: the quantities that a calibration may change, their search space, and the laws to which some belong."""
 
-from calibray.parameters.parameter import (
-    Parameter,
-    Scale,
-    fixed_constant,
-    is_effect,
-    itu_start,
-    split_name,
-    start_value,
-)
-from calibray.parameters.priors import NO_PRIOR, LogNormal
-from calibray.parameters.space import Parameters
-
-__all__ = [
-    "NO_PRIOR",
-    "LogNormal",
-    "Parameter",
-    "Parameters",
-    "Scale",
-    "fixed_constant",
-    "is_effect",
-    "itu_start",
-    "split_name",
-    "start_value",
-]
+from calibray.parameters.parameter import Parameter as Parameter
+from calibray.parameters.parameter import Scale as Scale
+from calibray.parameters.parameter import fixed_constant as fixed_constant
+from calibray.parameters.parameter import is_effect as is_effect
+from calibray.parameters.parameter import itu_start as itu_start
+from calibray.parameters.parameter import split_name as split_name
+from calibray.parameters.parameter import start_value as start_value
+from calibray.parameters.priors import NO_PRIOR as NO_PRIOR
+from calibray.parameters.priors import LogNormal as LogNormal
+from calibray.parameters.space import Parameters as Parameters

@@ -13,8 +13,7 @@ import pandas as pd
 from calibray.engines.cluster.chunks import CHUNK_LINKS, for_each_chunk, select_links, stated_chunk_size
 from calibray.engines.cluster.workers import InProcess, Workers
 from calibray.measurements import Measurements, PiecedTable
-from calibray.prediction.position_checks import remarks
-from calibray.prediction.predict import as_links, check_groups, interval, open_for_links
+from calibray.prediction.predict import as_links, check_groups, interval, open_for_links, position_remarks
 from calibray.result.record import Record
 from calibray.study import Setup
 from calibray.support.messages import duration
@@ -132,7 +131,7 @@ def _chunk_size(setup: Setup) -> int:
 def _predict_chunk(task: _Task, links: Measurements, progress: Progress | None = None) -> pd.DataFrame:
     setup = task.setup.at(links)
     predictions = interval(task.result, setup, task.level, progress)
-    return predictions.assign(remark=remarks(task.result, setup) if task.with_remarks else "")
+    return predictions.assign(remark=position_remarks(task.result, setup) if task.with_remarks else "")
 
 
 LOG: Final = logging.getLogger(__name__)

@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 from calibray.engines.cluster.workers import Workers
 from calibray.errors import InputError
 from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE
-from calibray.measurements import MIN_DISTANCE
+from calibray.measurements import MIN_DISTANCE, position_columns
 from calibray.measurements.placement import TX_COLUMNS
 from calibray.prediction.batches import announce, batch_size, predict_links
 from calibray.prediction.map_files import CoverageMap
 from calibray.prediction.observables import observable_columns
-from calibray.prediction.position_checks import INSIDE, is_indoors, locate
-from calibray.prediction.predict import as_links, open_for_links
+from calibray.prediction.predict import as_links, is_indoors, open_for_links
 from calibray.result.held_out import NO_PATH
 from calibray.result.record import Record
 from calibray.scenes import Triangles, ground_heights, read_triangles
+from calibray.scenes.checks.positions import INSIDE, locate
 from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Study
 from calibray.study.mounting import mounting_columns
@@ -93,7 +93,7 @@ def coverage_map(
         _check_number("power_dbm", power_dbm, -np.inf)
     frame = known_frame(study)
     # The study is opened with one link, 1 m above the transmitter, before the grid is known.
-    one_link = pd.DataFrame({**_positions(transmitter, transmitter[None] + np.eye(3)[2]), **constants})
+    one_link = pd.DataFrame({**position_columns(transmitter, transmitter[None] + np.eye(3)[2]), **constants})
     setup = open_for_links(result, as_links(result, one_link), allow_changed_inputs=allow_changed_inputs)
     triangles = read_triangles(setup.scene)
     x, y = _grid(triangles, bounds, cell)
@@ -108,7 +108,7 @@ def coverage_map(
     announce(result, len(cells), "cells")
     for start in range(0, len(cells), size):
         batch = cells[start : start + size]
-        links = pd.DataFrame({**_positions(transmitter, rx[batch]), **constants})
+        links = pd.DataFrame({**position_columns(transmitter, rx[batch]), **constants})
         setup = setup.at(as_links(result, links))
         batch_progress = with_total(progress, int(batch[0]), len(rx))
         predictions = predict_links(result, setup, level, batch_progress, workers)
@@ -232,9 +232,3 @@ def _check_number(name: str, value: float, lower: float) -> None:
     if not (np.isfinite(value) and value > lower):
         bound = "" if np.isinf(lower) else f" greater than {lower:g}"
         raise InputError(f"{name} = {value:g}: must be a finite number{bound}")
-
-
-def _positions(tx: NDArray[np.float64], rx: NDArray[np.float64]) -> dict[str, object]:
-    """Position columns of links from one transmitter [3] to receivers [n, 3], [m]."""
-    receivers = {f"rx_{axis}": rx[:, k] for k, axis in enumerate("xyz")}
-    return {**{f"tx_{axis}": tx[k] for k, axis in enumerate("xyz")}, **receivers}

@@ -16,7 +16,6 @@ from calibray.engines.kinds.replay import replay
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements, SourceTable
-from calibray.measurements.placement import POSITION_COLUMNS
 from calibray.parameters import fixed_constant, split_name
 from calibray.prediction.corrections import (
     calibration_residuals,
@@ -26,9 +25,10 @@ from calibray.prediction.corrections import (
     nuisance_shift,
 )
 from calibray.prediction.observables import Replayed, as_measured, further_observables
-from calibray.prediction.position_checks import remarks
 from calibray.result.held_out import Model, PredictionModel
 from calibray.result.record import Record
+from calibray.scenes import Triangles, read_triangles
+from calibray.scenes.checks.positions import INSIDE, locate
 from calibray.scenes.obstruction import CLUSTER, OUT_OF_SIGHT
 from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Setup
@@ -79,7 +79,7 @@ def predict_interval(
     setup = open_for_links(result, as_links(result, links), allow_changed_inputs=allow_changed_inputs)
     table = interval(result, setup, level, progress)
     measured_quantity = as_measured(result.study, setup.links, table)
-    return table.assign(**measured_quantity, remark=remarks(result, setup))
+    return table.assign(**measured_quantity, remark=position_remarks(result, setup))
 
 
 def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -> Measurements:
@@ -220,12 +220,11 @@ def _residual_db(result: Record, links: Measurements, ratio: float) -> NDArray[n
     that far away differs from the blocks as these differ from each other. The contribution of random effects to these
     errors is subtracted, because `nuisance_shift` adds their spread where a link's group is new.
     """
-    model = result.prediction.model
-    if model.blocks is None or not set(POSITION_COLUMNS) <= set(result.links):
+    model, ends = result.prediction.model, result.ends
+    if model.blocks is None or ends is None:
         return np.full(len(links), float(model.residual_db or 0.0))
     rows, _ = calibration_residuals(result.links)
-    measured = result.links[list(POSITION_COLUMNS)].to_numpy(float)[rows]
-    distance = KDTree(measured).query(np.hstack([links.tx, links.rx]))[0]
+    distance = KDTree(ends[rows]).query(np.hstack([links.tx, links.rx]))[0]
     beyond = np.clip(distance / max(model.blocks.reach_m, 1e-9) - 1.0, 0.0, 1.0)
     within, between = model.blocks.within_db**2, model.blocks.between_db**2 * (1.0 + beyond)
     total_db = np.sqrt(within + ratio**2 * np.maximum(between - model.blocks.groups_db**2, 0.0))
@@ -294,12 +293,11 @@ def _modelled(result: Record, links: Measurements, replayed: Replayed | None) ->
 
 def _residual_field(result: Record, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The residual field kriged to links [links], [dB], and the share of its variance that is known [links]."""
-    field = result.prediction.residual_field
-    if field is None or links.frequency is not None or not set(POSITION_COLUMNS) <= set(result.links):
+    field, ends = result.prediction.residual_field, result.ends
+    if field is None or links.frequency is not None or ends is None:
         return np.zeros(len(links)), np.zeros(len(links))
     rows, residuals = calibration_residuals(result.links)
-    measured = result.links[list(POSITION_COLUMNS)].to_numpy(float)[rows]
-    return krige_residuals(field, measured, residuals, np.hstack([links.tx, links.rx]))
+    return krige_residuals(field, ends[rows], residuals, np.hstack([links.tx, links.rx]))
 
 
 def check_inputs(result: Record, setup: Setup, allow_changed: bool) -> None:
@@ -321,3 +319,32 @@ def check_inputs(result: Record, setup: Setup, allow_changed: bool) -> None:
             f"{result.study.path}: {', '.join(changed[:5])} changed since the calibration, which may be invalid for "
             "the changed file; calibrate again, or give --allow-changed-inputs (allow_changed_inputs=True)"
         )
+
+
+def position_remarks(result: Record, setup: Setup) -> NDArray[np.str_]:
+    """A remark on the position of every link [links]; empty where the positions are plausible.
+
+    Indoors, if most calibrated receivers are inside a building, that remark is omitted.
+    """
+    triangles, links = read_triangles(setup.scene), setup.links
+    if not len(triangles.face):
+        return np.full(len(links), "")
+    indoors = is_indoors(result, triangles)
+    by_end = []
+    for end, points in (("transmitter", links.tx), ("receiver", links.rx)):
+        locations = locate(triangles, points).tolist()
+        by_end.append(
+            [
+                f"{end} {location}" if location and not (indoors and location == INSIDE) else ""
+                for location in locations
+            ]
+        )
+    joined = [", ".join(filter(None, ends)) for ends in zip(*by_end, strict=True)]
+    return np.array(joined, dtype=np.str_)
+
+
+def is_indoors(result: Record, triangles: Triangles) -> bool:
+    """Whether most calibrated receivers are inside a building; False if their positions are unknown."""
+    if result.ends is None:
+        return False
+    return bool(np.mean(locate(triangles, result.ends[:, 3:]) == INSIDE) > 0.5)

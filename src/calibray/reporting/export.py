@@ -15,6 +15,7 @@ import pandas as pd
 
 from calibray.errors import InputError
 from calibray.materials import FIELDS
+from calibray.measurements import position_columns
 from calibray.reporting.link_survey import Survey, survey
 from calibray.reporting.wording import scene_alone_text
 from calibray.result.record import Record
@@ -77,11 +78,7 @@ def export(
         raise InputError(
             f"{study.path}: its links {study.links.file} can no longer be read; restore the file"
         )
-    positions = {
-        f"{end}_{axis}": position[:, k]
-        for end, position in (("tx", links.tx), ("rx", links.rx))
-        for k, axis in enumerate("xyz")
-    }
+    positions = position_columns(links.tx, links.rx)
     group = {} if links.group is None else {"group": links.group}
     rows = list(_rows(result))
     materials = pd.DataFrame(rows)

@@ -10,7 +10,6 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.measurements.placement import POSITION_COLUMNS
 from calibray.result.record import Record
 
 
@@ -109,10 +108,9 @@ def survey(result: Record) -> Survey | None:
     None if the measurements cannot be read or have changed.
     """
     table, sign = result.links, measured_quantity(result).sign
-    if set(POSITION_COLUMNS) <= set(table.columns):
-        positions = table[list(POSITION_COLUMNS)].to_numpy(float)
+    if (ends := result.ends) is not None:
         group = table["group"].astype(str).to_numpy(object) if "group" in table else None
-        return Survey(table, positions[:, :3], positions[:, 3:], group, sign)
+        return Survey(table, ends[:, :3], ends[:, 3:], group, sign)
     try:
         links = result.study.measurements()
     except InputError:

@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from pydantic import Field
 
 from calibray.materials import Material
+from calibray.measurements.placement import POSITION_COLUMNS
 from calibray.paths import Paths
 from calibray.result.held_out import (
     HeldOutErrors,
@@ -265,6 +268,13 @@ class Record:
     def intervals(self) -> dict[str, Interval]:
         """95 % interval and verdict by parameter."""
         return self.uncertainty.intervals
+
+    @property
+    def ends(self) -> NDArray[np.float64] | None:
+        """Positions of transmitter and receiver of every link [links, 6], [m]; None if unknown."""
+        if not set(POSITION_COLUMNS) <= set(self.links):
+            return None
+        return self.links[list(POSITION_COLUMNS)].to_numpy(float)
 
     @property
     def scene_materials(self) -> dict[str, Material]:

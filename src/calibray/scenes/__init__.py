@@ -4,39 +4,23 @@ This package reads and writes scenes; `scenes.checks` finds faults in a scene an
 makes scenes from maps and floor plans. Both import from here, and not from each other.
 """
 
-from calibray.scenes.buildings import building_numbers
-from calibray.scenes.export import export_scene
-from calibray.scenes.meshes import Mesh, MeshObject, join_meshes, ply_bytes, read_mesh
-from calibray.scenes.scene import (
-    Scene,
-    check_material_name,
-    has_copied_meshes,
-    read_scene,
-    xml_with_copied_meshes,
-)
-from calibray.scenes.scene_file import read_frame, write_scene
-from calibray.scenes.shapes import COARSE, SurfaceSize
-from calibray.scenes.triangles import Triangles, ground_heights, read_meshes, read_triangles
-
-__all__ = [
-    "COARSE",
-    "Mesh",
-    "MeshObject",
-    "Scene",
-    "SurfaceSize",
-    "Triangles",
-    "building_numbers",
-    "check_material_name",
-    "export_scene",
-    "ground_heights",
-    "has_copied_meshes",
-    "join_meshes",
-    "ply_bytes",
-    "read_frame",
-    "read_mesh",
-    "read_meshes",
-    "read_scene",
-    "read_triangles",
-    "write_scene",
-    "xml_with_copied_meshes",
-]
+from calibray.scenes.buildings import building_numbers as building_numbers
+from calibray.scenes.export import export_scene as export_scene
+from calibray.scenes.meshes import Mesh as Mesh
+from calibray.scenes.meshes import MeshObject as MeshObject
+from calibray.scenes.meshes import join_meshes as join_meshes
+from calibray.scenes.meshes import ply_bytes as ply_bytes
+from calibray.scenes.meshes import read_mesh as read_mesh
+from calibray.scenes.scene import Scene as Scene
+from calibray.scenes.scene import check_material_name as check_material_name
+from calibray.scenes.scene import has_copied_meshes as has_copied_meshes
+from calibray.scenes.scene import read_scene as read_scene
+from calibray.scenes.scene import xml_with_copied_meshes as xml_with_copied_meshes
+from calibray.scenes.scene_file import read_frame as read_frame
+from calibray.scenes.scene_file import write_scene as write_scene
+from calibray.scenes.shapes import COARSE as COARSE
+from calibray.scenes.shapes import SurfaceSize as SurfaceSize
+from calibray.scenes.triangles import Triangles as Triangles
+from calibray.scenes.triangles import ground_heights as ground_heights
+from calibray.scenes.triangles import read_meshes as read_meshes
+from calibray.scenes.triangles import read_triangles as read_triangles

@@ -23,6 +23,7 @@ from calibray.materials import (
     BOUNDS,
     DEFAULT_REVISION,
     ITU_MATERIALS,
+    SCALAR_CONSTANTS,
     ItuLaw,
     Material,
     itu_law,
@@ -350,12 +351,6 @@ def _refer(shape: ElementTree.Element, identifier: str) -> None:
 def material_element(identifier: str, material: Material) -> ElementTree.Element:
     """Make the BSDF of a material, with the constants that Sionna's scene files can contain."""
     bsdf = ElementTree.Element("bsdf", {"type": "radio-material", "id": identifier})
-    for name in (
-        "relative_permittivity",
-        "conductivity",
-        "thickness",
-        "scattering_coefficient",
-        "xpd_coefficient",
-    ):
+    for name in SCALAR_CONSTANTS:
         ElementTree.SubElement(bsdf, "float", {"name": name, "value": repr(getattr(material, name))})
     return bsdf

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import (
-    LINK_COLUMNS,
+    POSITION_COLUMNS,
     TRACK_COLUMNS,
     Measurements,
     Preparation,
@@ -124,7 +124,7 @@ class Study(StudyModel):
         """
         links, columns = self.links, {*table.frame}
         group: str | Sequence[str] | None = self.offset_groups or None
-        if columns >= {*LINK_COLUMNS}:
+        if columns >= {*POSITION_COLUMNS}:
             # Tables of links that Calibray writes have one column of groups, and one of carriers.
             if "group" in columns and not columns & {*self.offset_groups}:
                 group = "group"
@@ -206,7 +206,7 @@ def _write_live_study(
     write_table(folder / "links.csv", table)
     power = {"tx_power_dbm": "tx_power_dbm"} if links.get("quantity") == "received_power" else {}
     antennas = zip(("tx", "rx"), live.antennas, strict=True)
-    ends = {"tx": LINK_COLUMNS[:3], "rx": LINK_COLUMNS[3:]}
+    ends = {"tx": POSITION_COLUMNS[:3], "rx": POSITION_COLUMNS[3:]}
     return {
         "version": 1,
         "scene": {"file": "scene.xml", "frequency": live.frequency},
@@ -242,7 +242,7 @@ def _links(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> pd.DataFrame:
         raise InputError(
             "measured: no value is a number; give one for each transmitter and receiver, NaN if none"
         )
-    table = pd.DataFrame(np.hstack([tx[row], rx[column]]), columns=list(LINK_COLUMNS))
+    table = pd.DataFrame(np.hstack([tx[row], rx[column]]), columns=list(POSITION_COLUMNS))
     return table.assign(
         transmitter=np.array(list(live.tx))[row],
         receiver=np.array(list(live.rx))[column],

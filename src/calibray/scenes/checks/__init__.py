@@ -1,14 +1,9 @@
 """Checks of scenes: faults of their files and meshes, and positions that do not match them."""
 
-from calibray.scenes.checks.positions import SceneSurfaces, building_outlines, count_crossings, move_outside
-from calibray.scenes.checks.scene_check import Finding, SceneCheck, check_scene
-
-__all__ = [
-    "Finding",
-    "SceneCheck",
-    "SceneSurfaces",
-    "building_outlines",
-    "check_scene",
-    "count_crossings",
-    "move_outside",
-]
+from calibray.scenes.checks.positions import SceneSurfaces as SceneSurfaces
+from calibray.scenes.checks.positions import building_outlines as building_outlines
+from calibray.scenes.checks.positions import count_crossings as count_crossings
+from calibray.scenes.checks.positions import move_outside as move_outside
+from calibray.scenes.checks.scene_check import Finding as Finding
+from calibray.scenes.checks.scene_check import SceneCheck as SceneCheck
+from calibray.scenes.checks.scene_check import check_scene as check_scene

@@ -5,7 +5,6 @@ from calibray.tracing import llvm
 # Before the imports below load Dr.Jit, which would abort the process with an unsuitable LLVM.
 llvm.prepare()
 
-from calibray.tracing.sionna.solver import SCALAR_CONSTANTS  # noqa: E402
 from calibray.tracing.sionna.tracer import Trace, Tracer  # noqa: E402
 
-__all__ = ["SCALAR_CONSTANTS", "Trace", "Tracer"]
+__all__ = ["Trace", "Tracer"]

@@ -23,14 +23,13 @@ from scipy.sparse.csgraph import connected_components
 from sionna.rt.antenna_pattern import antenna_pattern_registry
 
 from calibray.errors import InputError
-from calibray.materials import Material
+from calibray.materials import SCALAR_CONSTANTS, Material
 from calibray.scenes import Mesh, MeshObject, read_scene
 from calibray.scenes.export import exported_names
 from calibray.support.messages import did_you_mean, first_line, shortened
 from calibray.tracing.protocol import Links
 from calibray.tracing.settings import PATTERNS, POLARIZATIONS, Antenna
 from calibray.tracing.sionna.scene import scattering_pattern, surfaces_agree, surfaces_by_material
-from calibray.tracing.sionna.solver import SCALAR_CONSTANTS
 from calibray.tracing.sionna.tracer import Tracer
 
 DIRECTIONS: Final = 64

@@ -28,7 +28,7 @@ from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
 
 from calibray.errors import EngineError, InputError
-from calibray.materials import Material
+from calibray.materials import SCALAR_CONSTANTS, Material
 from calibray.paths import Paths
 from calibray.paths.chains import Chains
 from calibray.scenes import Scene, check_material_name
@@ -54,14 +54,6 @@ HASHES: Final = (16_777_213, 67_108_859)
 collide. Of 31,430 candidates of a launch to 25 receivers, it drops 1,067 with its own million entries, 36 with 16
 million, and 4 with 67 million, which take 0.5 GB and 0.3 s per launch. The numbers are primes, because the lowest bits
 of its hashes vary least."""
-SCALAR_CONSTANTS: Final = (
-    "relative_permittivity",
-    "conductivity",
-    "thickness",
-    "scattering_coefficient",
-    "xpd_coefficient",
-)
-"""Constants that Sionna's radio materials store as single-precision numbers."""
 
 
 @dataclass(frozen=True, eq=False)
