@@ -134,6 +134,13 @@ def position_columns(tx: NDArray[np.float64], rx: NDArray[np.float64]) -> dict[s
     return dict(zip(POSITION_COLUMNS, ends.T, strict=True))
 
 
+def ends_of(frame: pd.DataFrame) -> NDArray[np.float64] | None:
+    """The positions [rows, 6], [m], in the columns `POSITION_COLUMNS` of a table; None if it lacks one of them."""
+    if not set(POSITION_COLUMNS) <= set(frame.columns):
+        return None
+    return frame[list(POSITION_COLUMNS)].to_numpy(float)
+
+
 def place_rows(
     table: SourceTable, steps: Preparation, tx: Coordinates, rx: Coordinates
 ) -> tuple[SourceTable, Coordinates, Coordinates]:

@@ -19,7 +19,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.measurements import FEW
-from calibray.measurements.placement import POSITION_COLUMNS
+from calibray.measurements.placement import ends_of
 from calibray.reporting.link_survey import measured_quantity, residual
 from calibray.result.record import Record
 from calibray.scenes.obstruction import OUT_OF_SIGHT
@@ -74,18 +74,10 @@ def calibration_links(result: Record) -> tuple[pd.DataFrame, NDArray[np.float64]
     return links[mask], residuals[mask]
 
 
-def _ends(links: pd.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Positions of transmitters and receivers [links, 3], [m]; None if unknown."""
-    if not set(POSITION_COLUMNS) <= set(links.columns):
-        return None
-    positions = links[list(POSITION_COLUMNS)].to_numpy(float)
-    return positions[:, :3], positions[:, 3:]
-
-
 def link_distance(links: pd.DataFrame) -> NDArray[np.float64] | None:
     """Length of the links [L], [m]; None without positions."""
-    ends = _ends(links)
-    return None if ends is None else np.linalg.norm(ends[1] - ends[0], axis=1)
+    ends = ends_of(links)
+    return None if ends is None else np.linalg.norm(ends[:, 3:] - ends[:, :3], axis=1)
 
 
 def _by_distance(result: Record) -> pd.DataFrame:
@@ -142,10 +134,10 @@ def _by_obstruction(result: Record) -> pd.DataFrame:
 def _by_street(result: Record) -> pd.DataFrame:
     """Groups of neighbouring receivers, named by the position of their centre."""
     links, residuals = calibration_links(result)
-    ends = _ends(links)
+    ends = ends_of(links)
     if ends is None or len(residuals) < 2 * FEW:
         return pd.DataFrame()
-    place = ends[1][:, :2]
+    place = ends[:, 3:5]
     street = spatial_blocks(place, min(STREETS, len(residuals) // FEW))
     middles = [place[street == number].mean(axis=0) for number in range(street.max() + 1)]
     return pd.DataFrame(
@@ -163,12 +155,12 @@ def _by_street(result: Record) -> pd.DataFrame:
 
 def _missing_region(result: Record) -> pd.DataFrame:
     links, _ = calibration_links(result)
-    ends = _ends(links)
+    ends = ends_of(links)
     if ends is None:
         return pd.DataFrame()
     known = links[OUT_OF_SIGHT].to_numpy(float) if OUT_OF_SIGHT in links else np.zeros(len(links))
     excess_db = links["measured_db"].to_numpy(float) - links["predicted_db"].to_numpy(float)
-    region = _searched(np.column_stack([*ends, excess_db, known]).tobytes())
+    region = _searched(np.column_stack([ends, excess_db, known]).tobytes())
     if region is None:
         return pd.DataFrame()
     row = asdict(region)
@@ -231,11 +223,11 @@ def _scaled_draws(result: Record, name: str) -> NDArray[np.float64]:
 
 def _neighbours(result: Record) -> pd.DataFrame:
     links, residuals = calibration_links(result)
-    ends = _ends(links)
+    ends = ends_of(links)
     if ends is None or len(residuals) < FEW:
         return pd.DataFrame()
     # Distance in six dimensions: links of two transmitters to the same receiver are not neighbours.
-    distance, semivariance, pairs = variogram(residuals, np.hstack(ends))
+    distance, semivariance, pairs = variogram(residuals, ends)
     return pd.DataFrame({"distance_m": distance, "semivariance_db2": semivariance, "pairs": pairs})
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from calibray.materials import Material
-from calibray.measurements.placement import POSITION_COLUMNS
+from calibray.measurements.placement import ends_of
 from calibray.paths import Paths
 from calibray.result.held_out import (
     HeldOutErrors,
@@ -272,9 +272,7 @@ class Record:
     @property
     def ends(self) -> NDArray[np.float64] | None:
         """Positions of transmitter and receiver of every link [links, 6], [m]; None if unknown."""
-        if not set(POSITION_COLUMNS) <= set(self.links):
-            return None
-        return self.links[list(POSITION_COLUMNS)].to_numpy(float)
+        return ends_of(self.links)
 
     @property
     def scene_materials(self) -> dict[str, Material]:
