@@ -85,7 +85,7 @@ def test_an_error_reaches_the_caller_and_workers_go_on():
 
 
 def test_a_chunk_that_kills_its_workers_ends_the_run(caplog, monkeypatch):
-    monkeypatch.setattr("calibray.engines.cluster.local_workers.MOST_DEATHS", 2)
+    monkeypatch.setattr("calibray.engines.cluster.dask_workers.MOST_DEATHS", 2)
     with (
         caplog.at_level(logging.WARNING),
         engines.open_workers(1) as workers,

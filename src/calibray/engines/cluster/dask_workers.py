@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence, Sized
 from concurrent.futures import Executor
 from contextlib import contextmanager
@@ -41,6 +42,21 @@ FETCH_WAIT: Final = 30.0
 Answered = Callable[[int], None]
 """Called with a chunk's number after its answer."""
 
+
+def count_death(deaths: Counter[int], chunk: int) -> None:
+    """Count a worker that died on a chunk.
+
+    Raises:
+        EngineError: Too many workers died on it.
+    """
+    deaths[chunk] += 1
+    if deaths[chunk] >= MOST_DEATHS:
+        raise EngineError(
+            f"chunk {chunk + 1}: {MOST_DEATHS} workers died with it; give workers more memory, or lower "
+            "engine.chunk_links"
+        )
+
+
 _ADDRESS: Final = re.compile(
     r"(?:(?:tcp|tls|wss?)://)?(?P<host>\[[0-9A-Fa-f:.]+\]|[^\s:/\[\]]{1,253}):(?P<port>[0-9]{1,5})"
 )
@@ -74,7 +90,7 @@ class DaskWorkers:
     def __init__(self, connect: Callable[[], Client], open_executor: Callable[[], Executor]) -> None:
         self._connect, self._open_executor = connect, open_executor
         self._homes: dict[int, str] = {}
-        self._deaths: dict[int, int] = {}
+        self._deaths: Counter[int] = Counter()
         self._most_workers = 0
 
     def executor(self) -> Executor:
@@ -164,12 +180,7 @@ class DaskWorkers:
         for index in lost:
             waiting[index].cancel()
             del self._homes[index]
-            self._deaths[index] = self._deaths.get(index, 0) + 1
-            if self._deaths[index] >= MOST_DEATHS:
-                raise EngineError(
-                    f"chunk {index + 1}: {MOST_DEATHS} workers died with it; give workers more memory, or lower "
-                    "engine.chunk_links"
-                )
+            count_death(self._deaths, index)
         self._assign_homes(lost, living)
         return lost
 

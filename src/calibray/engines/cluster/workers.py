@@ -3,21 +3,47 @@
 Objects that are kept with a chunk are made on one worker and stay there. Functions are sent to the worker, which
 returns only their results. Chunks are numbered and results return in that order, so sums over chunks do not depend on
 the workers.
+
+Workers on this machine are processes that communicate through pipes only. A pipe is inherited by its process. No port
+is open, so no other user of the machine can send code to a worker or to the main process.
 """
 
 from __future__ import annotations
 
+import itertools
+import logging
+import os
+import pickle
+import signal
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence, Sized
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Any, Protocol, final
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from threading import Lock
+from typing import Any, Final, Protocol, cast, final
+from weakref import WeakSet
 
-from calibray.engines.cluster.dask_workers import Answered, DaskWorkers, scheduler_client
-from calibray.engines.cluster.local_workers import LocalWorkers
-from calibray.errors import InputError
+from calibray.engines.cluster.dask_workers import POLL, Answered, DaskWorkers, count_death, scheduler_client
+from calibray.errors import EngineError, InputError
 from calibray.support.cache_folder import cache_folder
 from calibray.support.memory import available_memory
+
+ALWAYS_ALLOWED: Final = 8
+"""Number of worker processes that is allowed on any machine, even with few cores."""
+
+END_WAIT: Final = 5.0
+"""Longest wait for a process to end before it is killed [s]."""
+
+_LOG: Final = logging.getLogger(__name__)
+_NUMBER: Final = itertools.count()
+_CAN_PIN: Final = hasattr(os, "sched_setaffinity")
+
+ObjectKey = tuple[int, int]
+"""The number of a handle and of a chunk."""
 
 
 class Workers(Protocol):
@@ -114,6 +140,257 @@ class _KeptHere:
         if self.has_room(len(self.objects)):
             self.objects[index] = kept
         return kept
+
+
+@dataclass(frozen=True)
+class _Question:
+    """A question to a worker about a chunk.
+
+    Attributes:
+        function: The function to call.
+        arguments: Its last arguments.
+        keys: The objects that are its first arguments.
+        recipes: How to make objects that the worker does not have yet.
+        handles: Handles that are still in use; objects of others are dropped.
+    """
+
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    keys: tuple[ObjectKey, ...]
+    recipes: dict[ObjectKey, tuple[Callable[[Any], Any], Any]]
+    handles: frozenset[int]
+
+
+@dataclass(eq=False)
+class _KeptInProcesses:
+    """Objects in worker processes, one per chunk."""
+
+    make: Callable[[Any], Any]
+    sources: list[Any]
+    number: int = field(default_factory=lambda: next(_NUMBER))
+
+    def __len__(self) -> int:
+        return len(self.sources)
+
+
+@dataclass(eq=False)
+class _Worker:
+    """A process, the pipe to it, the objects that it has made, and its current chunk."""
+
+    process: SpawnProcess
+    pipe: Connection
+    objects: set[ObjectKey] = field(default_factory=set)
+    chunk: int | None = None
+
+
+@final
+class LocalWorkers:
+    """Processes on this machine, started on first use, each with its share of the processor cores.
+
+    A chunk stays in one process. If a process dies, another one replaces it and makes the chunk's objects again.
+
+    Args:
+        count: Number of processes.
+        open_executor: Returns an executor for the calls of an external program.
+    """
+
+    def __init__(self, count: int, open_executor: Callable[[], Executor]) -> None:
+        self._count, self._open_executor = count, open_executor
+        self._workers: list[_Worker] = []
+        self._handles: WeakSet[_KeptInProcesses] = WeakSet()
+        self._deaths: Counter[int] = Counter()
+        self._lock = Lock()
+
+    def executor(self) -> Executor:
+        """An executor for the calls of an external program; see `Workers.executor`."""
+        return self._open_executor()
+
+    def keep(self, make: Callable[[Any], Any], sources: Sequence[Any]) -> Sized:
+        """Make and keep an object for every chunk; see `Workers.keep`."""
+        kept = _KeptInProcesses(make, list(sources))
+        self._handles.add(kept)
+        return kept
+
+    def ask(
+        self,
+        function: Callable[..., Any],
+        kept: Sequence[Sized],
+        *arguments: Any,
+        answered: Answered | None = None,
+    ) -> list[Any]:
+        """Call a function on the objects of every chunk; see `Workers.ask`."""
+        handles = [handle for handle in kept if isinstance(handle, _KeptInProcesses)]
+        with self._lock:
+            try:
+                answers = self._ask(function, handles, arguments, answered)
+            except BaseException:
+                # Other processes may be in the middle of an answer.
+                self.close()
+                raise
+        return [answers[index] for index in range(len(answers))]
+
+    def _ask(
+        self,
+        function: Callable[..., Any],
+        handles: list[_KeptInProcesses],
+        arguments: tuple[Any, ...],
+        answered: Answered | None,
+    ) -> dict[int, Any]:
+        self._start_all()
+        count, answers = len(handles[0]), {}
+        # A chunk's worker follows from its number, so that it finds the chunk's objects there the next time.
+        waiting = [list(range(home, count, self._count))[::-1] for home in range(self._count)]
+        while len(answers) < count:
+            for home, worker in enumerate(self._workers):
+                if worker.chunk is None and waiting[home]:
+                    worker.chunk = waiting[home].pop()
+                    self._send(worker, self._question(worker, function, handles, worker.chunk, arguments))
+            for home, answer in self._receive():
+                worker = self._workers[home]
+                if answer is None:
+                    if worker.chunk is not None:
+                        waiting[home].append(worker.chunk)
+                    self._replace(home)
+                    continue
+                result, error = answer
+                if error is not None:
+                    raise error
+                if worker.chunk is not None:
+                    answers[worker.chunk] = result
+                    if answered is not None:
+                        answered(worker.chunk)
+                worker.chunk = None
+        return answers
+
+    def close(self) -> None:
+        """End all processes."""
+        for worker in self._workers:
+            worker.pipe.close()
+            worker.process.terminate()
+        for worker in self._workers:
+            worker.process.join(END_WAIT)
+            if worker.process.is_alive():
+                worker.process.kill()
+                worker.process.join()
+        self._workers.clear()
+
+    def _start_all(self) -> None:
+        """Start the processes that are not running yet.
+
+        Raises:
+            InputError: The number of processes exceeds the limit of this machine.
+        """
+        most = max(os.cpu_count() or 1, ALWAYS_ALLOWED)
+        if self._count > most:
+            raise InputError(
+                f"--workers {self._count}: must be at most {most}, because each is a process that keeps a core busy; "
+                "use more machines and --scheduler"
+            )
+        while len(self._workers) < self._count:
+            self._workers.append(self._start(len(self._workers)))
+
+    def _start(self, home: int) -> _Worker:
+        context = get_context("spawn")  # a fork would copy the threads' locks of Dr.Jit and XLA
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_serve, args=(theirs, home, self._count), daemon=True)
+        process.start()
+        theirs.close()
+        return _Worker(process, ours)
+
+    def _question(
+        self,
+        worker: _Worker,
+        function: Callable[..., Any],
+        handles: list[_KeptInProcesses],
+        index: int,
+        arguments: tuple[Any, ...],
+    ) -> _Question:
+        keys = tuple((handle.number, index) for handle in handles)
+        alive = frozenset(handle.number for handle in self._handles)
+        recipes = {
+            key: (handle.make, handle.sources[index])
+            for key, handle in zip(keys, handles, strict=True)
+            if key not in worker.objects
+        }
+        worker.objects = {key for key in worker.objects if key[0] in alive} | set(keys)
+        return _Question(function, arguments, keys, recipes, alive)
+
+    def _send(self, worker: _Worker, question: _Question) -> None:
+        content = pickle.dumps(question)
+        with suppress(OSError):  # a dead worker is noticed when its answer is awaited
+            worker.pipe.send_bytes(content)
+
+    def _receive(self) -> list[tuple[int, tuple[Any, Exception | None] | None]]:
+        """The answers received, with the number of their worker; None for a worker that died."""
+        homes = {worker.pipe: home for home, worker in enumerate(self._workers)}
+        answers: list[tuple[int, tuple[Any, Exception | None] | None]] = []
+        for pipe in cast(list[Connection], wait(list(homes), POLL)):
+            try:
+                answers.append((homes[pipe], pickle.loads(pipe.recv_bytes())))
+            except (EOFError, OSError):
+                answers.append((homes[pipe], None))
+        return answers
+
+    def _replace(self, home: int) -> None:
+        """Start a process that replaces a dead one.
+
+        Raises:
+            EngineError: Too many processes died on the same chunk.
+        """
+        dead = self._workers[home]
+        dead.pipe.close()
+        dead.process.join(END_WAIT)
+        _LOG.warning(
+            "worker %d ended (exit status %s) and is being replaced", home + 1, dead.process.exitcode
+        )
+        if dead.chunk is not None:
+            count_death(self._deaths, dead.chunk)
+        self._workers[home] = self._start(home)
+
+
+def _serve(pipe: Connection, home: int, count: int) -> None:
+    """Answer questions until the main process ends or closes the pipe."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the main one ends the others
+    _pin(home, count)
+    objects: dict[ObjectKey, Any] = {}
+    while True:
+        try:
+            content = pipe.recv_bytes()
+        except (EOFError, OSError):
+            return
+        try:
+            question: _Question = pickle.loads(content)
+            for key in [key for key in objects if key[0] not in question.handles]:
+                del objects[key]
+            for key, (make, source) in question.recipes.items():
+                objects[key] = make(source)
+            result = question.function(*(objects[key] for key in question.keys), *question.arguments)
+            answer = pickle.dumps((result, None))
+        except Exception as error:
+            answer = pickle.dumps((None, _sendable(error)))
+        try:
+            pipe.send_bytes(answer)
+        except OSError:
+            return
+
+
+def _sendable(error: Exception) -> Exception:
+    """An error that can be sent to the main process."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:  # whatever a foreign class raises
+        return EngineError(f"{type(error).__name__}: {error}")
+    return error
+
+
+def _pin(home: int, count: int) -> None:
+    """Assign a process its share of the cores, before any library that counts cores is loaded.
+
+    Otherwise, the thread pools of Dr.Jit and XLA in every process use all cores and slow each other down.
+    """
+    if _CAN_PIN:
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, cores[home % count :: count] or cores)
 
 
 @contextmanager
