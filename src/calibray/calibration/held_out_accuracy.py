@@ -33,7 +33,7 @@ from calibray.validation.held_out_statistics import (
     two_levels,
 )
 from calibray.validation.validation import Validation
-from calibray.validation.variants import add_nuisance, initial_objective
+from calibray.validation.variants import initial_objective
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ def _choice(
     """The model that held-out links choose, and its residuals there; with too few links, the calibrated model."""
     objective, setup = problem.objective, problem.setup
     modelled = {
-        Model.INITIAL: add_nuisance(initial_objective(objective, setup), problem.before),
+        Model.INITIAL: initial_objective(objective, setup).with_nuisance(problem.before),
         Model.CALIBRATED: models.calibrated,
         Model.LOG_DISTANCE: models.log_distance,
     }
@@ -202,7 +202,7 @@ def fit_fallback(
     setup, links = problem.setup, problem.setup.links
     objective, known_db = log_distance(links, problem.objective, without_scene(setup.study, links))
     terms = fitted_terms(objective, known_db, setup.study)
-    residuals = objective.measured - add_nuisance(objective, known_db)
+    residuals = objective.measured - objective.with_nuisance(known_db)
     usable = without_path & ~setup.held_out
     for excluded in (links.censored, problem.faint):
         usable = usable if excluded is None else usable & ~excluded

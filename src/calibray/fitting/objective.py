@@ -254,6 +254,11 @@ class Objective:
         """Path loss limited to the ceiling, if there is one [dB]."""
         return path_loss if self.ceiling_db is None else np.minimum(path_loss, self.ceiling_db)
 
+    def with_nuisance(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Path loss [L], [dB], plus the nuisance fitted to links with weight; a group without any gets the mean."""
+        filled, _ = self.nuisance.filled(self.coefficients(path_loss[None]), self.weight > 0)
+        return self.capped(path_loss) + self.nuisance.contribution(filled)[0]
+
     def _model(
         self, path_loss: NDArray[np.float64], coefficients: NDArray[np.float64]
     ) -> NDArray[np.float64]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
@@ -132,9 +132,9 @@ def rounds(optimizer: Optimizer, evaluate: Evaluate) -> Iterator[tuple[NDArray[n
             yield points, evaluation
 
 
-def least_squares(problem: Problem, starts: int, x0: NDArray[np.float64]) -> LeastSquares:
+def least_squares(problem: Problem, starts: int, x0: NDArray[np.float64], **settings: Any) -> LeastSquares:
     """Run local least-squares searches on a problem, from random starting points and from x0 [k, d]."""
-    optimizer = LeastSquares(*problem.parameters.search_bounds, starts=starts, x0=x0)
+    optimizer = LeastSquares(*problem.parameters.search_bounds, starts=starts, x0=x0, **settings)
     for _ in rounds(optimizer, problem.squares):
         pass
     return optimizer

@@ -64,9 +64,7 @@ class Baseline(NamedTuple):
 
     def path_loss_db(self) -> NDArray[np.float64]:
         """Path loss at all links [links], [dB]; a group without links of a weight gets the mean of the others."""
-        coefficients = self.objective.coefficients(self.known_db[None])
-        filled, _ = self.objective.nuisance.filled(coefficients, self.objective.weight > 0)
-        return self.objective.nuisance.contribution(filled)[0] + self.known_db
+        return self.objective.with_nuisance(self.known_db)
 
 
 def log_distance(links: Measurements, objective: Objective, known_db: NDArray[np.float64]) -> Baseline:

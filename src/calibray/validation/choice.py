@@ -30,7 +30,6 @@ from calibray.validation.baselines import (
 )
 from calibray.validation.variants import (
     TX_OFFSET,
-    add_nuisance,
     find_minima,
     initial_objective,
     variants,
@@ -135,7 +134,7 @@ def fit_prediction_model(
         whole = parameters.materials(candidate, setup.scene.materials)
         whole |= {name: whole[section.of] for name, section in facades.items()}
         scene_db = path_loss(problem.engine.paths, whole, setup.radio.combining, setup.radio.bandwidth)
-    path_loss_db = add_nuisance(objective, modelled)
+    path_loss_db = objective.with_nuisance(modelled)
     if retrace_gap_db is not None and (candidate == trail.best).all():
         scene_db = traced_again(scene_db, retrace_gap_db)
         path_loss_db = traced_again(path_loss_db, retrace_gap_db) if uses_scene else path_loss_db

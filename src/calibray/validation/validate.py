@@ -28,7 +28,7 @@ from calibray.tracing.protocol import TracerFactory
 from calibray.validation.baselines import has_obstruction, kriging, log_distance, obstructed, without_scene
 from calibray.validation.held_out_statistics import MODELS, held_out_gaps, observable_errors, spatial_blocks
 from calibray.validation.validation import Validation
-from calibray.validation.variants import NO_MINIMA, add_nuisance, fit_variants
+from calibray.validation.variants import NO_MINIMA, fit_variants
 
 TX: Final = "tx"
 """Name of the transmitter's position as a label, if the table has no such column."""
@@ -172,7 +172,7 @@ def fit_models(
     """
     setup, objective = part.setup, part.objective
     path_loss_db: dict[str, NDArray[np.float64]] = {
-        name: add_nuisance(variant.objective, variant.modelled(minima[:1])[0])
+        name: variant.objective.with_nuisance(variant.modelled(minima[:1])[0])
         for name, (variant, minima) in fits.items()
     }
     known_db = without_scene(setup.study, setup.links)

@@ -20,9 +20,8 @@ from calibray.engines.protocol import Differentiable
 from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE, Nuisance, make_term, transmitters
 from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import STARTS, local_searches, rounds
+from calibray.fitting.search import STARTS, least_squares, local_searches
 from calibray.measurements import Measurements
-from calibray.optimizers import LeastSquares
 from calibray.optimizers.least_squares import CATCH_UP, NEARER
 from calibray.parameters import LogNormal
 from calibray.result.held_out import Model
@@ -118,26 +117,11 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
 
 
 def find_minima(problem: Problem, starts: NDArray[np.float64], new_starts: int) -> NDArray[np.float64]:
-    """Find minima of a problem by local searches.
-
-    Args:
-        problem: The problem.
-        starts: Starting points, the most promising first [k, d].
-        new_starts: Number of additional starting points.
-
-    Returns:
-        The minima, the best first [k, d].
-    """
-    search = LeastSquares(
-        *problem.parameters.search_bounds,
-        starts=new_starts,
-        x0=starts[:MOST_STARTS],
-        tolerance=TOLERANCE,
-        catch_up=NEARER if len(starts) else CATCH_UP,
-    )
-    for _ in rounds(search, problem.squares):
-        pass
-    return search.minima
+    """Find minima of a problem [m, d] by local searches from starting points [k, d] and new ones, the best first."""
+    catch_up = NEARER if len(starts) else CATCH_UP
+    return least_squares(
+        problem, new_starts, starts[:MOST_STARTS], tolerance=TOLERANCE, catch_up=catch_up
+    ).minima
 
 
 def _searches(problem: Problem) -> int:
@@ -153,21 +137,6 @@ def _new_starts(problem: Problem) -> int:
     in Auckland are the same to 0.001 dB; in small programs, more points often find a lower minimum.
     """
     return min(max(_searches(problem) // STARTS[0], 1), NEW_STARTS)
-
-
-def add_nuisance(objective: Objective, path_loss_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Add the nuisance fitted to the links with weight; a group without such links gets the mean.
-
-    Args:
-        objective: The objective.
-        path_loss_db: Path loss without nuisance [links], [dB].
-
-    Returns:
-        Path loss with nuisance [links], [dB].
-    """
-    coefficients = objective.coefficients(path_loss_db[None])
-    filled, _ = objective.nuisance.filled(coefficients, objective.weight > 0)
-    return objective.capped(path_loss_db) + objective.nuisance.contribution(filled)[0]
 
 
 def initial_objective(objective: Objective, setup: Setup) -> Objective:
