@@ -269,7 +269,7 @@ def _check_origin(origin: str | None, buildings: Footprints) -> None:
     """Refuse an origin far from the buildings, such as latitude before longitude."""
     import numpy as np
 
-    from calibray.scenes.authoring import WIDEST
+    from calibray.scenes.meshes import WIDEST
 
     distance = float(np.abs(buildings.bounds).max())
     if origin is not None and distance > WIDEST:

@@ -25,7 +25,7 @@ from calibray.engines.replay import Replay
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_fit import Understanding, common, understand
 from calibray.fitting.ray_model import Call, RayModel
-from calibray.fitting.search import AUTO, Trail, least_squares, local_searches
+from calibray.fitting.search import AUTO, SEARCHES, Trail, least_squares, local_searches
 from calibray.optimizers.sampling import design
 from calibray.result.verdict import Remark, RemarkKind
 from calibray.study import Setup
@@ -33,9 +33,6 @@ from calibray.support.progress import Progress
 
 Ask = Callable[[NDArray[np.float64]], Export]
 """Calls the engine for a candidate [d]; returns its rays."""
-
-SEARCHES: Final = 64
-"""Local searches for the minimum of the corrected program."""
 
 PROBES: Final = 32
 """Number of points of the box from which the second call is chosen."""

@@ -105,7 +105,7 @@ Evaluate = Callable[[NDArray[np.float64], bool], Evaluation]
 """Evaluates points of the search space [n, d]; the flag requests derivatives."""
 
 SEARCHES: Final = 64
-"""Number of local searches for further minima if the method kept only its best."""
+"""Number of local searches for further minima if the method kept only its best, and on a corrected program."""
 
 BASINS: Final = 24
 """Smallest number of minima from which posterior sampling starts."""

@@ -28,6 +28,9 @@ from calibray.support.messages import first_line, shortened
 MILLIMETRE: Final = 0.001
 """Unit of corners that are whole numbers [m]."""
 
+WIDEST: Final = 50_000.0
+"""Largest extent of a scene that is made [m]; a wider one is probably not in metres about a local origin."""
+
 LARGEST_COORDINATE: Final = 1e9
 """Largest coordinate of a vertex or an antenna [m], as of a position in a path file."""
 

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from calibray.scenes.authoring.floor_plan_scene import LIDS as LIDS
     from calibray.scenes.authoring.floor_plan_scene import WALL_THICKNESS as WALL_THICKNESS
     from calibray.scenes.authoring.floor_plan_scene import make_plan_scene as make_plan_scene
-    from calibray.scenes.authoring.footprints import WIDEST as WIDEST
     from calibray.scenes.authoring.footprints import FootprintColumns as FootprintColumns
     from calibray.scenes.authoring.footprints import Footprints as Footprints
     from calibray.scenes.authoring.footprints import HeightRule as HeightRule
@@ -43,7 +42,7 @@ __all__, __getattr__, __dir__ = lazy_attributes(
         "extrusion": "Windows",
         "floor_plan": "Segment read_plan",
         "floor_plan_scene": "LIDS WALL_THICKNESS make_plan_scene",
-        "footprints": "WIDEST FootprintColumns Footprints HeightRule HeightSource clean_footprints read_footprints "
+        "footprints": "FootprintColumns Footprints HeightRule HeightSource clean_footprints read_footprints "
         "read_openstreetmap",
         "made_scene": "SCENE_FILES MadeScene Palette SurfaceMaterial material_name",
         "terrain": "Terrain lower_origin read_terrain",

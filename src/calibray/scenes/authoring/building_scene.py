@@ -25,12 +25,12 @@ from calibray.scenes.authoring.extrusion import (
     extrude,
     split_overlaps,
 )
-from calibray.scenes.authoring.footprints import WIDEST, Footprints
+from calibray.scenes.authoring.footprints import Footprints
 from calibray.scenes.authoring.made_scene import SCENE_FILES, MadeScene, Palette, extent, write_made_scene
 from calibray.scenes.authoring.terrain import Terrain, make_level_ground
 from calibray.scenes.authoring.trees import TREES_FILE, Trees
 from calibray.scenes.authoring.wall_alignment import align
-from calibray.scenes.meshes import MeshObject, weld
+from calibray.scenes.meshes import WIDEST, MeshObject, weld
 from calibray.support.lazy_imports import library
 from calibray.support.output_files import check_outputs
 

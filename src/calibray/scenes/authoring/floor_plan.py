@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.measurements.column_names import LENGTH_UNITS, find_length_unit, without_accents, words
 from calibray.measurements.delimited_text import parse_text, read_text
-from calibray.scenes.authoring.footprints import HIGHEST, WIDEST
+from calibray.scenes.authoring.footprints import HIGHEST
 from calibray.scenes.authoring.geodata import read_features
-from calibray.scenes.meshes import MILLIMETRE
+from calibray.scenes.meshes import MILLIMETRE, WIDEST
 from calibray.support.lazy_imports import library
 from calibray.support.messages import did_you_mean, first_line, shortened
 from calibray.support.output_files import exists

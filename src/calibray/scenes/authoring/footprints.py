@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from calibray.coordinates import WGS84, Frame, transformer
 from calibray.errors import InputError
 from calibray.scenes.authoring.geodata import read_features
+from calibray.scenes.meshes import WIDEST
 from calibray.scenes.scene_file import unique_names
 from calibray.support.lazy_imports import library
 from calibray.support.messages import did_you_mean, shortened
@@ -33,9 +34,6 @@ SMALLEST: Final = 1.0
 
 HIGHEST: Final = 1000.0
 """Largest height of a building or part of one [m]; the highest building is 828 m high."""
-
-WIDEST: Final = 50_000.0
-"""Largest extent of a scene that is made [m]."""
 
 HeightSource = Literal["height", "levels", "default"]
 

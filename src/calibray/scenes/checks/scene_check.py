@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from calibray.scenes.meshes import MILLIMETRE, MeshObject
+from calibray.scenes.meshes import MILLIMETRE, WIDEST, MeshObject
 from calibray.scenes.scene import ITU_NAMES
 from calibray.scenes.scene_file import find_scene
 from calibray.scenes.shapes import COARSE, TOO_COARSE
@@ -21,9 +21,6 @@ from calibray.scenes.triangles import read_meshes
 from calibray.support.progress import Progress
 
 Severity = Literal["error", "warning", "note"]
-
-LARGEST: Final = 50_000.0
-"""Extent above which a scene is probably not in metres about a local origin [m]."""
 
 _FLAT: Final = 1e-10  # a face of less area counts as empty [m^2]
 
@@ -194,7 +191,7 @@ def _scale_findings(low: NDArray[np.float64], high: NDArray[np.float64]) -> Iter
         problem = f"the scene is {size} large, as if in degrees of longitude and latitude"
         yield Finding("error", "", problem, "project it to metres (calibray scene does)")
         return
-    if width > LARGEST:
+    if width > WIDEST:
         problem = f"the scene is {size} m large, as if in millimetres"
         yield Finding("error", "", problem, "scale it by 0.001 to metres")
     if 0 < extent[2] < 0.005 * width and extent[2] < 1:
