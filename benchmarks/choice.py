@@ -49,8 +49,8 @@ from calibray.scenarios import demo_study_path
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers, render
 from calibray.validation.held_out_statistics import spatial_blocks
+from calibray.validation.models import fit_variants
 from calibray.validation.validate import fit_models, validate_problem
-from calibray.validation.variants import fit_variants
 
 LEVEL = 0.9
 NOISE_DB = 4.0

@@ -32,8 +32,8 @@ from calibray.result.held_out import Model
 from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.verdicts import credible_sets
+from calibray.validation.models import fit_variants
 from calibray.validation.validate import fit_models, validate_problem
-from calibray.validation.variants import fit_variants
 from misfit_worlds import WORLDS, World, make, named
 
 LEVEL = 0.9

@@ -29,7 +29,7 @@ import misfit_worlds
 from calibray.errors import InputError
 from calibray.fitting.problem import Problem
 from calibray.study import Study
-from calibray.validation.baselines import obstructed, without_scene
+from calibray.validation.models import obstructed, without_scene
 from districts import District
 
 NOISE_DB, LOSS_DB, SPREAD_DB = 3.0, 5.0, 6.0

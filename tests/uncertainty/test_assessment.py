@@ -23,7 +23,7 @@ from calibray.result.wording import NOT_JUDGED, reason_text
 from calibray.study import Setup, Study
 from calibray.tables import render
 from calibray.uncertainty.assessment import certainty
-from calibray.validation import variants
+from calibray.validation import models
 from calibray.validation.validate import validate_problem
 from link_tables import links_from_frame
 
@@ -183,14 +183,14 @@ def test_a_hopeless_variant_is_reported(tmp_path, noisy):
 def test_searches_away_from_known_minima_end_early(tmp_path, noisy, monkeypatch):
     """The models are the same and cost fewer replays."""
     problem = Problem.of(Setup.open(planted.study(tmp_path, noisy)), planted.engine())
-    known = {Model.CALIBRATED: variants.find_minima(problem, np.zeros((0, 3)), 64)}
+    known = {Model.CALIBRATED: models.find_minima(problem, np.zeros((0, 3)), 64)}
 
     def judged():
         before = problem.engine.calls
         return validate_problem(problem, 3, known_minima=known), problem.engine.calls - before
 
     quick, spent = judged()
-    monkeypatch.setattr(variants, "NEARER", 1e6)
+    monkeypatch.setattr(models, "NEARER", 1e6)
     patient, more = judged()
     assert spent < 0.95 * more
     for name, errors in patient.errors.items():

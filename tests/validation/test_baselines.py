@@ -17,14 +17,14 @@ from calibray.prediction.corrections import fill_missing
 from calibray.result.held_out import FittedTerm, Model, PredictionModel
 from calibray.result.record import Prediction
 from calibray.study import Study
-from calibray.validation.baselines import (
+from calibray.validation.choice import with_prior_mean
+from calibray.validation.models import (
     OUT_OF_SIGHT_DB,
     has_obstruction,
     log_distance,
     obstructed,
     without_scene,
 )
-from calibray.validation.choice import with_prior_mean
 
 DISTANCE = np.geomspace(5, 500, 20)
 LOSS = 38.5 + 27.0 * np.log10(DISTANCE)

@@ -14,8 +14,8 @@ from calibray.fitting.objective import Objective
 from calibray.measurements import Measurements, SourceTable
 from calibray.result.held_out import Model
 from calibray.scenes.obstruction import OUT_OF_SIGHT
-from calibray.validation import variants
-from calibray.validation.variants import TX_OFFSET, with_offsets
+from calibray.validation import models
+from calibray.validation.models import TX_OFFSET, with_offsets
 
 COUNT = 120
 
@@ -83,11 +83,11 @@ def test_a_large_program_has_fewer_additional_starts(
         return starts
 
     known = np.zeros((1, 2))
-    monkeypatch.setattr(variants, "local_searches", lambda _: searches)
-    monkeypatch.setattr(variants, "find_minima", without_search)
-    monkeypatch.setattr(variants, "variants", lambda part, best: {Model.CALIBRATED: part, Model.SLOPE: part})
+    monkeypatch.setattr(models, "local_searches", lambda _: searches)
+    monkeypatch.setattr(models, "find_minima", without_search)
+    monkeypatch.setattr(models, "variants", lambda part, best: {Model.CALIBRATED: part, Model.SLOPE: part})
     part: Any = SimpleNamespace(engine=None)
-    variants.fit_variants(part, {Model.CALIBRATED: known})
-    variants.fit_variants(part, {Model.CALIBRATED: known, Model.SLOPE: known})
+    models.fit_variants(part, {Model.CALIBRATED: known})
+    models.fit_variants(part, {Model.CALIBRATED: known, Model.SLOPE: known})
     # A variant without minima over more links starts from those of the study's own model, and gets all.
     assert used == [additional, 4, additional, additional]

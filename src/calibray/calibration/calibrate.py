@@ -30,8 +30,8 @@ from calibray.support.progress import Progress
 from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.protocol import TracerFactory
 from calibray.uncertainty.assessment import certainty
+from calibray.validation.models import NO_MINIMA
 from calibray.validation.validate import check_engine, validate_problem
-from calibray.validation.variants import NO_MINIMA
 
 MINIMA_WITHOUT_MULTISTART: Final = 2
 """If a method has no multi-start, it returns at most this many minima, which are too few starting points for a

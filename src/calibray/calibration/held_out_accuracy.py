@@ -21,7 +21,6 @@ from calibray.result.held_out import FittedTerm, Model, PredictionModel
 from calibray.result.record import Accuracy
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study.calibration_sections import DEFAULT_BLOCKS
-from calibray.validation.baselines import has_obstruction, log_distance, obstructed, without_scene
 from calibray.validation.choice import HeldOutResiduals, fitted_terms, quantiles
 from calibray.validation.held_out_statistics import (
     choose,
@@ -32,8 +31,14 @@ from calibray.validation.held_out_statistics import (
     spatial_blocks,
     two_levels,
 )
+from calibray.validation.models import (
+    has_obstruction,
+    initial_objective,
+    log_distance,
+    obstructed,
+    without_scene,
+)
 from calibray.validation.validation import Validation
-from calibray.validation.variants import initial_objective
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,8 +53,8 @@ from calibray.uncertainty.draws import evenly_spaced
 from calibray.uncertainty.emulator import emulate
 from calibray.uncertainty.noise_models import HEAVY
 from calibray.uncertainty.residual_correlation import shared_errors
-from calibray.validation.baselines import log_distance, without_scene
 from calibray.validation.choice import fit_prediction_model
+from calibray.validation.models import log_distance, without_scene
 from calibray.validation.validation import Validation
 
 FAINT: Final = "predicted too near the noise floor, left out"

@@ -29,8 +29,8 @@ from calibray.measurements import Measurements
 from calibray.result.held_out import NO_PATH, PredictionModel, ResidualField
 from calibray.result.record import Prediction
 from calibray.study.model import StudyModel
-from calibray.validation.baselines import without_scene
 from calibray.validation.held_out_statistics import interval_half_width
+from calibray.validation.models import without_scene
 
 TRANSMITTER: Final = "transmitter"
 """`FittedTerm.per` of a term with one coefficient per transmitter, which needs no column."""

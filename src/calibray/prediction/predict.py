@@ -33,7 +33,7 @@ from calibray.scenes.obstruction import CLUSTER, OUT_OF_SIGHT
 from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Setup
 from calibray.support.progress import Progress
-from calibray.validation.baselines import without_scene
+from calibray.validation.models import without_scene
 
 NEIGHBOURS: Final = (0.125, 0.5)
 """Distances of the displaced antennas that are traced, as shares of the largest displacement: 1 and 4 m of 8 m."""

@@ -22,17 +22,15 @@ from calibray.materials import Material
 from calibray.result.held_out import WITHOUT_MATERIALS, BlockErrors, FittedTerm, Model, PredictionModel
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study.model import StudyModel
-from calibray.validation.baselines import (
+from calibray.validation.models import (
     OUT_OF_SIGHT_DB,
-    log_distance,
-    obstructed,
-    without_scene,
-)
-from calibray.validation.variants import (
     TX_OFFSET,
     find_minima,
     initial_objective,
+    log_distance,
+    obstructed,
     variants,
+    without_scene,
 )
 
 SEARCHES: Final = 16

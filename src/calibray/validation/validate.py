@@ -25,10 +25,17 @@ from calibray.study.model import StudyModel
 from calibray.support.progress import Progress
 from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.protocol import TracerFactory
-from calibray.validation.baselines import has_obstruction, kriging, log_distance, obstructed, without_scene
 from calibray.validation.held_out_statistics import MODELS, held_out_gaps, observable_errors, spatial_blocks
+from calibray.validation.models import (
+    NO_MINIMA,
+    fit_variants,
+    has_obstruction,
+    kriging,
+    log_distance,
+    obstructed,
+    without_scene,
+)
 from calibray.validation.validation import Validation
-from calibray.validation.variants import NO_MINIMA, fit_variants
 
 TX: Final = "tx"
 """Name of the transmitter's position as a label, if the table has no such column."""
