@@ -1,6 +1,7 @@
 """Ray mapping on foreign engines: calls until the engine's own optimum is reached to 0.01 dB.
 
     python benchmarks/ray_mapping.py --first 3000 --districts 20 --offices 10 --seeds 3 --out rays.jsonl
+    python benchmarks/ray_mapping.py --first 3000 --districts 20 --offices 10 --seeds 3 --in-turn 1   # of eight engines
 
 The engine is the replay of a district or an office with its own antennas, constants and physics, which the study does
 not state; it answers with the power of every path. Truths are drawn evenly within the bounds, errors have 3 dB. The
@@ -242,6 +243,9 @@ def main() -> None:
     parser.add_argument("--offices", type=int, default=0)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--engines", default=",".join(ENGINES))
+    parser.add_argument(
+        "--in-turn", type=int, default=len(ENGINES), help="engines of a truth, which take turns"
+    )
     parser.add_argument("--out", type=Path, help="file of the repetitions; a run that was stopped goes on")
     parser.add_argument("--minutes", type=float, default=np.inf, help="start no repetition after this time")
     options = parser.parse_args()
@@ -260,9 +264,12 @@ def main() -> None:
         made = Places(Path(folder))
         # One visit is one truth per engine: a run that is stopped has seen whole visits, in random order of the places,
         # and the engines of a visit share what is compiled for the place.
-        for seed, (make, number) in product(range(options.seeds), order):
+        for visit, (seed, (make, number)) in enumerate(product(range(options.seeds), order)):
             jax.clear_caches()  # the functions of the place before
-            for name in engines:
+            turns = range(
+                options.in_turn * visit, options.in_turn * visit + min(options.in_turn, len(engines))
+            )
+            for name in [engines[turn % len(engines)] for turn in turns]:
                 if time.monotonic() > ends or (f"{make.__name__}-{number}", name, seed) in done:
                     continue
                 if (place := made.get(make, number, name == "scattering")) is None:
