@@ -8,14 +8,16 @@
 Every repetition draws a truth for each parameter evenly from its search range, makes path losses of it, adds the errors
 of its world, and calibrates as `calibray run` does, from fewer starting points. The study does not state the world:
 all settings are defaults. A row says how often the interval covered the truth, over all repetitions and where the
-verdict was "identified" or "weakly identified", and how often the verdict was "not identifiable". For comparison, the
-same draws are weighted with the true noise. That posterior covers its share of truths by definition, apart from the
-chance of the repetitions, and its width is the narrowest possible. If buildings differ, this posterior does not exist.
+verdict was "identified" or "weakly identified", and how often the verdict was "not identifiable". For comparison,
+there are two posteriors that know the noise and that buildings are equal. One has the study's prior of the constants
+that the scene fixes; the other knows these constants, and no posterior is narrower. If buildings differ, neither
+exists.
 
 Each repetition is a line of the file `--out`; an interrupted run continues where it stopped, and `--repetitions 0`
 prints the tables of the stored repetitions. The last rows are the negative control, the same posterior with the noise
-understated by two, which must cover too seldom: the script fails if it does not. It fails as well where a parameter is
-called not identifiable whose posterior with the noise known is narrower than a tenth of its range.
+understated by two, which must cover too seldom: the script fails if it does not. It fails as well if more than a tenth
+of the values that the posterior with the noise known determines to a tenth of the range are not called identified or
+weakly identified.
 """
 
 from __future__ import annotations
@@ -142,6 +144,11 @@ KNOWN: dict[str, Callable[[District, np.ndarray], np.ndarray]] = {
 DETERMINED: Final = 0.1
 """Width of the posterior with the noise known, of the range, below which a parameter is well determined."""
 
+DENIED: Final = 0.1
+"""Largest share of well-determined values that may have another verdict than these."""
+
+IDENTIFIED: Final = ("identified", "weakly identified")
+
 
 @cache
 def _district(name: str, folder: Path) -> District:
@@ -181,23 +188,29 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
     if posterior is None:
         raise RuntimeError(f"{name}, {world}, {turn}: no draws; {assessed.remarks}")
     means = posterior.means
-    reference = _known(district, world, problem, trail, turn) if known.all() else None
+    references = {
+        reference: _known(district, world, problem, trail, turn, exact)
+        for reference, exact in (("known", False), ("exact", True))
+        if known.all() and world in KNOWN
+    }
     narrow = means.weight * np.exp((UNDERSTATED - 1) * (means.density - means.density.max()))
     for k, parameter in enumerate(problem.parameters.names):
         told_sets = credible_sets(means.point[:, k], means.weight, lower[k], upper[k], LEVELS)
         sets = dict(zip(map(str, LEVELS), told_sets, strict=True))
         control = credible_sets(means.point[:, k], narrow / narrow.sum(), lower[k], upper[k], [LEVELS[0]])[0]
-        luck = None
-        if reference is not None:
-            alike = credible_sets(reference.point[:, k], reference.weight, lower[k], upper[k], [LEVELS[0]])[0]
-            luck = {"held": bool(_holds(alike, point[k])), "width": _width(alike) / (upper[k] - lower[k])}
+        by_reference = {}
+        for reference, draws in references.items():
+            alike = credible_sets(draws.point[:, k], draws.weight, lower[k], upper[k], [LEVELS[0]])[0]
+            by_reference[reference] = {
+                "held": bool(_holds(alike, point[k])), "width": _width(alike) / (upper[k] - lower[k])
+            }  # fmt: skip
         found.append({
             "name": parameter,
             "verdict": assessed.intervals[parameter].verdict,
             "held": {level: bool(_holds(pieces, point[k])) for level, pieces in sets.items()},
             "width": _width(sets["0.9"]) / (upper[k] - lower[k]),
-            "known": luck,
             "control": bool(_holds(control, point[k])),
+            **by_reference,
         })  # fmt: skip
     return {
         "district": name, "world": world, "repetition": turn, "seed": seed, "parameters": found,
@@ -226,13 +239,14 @@ class KnownNoise:
         return density[:, None]
 
 
-def _known(district: District, world: str, problem: Problem, trail: Trail, seed: int) -> Draws | None:
-    """Draws where noise and constants are known and buildings are alike; None where the world has no such density."""
-    if world not in KNOWN:
-        return None
+def _known(
+    district: District, world: str, problem: Problem, trail: Trail, seed: int, exact_constants: bool
+) -> Draws:
+    """Draws where the noise is known and buildings are equal; the constants that the scene fixes may be known too."""
     study = problem.setup.study
-    exact = study.noise.model_copy(update={"constants_spread": 0.0, "heterogeneity": 0.0})
-    setup = replace(problem.setup, study=study.model_copy(update={"noise": exact}))
+    spread = 0.0 if exact_constants else study.noise.constants_spread
+    noise = study.noise.model_copy(update={"constants_spread": spread, "heterogeneity": 0.0})
+    setup = replace(problem.setup, study=study.model_copy(update={"noise": noise}))
     best, freedom = problem.parameters.to_search(trail.best), max(problem.freedom, 1)
     model = joint_model(replace(problem, setup=setup), best, float(trail.best_value**2), freedom)
     known = KnownNoise(district, world, column=np.ones(problem.objective.num_counted))
@@ -310,21 +324,24 @@ def main() -> None:
     lines = [each for each in lines if each["district"] in names and each["world"] in worlds]
     for table in tables(lines):
         print(f"\n**{table.title}**\n\n{render_markdown(table)}" if given.markdown else render(table))
-    count, denied = determined(lines)
-    print(f"Well determined with the noise known: {count} values; called not identifiable of them: {denied}.")
-    if denied:
-        sys.exit("well-determined parameters are called not identifiable")
+    for reference, words in (("known", "the noise"), ("exact", "the noise and the scene's constants")):
+        count, denied = determined(lines, reference)
+        print(
+            f"Determined to a tenth of the range by {words}: {count}; of these not (weakly) identified: {denied}."
+        )
+        if reference == "known" and denied > DENIED * count:
+            sys.exit("too many well-determined parameters are not called identified or weakly identified")
     control = [entry["control"] for line in lines if line["world"] == "random" for entry in line["parameters"]
                if entry["verdict"] != "not identifiable"]  # fmt: skip
     if control and np.mean(control) > LEVELS[0] - 0.04:
         sys.exit("negative control: intervals with the noise understated by two cover as if they were right")
 
 
-def determined(lines: list[dict[str, Any]]) -> tuple[int, int]:
-    """Values that the data tell well where the noise is known, and those of them called not identifiable."""
-    entries = [entry for line in lines for entry in line["parameters"] if entry.get("known")]
-    verdicts = [entry["verdict"] for entry in entries if entry["known"]["width"] < DETERMINED]
-    return len(verdicts), verdicts.count("not identifiable")
+def determined(lines: list[dict[str, Any]], reference: str) -> tuple[int, int]:
+    """Number of values that a reference determines well, and of those not called identified or weakly identified."""
+    entries = [entry for line in lines for entry in line["parameters"] if entry.get(reference)]
+    verdicts = [entry["verdict"] for entry in entries if entry[reference]["width"] < DETERMINED]
+    return len(verdicts), sum(verdict not in IDENTIFIED for verdict in verdicts)
 
 
 def tables(lines: list[dict[str, Any]]) -> list[Table]:
@@ -342,20 +359,22 @@ def _table(title: str, lines: list[dict[str, Any]], by_name: bool) -> Table:
         Column("world"), Column("parameter"), numbers("repetitions"), numbers("90 % held"), numbers("95 % held"),
         numbers("noise known, 90 %"), numbers("identified"), numbers("90 % held there"), numbers("95 % held there"),
         numbers("noise known, 90 % there"), numbers("not identifiable"), numbers("median width"),
-        numbers("by that, noise known"), numbers("control, 90 %"),
+        numbers("by that, noise known"), numbers("there"), numbers("constants known too"), numbers("there"),
+        numbers("control, 90 %"),
     )  # fmt: skip
     rows = []
     for world in dict.fromkeys(line["world"] for line in lines):
         here = [entry for line in lines if line["world"] == world for entry in line["parameters"]]
         for name in dict.fromkeys(entry["name"] for entry in here) if by_name else ("all",):
             mine = [entry for entry in here if name in (entry["name"], "all")]
-            sure = [entry for entry in mine if entry["verdict"] in ("identified", "weakly identified")]
+            sure = [entry for entry in mine if entry["verdict"] in IDENTIFIED]
             blind = np.mean([entry["verdict"] == "not identifiable" for entry in mine])
             rows.append((
                 world, name, str(len(mine)), _share(mine, "0.9"), _share(mine, "0.95"), _lucky(mine), str(len(sure)),
                 _share(sure, "0.9") + _error(sure, "0.9"), _share(sure, "0.95") + _error(sure, "0.95"), _lucky(sure),
                 f"{blind:.2f}",
-                f"{np.median([entry['width'] for entry in mine]):.2f}", _wider(mine),
+                f"{np.median([entry['width'] for entry in mine]):.2f}",
+                *(_wider(entries, known) for known in ("known", "exact") for entries in (mine, sure)),
                 f"{np.mean([entry['control'] for entry in sure]):.2f}" if sure and world == "random" else "-",
             ))  # fmt: skip
     seconds = sum(line["seconds"] for line in lines) / max(len(lines), 1)
@@ -368,9 +387,9 @@ def _lucky(entries: list[dict[str, Any]]) -> str:
     return f"{np.mean(known):.2f}" if known else "-"
 
 
-def _wider(entries: list[dict[str, Any]]) -> str:
-    """Median of the widths by those of the posterior whose noise is known."""
-    ratio = [entry["width"] / entry["known"]["width"] for entry in entries if entry.get("known")]
+def _wider(entries: list[dict[str, Any]], reference: str) -> str:
+    """Median of the widths by those of a reference."""
+    ratio = [entry["width"] / entry[reference]["width"] for entry in entries if entry.get(reference)]
     return f"{np.median(ratio):.2f}" if ratio else "-"
 
 
