@@ -333,6 +333,14 @@ def test_each_step_leaves_half_of_the_members_effective():
     assert module._next_power(0.01 * log_likelihood, 0.1) == 1.0
 
 
+def test_progress_rises_during_the_last_sweeps_too():
+    shares = []
+    draw_posterior(_model(_parameters(), _uninformative, 4, buildings=0), progress=shares.append)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    assert max(np.diff([0.0, *shares])) < 0.3
+
+
 def test_draws_are_the_same_for_a_seed():
     one, two, other = (
         draw_posterior(_model(_parameters(), _uninformative, 4, interactions=LARGE), seed=seed).means.point

@@ -13,6 +13,7 @@ from calibray.result.held_out import HeldOutErrors, Model
 from calibray.result.record import Record
 from calibray.support.messages import percent
 from calibray.tables import Column, Table, rows_text
+from calibray.uncertainty.verdicts import TRADE_OFF
 
 SCENE_ALONE_DB: Final = 0.05
 """Largest difference between the exported scene and the predictions that is not reported."""
@@ -114,10 +115,6 @@ def held_out_text(record: Record) -> str:
 def block_sentence(held_out: HeldOutErrors) -> str:
     """How many blocks were held out."""
     return f"{len(held_out.labels)} blocks of links were held out in turn."
-
-
-TRADE_OFF: Final = 0.7
-"""Correlation of the draws above which two unknowns are reported as compensating for each other."""
 
 
 DECIDING: Final = 0.5

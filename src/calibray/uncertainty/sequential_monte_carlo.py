@@ -157,9 +157,9 @@ def draw_posterior(
             break
         for number in range(len(populations), total):
 
-            def stepped(power: float, number: int = number) -> None:
+            def stepped(share: float, number: int = number) -> None:
                 if progress is not None:
-                    progress((number % 2 + power) / 2)
+                    progress((number % 2 + share) / 2)
 
             random = np.random.default_rng([seed, number])
             population, evidence = _anneal(model, size, sweeps, random, stepped)
@@ -224,7 +224,8 @@ def _anneal(
 ) -> tuple[Population, float]:
     """Members of a population that followed the likelihood's power from 0 to 1, and its log evidence.
 
-    They are kept during the `last` sweeps.
+    They are kept during the `last` sweeps. `stepped` is called with the share of the work done: half of it is done when
+    the power is 1.
     """
     point = model.draw_prior(size, random)
     deviation = random.standard_normal((size, len(model.parameter_of)))
@@ -255,15 +256,16 @@ def _anneal(
         for _ in range(SWEEPS):
             population, lengths = moves.sweep(population, lengths)
         population = moves.redraw_categories(population)
-        stepped(power)
+        stepped(0.5 * power)
         if power == 1.0:
             break
-    kept = []
-    for _ in range(last // KEPT):
+    kept, groups = [], last // KEPT
+    for group in range(groups):
         for _ in range(KEPT):
             population, lengths = moves.sweep(population, lengths)
         population = moves.redraw_categories(population)
         kept.append(population.without_gaps())
+        stepped(0.5 + 0.5 * (group + 1) / groups)
     return _together(kept), evidence
 
 
