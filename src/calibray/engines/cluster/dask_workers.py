@@ -36,8 +36,9 @@ NO_WORKER_WAIT: Final = 600.0
 MOST_DEATHS: Final = 4
 """Number of workers that die on a chunk before the run ends; the chunk is then probably too large."""
 
-FETCH_WAIT: Final = 30.0
-"""Longest wait for an answer before it is requested again [s]."""
+FETCH_WAIT: Final = 0.5
+"""First wait for an answer that a worker has [s], doubled at each further request. In between, it is noticed if the
+worker died with the answer; an answer that takes long to send arrives in the end."""
 
 Answered = Callable[[int], None]
 """Called with a chunk's number after its answer."""
@@ -117,14 +118,17 @@ class DaskWorkers:
         count = len(handles[0])
         self._assign_homes(range(count), self._living(at_least=1))
         waiting = {index: self._submit(function, handles, index, arguments) for index in range(count)}
+        patience = dict.fromkeys(waiting, FETCH_WAIT)
         answers: dict[int, Any] = {}
         while waiting:
             self._wait_for_any(list(waiting.values()))
             for index in [index for index, future in waiting.items() if future.done()]:
-                if self._fetch(waiting[index], index, answers):
-                    del waiting[index]
-                    if answered is not None:
-                        answered(index)
+                if not self._fetch(waiting[index], index, answers, patience[index]):
+                    patience[index] *= 2
+                    continue
+                del waiting[index]
+                if answered is not None:
+                    answered(index)
             for index in self._move_from_dead(waiting):
                 waiting[index] = self._submit(function, handles, index, arguments)
         return [answers[index] for index in range(count)]
@@ -152,12 +156,12 @@ class DaskWorkers:
         except TimeoutError:
             return
 
-    def _fetch(self, future: Future, index: int, answers: dict[int, Any]) -> bool:
-        """Fetch an answer; False if it was lost with its worker."""
+    def _fetch(self, future: Future, index: int, answers: dict[int, Any], patience: float) -> bool:
+        """Fetch an answer; False if it was lost with its worker, or takes longer to send than we wait for it [s]."""
         from distributed import KilledWorker
 
         try:
-            answers[index] = future.result(timeout=FETCH_WAIT)
+            answers[index] = future.result(timeout=patience)
         except TimeoutError:
             return False
         except KilledWorker:
