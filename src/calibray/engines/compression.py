@@ -19,7 +19,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
-from scipy.stats import qmc
 
 from calibray.engines.replay import TABLE_TOLERANCE
 from calibray.errors import InputError
@@ -126,6 +125,8 @@ def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
     The power is the sum over candidates that are spread over the parameters' bounds, so the share of the omitted paths
     at a single candidate is smaller. Raises InputError if a parameter's material is not in the paths.
     """
+    from scipy.stats import qmc  # takes 0.4 s
+
     candidates = parameters.from_unit(qmc.Sobol(len(parameters), rng=0).random(RANKING))
     _, strength, _ = _evaluate_all(paths, parameters, [candidates], FIRST_INTERVALS)
     order = np.lexsort((strength, paths.link))
@@ -139,6 +140,8 @@ def _candidate_sets(parameters: Parameters) -> list[NDArray[np.float64]]:
 
     A fit fails first where it extrapolates, so half of the candidates of a check are on faces of the bounds.
     """
+    from scipy.stats import qmc  # takes 0.4 s
+
     d, random = len(parameters), np.random.default_rng(0)
     corners = np.full((2 ** min(d, CORNER_PARAMETERS), d), 0.5)
     corners[:, :CORNER_PARAMETERS] = list(product([0.0, 1.0], repeat=min(d, CORNER_PARAMETERS)))

@@ -9,7 +9,6 @@ from typing import Final, final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from calibray import fields
 from calibray.engines.protocol import Responses, check_candidates, joined, of_links
@@ -242,6 +241,8 @@ class Replay:
         """Intervals of the tables by material and mode; None if evaluating every coefficient is faster."""
         if not force and self.interactions <= MAY_TABULATE:
             return None
+        from scipy.stats import qmc  # takes 0.4 s
+
         unit = qmc.Sobol(len(self.parameters), rng=0).random(TABLE_CANDIDATES)
         candidates = np.concatenate([self.parameters.start[None], self.parameters.from_unit(unit)])
         tables = self.parameters.constants_of(candidates, self.paths.materials, self.paths.frequency)

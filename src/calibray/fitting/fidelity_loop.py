@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from calibray.engines.kinds.replay import ReplaySection, replay
 from calibray.engines.protocol import Chunked
@@ -103,7 +103,7 @@ def with_interpolation_error(
     residual = (objective.model(modelled[None])[0] - objective.measured)[counted]
     # Relative to the mean weight; the median is not moved by the links whose interpolation is bad.
     relative = objective.weight[counted] / objective.weight[counted].mean()
-    variance = np.median(residual**2 * relative) / chi2.ppf(0.5, 1) / relative
+    variance = np.median(residual**2 * relative) / chdtri(1, 0.5) / relative
     weight = objective.weight.copy()
     weight[counted] *= variance / (variance + error_db[counted] ** 2)
     # The standard deviation at the mean weight follows that weight.

@@ -12,8 +12,7 @@ from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import erfcx
-from scipy.stats import norm
+from scipy.special import erfcx, ndtr
 
 from calibray.optimizers.arguments import Box, whole
 from calibray.optimizers.evaluations import Archive, merge_repeated
@@ -118,4 +117,5 @@ def log_shape(z: NDArray[np.float64]) -> NDArray[np.float64]:
     ratio = 1.0 + low * np.sqrt(np.pi / 2.0) * erfcx(-low / np.sqrt(2.0))
     rest = np.where(low < -1e4, -2.0 * np.log(-low), np.log(np.maximum(ratio, 1e-300)))
     tail = -0.5 * low**2 - 0.5 * np.log(2.0 * np.pi) + rest
-    return np.where(z > -1.0, np.log(norm.pdf(high) + high * norm.cdf(high)), tail)
+    density = np.exp(-0.5 * high**2) / np.sqrt(2.0 * np.pi)
+    return np.where(z > -1.0, np.log(density + high * ndtr(high)), tail)

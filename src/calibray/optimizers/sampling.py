@@ -10,7 +10,6 @@ from typing import ClassVar, Final, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.distance import cdist, pdist
-from scipy.stats import qmc
 
 from calibray.optimizers.arguments import Box, whole
 from calibray.optimizers.evaluations import Archive
@@ -26,6 +25,8 @@ def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> N
     """
     if kind == "random":
         return rng.random((count, dimension))
+    from scipy.stats import qmc  # takes 0.4 s, which commands that do not search need not wait for
+
     if kind == "latin-hypercube":
         return qmc.LatinHypercube(dimension, rng=rng).random(count)
     # SciPy swallows an interruption while it reads its direction numbers, and goes on without them.

@@ -9,7 +9,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from trimesh.triangles import closest_point
 
 from calibray.errors import InputError
 from calibray.scenes import Scene
@@ -68,14 +67,14 @@ class Surfaces:
         )
         if not len(index):
             return index, face, np.zeros(0)
-        distance = np.linalg.norm(closest_point(self.corners[face], point[index]) - point[index], axis=1)
+        distance = np.linalg.norm(_nearest(self.corners[face], point[index]) - point[index], axis=1)
         close = distance <= within
         return index[close], face[close], distance[close]
 
     def distance(self, point: NDArray[np.float64], faces: NDArray[np.bool_]) -> float:
         """Distance of one point [3] from the nearest of some faces [F], [m]."""
         corners = self.corners[faces]
-        nearest = closest_point(corners, np.broadcast_to(point, (len(corners), 3)))
+        nearest = _nearest(corners, np.broadcast_to(point, (len(corners), 3)))
         return float(np.linalg.norm(nearest - point, axis=1).min(initial=np.inf))
 
     def _box_pairs(self, point: NDArray[np.float64], within: float) -> Iterator[tuple[NDArray, NDArray]]:
@@ -238,3 +237,10 @@ def _edge(surfaces: Surfaces, hits: Hits, number: int, faces: tuple[int, int]) -
         return None
     error = abs(np.dot(incident - leaving, direction)) * hits.length[number]
     return Edge(faces[0], normal_0, normal_n, direction, float(error))
+
+
+def _nearest(corners: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The points [k, 3] of triangles with corners [k, 3, 3] that are nearest to points [k, 3], [m]."""
+    from trimesh.triangles import closest_point  # takes 0.2 s, and only rays of other programs need it
+
+    return closest_point(corners, point)
