@@ -60,7 +60,7 @@ def test_rt_calls_are_the_papers(demo):
 def test_auto_reaches_the_global_optimum_of_an_exhaustive_scan(demo, problem):
     engine = problem.engine
     axes = [
-        np.linspace(low, high, 24)
+        np.linspace(low, high, 16)
         for low, high in zip(engine.parameters.lower, engine.parameters.upper, strict=True)
     ]
     grid = np.array(list(product(*axes)))
