@@ -39,7 +39,7 @@ links = {{ file = "links.csv", tx = ["tx_x", "tx_y", "tx_z"], rx = ["rx_x", "rx_
 trace = {{ max_depth = 1, samples = 10_000 }}
 engine = {{ name = "command", command = {command}, retries = 0 }}
 method = {{ name = "{method}", options = {options} }}
-noise = {{ kind = "gaussian", range_m = 0 }}
+noise = {{ kind = "gaussian", range_m = 0, heterogeneity = 0, constants_spread = 0 }}
 [parameters]
 "concrete.relative_permittivity" = {{ bounds = [1.5, 12.0] }}
 "marble.relative_permittivity" = {{ bounds = [1.5, 12.0] }}

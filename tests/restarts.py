@@ -32,7 +32,7 @@ from calibray.errors import EngineError, InputError
 from calibray.study import Study
 from calibray.uncertainty import sequential_monte_carlo as sampler
 # Else every child would import them.
-import trimesh
+import scipy.stats, trimesh
 import calibray.engines.make_engine, calibray.engines.external.program
 
 for name, value in json.loads(sys.argv[1]).items():

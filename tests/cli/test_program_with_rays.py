@@ -141,9 +141,9 @@ def test_predictions_and_the_page_show_the_rays_of_the_program(
 def test_a_program_of_other_physics_is_not_understood(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ray mapping ends after four calls here; the search for an explanation takes longer after each."""
-    monkeypatch.setattr(ray_mapping, "map_rays", partial(ray_mapping.map_rays, most_calls=4))
-    method = {"name": "auto", "options": {"budget": 5}}
+    """Ray mapping ends after two calls here; the search for an explanation takes longer after each."""
+    monkeypatch.setattr(ray_mapping, "map_rays", partial(ray_mapping.map_rays, most_calls=2))
+    method = {"name": "auto", "options": {"budget": 3}}
     antennas = {"tx": ISOTROPIC, "rx": ISOTROPIC}
     study = write_study(tmp_path / "study", RIPPLE, antennas, method=method, holdout=None)
     ran = run("run", study, "--out", tmp_path / "out")

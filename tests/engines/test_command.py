@@ -226,7 +226,8 @@ def test_a_run_completes_in_spite_of_failures(tmp_path):
 def test_a_program_that_breaks_down_ends_the_run_and_loses_nothing(tmp_path):
     """It answers 8 calls and then never again; mended, it goes on from there."""
     content = programs.content(tmp_path, "if earlier > 8: sys.exit('the licence ran out')", give_up_after=4)
-    study = Study.from_content(content | {"method": SMALL}, tmp_path / "study.toml")
+    method = SMALL | {"options": {"population": 5, "iterations": 4, "full_iterations": 2, "elites": 2}}
+    study = Study.from_content(content | {"method": method}, tmp_path / "study.toml")
     out = tmp_path / "out"
     with pytest.raises(
         EngineError, match=r"the licence ran out.*so did the 3 calls before it.*--forget-failed"

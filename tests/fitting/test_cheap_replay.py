@@ -159,13 +159,13 @@ def test_nothing_is_traced_without_a_cheap_model(tmp_path, monkeypatch, method):
 
 def test_a_killed_run_is_repeated_from_its_ledger(tmp_path):
     """The program differs from the scene, so the candidates depend on its answers; a restart repeats them."""
-    content = programs.content(tmp_path) | {"method": {"name": "auto", "options": {"budget": 4}}}
+    content = programs.content(tmp_path) | {"method": {"name": "auto", "options": {"budget": 3}}}
     study = Study.from_content(content, tmp_path / "study.toml")
     first = calibrate(study, out=tmp_path / "out")
     again = calibrate(study, out=tmp_path / "out", overwrite=True)
-    assert (first.rt_calls, first.cost.ledger_hits) == (4, 0)
+    assert (first.rt_calls, first.cost.ledger_hits) == (3, 0)
     assert first.cost.cheap_replays > 100
     assert f"{first.cost.cheap_replays:,} in" in render(costs(first))
-    assert (again.rt_calls, again.cost.ledger_hits) == (4, 4)
+    assert (again.rt_calls, again.cost.ledger_hits) == (3, 3)
     assert again.history.rmse_db.tolist() == first.history.rmse_db.tolist()
     assert again.parameters == first.parameters

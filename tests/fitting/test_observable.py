@@ -32,7 +32,7 @@ def test_a_calibration_on_delay_spreads(tmp_path):
     engine = planted.engine()
     truth = np.array([planted.TRUTH[name] for name in engine.parameters.names])
     measured = delay_spread(engine, truth[None])[0]
-    setup = setup_of(tmp_path, measured, name="vector-surrogate", options={"budget": 120})
+    setup = setup_of(tmp_path, measured, name="vector-surrogate", options={"budget": 90})
     problem = Problem.of(setup, engine, SPREAD)
     assert not problem.differentiable
     trail = search(problem, choose(problem))
