@@ -22,7 +22,6 @@ KERB: Final = 2.0
 CLEARANCE: Final = 0.05
 """A surface is above an antenna if it is higher by more than this [m]."""
 
-
 BEYOND: Final = "beyond the scene"
 UNDER: Final = "under the ground"
 INSIDE: Final = "inside a building"
