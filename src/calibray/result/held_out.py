@@ -35,10 +35,13 @@ WITHOUT_MATERIALS: Final = (Model.LOG_DISTANCE, Model.OBSTRUCTION)
 BASELINES: Final = (Model.INITIAL, *WITHOUT_MATERIALS, Model.KRIGING)
 """Models that calibrate no material."""
 
-STATED_NUISANCES: Final = (Model.CALIBRATED, Model.PRIOR)
-"""Models that calibrate materials, with the nuisances that the study states."""
-
-FITTED: Final = (*STATED_NUISANCES, Model.SLOPE, Model.OFFSETS, Model.PRIOR_OFFSETS)
+FITTED: Final = (
+    Model.CALIBRATED,
+    Model.PRIOR,
+    Model.SLOPE,
+    Model.OFFSETS,
+    Model.PRIOR_OFFSETS,
+)
 """Models that calibrate materials and can make predictions anywhere."""
 
 

@@ -300,14 +300,10 @@ def choice_text(chosen: str, best: str) -> str:
     """Which model predictions use, and why; `best` has the lowest held-out RMSE among those that predict anywhere."""
     if chosen == best:
         return f"Predictions use the model {str(chosen)!r}, the best on held-out blocks."
-    if best in WITHOUT_MATERIALS:
-        return (
-            f"Predictions use the model {str(chosen)!r}: it uses the scene and is worse than {str(best)!r} by no more "
-            "than the bootstrap error or 5 %."
-        )
+    reason = "uses the scene" if best in WITHOUT_MATERIALS else "keeps the initial materials"
     return (
-        f"Predictions use the model {str(chosen)!r}: {str(best)!r}, the best on held-out blocks, is not better than "
-        "each model with fewer unknowns by more than the bootstrap error and 5 %."
+        f"Predictions use the model {str(chosen)!r}: it {reason} and is worse than {str(best)!r} by no more than the "
+        "bootstrap error or 5 %."
     )
 
 

@@ -27,7 +27,6 @@ from calibray.measurements import Measurements
 from calibray.measurements.observables import ROUND_TRIP, TIME_OF_FLIGHT
 from calibray.result.held_out import (
     FITTED,
-    STATED_NUISANCES,
     WITHOUT_MATERIALS,
     BlockErrors,
     Judgement,
@@ -118,20 +117,15 @@ def choose(errors: Errors, position: NDArray[np.float64]) -> str:
     """Choose the model for predictions by held-out residuals [n], [dB], `Model.INITIAL` among them.
 
     The initial materials are kept until another model is better by more than the bootstrap error of the difference, and
-    by more than `LEAST_GAIN`. A calibrated model with further nuisances must be better by the same margins than those
-    without them. Kriging is never chosen, because it predicts well only near the measured links.
+    by more than `LEAST_GAIN`. Kriging is never chosen, because it predicts well only near the measured links.
     """
-
-    def better(name: str, other: str) -> str:
-        """The first model if it is better by the margins, otherwise the second one."""
-        comparison = compare(errors[name], {other: errors[other]}, position)
-        error_db = np.inf if comparison.error_db is None else comparison.error_db
-        margin_db = max(error_db, LEAST_GAIN * comparison.baseline_rmse_db)
-        return name if comparison.gain_db > margin_db else other
-
-    chosen = better(better(least(errors, FITTED), least(errors, STATED_NUISANCES)), Model.INITIAL)
-    for name in WITHOUT_MATERIALS:
-        chosen = better(name, chosen) if name in errors else chosen
+    chosen: str = Model.INITIAL
+    for name in (least(errors, FITTED), *WITHOUT_MATERIALS):
+        if name in errors:
+            comparison = compare(errors[name], {chosen: errors[chosen]}, position)
+            error_db = np.inf if comparison.error_db is None else comparison.error_db
+            margin_db = max(error_db, LEAST_GAIN * comparison.baseline_rmse_db)
+            chosen = name if comparison.gain_db > margin_db else chosen
     return chosen
 
 

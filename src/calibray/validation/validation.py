@@ -2,8 +2,7 @@
 
 Predictions use the initial materials with fitted offsets until another model is better by more than the bootstrap error
 of the difference (the one-standard-error rule, L. Breiman et al., Classification and Regression Trees, 1984) and by 5 %
-of the RMSE. The best calibrated model is tried first, then the log-distance model, which uses no scene. A calibrated
-model with nuisances that the study does not state must be better by the same margins than those without. A few blocks
+of the RMSE. The best calibrated model is tried first, then the log-distance model, which uses no scene. A few blocks
 hardly distinguish models of similar accuracy, and a fitted model loses more if its fit does not apply elsewhere.
 """
 
