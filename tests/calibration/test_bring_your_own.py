@@ -47,7 +47,7 @@ def test_planted_walls_and_phones_are_found_from_a_map_and_a_log(tmp_path):
     ends = SimpleNamespace(tx=links[["tx_x", "tx_y", "tx_z"]].to_numpy(), rx=rx)
     antenna = {"pattern": "iso", "polarization": "V"}
     paths = trace(
-        made.path, ends, frequency=truth["frequency"], max_depth=3, samples=100_000, tx_antenna=antenna,
+        made.path, ends, frequency=truth["frequency"], max_depth=3, samples=25_000, tx_antenna=antenna,
         rx_antenna=antenna,
     )  # fmt: skip
     group = pd.factorize(links["cell"] + " " + links["device"])
