@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import binom
 
 from calibray.fields.arithmetic import Pair, safe_sqrt
@@ -182,51 +183,43 @@ def pattern_value(table: jax.Array, diffuse: DiffuseArguments) -> jax.Array:
     material, patterns, lambertian = diffuse.material, diffuse.patterns, diffuse.cos_scattered / jnp.pi
     if all(pattern == "lambertian" for pattern in patterns):
         return lambertian
-    alpha_r, alpha_i, share = (
-        table[:, FIELD_COLUMN[name]][material] for name in ("alpha_r", "alpha_i", "lambda_")
-    )
+    alpha_r, alpha_i, share = (table[:, FIELD_COLUMN[name]] for name in ("alpha_r", "alpha_i", "lambda_"))
     # The directive pattern is the backscattering one with all energy in the lobe around the specular direction.
-    is_directive = jnp.asarray(np.array([pattern == "directive" for pattern in patterns]))[material]
+    is_directive = np.array([pattern == "directive" for pattern in patterns])
     share, alpha_i = jnp.where(is_directive, 1.0, share), jnp.where(is_directive, 1.0, alpha_i)
+    norm_r, norm_i = (_normalization(alpha, diffuse) for alpha in (alpha_r, alpha_i))
+    alpha_r, alpha_i, share = alpha_r[material], alpha_i[material], share[material]
     lobes = (
         share * (0.5 * (1 + diffuse.cos_specular)) ** alpha_r
         + (1 - share) * (0.5 * (1 + diffuse.cos_backward)) ** alpha_i
     )
-    cosine = diffuse.cos_incidence
-    norm = share * _normalization(alpha_r, cosine) + (1 - share) * _normalization(alpha_i, cosine)
     is_lambertian = jnp.asarray(np.array([pattern == "lambertian" for pattern in patterns]))[material]
-    return jnp.where(is_lambertian, lambertian, lobes / norm)
+    return jnp.where(is_lambertian, lambertian, lobes / (share * norm_r + (1 - share) * norm_i))
 
 
-def _normalization(alpha: jax.Array, cosine: jax.Array) -> jax.Array:
-    """F_alpha, integral of a lobe over the half space (eqs. 7 and 8 of the paper); linear between whole exponents."""
+def _normalization(alpha: jax.Array, diffuse: DiffuseArguments) -> jax.Array:
+    """F_alpha [D], integral of a lobe over the half space (eqs. 7 and 8 of the paper), for exponents alpha [M].
+
+    It is linear between whole exponents.
+    """
     low = jnp.clip(jnp.floor(alpha), 1, LARGEST_EXPONENT - 1)
-    weight = alpha - low
-    values = _whole_normalizations(cosine)
-    row = low.astype(jnp.int32)
-    column = jnp.arange(values.shape[1])
-    return (1 - weight) * values[row, column] + weight * values[row + 1, column]
+    weight, row = alpha - low, low.astype(jnp.int32)
+    table = jnp.asarray(_whole_normalizations(), diffuse.cos_incidence.dtype)
+    factors = ((1 - weight) * table[:, row] + weight * table[:, row + 1])[:, diffuse.material]
+    series = jnp.polyval(factors[:-1], 1 - diffuse.cos_incidence**2, unroll=4)
+    return factors[-1] + diffuse.cos_incidence * series
 
 
-def _whole_normalizations(cosine: jax.Array) -> jax.Array:
-    """F_alpha for alpha = 0 .. LARGEST_EXPONENT [alpha, n].
+@cache
+def _whole_normalizations() -> NDArray[np.float64]:
+    """Factors of F_alpha for alpha = 0 .. LARGEST_EXPONENT [terms, alpha].
 
     F_alpha = 2^-alpha sum_j binom(alpha, j) I_j. I_j is 2 pi / (j + 1) for even j, and for odd j that times
-    cos theta sum_{w <= (j - 1) / 2} binom(2w, w) (sin^2 theta / 4)^w.
+    cos theta sum_{w <= (j - 1) / 2} binom(2w, w) (sin^2 theta / 4)^w. The factors are those of cos theta sin^2w theta,
+    the highest power first, and then the constant.
     """
-    sine_squared = 1 - cosine**2
-    moments, series = [], jnp.zeros_like(cosine)
-    for j in range(LARGEST_EXPONENT + 1):
-        if j % 2 == 0:
-            moments.append(jnp.full_like(cosine, 2 * np.pi / (j + 1)))
-        else:
-            w = (j - 1) // 2
-            series = series + binom(2 * w, w) / 4.0**w * sine_squared**w
-            moments.append(cosine * series * 2 * np.pi / (j + 1))
-    weights = np.array(
-        [
-            [binom(alpha, j) / 2.0**alpha for j in range(LARGEST_EXPONENT + 1)]
-            for alpha in range(LARGEST_EXPONENT + 1)
-        ]
-    )
-    return jnp.asarray(weights, dtype=cosine.dtype) @ jnp.stack(moments)
+    alpha = np.arange(LARGEST_EXPONENT + 1)
+    j, w = alpha[:, None], np.arange(LARGEST_EXPONENT // 2)[::-1, None]
+    share = binom(alpha, j) / 2.0**alpha * 2 * np.pi / (j + 1)
+    from_w_on = np.cumsum(share[-2::-2], axis=0)
+    return np.concatenate([from_w_on * binom(2 * w, w) / 4.0**w, share[::2].sum(axis=0)[None]])
