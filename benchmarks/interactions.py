@@ -23,7 +23,8 @@ from scipy.constants import speed_of_light
 from calibray import Material
 from calibray.engines import Replay
 from calibray.engines.replay import Computation
-from calibray.fields import compiled, layout
+from calibray.fields import layout
+from calibray.fields import program as programs
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Diffuse, Kind, Paths
 from timing import seconds
@@ -127,7 +128,7 @@ def measure_compiling() -> None:
     points = chosen.lower + unit * (chosen.upper - chosen.lower)
     for size in (60, 120, 300, 960):
         for small, name in ((0, "to run fast"), (size, "fast")):
-            compiled.SMALL = small
+            programs.SMALL = small
             engine = Replay(program(size, False), chosen, computation=Computation(np.float64))
             started = time.process_time()
             engine.path_loss(points)

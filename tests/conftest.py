@@ -21,7 +21,7 @@ import pytest
 from hypothesis import settings
 
 from calibray.cli import console
-from calibray.fields import compiled
+from calibray.fields import program as programs
 from calibray.fitting import search
 from calibray.support import cache_folder as caching
 from calibray.uncertainty import sequential_monte_carlo as sampler
@@ -89,7 +89,7 @@ def _compiled_fast(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
         return
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiled, "SMALL", sys.maxsize)
+        patch.setattr(programs, "SMALL", sys.maxsize)
         patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
         jax.config.update("jax_disable_most_optimizations", True)
         yield

@@ -171,6 +171,11 @@ class ItuLaw(NamedTuple):
     d: float
 
 
+def frequency_independent_law(material: Material) -> ItuLaw:
+    """The law of a material whose constants are the same at all frequencies."""
+    return ItuLaw(0, inf, material.relative_permittivity, 0.0, material.conductivity, 0.0)
+
+
 _Table = Mapping[str, tuple[ItuLaw, ...]]
 
 

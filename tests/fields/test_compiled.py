@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import synthetic
-from calibray.fields import compiled, evaluation, layout, path_losses_and_slopes
-from calibray.fields.combining import POWER
+from calibray.fields import evaluation, jax_context, layout, path_losses_and_slopes
+from calibray.fields import program as programs
+from calibray.fields.propagation import POWER
 from calibray.paths import Kind
 
 SEQUENCES = [(Kind.DIFFUSE,), (Kind.REFRACTION, Kind.DIFFUSE)]
@@ -24,13 +25,13 @@ def test_a_small_program_has_the_numbers_of_a_large_one(monkeypatch: pytest.Monk
     paths = synthetic.program(SEQUENCES[1:] * 8, seed=8)
     program, table = layout(paths, phases=False).program, paths.material_table()[None]
     of_tests = path_losses_and_slopes(program, table, (0,))
-    monkeypatch.setattr(compiled, "WIDE", compiled.WIDE | OPTIMIZED)
-    monkeypatch.setattr(compiled, "_QUICK", OPTIMIZED | compiled._QUICK)
-    function = compiled.compiled(evaluation._slopes_by_formula.__wrapped__, static_argnums=3)
-    assert compiled.is_small(program)
+    monkeypatch.setattr(jax_context, "WIDE", jax_context.WIDE | OPTIMIZED)
+    monkeypatch.setattr(jax_context, "_QUICK", OPTIMIZED | jax_context._QUICK)
+    function = jax_context.compiled(evaluation._slopes_by_formula.__wrapped__, static_argnums=3)
+    assert program.is_small
     small = function(program, table, 1, (0,), POWER)
-    monkeypatch.setattr(compiled, "SMALL", 0)
-    assert not compiled.is_small(program)
+    monkeypatch.setattr(programs, "SMALL", 0)
+    assert not program.is_small
     large = function(program, table, 1, (0,), POWER)
     for answers in zip(small, large, of_tests[:2], strict=True):
         for other in answers[1:]:
@@ -41,18 +42,18 @@ def test_a_small_program_has_the_numbers_of_a_large_one(monkeypatch: pytest.Monk
 
 
 def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = compiled._xla_has_the_option.__wrapped__
+    known = jax_context._xla_has_the_option.__wrapped__
     assert known()
-    monkeypatch.setattr(compiled, "_QUICK", {"xla_cpu_no_such_option": True})
+    monkeypatch.setattr(jax_context, "_QUICK", {"xla_cpu_no_such_option": True})
     assert not known()
 
 
 def test_only_small_programs_are_compiled_fast(monkeypatch: pytest.MonkeyPatch) -> None:
     program = layout(synthetic.program(SEQUENCES, seed=8), phases=False).program
-    assert compiled._xla_has_the_option()
-    monkeypatch.setattr(compiled, "_QUICK", {"xla_cpu_no_such_option": True})
-    function = compiled.compiled(lambda program: jnp.zeros(()))
+    assert jax_context._xla_has_the_option()
+    monkeypatch.setattr(jax_context, "_QUICK", {"xla_cpu_no_such_option": True})
+    function = jax_context.compiled(lambda program: jnp.zeros(()))
     with pytest.raises(jax.errors.JaxRuntimeError, match="no_such_option"):
         function(program)
-    monkeypatch.setattr(compiled, "SMALL", 0)
+    monkeypatch.setattr(programs, "SMALL", 0)
     assert function(program) == 0

@@ -8,7 +8,7 @@ import pytest
 from calibray.errors import InputError
 from calibray.materials import FIELDS, Material, itu_law, itu_material
 from calibray.parameters import Parameter, Parameters, start_value
-from calibray.parameters.laws import CONSTANT_OF_FIELD, LAWS, power_law
+from calibray.parameters.parameter import CONSTANT_OF_FIELD, LAWS, power_law
 
 BASE = {"walls": Material(5.0, 0.1, 0.3), "soil": Material(3.0, 0.01, 0.5)}
 CONCRETE = itu_law("concrete", 4e9)

@@ -16,8 +16,7 @@ from calibray.cli.console import echo
 from calibray.cli.doctor import cache, doctor, ledger
 from calibray.cli.init import init, open, schema
 from calibray.cli.predict import map, predict, suggest
-from calibray.cli.report import export, report
-from calibray.cli.run import demo, run, trace
+from calibray.cli.run import demo, export, report, run, trace
 from calibray.cli.scene import scene
 from calibray.cli.validate import compare, validate
 from calibray.errors import EngineError, InputError

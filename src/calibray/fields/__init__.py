@@ -9,8 +9,6 @@ settings (`calibray.fields.jax_settings`); importing the package does not change
 
 from calibray.fields.coefficient_tables import FINEST as FINEST
 from calibray.fields.coefficient_tables import table_intervals as table_intervals
-from calibray.fields.combining import Combining as Combining
-from calibray.fields.combining import path_loss_of_gains as path_loss_of_gains
 from calibray.fields.effects import DisplacementLoss as DisplacementLoss
 from calibray.fields.effects import EffectBatch as EffectBatch
 from calibray.fields.effects import Effects as Effects
@@ -35,3 +33,5 @@ from calibray.fields.observables import link_responses_and_slopes as link_respon
 from calibray.fields.program import GroupedProgram as GroupedProgram
 from calibray.fields.program import Layout as Layout
 from calibray.fields.program import layout as layout
+from calibray.fields.propagation import Combining as Combining
+from calibray.fields.propagation import path_loss_of_gains as path_loss_of_gains

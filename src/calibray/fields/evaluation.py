@@ -26,8 +26,6 @@ from scipy.constants import speed_of_light
 from calibray.fields import coefficient_tables
 from calibray.fields.arithmetic import Pair, materialize, segment_sums
 from calibray.fields.coefficient_tables import CoefficientTables, TableLayout
-from calibray.fields.combining import POWER, Combining, decibel, link_power, path_power
-from calibray.fields.compiled import WIDE, compiled
 from calibray.fields.effects import (
     AntennaFields,
     EffectBatch,
@@ -36,7 +34,7 @@ from calibray.fields.effects import (
     with_antenna_fields,
 )
 from calibray.fields.grouping import COEFFICIENT
-from calibray.fields.jax_context import jax_settings
+from calibray.fields.jax_context import WIDE, compiled, jax_settings
 from calibray.fields.material_response import (
     GroupResponse,
     MaterialResponse,
@@ -45,7 +43,7 @@ from calibray.fields.material_response import (
     split_by_step,
 )
 from calibray.fields.program import FormulaArguments, GroupedProgram, layout
-from calibray.fields.propagation import path_fields
+from calibray.fields.propagation import POWER, Combining, decibel, link_power, path_fields, path_power
 from calibray.materials import Material
 from calibray.paths import Paths
 

@@ -20,13 +20,11 @@ from numpy.typing import NDArray
 
 from calibray.fields.arithmetic import materialize
 from calibray.fields.channel import angular_spread, delay_spread, k_factor_db, link_mean
-from calibray.fields.combining import decibel, path_power
-from calibray.fields.compiled import compiled
 from calibray.fields.effects import Effects, apply_effects
-from calibray.fields.jax_context import jax_settings
+from calibray.fields.jax_context import compiled, jax_settings
 from calibray.fields.material_response import material_response, split_by_step
 from calibray.fields.program import GroupedProgram
-from calibray.fields.propagation import path_fields
+from calibray.fields.propagation import decibel, path_fields, path_power
 from calibray.measurements.observables import (
     ARRIVAL_ELEVATION,
     DELAY_BIN,

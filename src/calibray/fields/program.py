@@ -36,6 +36,10 @@ from calibray.paths import Kind, Paths
 PADDED: Final = 50_000
 """Largest number of interactions at which a program with tables is padded."""
 
+SMALL: Final = 300
+"""Largest number of coefficients of a small program. With 120, path loss and derivatives are compiled in 2.3 s instead
+of 3.4 s, and a candidate takes up to 20 us longer; with 960, 135 us longer (`docs/measurements/speed.md`)."""
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -157,6 +161,12 @@ class GroupedProgram:
         if self.link is None or self.delay is None:
             raise InputError("the program was laid out for sums of powers only; lay it out with phases=True")
         return self.link, self.delay
+
+    @property
+    def is_small(self) -> bool:
+        """Whether it takes so little time to evaluate that the time of its compilation matters more."""
+        source = self.coefficients
+        return isinstance(source, FormulaArguments) and len(source.material) <= SMALL
 
     @property
     def nbytes(self) -> int:

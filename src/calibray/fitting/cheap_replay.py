@@ -23,7 +23,7 @@ from calibray.materials import Material
 from calibray.measurements.observables import Statistic
 from calibray.optimizers.protocol import CheapAnswer, Constants
 from calibray.parameters import Parameter, Parameters
-from calibray.parameters.laws import PARAMETER_BOUNDS
+from calibray.parameters.parameter import PARAMETER_BOUNDS
 from calibray.result.verdict import Remark, RemarkKind
 from calibray.study import Setup
 from calibray.support.progress import Progress

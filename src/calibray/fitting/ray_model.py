@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from calibray.engines.rays.export import Export
 from calibray.fields import GroupedProgram, Layout, jax_settings, layout, program_gains
-from calibray.fields.combining import path_power
+from calibray.fields.propagation import path_power
 from calibray.fitting.cheap_replay import METAL
 from calibray.materials import FIELDS, Material
 from calibray.parameters import Parameters

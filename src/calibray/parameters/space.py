@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.materials import FIELDS, ItuLaw, Material, constants_matrix
-from calibray.parameters.laws import (
+from calibray.materials import FIELDS, ItuLaw, Material, constants_matrix, frequency_independent_law
+from calibray.parameters.parameter import (
     LAWS,
     PARAMETER_BOUNDS,
+    Parameter,
     check_law,
-    frequency_independent_law,
+    check_material,
     power_law,
 )
-from calibray.parameters.parameter import Parameter, check_material
 
 _DEFAULT_LAW: Final = frequency_independent_law(Material(1.0, 0.0, 1.0))
 _UNBOUNDED: Final = 1e300

@@ -8,7 +8,7 @@ from math import log
 from typing import Final
 
 from calibray.fitting.nuisance import OFFSET
-from calibray.parameters.laws import PARAMETER_BOUNDS
+from calibray.parameters.parameter import PARAMETER_BOUNDS
 from calibray.reporting.wording import diagnostics_table
 from calibray.result import wording
 from calibray.result.record import Record

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from calibray.optimizers.methods import label
-from calibray.parameters.laws import PARAMETER_BOUNDS
+from calibray.parameters.parameter import PARAMETER_BOUNDS
 from calibray.reporting.wording import block_sentence, prediction_text, scene_alone_text
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict

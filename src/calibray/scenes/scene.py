@@ -26,10 +26,10 @@ from calibray.materials import (
     SCALAR_CONSTANTS,
     ItuLaw,
     Material,
+    frequency_independent_law,
     itu_law,
     itu_material,
 )
-from calibray.parameters.laws import frequency_independent_law
 from calibray.scenes.scene_file import keep_traced_elements, parse, scene_path
 from calibray.scenes.shapes import SurfaceSize, local_origin, read_surface, write_local_shape
 from calibray.support.messages import did_you_mean, shortened

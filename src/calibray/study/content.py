@@ -13,7 +13,7 @@ from calibray.engines.kinds import AnyEngine, default
 from calibray.errors import InputError
 from calibray.materials import DEFAULT_REVISION, itu_material
 from calibray.parameters import Parameter, Parameters, itu_start, split_name
-from calibray.parameters.laws import ROUGHNESS
+from calibray.parameters.parameter import ROUGHNESS
 from calibray.scenes.obstruction import REGION
 from calibray.study.calibration_sections import (
     FidelitySection,

@@ -13,9 +13,9 @@ from pydantic import Field, model_validator
 from scipy.constants import speed_of_light
 
 from calibray.errors import InputError
-from calibray.materials import DEFAULT_REVISION, Material, itu_law, itu_material
+from calibray.materials import DEFAULT_REVISION, Material, frequency_independent_law, itu_law, itu_material
 from calibray.parameters import Parameters
-from calibray.parameters.laws import ROUGHNESS, frequency_independent_law
+from calibray.parameters.parameter import ROUGHNESS
 from calibray.paths import Kind, Paths
 from calibray.scenes import Scene, check_material_name
 from calibray.study.regions import Place, read_polygons

@@ -16,11 +16,10 @@ from pydantic import ValidationError
 
 from calibray.engines.kinds.replay import ReplaySection
 from calibray.errors import InputError
-from calibray.materials import ItuLaw, Material
+from calibray.materials import ItuLaw, Material, frequency_independent_law
 from calibray.measurements import Measurements
 from calibray.parameters import LogNormal, Parameter, Parameters, is_effect, split_name, start_value
-from calibray.parameters.laws import ROUGHNESS, frequency_independent_law
-from calibray.parameters.parameter import check_material
+from calibray.parameters.parameter import ROUGHNESS, check_material
 from calibray.scenes.obstruction import CLUTTER
 from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study.calibration_sections import NuisanceTerm

@@ -18,7 +18,7 @@ from calibray.engines.replay import Computation, Replay
 from calibray.fitting.problem import Problem
 from calibray.measurements.observables import Statistic
 from calibray.parameters import Parameters
-from calibray.parameters.laws import PARAMETER_BOUNDS
+from calibray.parameters.parameter import PARAMETER_BOUNDS
 from calibray.paths import Paths
 from calibray.scenes import Scene, building_numbers, read_triangles
 
