@@ -293,14 +293,6 @@ def test_a_logarithmic_parameter_is_searched_by_its_logarithm():
     assert parameters.search_slope(values)[0] == pytest.approx((ahead - behind)[0] / (2 * step))
 
 
-def test_a_surrogate_uses_the_scale_of_a_parameter(tmp_path, exact):
-    def history(**options):
-        method = {"name": "vector-surrogate", "options": {"budget": 9, **options}}
-        return run(tmp_path, exact, None, method=method).history.rmse_db.tolist()
-
-    assert history() == history(logarithmic=False) != history(logarithmic=True)
-
-
 @pytest.mark.parametrize(
     ("method", "message"),
     [

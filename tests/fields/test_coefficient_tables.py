@@ -188,7 +188,7 @@ def test_large_programs_are_tabulated_without_padding(monkeypatch: pytest.Monkey
     table = paths.material_table()[None]
     padded = layout(paths, np.float64, 512).program
     assert any("r" in group.signature for group in padded.groups)
-    monkeypatch.setattr(program, "PADDED", 0)
+    monkeypatch.setattr(program, "LARGE", 0)
     exact = layout(paths, np.float64, 512).program
     assert all("r" not in group.signature for group in exact.groups)
     np.testing.assert_allclose(path_losses(exact, table)[0], path_losses(padded, table)[0], rtol=1e-12)

@@ -71,9 +71,6 @@ def calibrate(
         cheap_model: A study with the same links and materials whose replay is the cheap model of an expensive engine;
             if None, the study itself.
 
-    Returns:
-        The result.
-
     Raises:
         InputError: Something in the study, the method or the folder cannot be used.
         EngineError: The engine failed.

@@ -75,15 +75,11 @@ def _leverage(problem: Problem, best: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def leverage(jacobian: NDArray[np.float64], design: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Leverage of each link: how much its model follows its own measurement.
+    """Leverage of each link [m]: how much its model follows its own measurement.
 
-    Args:
-        jacobian: Derivatives of the residuals with respect to the parameters, with the nuisance eliminated [m, d].
-        design: Columns of the nuisance at the same links, scaled like the residuals [m, q].
-
-    Returns:
-        Diagonal of the projection onto both [m]: 0 for a link without influence, 1 for a link that alone determines an
-        unknown. The sum is the number of unknowns that the links determine.
+    It is the diagonal of the projection onto the derivatives of the residuals, with the nuisance eliminated [m, d], and
+    the columns of the nuisance, scaled like the residuals [m, q]: 0 for a link without influence, 1 for a link that
+    alone determines an unknown. The sum is the number of unknowns that the links determine.
 
     Example:
         >>> leverage(np.array([[1.0], [1.0], [0.0]]), np.zeros((3, 0))).round(2).tolist()

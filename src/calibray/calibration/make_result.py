@@ -63,12 +63,7 @@ FAINT: Final = "predicted too near the noise floor, left out"
 
 @dataclass(frozen=True)
 class Timing:
-    """Time of parts of a calibration [s].
-
-    Attributes:
-        search: The search by the method, without tracing.
-        trace: Tracing and loading before the search.
-    """
+    """Time of the search by the method, without tracing, and of tracing and loading before it [s]."""
 
     search: float
     trace: float

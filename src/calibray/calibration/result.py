@@ -40,14 +40,7 @@ class Result(Record):
 
     @classmethod
     def load(cls, folder: str | Path, *, allow_changed_inputs: bool = False) -> Result:
-        """Read a folder that `save` wrote.
-
-        Args:
-            folder: The folder.
-            allow_changed_inputs: Read the result although its files were changed after they were written.
-
-        Returns:
-            The result.
+        """Read a folder that `save` wrote; with `allow_changed_inputs`, although its files were changed since.
 
         Raises:
             InputError: The folder contains no result, or a result of another version, or one that was damaged or
@@ -77,11 +70,8 @@ class Result(Record):
     def save(self, folder: str | Path, overwrite: bool = False) -> None:
         """Write `result.json`, `result-links.csv`, `result-history.csv` and the calibrated `result-scene.xml`.
 
-        After a validation, it also writes `result-validation.json`. Every file is written completely or not at all.
-
-        Args:
-            folder: Folder to write into; created if absent.
-            overwrite: Replace files that Calibray did not write.
+        After a validation, it also writes `result-validation.json`. Every file is written completely or not at all. The
+        folder is created if absent; `overwrite` also replaces files that Calibray did not write.
 
         Raises:
             InputError: The folder cannot be written, or a file there must not be replaced.

@@ -286,9 +286,6 @@ def compare(
         workers: Number of processes.
         progress: Called after every run.
 
-    Returns:
-        The comparison.
-
     Raises:
         InputError: A method, a number or the folder is invalid.
     """

@@ -234,11 +234,8 @@ def run_optimizer(problem: ComparisonProblem, key: RunKey, make: Callable[[], Op
 class RunFile:
     """Finished runs of one problem, in a file of JSON lines that can also contain runs of other problems.
 
-    Runs are appended one by one, so an interrupted comparison continues where it stopped.
-
-    Args:
-        path: The file; created when the first run is added.
-        problem: Digest of everything that determines a run apart from method, budget and seed.
+    Runs are appended one by one, so an interrupted comparison continues where it stopped. The file is created when the
+    first run is added; `problem` is a digest of everything that determines a run apart from method, budget and seed.
 
     Raises:
         InputError: The file contains something else.

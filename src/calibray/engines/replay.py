@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from calibray import fields
 from calibray.engines.protocol import Responses, check_candidates, joined, of_links
+from calibray.fields.program import LARGE
 from calibray.materials import Material
 from calibray.measurements.observables import Statistic
 from calibray.parameters import Parameters
@@ -19,9 +20,6 @@ from calibray.paths import Paths
 
 MOST_DERIVATIVES: Final = 2_000_000
 """Largest number of derivatives with respect to material constants in one call; more would fill the memory."""
-
-LARGE: Final = 50_000
-"""Number of interactions above which a program is large."""
 
 MAY_TABULATE: Final = 30_000
 """Number of interactions above which coefficients may come from tables."""

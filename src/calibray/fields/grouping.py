@@ -37,12 +37,7 @@ Step = tuple[str, NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class PathGroup:
-    """Paths that are evaluated together.
-
-    Attributes:
-        paths: Their indices [n].
-        steps: Their interactions, step by step.
-    """
+    """Paths that are evaluated together: their indices [n], and their interactions step by step."""
 
     paths: NDArray[np.int64]
     steps: tuple[Step, ...]

@@ -163,9 +163,8 @@ def compiled(
 ) -> Callable[..., Any]:
     """A compiled function, like `jax.jit`, whose first argument is a program or has one as `program`.
 
-    Args:
-        function: The function; None returns a decorator.
-        static_argnums: Positions of arguments for whose every value it is compiled.
+    It is compiled for every value of the arguments at the positions `static_argnums`. Without a function, the result is
+    a decorator.
     """
     if function is None:
         return lambda function: compiled(function, static_argnums=static_argnums)

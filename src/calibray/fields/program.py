@@ -33,8 +33,8 @@ from calibray.fields.jax_context import jax_settings
 from calibray.fields.slab import Mode
 from calibray.paths import Kind, Paths
 
-PADDED: Final = 50_000
-"""Largest number of interactions at which a program with tables is padded."""
+LARGE: Final = 50_000
+"""Number of interactions above which a program is large: it is not padded, and a candidate takes milliseconds."""
 
 SMALL: Final = 300
 """Largest number of coefficients of a small program. With 120, path loss and derivatives are compiled in 2.3 s instead
@@ -176,12 +176,7 @@ class GroupedProgram:
 
 @dataclass(frozen=True)
 class Layout:
-    """A grouped program and the order of its paths.
-
-    Attributes:
-        program: The program.
-        order: Index in the path program of every path of the grouped program [P].
-    """
+    """A grouped program, and the index in the path program of each of its paths [P]."""
 
     program: GroupedProgram
     order: NDArray[np.int64]
@@ -201,7 +196,7 @@ def layout(
     kept. Without them, only sums of powers can be computed.
     """
     # Arrays are put on the device as they are: jnp.asarray compiles a program for every shape, 15 ms each.
-    padded = intervals is None or paths.num_interactions <= PADDED
+    padded = intervals is None or paths.num_interactions <= LARGE
     path_groups = padded_groups(paths) if padded else exact_groups(paths)
     order = _joined([group.paths for group in path_groups])
     numbering = _Numbering(paths, path_groups)

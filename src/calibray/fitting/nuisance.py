@@ -112,9 +112,6 @@ def make_term(
         bounds: Lower and upper bound of the coefficients; unbounded if None.
         prior: Standard deviation of the coefficients' Gaussian prior around zero; flat if None.
 
-    Returns:
-        The term.
-
     Raises:
         InputError: The bounds are not ordered, the prior is not positive, the number of labels is wrong, or the column
             does not exist or is not numeric.

@@ -315,9 +315,6 @@ def make_objective(
         ceiling_db: Path loss assigned to a link without a path [dB]; if None, these links are left out.
         noise_db: Standard deviation of a link's error [dB]; required if a coefficient has a prior.
 
-    Returns:
-        The objective.
-
     Raises:
         InputError: No link is left, the nuisance has another number of links, or a prior is given without noise_db.
     """

@@ -163,7 +163,7 @@ LARGEST_TABLE: Final = 2 * 2**30
 LARGEST_ROW_GROUP: Final = 2**30
 """Largest decompressed size of a row group, or of a piece, of a Parquet file that is read in pieces [bytes]."""
 
-DECODING_MEMORY: Final = 4 * 2**30
+DECODING_MEMORY: Final = 2 * LARGEST_TABLE
 """Limit of the address space in which a Parquet file is first decoded [bytes]."""
 
 PIECE_ROWS: Final = 100_000

@@ -56,12 +56,7 @@ def choice(name: str, value: str, allowed: Iterable[str]) -> str:
 
 @dataclass(frozen=True)
 class Box:
-    """A box lower <= x <= upper; build it with `Box.between`, which checks the bounds.
-
-    Attributes:
-        lower: Lower bounds [d].
-        upper: Upper bounds [d], each above its lower bound.
-    """
+    """A box lower <= x <= upper [d]; build it with `Box.between`, which checks the bounds."""
 
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
@@ -102,11 +97,6 @@ class Box:
     def width(self) -> NDArray[np.float64]:
         """Upper minus lower bounds [d]."""
         return self.upper - self.lower
-
-    @property
-    def centre(self) -> NDArray[np.float64]:
-        """The middle of the box [d]."""
-        return 0.5 * (self.lower + self.upper)
 
     def clip(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Move points outside the box to its nearest face [..., d]."""

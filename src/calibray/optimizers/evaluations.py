@@ -23,12 +23,7 @@ DECIMALS = 9
 
 @dataclass(frozen=True)
 class Best:
-    """The best real evaluation so far.
-
-    Attributes:
-        x: The point [d].
-        y: Its value; +inf if every evaluation failed.
-    """
+    """The best real evaluation so far: the point [d] and its value, +inf if every evaluation failed."""
 
     x: NDArray[np.float64]
     y: float

@@ -11,8 +11,7 @@ following choices apply where descriptions and common implementations differ:
 - Positions outside the bounds are clipped to them before evaluation.
 - A failed evaluation (+inf) ranks last and has no other effect.
 - C multiplies a position, so steps are short near the origin of the coordinates and long far from it: the pack is
-  biased towards the origin. This is the published algorithm and the default; with `centred=True`, positions are
-  measured from the middle of the box instead, and the origin has no effect.
+  biased towards the origin, as published.
 
 SGWO-IM, the Surrogate-assisted Grey Wolf Optimizer with Individual Memory, is X. Zou, P. Tang, P. Liu, C. Tai,
 "Efficient and Accurate Surrogate-Assisted Electromagnetic Parameter Calibration for 6G Digital Twin Channels",
@@ -32,22 +31,19 @@ The following choices apply where the paper is silent, in addition to those of G
 
 With `w_min = w_max = 0`, linear convergence and no surrogate, this is GWO, bit for bit.
 
-The surrogate is SciPy's `RBFInterpolator` on inputs scaled to the unit cube, with smoothing 1e-6. The default kernel is
-cubic with a linear tail. The Gaussian one is the classical RBF network with a constant tail; its width follows the rule
-of the largest spacing, sigma = d_max / sqrt(2 M) for M centres (S. Haykin, Neural Networks, 2nd ed., sec. 5.13).
-Repeated points are merged with the mean of their objectives. A failed evaluation counts as the worst successful one, so
-that the model avoids it and is not distorted by infinity.
+The surrogate is SciPy's `RBFInterpolator`, cubic with a linear tail, on inputs scaled to the unit cube, with smoothing
+1e-6. Repeated points are merged with the mean of their objectives. A failed evaluation counts as the worst successful
+one, so that the model avoids it and is not distorted by infinity.
 """
 
 from __future__ import annotations
 
-from math import cos, pi, sqrt
+from math import cos, pi
 from typing import ClassVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RBFInterpolator
-from scipy.spatial.distance import pdist
 
 from calibray.errors import InputError
 from calibray.optimizers.arguments import Box, choice, real, whole
@@ -69,7 +65,6 @@ FULL_ITERATIONS = 5
 ELITES = 5
 """K, wolves evaluated in each later iteration (table II)."""
 
-KERNELS = ("cubic", "gaussian")
 SMOOTHING = 1e-6
 
 
@@ -84,19 +79,16 @@ def encircle(
     a: float,
     r1: NDArray[np.float64],
     r2: NDArray[np.float64],
-    origin: NDArray[np.float64] | float = 0.0,
 ) -> NDArray[np.float64]:
     """Move a pack by the guidance of its leaders (Mirjalili et al. 2014, eqs. 3.1 to 3.7).
 
-    `r1` and `r2` [n, 3, d] are independent uniform random numbers, `leaders` are alpha, beta and delta [3, d], and
-    positions [n, d] are measured from `origin` [d]. Returns X_GWO, the mean of the three guided positions [n, d], not
-    yet clipped.
+    `r1` and `r2` [n, 3, d] are independent uniform random numbers, and `leaders` are alpha, beta and delta [3, d].
+    Returns X_GWO, the mean of the three guided positions [n, d], not yet clipped.
     """
-    guide = leaders - origin
     a_coefficient = 2.0 * a * r1 - a  # A, eq. 3.3
     c_coefficient = 2.0 * r2  # C, eq. 3.4
-    distance = np.abs(c_coefficient * guide - (positions - origin)[:, None, :])  # D, eq. 3.5
-    return (guide - a_coefficient * distance).mean(axis=1) + origin  # eqs. 3.6, 3.7
+    distance = np.abs(c_coefficient * leaders - positions[:, None, :])  # D, eq. 3.5
+    return (leaders - a_coefficient * distance).mean(axis=1)  # eqs. 3.6, 3.7
 
 
 def whole_iterations(budget: int) -> dict[str, int]:
@@ -119,7 +111,6 @@ class GWO(Optimizer):
     Args:
         population: N, number of wolves.
         iterations: T.
-        centred: Measure positions from the middle of the box instead of the origin.
 
     Raises:
         InputError: An argument is out of range.
@@ -144,13 +135,11 @@ class GWO(Optimizer):
         seed: int = 0,
         population: int = WOLVES,
         iterations: int = 20,
-        centred: bool = False,
     ) -> None:
         self.box = Box.between(lower, upper)
         self.population = whole("population", population, at_least=LEADERS)
         self.iterations = whole("iterations", iterations, at_least=1)
         self._budget = self.population * self.iterations
-        self.origin = self.box.centre if centred else np.zeros(self.box.dimension)
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
         self._session = Session(self.box, self.uses, self._search)
 
@@ -165,7 +154,7 @@ class GWO(Optimizer):
             yield positions
             r1, r2 = self._rng.random((2, self.population, LEADERS, self.box.dimension))
             a = linear_decay(iteration, self.iterations)
-            positions = self.box.clip(encircle(positions, archive.leaders(LEADERS), a, r1, r2, self.origin))
+            positions = self.box.clip(encircle(positions, archive.leaders(LEADERS), a, r1, r2))
 
 
 def cosine_decay(iteration: int, iterations: int) -> float:
@@ -209,8 +198,6 @@ class SGWOIM(Optimizer):
         w_max: Memory weight at the end.
         convergence: "cosine" (the paper's eq. 2) or "linear" (standard GWO).
         surrogate: Whether the surrogate selects wolves; without it, every iteration evaluates the whole population.
-        kernel: Radial basis function of the surrogate: "cubic" or "gaussian".
-        centred: Measure positions from the middle of the box instead of the origin.
 
     Raises:
         InputError: An argument is out of range.
@@ -232,8 +219,6 @@ class SGWOIM(Optimizer):
         w_max: float = 0.3,
         convergence: str = "cosine",
         surrogate: bool = True,
-        kernel: str = "cubic",
-        centred: bool = False,
     ) -> None:
         self.box = Box.between(lower, upper)
         self.population = whole("population", population, at_least=LEADERS)
@@ -244,7 +229,6 @@ class SGWOIM(Optimizer):
         self.w_max = real("w_max", w_max, at_least=0.0, at_most=1.0)
         self.convergence = choice("convergence", convergence, CONVERGENCE)
         self.surrogate = surrogate
-        self.kernel = choice("kernel", kernel, KERNELS)
         samples, d = self.population * self.full_iterations, self.box.dimension
         if surrogate and samples <= d:
             raise InputError(
@@ -253,7 +237,6 @@ class SGWOIM(Optimizer):
             )
         full = min(self.full_iterations, self.iterations) if surrogate else self.iterations
         self._budget = self.population * full + self.elites * (self.iterations - full)
-        self.origin = self.box.centre if centred else np.zeros(d)
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
         self._memory: Evaluations | None = None
         self._session = Session(self.box, self.uses, self._search)
@@ -287,14 +270,14 @@ class SGWOIM(Optimizer):
             a = CONVERGENCE[self.convergence](iteration, total)  # eq. 2
             w = memory_weight(iteration, total, self.w_min, self.w_max)  # eq. 4
             r1, r2 = self._rng.random((2, self.population, LEADERS, self.box.dimension))
-            guided = encircle(positions, archive.leaders(LEADERS), a, r1, r2, self.origin)
+            guided = encircle(positions, archive.leaders(LEADERS), a, r1, r2)
             positions = self.box.clip((1.0 - w) * guided + w * memory.x)  # eq. 3
 
     def _screen(self, archive: Archive, positions: NDArray[np.float64], iteration: int) -> NDArray[np.intp]:
         """The wolves to evaluate: first all of them, then the K that the surrogate ranks best."""
         if not self.surrogate or iteration <= self.full_iterations:
             return np.arange(self.population)
-        predicted = predict(archive, positions, self.kernel)
+        predicted = predict(archive, positions)
         return np.argsort(predicted, kind="stable")[: self.elites]
 
 
@@ -306,7 +289,7 @@ def remember(memory: Evaluations, wolves: NDArray[np.intp], answers: Evaluations
     return Evaluations(read_only(x), read_only(y))
 
 
-def predict(archive: Archive, candidates: NDArray[np.float64], kernel: str = "cubic") -> NDArray[np.float64]:
+def predict(archive: Archive, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
     """Predict the objective of candidates [n, d] from all real evaluations; zero while all have failed.
 
     The archive must contain more than d distinct points that span the box.
@@ -315,9 +298,5 @@ def predict(archive: Archive, candidates: NDArray[np.float64], kernel: str = "cu
         return np.zeros(len(candidates))
     evaluated = archive.imputed(archive.all())
     x, y = merge_repeated(archive.box.to_unit(evaluated.x), evaluated.y)
-    if kernel == "gaussian":
-        # phi(r) = exp(-(epsilon r)^2) with epsilon = 1 / (sqrt(2) sigma)
-        settings = {"kernel": "gaussian", "epsilon": sqrt(len(x)) / pdist(x).max(), "degree": 0}
-    else:
-        settings = {"kernel": "cubic", "degree": 1}
-    return RBFInterpolator(x, y, smoothing=SMOOTHING, **settings)(archive.box.to_unit(candidates))
+    model = RBFInterpolator(x, y, smoothing=SMOOTHING, kernel="cubic", degree=1)
+    return model(archive.box.to_unit(candidates))

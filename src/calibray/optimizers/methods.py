@@ -107,9 +107,6 @@ def make(
         cheap_model: A cheap model of the engine, for methods that use one.
         options: Settings of the method, which override all of these.
 
-    Returns:
-        The optimizer.
-
     Raises:
         InputError: The method does not exist, it has no such setting or refuses a value, the budget is too small, or
             its library is not installed.

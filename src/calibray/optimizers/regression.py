@@ -105,9 +105,7 @@ class Kernel:
 class Trend(NamedTuple):
     """A trend at evaluated points.
 
-    Attributes:
-        contrasts: C [n, f].
-        left_inverse: Maps values at the points to the coefficients of the trend through them [p, n].
+    `contrasts` is C [n, f]; `left_inverse` maps values at the points to the coefficients of the trend [p, n].
     """
 
     contrasts: NDArray[np.float64]

@@ -32,8 +32,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.distance import cdist, pdist
 
-from calibray.errors import InputError
-from calibray.optimizers.arguments import Box, real, whole
+from calibray.optimizers.arguments import Box, whole
 from calibray.optimizers.descent import descend_all
 from calibray.optimizers.evaluations import Archive, Objective, merge_repeated, root_mean_square
 from calibray.optimizers.protocol import Optimizer, Search, Session
@@ -61,9 +60,6 @@ SEARCHES = 16
 UNCERTAIN = 1e-3
 """Share of the prior variance above which a predicted minimum counts as another basin."""
 
-PATIENCE = 4
-"""Number of successive batches with too small a predicted gain after which the search stops."""
-
 
 @final
 class VectorSurrogate(Optimizer):
@@ -74,10 +70,7 @@ class VectorSurrogate(Optimizer):
         initial: Points of the initial design, the lesser of 2 (d + 1) and d + 5 if None. Points passed to `tell` before
             the first `ask` count; those closer together than half of the design's spacing count as one.
         batch: Number of candidates per batch after the initial design, for engines that run in parallel.
-        logarithmic: Whether the model uses each parameter on a logarithmic scale, [d] or one for all.
         noisy: Whether the engine's answers scatter; the model then smooths instead of interpolating.
-        tolerance: Stop before the budget is used if the predicted gain stays below this, in the unit of the residuals'
-            root mean square; never if None.
 
     Raises:
         InputError: An argument is out of range.
@@ -104,9 +97,7 @@ class VectorSurrogate(Optimizer):
         budget: int | None = None,
         initial: int | None = None,
         batch: int = 1,
-        logarithmic: ArrayLike = False,
         noisy: bool = False,
-        tolerance: float | None = None,
         objective: Objective = root_mean_square,
     ) -> None:
         self.box = Box.between(lower, upper)
@@ -116,23 +107,21 @@ class VectorSurrogate(Optimizer):
         self.initial = default if initial is None else whole("initial", initial, at_least=d + 2)
         self.batch = whole("batch", batch, at_least=1)
         self.noisy = noisy
-        self.tolerance = None if tolerance is None else real("tolerance", tolerance, at_least=0.0)
-        self._logarithmic = _flags(logarithmic, self.box)
-        self._scaled_box = Box.between(self._scaled(self.box.lower), self._scaled(self.box.upper))
         self._model: Kriging | None = None
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
         self._session = Session(self.box, self.uses, self._search, objective)
 
     def _search(self, archive: Archive) -> Search:
-        d, left, quiet, turn = self.box.dimension, self._budget, 0, 0
-        missing = self._design(self._to_unit(archive.all().x) if len(archive) else np.empty((0, d)))[:left]
+        box, left, turn = self.box, self._budget, 0
+        d = box.dimension
+        missing = self._design(box.to_unit(archive.all().x) if len(archive) else np.empty((0, d)))[:left]
         if len(missing):
-            yield self._from_unit(missing)
+            yield box.from_unit(missing)
             left -= len(missing)
-        while left > 0 and quiet < PATIENCE:
+        while left > 0:
             count = min(self.batch, left)
             evaluated = archive.all()
-            unit, good = self._to_unit(evaluated.x), np.isfinite(evaluated.y)
+            unit, good = box.to_unit(evaluated.x), np.isfinite(evaluated.y)
             points, residuals = merge_repeated(unit, archive.imputed(evaluated).errors)
             spanned = np.linalg.matrix_rank(points - points.mean(axis=0))
             if spanned < d or len(points) < d + 2 or good.sum() < 2:  # too few points for a model
@@ -141,9 +130,8 @@ class VectorSurrogate(Optimizer):
                 self._model = self._fitted(points, residuals)
                 best_first = unit[np.argsort(evaluated.y, kind="stable")]
                 best = float(root_mean_square(archive.leading.errors)[0])
-                chosen, gain = self._choose(self._model, best_first, best, turn, count)
-                quiet = quiet + 1 if self.tolerance is not None and gain < self.tolerance else 0
-            yield self._from_unit(chosen)
+                chosen = self._choose(self._model, best_first, best, turn, count)
+            yield box.from_unit(chosen)
             left, turn = left - count, turn + count
 
     def _design(self, earlier: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -170,31 +158,30 @@ class VectorSurrogate(Optimizer):
 
     def _choose(
         self, model: Kriging, taken: NDArray[np.float64], best: float, turn: int, count: int
-    ) -> tuple[NDArray[np.float64], float]:
-        """The next batch [count, d] and its predicted gain; `taken` are the evaluated points, best first."""
+    ) -> NDArray[np.float64]:
+        """The next batch [count, d]; `taken` are the evaluated points, best first."""
         d = self.box.dimension
         starts = np.vstack([taken[: SEARCHES // 2], self._rng.random((SEARCHES, d))])[:SEARCHES]
         minima = predicted_minima(model, starts)
-        chosen, gain = [], 0.0
+        chosen = []
         for step in range(turn, turn + count):
             fresh = minima[distance_to_nearest(minima, taken) > SEPARATION]
             if step % 3 and len(fresh):
-                mean, share = model.predict(fresh)
+                _, share = model.predict(fresh)
                 # argmax of flags is the first uncertain minimum, or the lowest one if none is uncertain
                 index = 0 if step % 3 == 1 else np.argmax(share > UNCERTAIN)
-                x, promised = fresh[index], best - float(np.sqrt(np.mean(mean[index] ** 2)))
+                x = fresh[index]
             else:
-                x, promised = self._explore(model, taken, fresh, best)
+                x = self._explore(model, taken, fresh, best)
             chosen.append(x)
-            gain = max(gain, promised)
             if len(chosen) < count:
                 model, taken = model.with_point(x), np.vstack([taken, x])
-        return np.array(chosen), gain
+        return np.array(chosen)
 
     def _explore(
         self, model: Kriging, taken: NDArray[np.float64], fresh: NDArray[np.float64], best: float
-    ) -> tuple[NDArray[np.float64], float]:
-        """The point of the largest expected improvement [d], and its predicted gain."""
+    ) -> NDArray[np.float64]:
+        """The point of the largest expected improvement [d]."""
         around = draw_around(taken[:5], CANDIDATES, -3.0, self._rng)
         candidates = np.vstack([self._rng.random((CANDIDATES, self.box.dimension)), around, fresh])
         candidates = candidates[distance_to_nearest(candidates, taken) > SEPARATION]
@@ -203,20 +190,8 @@ class VectorSurrogate(Optimizer):
         gain = improvement(mean, share, normal @ model.root, best)
         if not gain.any():  # no draw improves anywhere: take the point closest to improving
             centre, spread = mean_square(model, candidates)
-            return candidates[np.argmax((best**2 - centre) / np.maximum(spread, 1e-300))], 0.0
-        return candidates[np.argmax(gain)], best - np.sqrt(max(best**2 - gain.max(), 0.0))
-
-    def _scaled(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Logarithms of the logarithmic parameters."""
-        return np.where(self._logarithmic, np.log(np.where(self._logarithmic, x, 1.0)), x)
-
-    def _to_unit(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        return self._scaled_box.to_unit(self._scaled(x))
-
-    def _from_unit(self, unit: NDArray[np.float64]) -> NDArray[np.float64]:
-        scaled = self._scaled_box.from_unit(unit)
-        raised = np.exp(np.where(self._logarithmic, scaled, 0.0))
-        return self.box.clip(np.where(self._logarithmic, raised, scaled))
+            return candidates[np.argmax((best**2 - centre) / np.maximum(spread, 1e-300))]
+        return candidates[np.argmax(gain)]
 
 
 def mean_square(model: Kriging, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -250,17 +225,3 @@ def predicted_minima(model: Kriging, starts: NDArray[np.float64]) -> NDArray[np.
     """Local minima of the predicted objective, lowest first [k, d], from starting points in the unit cube [s, d]."""
     ends = descend_all(starts, model.mean_and_slope, 30, 1e-8)
     return ends.unit[np.argsort(ends.cost, kind="stable")]
-
-
-def _flags(value: ArrayLike, box: Box) -> NDArray[np.bool_]:
-    flags = np.array(value)
-    if flags.dtype != bool or flags.shape not in ((), (box.dimension,)):
-        raise InputError(
-            f"logarithmic = {value!r}; it must be True, False, or one of them for each parameter"
-        )
-    flags = np.broadcast_to(flags, box.dimension)
-    for index in np.flatnonzero(flags & (box.lower <= 0.0)):
-        raise InputError(
-            f"lower[{index}] = {box.lower[index]:g} of a logarithmic parameter; raise it above 0 or use a linear scale"
-        )
-    return flags

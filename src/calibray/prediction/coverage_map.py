@@ -72,9 +72,6 @@ def coverage_map(
         workers: Workers that trace and predict chunks of cells (`engines.open_workers`); this process if None.
         allow_changed_inputs: Predict although a file of the scene or an antenna has changed since the calibration.
 
-    Returns:
-        The map.
-
     Raises:
         InputError: An argument is impossible, a column is missing, there would be more than a million cells, or
             `Result.predict_interval` refuses the links.

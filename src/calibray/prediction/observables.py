@@ -31,12 +31,7 @@ deviation from them is 9 %."""
 
 
 class Replayed(NamedTuple):
-    """An engine over new links, with the values to evaluate.
-
-    Attributes:
-        engine: The engine.
-        values: Values of the prediction model, then of every draw [1 + draws, d].
-    """
+    """An engine over new links, and the values of the prediction model, then of every draw [1 + draws, d]."""
 
     engine: Engine
     values: NDArray[np.float64]
@@ -95,9 +90,7 @@ ERROR_DB: Final = 1.0
 class Worth(NamedTuple):
     """The observable worth measuring at a suggestion and those above it.
 
-    Attributes:
-        kind: The observable.
-        narrowed: Expected standard deviation of every parameter, relative to its value with path loss alone [d].
+    `narrowed` is the expected standard deviation of every parameter, relative to that with path loss alone [d].
     """
 
     kind: str

@@ -400,9 +400,8 @@ def _lengths(
 def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> Iterator[Explained]:
     """The best rectangle of the grid, width by width.
 
-    Args:
-        moments: Products of residuals and the columns of the cells, with the residuals in order first [cells, k].
-        products: Products of the columns of the cells [cells, cells].
+    The arguments are products of residuals and the columns of the cells, with the residuals in order first [cells, k],
+    and products of the columns of the cells [cells, cells].
     """
     moment = _summed(moments.reshape(GRID, GRID, -1), (0, 1))
     total = _summed(products.reshape((GRID,) * 4), (0, 1, 2, 3))

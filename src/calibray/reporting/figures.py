@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calibray.optimizers import label
 from calibray.reporting.link_survey import Survey, in_measured_quantity, measured_quantity
-from calibray.reporting.trust_figures import residuals_by_direction, trust_figures
+from calibray.reporting.trust_figures import PANELS, residuals_by_direction, trust_figures
 from calibray.result.record import Record
 from calibray.support.figure_style import (
     BLUE,
@@ -239,14 +239,10 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(start), int(end)) for start, end in edges.reshape(-1, 2)]
 
 
-MOST: Final = 6
-"""Largest number of observables that are drawn, the first ones of the study."""
-
-
 @styled()
 def measured_over_modelled(result: Record) -> Figure | None:
-    """Draw measured over modelled values of the observables, without biases of devices; None without observables."""
-    fits = dict(list(result.fit.observables.items())[:MOST])
+    """Draw measured over modelled values of the first observables, without biases of devices; None without any."""
+    fits = dict(list(result.fit.observables.items())[:PANELS])
     if not fits:
         return None
     columns = min(len(fits), 3)

@@ -113,9 +113,6 @@ def report(
         overwrite: Replace files that Calibray did not write.
         progress: Called with the stage "tracing" after every launch.
 
-    Returns:
-        The file.
-
     Raises:
         InputError: The file or the folder cannot be written, or a file in it must not be replaced.
     """

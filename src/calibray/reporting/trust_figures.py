@@ -43,8 +43,8 @@ BARS: Final = 36
 ROWS: Final = 14
 """Largest number of rows of the figure of power."""
 
-POLAR_FIGURES: Final = 6
-"""Largest number of transmitters that are drawn, those with the most links."""
+PANELS: Final = 6
+"""Largest number of panels of a figure: transmitters with the most links, or observables."""
 
 DEEPEST_DB: Final = -30.0
 """Level of the pattern at the centre of a figure [dB]; sector antennas radiate backwards at about this level."""
@@ -228,7 +228,7 @@ def residuals_by_direction(result: Record) -> Figure | None:
     labels = links.table.labels(study.links.transmitter) if has_names else np.full(len(links), "all")
     away = links.rx - links.tx
     bearing = np.arctan2(away[:, 0], away[:, 1])
-    names = sorted(name for name, _ in Counter(labels[shown].tolist()).most_common(POLAR_FIGURES))
+    names = sorted(name for name, _ in Counter(labels[shown].tolist()).most_common(PANELS))
     return _polar_figures(
         names, {name: shown & (labels == name) for name in names}, bearing, residuals, mounting
     )

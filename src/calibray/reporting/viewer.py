@@ -96,12 +96,7 @@ def strongest(paths: Paths, result: Record) -> Rays:
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid to which positions are rounded.
-
-    Attributes:
-        low: Its lower corner [3], [m].
-        step: Its spacing [m], the same in all directions.
-    """
+    """A grid to which positions are rounded: its lower corner [3], and its spacing in all directions [m]."""
 
     low: NDArray[np.float64]
     step: float

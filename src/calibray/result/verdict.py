@@ -136,12 +136,7 @@ Value = float | int | bool | str | list[str] | list[float] | list[list[float]]
 
 @dataclass(frozen=True)
 class Remark:
-    """One warning or piece of advice.
-
-    Attributes:
-        kind: The kind of remark.
-        values: Its numbers and names; see `RemarkKind`.
-    """
+    """One warning or piece of advice; `RemarkKind` describes its values."""
 
     kind: RemarkKind
     values: dict[str, Value] = field(default_factory=dict)

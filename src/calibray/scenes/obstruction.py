@@ -32,7 +32,7 @@ SAME_CROSSING: Final = 1e-3
 """Crossings closer than this count as one, on an edge that two triangles share [m]."""
 
 BATCH: Final = 2_000_000
-"""Largest number of pairs of a line and a triangle in memory at once."""
+"""Largest number of pairs of a line and a triangle in memory at once; each needs about 100 bytes."""
 
 CLEAR: Final = -0.78
 """Fresnel parameter below which an edge causes no loss (ITU-R P.526-15, section 4.1)."""

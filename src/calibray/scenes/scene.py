@@ -49,12 +49,7 @@ _BULK_FIELDS: Final = frozenset({"relative_permittivity", "conductivity"})
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One mesh of a scene.
-
-    Attributes:
-        name: Its id without the prefix `mesh-`.
-        material: Name of its material.
-    """
+    """One mesh of a scene: its id without the prefix `mesh-`, and the name of its material."""
 
     name: str
     material: str
@@ -104,9 +99,6 @@ def read_scene(
         split: Separate materials for some objects: by name of the new material, a pattern of object names in which `*`
             matches any text. If the name ends in `*`, each object gets its own material, with `*` replaced by the
             object's name.
-
-    Returns:
-        The scene.
 
     Raises:
         InputError: The file does not exist or is not a Mitsuba scene; a mesh is missing or malformed; a material has no

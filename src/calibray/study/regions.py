@@ -176,12 +176,7 @@ def _known(frame: Frame | None, path: Path) -> Frame:
 
 @dataclass(frozen=True)
 class Place:
-    """The data of a scene that regions need.
-
-    Attributes:
-        frame: Its position on the globe, if known.
-        surfaces: Reads its surfaces.
-    """
+    """The data of a scene that regions need: its position on the globe, if known, and a reader of its surfaces."""
 
     frame: Frame | None
     surfaces: Callable[[], SceneSurfaces]

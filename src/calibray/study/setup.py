@@ -98,9 +98,6 @@ class Setup:
             tracer: Opens the scene in a ray tracer.
             links: Links in place of the study's; none of them is held out.
 
-        Returns:
-            The opened study.
-
         Raises:
             InputError: The links, the scene, the parameters or the hold-out cannot be used.
         """

@@ -167,12 +167,9 @@ def read_rays(
 
 
 def write_rays(paths: Paths, file: str | Path, *, overwrite: bool = False) -> None:
-    """Write paths as a ray table, for other engines and programs.
+    """Write paths as a ray table, for other engines and programs; powers are those for the program's materials.
 
-    Args:
-        paths: The path program; powers are those for its materials.
-        file: A .csv, .parquet, .json or .h5 file.
-        overwrite: Replace a file that Calibray did not write.
+    The file ends in .csv, .parquet, .json or .h5; `overwrite` replaces one that Calibray did not write.
 
     Raises:
         InputError: The file cannot be written, or a path has no power.

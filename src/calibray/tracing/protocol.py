@@ -38,12 +38,7 @@ class Links(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class LinkPositions:
-    """The ends of links.
-
-    Attributes:
-        tx: Transmitters [L, 3], [m].
-        rx: Receivers [L, 3], [m].
-    """
+    """The ends of links: transmitters and receivers [L, 3] each, [m]."""
 
     tx: NDArray[np.float64]
     rx: NDArray[np.float64]

@@ -44,11 +44,7 @@ _NAME: Final = re.compile(r"[\w][\w .()+-]{0,119}")
 
 @dataclass(frozen=True)
 class StudyFolder:
-    """A study's folder.
-
-    Attributes:
-        path: The folder, absolute.
-    """
+    """A study's folder, by its absolute path."""
 
     path: Path
 
@@ -133,7 +129,6 @@ class StudyFolder:
         Raises:
             InputError: The content is not a study; the file is unchanged.
         """
-        from calibray.study import Study
         from calibray.study.toml_file import study_text
 
         text = study_text(content, self.reasons())

@@ -36,7 +36,7 @@ NO_WORKER_WAIT: Final = 600.0
 MOST_DEATHS: Final = 4
 """Number of workers that die on a chunk before the run ends; the chunk is then probably too large."""
 
-FETCH_WAIT: Final = 0.5
+FETCH_WAIT: Final = POLL
 """First wait for an answer that a worker has [s], doubled at each further request. In between, it is noticed if the
 worker died with the answer; an answer that takes long to send arrives in the end."""
 
@@ -81,11 +81,8 @@ class DaskWorkers:
     """The workers of a Dask cluster, opened on first use.
 
     A chunk stays on one worker, its home. If that worker dies, its replacement, or another worker, gets the chunk and
-    makes its objects again. Paths then come from the cache, if workers share its folder.
-
-    Args:
-        connect: Returns Dask's client.
-        open_executor: Returns an executor for the calls of an external program.
+    makes its objects again. Paths then come from the cache, if workers share its folder. `connect` returns Dask's
+    client, and `open_executor` an executor for the calls of an external program.
     """
 
     def __init__(self, connect: Callable[[], Client], open_executor: Callable[[], Executor]) -> None:

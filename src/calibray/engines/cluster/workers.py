@@ -82,9 +82,8 @@ class Workers(Protocol):
 class InProcess:
     """This process works on one chunk after the other.
 
-    Args:
-        at_most: Largest number of chunks to keep; other chunks are made again for each question. If None, chunks are
-            kept until they use half of the memory that was free at the start.
+    It keeps `at_most` chunks, and makes others again for each question. If None, chunks are kept until they use half of
+    the memory that was free at the start.
     """
 
     def __init__(self, at_most: int | None = None) -> None:
@@ -188,10 +187,7 @@ class LocalWorkers:
     """Processes on this machine, started on first use, each with its share of the processor cores.
 
     A chunk stays in one process. If a process dies, another one replaces it and makes the chunk's objects again.
-
-    Args:
-        count: Number of processes.
-        open_executor: Returns an executor for the calls of an external program.
+    `open_executor` returns an executor for the calls of an external program.
     """
 
     def __init__(self, count: int, open_executor: Callable[[], Executor]) -> None:

@@ -26,11 +26,7 @@ if TYPE_CHECKING:
 
 @final
 class RetraceSection(EngineSection):
-    """``[engine]`` with ``name = "retrace"``.
-
-    Attributes:
-        name: "retrace".
-    """
+    """``[engine]`` with ``name = "retrace"``."""
 
     expensive: ClassVar[bool] = True
     external: ClassVar[bool] = False

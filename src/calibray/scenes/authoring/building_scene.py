@@ -68,9 +68,6 @@ def make_scene(
         overwrite: Replace files that Calibray did not write.
         trees: Trees; those over the ground are written next to the scene as `TREES_FILE`, which needs a frame.
 
-    Returns:
-        The scene.
-
     Raises:
         InputError: There is no building, the margin is out of range, the folder cannot be written, or a file there must
             not be replaced.

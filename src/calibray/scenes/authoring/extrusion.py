@@ -42,12 +42,7 @@ THINNEST: Final = GRID / 2
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """A piece of ground and the buildings on it.
-
-    Attributes:
-        polygon: Its outline, a shapely Polygon [m].
-        stands: The buildings on it, from below, not overlapping.
-    """
+    """A piece of ground, a shapely Polygon [m], and the buildings on it from below, not overlapping."""
 
     polygon: Any
     stands: tuple[Interval, ...]

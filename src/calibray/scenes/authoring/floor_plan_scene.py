@@ -89,9 +89,6 @@ def make_plan_scene(
         merge: Whether two parallel lines are merged into one wall (`merge_faces`).
         overwrite: Replace files that Calibray did not write.
 
-    Returns:
-        The scene.
-
     Raises:
         InputError: A type has no material, there is no segment, the folder cannot be written, or a file there must not
             be replaced.

@@ -313,9 +313,6 @@ def read_footprints(
         frame: The scene's frame; by default a local frame centred on the footprints.
         rule: Assumptions for heights that are not given.
 
-    Returns:
-        The footprints, and their frame.
-
     Raises:
         InputError: The file does not exist, cannot be read, states no reference system, lacks a column or contains no
             polygon; or a height is negative or not a number.

@@ -33,12 +33,7 @@ CROSSING: Final = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """New positions of the corners of walls.
-
-    Attributes:
-        points: Corners in plan, sorted [n, 2], [mm].
-        moved: Their new positions [n, 2], [m].
-    """
+    """Corners of walls in plan, sorted [n, 2], [mm], and their new positions [n, 2], [m]."""
 
     points: NDArray[np.int64]
     moved: NDArray[np.float64]

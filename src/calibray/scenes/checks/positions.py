@@ -26,9 +26,6 @@ BEYOND: Final = "beyond the scene"
 UNDER: Final = "under the ground"
 INSIDE: Final = "inside a building"
 
-PAIRS: Final = 5_000_000
-"""Number of triangle-point pairs that are compared at a time; each pair needs about 100 bytes."""
-
 
 def _is_wall(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -264,7 +261,7 @@ def _crossed_triangles(
     low, high = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
     first = np.searchsorted(x, low[:, 0], "left")
     count = np.searchsorted(x, high[:, 0], "right") - first
-    batch = np.cumsum(count) // PAIRS
+    batch = np.cumsum(count) // BATCH
     for members in np.split(np.arange(len(corners)), np.flatnonzero(np.diff(batch)) + 1):
         triangle = np.repeat(members, count[members])
         start = np.cumsum(count[members]) - count[members]
