@@ -62,6 +62,11 @@ def print_costs() -> None:
     LOG.propagate = False
 
 
+def option(placeholder: str, meaning: str, *names: str, **limits: Any) -> Any:
+    """An option with a value; its names are given if they are not that of the argument."""
+    return typer.Option(*names, metavar=placeholder, help=meaning, **limits)
+
+
 StudyFile = Annotated[
     Path, typer.Argument(metavar="STUDY", help="The study file, in TOML.", show_default=False)
 ]
@@ -81,14 +86,10 @@ class Pool:
     """Options that state the workers; their fields are the arguments of `calibray.engines.open_workers`."""
 
     workers: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N", help="Number of local processes among which chunks of links are distributed."
-        ),
+        int | None, option("N", "Number of local processes among which chunks of links are distributed.")
     ] = None
     scheduler: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers process chunks of links."),
+        str | None, option("ADDRESS", "Dask scheduler whose workers process chunks of links.")
     ] = None
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, echo, log, progress_bars
+from calibray.cli.console import Overwrite, echo, log, option, progress_bars
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,8 +27,7 @@ def doctor(
         ),
     ] = None,
     plot: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Draw the study's antennas over its scene (.png, .svg or .pdf)."),
+        Path | None, option("FILE", "Draw the study's antennas over its scene (.png, .svg or .pdf).")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -114,10 +113,7 @@ def ledger(
         typer.Argument(metavar="DIR", help="Folder that `calibray run` writes into.", show_default=False),
     ],
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", "-o", metavar="FILE", help="Write a CSV or Parquet file with every link's path loss."
-        ),
+        Path | None, option("FILE", "Write a CSV or Parquet file with every link's path loss.", "--out", "-o")
     ] = None,
     forget_failed: Annotated[
         bool, typer.Option("--forget-failed", help="Remove failed calls, so that they run again.")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import echo, log, progress_bars, warn, with_groups
+from calibray.cli.console import echo, log, option, progress_bars, warn, with_groups
 from calibray.errors import InputError
 
 
@@ -16,19 +16,11 @@ from calibray.errors import InputError
 class Known:
     """Options that state what the table of links lacks."""
 
-    transmitters: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Table of transmitter positions.")
-    ] = None
-    track: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="GPX track with the position of each row over time.")
-    ] = None
-    antennas: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder of MSI files named after the antennas.")
-    ] = None
-    tx: Annotated[
-        str | None, typer.Option(metavar="X,Y,Z", help="Transmitter position in the scene frame [m].")
-    ] = None
-    frequency: Annotated[float | None, typer.Option(metavar="HZ", help="Carrier frequency [Hz].")] = None
+    transmitters: Annotated[Path | None, option("FILE", "Table of transmitter positions.")] = None
+    track: Annotated[Path | None, option("FILE", "GPX track with the position of each row over time.")] = None
+    antennas: Annotated[Path | None, option("DIR", "Folder of MSI files named after the antennas.")] = None
+    tx: Annotated[str | None, option("X,Y,Z", "Transmitter position in the scene frame [m].")] = None
+    frequency: Annotated[float | None, option("HZ", "Carrier frequency [Hz].")] = None
 
 
 @with_groups
@@ -43,16 +35,12 @@ def init(
         ),
     ],
     out: Annotated[
-        Path,
-        typer.Option(
-            "--out", "-o", metavar="FILE", help="Study file to write; an existing file is never replaced."
-        ),
+        Path, option("FILE", "Study file to write; an existing file is never replaced.", "--out", "-o")
     ] = Path("study.toml"),
     *,
     known: Known,
     plot: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Draw the antennas over the scene (.png, .svg or .pdf)."),
+        Path | None, option("FILE", "Draw the antennas over the scene (.png, .svg or .pdf).")
     ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a plot that Calibray did not write.")
@@ -124,7 +112,7 @@ def open(
         Path,
         typer.Argument(metavar="FOLDER", help="Folder of the study; it is created if it does not exist."),
     ] = Path(),
-    port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="Port; 0 for a free one.")] = 0,
+    port: Annotated[int, option("N", "Port; 0 for a free one.", min=0, max=65535)] = 0,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Only print the address.")] = False,
 ) -> None:
     """Open a study's folder in the browser, from a map and measurements to predictions without a terminal.

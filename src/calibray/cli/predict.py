@@ -18,6 +18,7 @@ from calibray.cli.console import (
     ResultFolder,
     echo,
     log,
+    option,
     print_costs,
     progress_bars,
     with_groups,
@@ -54,16 +55,13 @@ def predict(
         ),
     ],
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", "-o", metavar="FILE", help="CSV or Parquet file to write, in place of CSV on stdout."
-        ),
+        Path | None, option("FILE", "CSV or Parquet file to write, in place of CSV on stdout.", "--out", "-o")
     ] = None,
     level: Annotated[
         float | None,
-        typer.Option(
-            metavar="P",
-            help="Add the interval that contains a measurement with this probability, such as 0.9: columns lower_db "
+        option(
+            "P",
+            "Add the interval that contains a measurement with this probability, such as 0.9: columns lower_db "
             "and upper_db, and a remark if an antenna is inside a building or outside the scene.",
         ),
     ] = None,
@@ -173,10 +171,9 @@ def _renamed_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) 
 class SuggestOptions:
     """Options that state what is suggested, and in which form."""
 
-    count: Annotated[int, typer.Option(metavar="N", min=1, help="Number of links to suggest.")] = 5
+    count: Annotated[int, option("N", "Number of links to suggest.", min=1)] = 5
     out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="FILE", help="Also write the table to this CSV or Parquet file."),
+        Path | None, option("FILE", "Also write the table to this CSV or Parquet file.", "--out", "-o")
     ] = None
     observables: Annotated[
         bool,
@@ -269,21 +266,16 @@ class Area:
 
     tx: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(
-            metavar="X Y Z",
-            help="Transmitter position [m]; by default that of the links, if they have only one transmitter.",
+        option(
+            "X Y Z",
+            "Transmitter position [m]; by default that of the links, if they have only one transmitter.",
         ),
     ] = None
-    height: Annotated[
-        float, typer.Option(metavar="M", help="Height of the receivers above the ground [m].")
-    ] = 1.5
-    cell: Annotated[float, typer.Option(metavar="M", help="Width of the cells [m].")] = 5.0
+    height: Annotated[float, option("M", "Height of the receivers above the ground [m].")] = 1.5
+    cell: Annotated[float, option("M", "Width of the cells [m].")] = 5.0
     bounds: Annotated[
         tuple[float, float, float, float] | None,
-        typer.Option(
-            metavar="W S E N",
-            help="West, south, east and north end of the area [m]; by default the whole scene.",
-        ),
+        option("W S E N", "West, south, east and north end of the area [m]; by default the whole scene."),
     ] = None
 
 
@@ -292,27 +284,23 @@ class Values:
     """Options that state what is predicted, and how."""
 
     level: Annotated[
-        float,
-        typer.Option(
-            metavar="P", help="Probability that a measurement lies in the interval; 0 for no interval."
-        ),
+        float, option("P", "Probability that a measurement lies in the interval; 0 for no interval.")
     ] = 0.9
     power: Annotated[
-        float | None,
-        typer.Option(metavar="DBM", help="Transmit power [dBm], for received power instead of path loss."),
+        float | None, option("DBM", "Transmit power [dBm], for received power instead of path loss.")
     ] = None
     samples: Annotated[
         str | None,
-        typer.Option(
-            metavar="N|auto",
-            help="Number of rays, in place of the study's. The time grows with this number; too few rays miss paths.",
+        option(
+            "N|auto",
+            "Number of rays, in place of the study's. The time grows with this number; too few rays miss paths.",
         ),
     ] = None
     column: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE",
-            help="Value of a group or frequency column of the links for this transmitter; can be repeated.",
+        option(
+            "NAME=VALUE",
+            "Value of a group or frequency column of the links for this transmitter; can be repeated.",
         ),
     ] = None
 
@@ -322,9 +310,7 @@ def map(
     folder: ResultFolder,
     area: Area,
     values: Values,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="FOLDER", help="Folder for the map instead of DIR.")
-    ] = None,
+    out: Annotated[Path | None, option("FOLDER", "Folder for the map instead of DIR.", "--out", "-o")] = None,
     *,
     pool: Pool,
     permissions: Permissions,

@@ -16,6 +16,7 @@ from calibray.cli.console import (
     StudyFile,
     echo,
     log,
+    option,
     progress_bars,
     warn,
     with_groups,
@@ -35,13 +36,11 @@ class Changes:
     """Options in place of the study's own."""
 
     method: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Method instead of the study's: auto, sgwo-im, gwo, ..."),
+        str | None, option("NAME", "Method instead of the study's: auto, sgwo-im, gwo, ...")
     ] = None
-    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed instead of the study's.")] = None
+    seed: Annotated[int | None, option("N", "Seed instead of the study's.")] = None
     engine: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Engine instead of the study's: replay, retrace or command."),
+        str | None, option("NAME", "Engine instead of the study's: replay, retrace or command.")
     ] = None
 
 
@@ -51,17 +50,16 @@ class RunPool:
 
     workers: Annotated[
         int | None,
-        typer.Option(
-            metavar="N",
-            help="Number of local processes among which chunks of links are distributed, or of simultaneous programs "
+        option(
+            "N",
+            "Number of local processes among which chunks of links are distributed, or of simultaneous programs "
             "of the engine 'command'.",
         ),
     ] = None
     scheduler: Annotated[
         str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Dask scheduler whose workers process chunks of links, or run the engine 'command'.",
+        option(
+            "ADDRESS", "Dask scheduler whose workers process chunks of links, or run the engine 'command'."
         ),
     ] = None
 
@@ -82,7 +80,7 @@ class Output:
 @with_groups
 def run(
     study_file: StudyFile,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the result.")],
+    out: Annotated[Path, option("DIR", "Folder for the result.", "--out", "-o")],
     changes: Changes,
     pool: RunPool,
     output: Output,
@@ -160,19 +158,16 @@ def _write_report(result: Result, out: Path, output: Output) -> list[str]:
 
 def demo(
     out: Annotated[
-        Path,
-        typer.Option(
-            "--out", "-o", metavar="DIR", help="Folder for tables, figures, results and the report."
-        ),
+        Path, option("DIR", "Folder for tables, figures, results and the report.", "--out", "-o")
     ] = Path("out/demo"),
     engine: Annotated[
         str,
-        typer.Option(
-            metavar="NAME",
-            help="replay (trace once) or retrace (run the ray tracer for every candidate, as in the paper).",
+        option(
+            "NAME",
+            "replay (trace once) or retrace (run the ray tracer for every candidate, as in the paper).",
         ),
     ] = "replay",
-    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the methods.")] = 0,
+    seed: Annotated[int, option("N", "Seed of the methods.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
     """Run the experiment of the paper in the demo district: tables, figures and a report."""
@@ -193,9 +188,7 @@ def demo(
 @with_groups
 def trace(
     study_file: StudyFile,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="FILE", help="HDF5 file for the paths.")
-    ] = None,
+    out: Annotated[Path | None, option("FILE", "HDF5 file for the paths.", "--out", "-o")] = None,
     check: Annotated[
         bool,
         typer.Option(
@@ -268,8 +261,7 @@ def _trace(
 def report(
     folder: ResultFolder,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="FILE", help="HTML file to write instead of DIR/report.html."),
+        Path | None, option("FILE", "HTML file to write instead of DIR/report.html.", "--out", "-o")
     ] = None,
     figures: Annotated[
         bool, typer.Option("--figures", help="Also write the figures as SVG and PNG into DIR/figures.")
@@ -295,9 +287,7 @@ def report(
 
 def export(
     folder: ResultFolder,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="FOLDER", help="Folder to write into.", show_default=False)
-    ],
+    out: Annotated[Path, option("FOLDER", "Folder to write into.", "--out", "-o", show_default=False)],
     copy: Annotated[
         bool, typer.Option("--copy", help="Copy the meshes too, so that the folder is self-contained.")
     ] = False,

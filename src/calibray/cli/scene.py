@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from calibray.cli.console import Overwrite, echo, log, progress_bars, with_groups
+from calibray.cli.console import Overwrite, echo, log, option, progress_bars, with_groups
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ scene = typer.Typer(
 )
 """The commands; `app.add_typer(scene)` adds them."""
 
-Out = Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for scene.xml and the meshes.")]
+Out = Annotated[Path, option("DIR", "Folder for scene.xml and the meshes.", "--out", "-o")]
 
 
 @dataclass(frozen=True)
@@ -31,20 +31,14 @@ class MapOptions:
     """Options of scenes of buildings and ground."""
 
     terrain: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="GeoTIFF height model of the ground; by default the ground is level."
-        ),
+        Path | None, option("FILE", "GeoTIFF height model of the ground; by default the ground is level.")
     ] = None
     spacing: Annotated[
-        float | None,
-        typer.Option(metavar="M", help="Cell width of the ground [m]; by default that of the height model."),
+        float | None, option("M", "Cell width of the ground [m]; by default that of the height model.")
     ] = None
     origin: Annotated[
         str | None,
-        typer.Option(
-            metavar="LON,LAT", help="Origin of the scene frame [deg]; by default the centre of the buildings."
-        ),
+        option("LON,LAT", "Origin of the scene frame [deg]; by default the centre of the buildings."),
     ] = None
     utm: Annotated[
         bool,
@@ -53,34 +47,26 @@ class MapOptions:
         ),
     ] = False
     wall: Annotated[
-        str,
-        typer.Option(
-            metavar="ITU[:M]", help="P.2040 material of the walls, with the thickness [m] after a colon."
-        ),
+        str, option("ITU[:M]", "P.2040 material of the walls, with the thickness [m] after a colon.")
     ] = "concrete:0.3"
     roof: Annotated[
         str,
-        typer.Option(
-            metavar="ITU[:M]",
-            help="Material of the roofs. 'wall' makes one mesh of roofs and walls, so that eaves diffract.",
+        option(
+            "ITU[:M]",
+            "Material of the roofs. 'wall' makes one mesh of roofs and walls, so that eaves diffract.",
         ),
     ] = "concrete:0.3"
-    ground: Annotated[str, typer.Option(metavar="ITU[:M]", help="Material of the ground.")] = "concrete:1.0"
+    ground: Annotated[str, option("ITU[:M]", "Material of the ground.")] = "concrete:1.0"
     window_share: Annotated[
-        float, typer.Option(metavar="SHARE", help="Share of windows in every wall, at least 0 and below 1.")
+        float, option("SHARE", "Share of windows in every wall, at least 0 and below 1.")
     ] = 0.0
     storey: Annotated[
-        float,
-        typer.Option(
-            metavar="M", help="Height of a storey [m], for buildings with only the number of storeys."
-        ),
+        float, option("M", "Height of a storey [m], for buildings with only the number of storeys.")
     ] = 3.0
-    default_height: Annotated[
-        float, typer.Option(metavar="M", help="Height of a building without height and storeys [m].")
-    ] = 9.0
-    margin: Annotated[
-        float, typer.Option(metavar="M", help="Width of the ground around the buildings [m].")
-    ] = 50.0
+    default_height: Annotated[float, option("M", "Height of a building without height and storeys [m].")] = (
+        9.0
+    )
+    margin: Annotated[float, option("M", "Width of the ground around the buildings [m].")] = 50.0
     per_building: Annotated[
         bool,
         typer.Option(
@@ -122,18 +108,13 @@ class MapOptions:
 class ColumnOptions:
     """Options that name the columns of a vector file."""
 
-    height: Annotated[
-        str, typer.Option(metavar="COLUMN", help="Column with the heights above the ground, or a number [m].")
-    ]
+    height: Annotated[str, option("COLUMN", "Column with the heights above the ground, or a number [m].")]
     bottom: Annotated[
-        str,
-        typer.Option(metavar="COLUMN", help="Column with the heights of the lower ends, or a number [m]."),
+        str, option("COLUMN", "Column with the heights of the lower ends, or a number [m].")
     ] = "0"
-    levels: Annotated[
-        str | None, typer.Option(metavar="COLUMN", help="Column with the numbers of storeys.")
-    ] = None
-    name: Annotated[str | None, typer.Option(metavar="COLUMN", help="Column with the names.")] = None
-    layer: Annotated[str | None, typer.Option(metavar="NAME", help="Layer of the file.")] = None
+    levels: Annotated[str | None, option("COLUMN", "Column with the numbers of storeys.")] = None
+    name: Annotated[str | None, option("COLUMN", "Column with the names.")] = None
+    layer: Annotated[str | None, option("NAME", "Layer of the file.")] = None
 
 
 @scene.command()
@@ -182,18 +163,13 @@ def footprints(
 class PlanOptions:
     """Options of scenes of floor plans."""
 
-    height: Annotated[
-        float, typer.Option(metavar="M", help="Height of walls for which the plan states none [m].")
-    ] = 3.0
-    unit: Annotated[
-        float, typer.Option(metavar="M", help="Unit of length of the plan [m]; 0.001 for mm.")
-    ] = 1.0
+    height: Annotated[float, option("M", "Height of walls for which the plan states none [m].")] = 3.0
+    unit: Annotated[float, option("M", "Unit of length of the plan [m]; 0.001 for mm.")] = 1.0
     floor: Annotated[bool, typer.Option(help="Make a floor.")] = True
     ceiling: Annotated[bool, typer.Option(help="Make a ceiling.")] = True
     merge: Annotated[bool, typer.Option(help="Merge two parallel lines into one wall.")] = True
     material: Annotated[
-        list[str] | None,
-        typer.Option(metavar="TYPE=ITU[:M]", help="Material of one type of wall; can be repeated."),
+        list[str] | None, option("TYPE=ITU[:M]", "Material of one type of wall; can be repeated.")
     ] = None
     overwrite: Overwrite = False
 

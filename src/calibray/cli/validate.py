@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, Pool, StudyFile, echo, log, progress_bars, with_groups
+from calibray.cli.console import Overwrite, Pool, StudyFile, echo, log, option, progress_bars, with_groups
 
 
 @dataclass(frozen=True)
@@ -18,18 +18,17 @@ class Division:
 
     blocks: Annotated[
         int | None,
-        typer.Option(
-            metavar="N",
+        option(
+            "N",
+            "Number of blocks, each held out in turn; by default the study's number, or 4.",
             min=2,
             max=100,
-            help="Number of blocks, each held out in turn; by default the study's number, or 4.",
         ),
     ] = None
     by: Annotated[
         str | None,
-        typer.Option(
-            metavar="COLUMN",
-            help="Hold out the links of each value of a column in turn; use tx for each transmitter.",
+        option(
+            "COLUMN", "Hold out the links of each value of a column in turn; use tx for each transmitter."
         ),
     ] = None
 
@@ -40,11 +39,11 @@ def validate(
     division: Division,
     out: Annotated[
         Path | None,
-        typer.Option(
+        option(
+            "DIR",
+            "Write the validation into this folder of a result, so that `calibray report DIR` shows it.",
             "--out",
             "-o",
-            metavar="DIR",
-            help="Write the validation into this folder of a result, so that `calibray report DIR` shows it.",
         ),
     ] = None,
     *,
@@ -80,14 +79,11 @@ class Runs:
     """Options that state the runs to compare."""
 
     methods: Annotated[
-        str,
-        typer.Option(
-            metavar="NAMES", help="Methods, separated by commas; METHOD@CALLS sets the budget of one method."
-        ),
+        str, option("NAMES", "Methods, separated by commas; METHOD@CALLS sets the budget of one method.")
     ] = "sgwo-im,gwo,gwo@600,vector-surrogate,gaussian-process,differential-evolution,random,least-squares"
-    seeds: Annotated[int, typer.Option(metavar="N", help="Runs of each method, with seeds 0 to N - 1.")] = 25
-    budget: Annotated[int, typer.Option(metavar="CALLS", help="RT calls per run.")] = 225
-    workers: Annotated[int, typer.Option(metavar="N", help="Number of local processes.")] = 1
+    seeds: Annotated[int, option("N", "Runs of each method, with seeds 0 to N - 1.")] = 25
+    budget: Annotated[int, option("CALLS", "RT calls per run.")] = 225
+    workers: Annotated[int, option("N", "Number of local processes.")] = 1
 
 
 @with_groups
@@ -95,12 +91,7 @@ def compare(
     study_file: Annotated[Path, typer.Argument(metavar="STUDY", help="The study file, in TOML.")],
     out: Annotated[
         Path,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="DIR",
-            help="Folder for the tables and the figure; it also keeps finished runs.",
-        ),
+        option("DIR", "Folder for the tables and the figure; it also keeps finished runs.", "--out", "-o"),
     ],
     runs: Runs,
     overwrite: Overwrite = False,
