@@ -157,11 +157,11 @@ def _has_value(cell: Any) -> bool:
     return cell is not None and bool(str(cell).strip())
 
 
-LARGEST_TABLE: Final = 2 * 2**30
-"""Largest decompressed size of a Parquet file that is read at once [bytes]; pandas needs up to twice as much."""
-
 LARGEST_ROW_GROUP: Final = 2**30
 """Largest decompressed size of a row group, or of a piece, of a Parquet file that is read in pieces [bytes]."""
+
+LARGEST_TABLE: Final = 2 * LARGEST_ROW_GROUP
+"""Largest decompressed size of a Parquet file that is read at once [bytes]; pandas needs up to twice as much."""
 
 DECODING_MEMORY: Final = 2 * LARGEST_TABLE
 """Limit of the address space in which a Parquet file is first decoded [bytes]."""

@@ -1,27 +1,12 @@
 """Paths: the path program, and the chains of interactions from which any tracer makes one."""
 
-from typing import TYPE_CHECKING
-
-from calibray.support.lazy_imports import lazy_attributes
-
-if TYPE_CHECKING:
-    from calibray.paths.file_format import FORMAT_VERSION as FORMAT_VERSION
-    from calibray.paths.file_format import seal as seal
-    from calibray.paths.interactions import Diffraction as Diffraction
-    from calibray.paths.interactions import Diffuse as Diffuse
-    from calibray.paths.interactions import Kind as Kind
-    from calibray.paths.program import Paths as Paths
-    from calibray.paths.selection import concatenate as concatenate
-    from calibray.paths.selection import join_links as join_links
-    from calibray.paths.selection import take as take
-    from calibray.paths.selection import take_links as take_links
-
-__all__, __getattr__, __dir__ = lazy_attributes(
-    __name__,
-    {
-        "file_format": "FORMAT_VERSION seal",
-        "interactions": "Diffraction Diffuse Kind",
-        "program": "Paths",
-        "selection": "concatenate join_links take take_links",
-    },
-)
+from calibray.paths.file_format import FORMAT_VERSION as FORMAT_VERSION
+from calibray.paths.file_format import seal as seal
+from calibray.paths.interactions import Diffraction as Diffraction
+from calibray.paths.interactions import Diffuse as Diffuse
+from calibray.paths.interactions import Kind as Kind
+from calibray.paths.program import Paths as Paths
+from calibray.paths.selection import concatenate as concatenate
+from calibray.paths.selection import join_links as join_links
+from calibray.paths.selection import take as take
+from calibray.paths.selection import take_links as take_links

@@ -17,8 +17,7 @@ from scipy.interpolate import PchipInterpolator
 from calibray.errors import InputError
 from calibray.measurements import Measurements
 from calibray.parameters import Parameter, Parameters
-from calibray.paths import Paths, take_links
-from calibray.paths.selection import concatenate
+from calibray.paths import Paths, concatenate, take_links
 from calibray.support.messages import did_you_mean
 from calibray.tracing.antennas import EVERY, NEW, POSE, Mounting, concerned
 

@@ -211,11 +211,11 @@ class LinksSection(Section):
         where: Row filter.
         weight: Column of relative weights [1].
         std: Standard deviation [dB] of the values, a number or a column.
+        tx_power_dbm: Transmitted power [dBm], a number or a column; needed with a received power.
         eirp_dbm: Radiated power [dBm] in the main direction, in place of the transmitted power.
         cable_loss_db: Loss between transmitter and antenna [dB], a number or a column, with a transmitted power.
         tx_antenna: Antennas of the transmitters, if they differ.
         rx_antenna: Antennas of the receivers, if they differ.
-        device: Column of the names of receiving devices, which parameters such as "rx:PHONE.dx" displace.
         device: Column of the names of receiving devices, which parameters such as "rx:PHONE.dx" displace.
         position_error_m: Standard deviation of the receivers' positions along x and y [m], a number or a column.
         frequency: Column of carrier frequencies [Hz]; if absent, all links have the scene's carrier.

@@ -11,7 +11,8 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -225,23 +226,13 @@ class Desk:
             ui.notify(f"Started: {job.command}", type="info", color="primary")
             self.refresh()
 
-    def messages(self) -> Messages:
-        """A context that shows errors instead of raising them."""
-        return Messages()
-
-
-class Messages:
-    """Shows the message of an `InputError`, as text."""
-
-    def __enter__(self) -> None:
-        """Nothing to do."""
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: Any) -> bool:
-        """Show the error, if it is one of the input or of a file."""
-        if not isinstance(error, InputError | OSError):
-            return False
-        ui.notify(str(error), type="negative", multi_line=True, timeout=15_000, close_button="Close")
-        return True
+    @contextmanager
+    def messages(self) -> Iterator[None]:
+        """Show an error of the input or of a file, as text, instead of raising it."""
+        try:
+            yield
+        except (InputError, OSError) as error:
+            ui.notify(str(error), type="negative", multi_line=True, timeout=15_000, close_button="Close")
 
 
 def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
