@@ -24,7 +24,7 @@ def test_a_library_that_cannot_be_loaded_is_not_called_missing(tmp_path, monkeyp
         library("absent", "scenes")
 
 
-@pytest.mark.parametrize("room", ["engines", "paths", "scenes.authoring", "study"])
+@pytest.mark.parametrize("room", ["engines", "scenes.authoring", "study"])
 def test_every_name_of_a_room_is_loaded_from_its_module(room):
     module = import_module(f"calibray.{room}")
     assert [name for name in module.__all__ if not hasattr(module, name)] == []
