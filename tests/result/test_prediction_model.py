@@ -17,13 +17,14 @@ from calibray.reporting.link_survey import residual
 from calibray.reporting.result_tables import parameters, values
 from calibray.reporting.summary import summary
 from calibray.reporting.wording import prediction_text, scene_alone_text
-from calibray.result.held_out import Model, ResidualField
+from calibray.result.held_out import FittedTerm, Model, ResidualField
 from calibray.result.verdict import Interval, ReasonKind, Verdict
 from calibray.result.wording import reason_text
 from calibray.scenes import read_scene
 from calibray.scenes.export import exported_names
 from calibray.tables import render
 from calibray.uncertainty.verdicts import consistent
+from calibray.validation.choice import averaged_terms
 
 NAME = next(name for name in shown.result().parameters if name.endswith(".relative_permittivity"))
 MATERIAL = NAME.rpartition(".")[0]
@@ -122,3 +123,53 @@ def test_a_verdict_never_contradicts_its_value() -> None:
     assert "14.99, is outside the interval" in reason_text(contradicted.reason)
     unknown = replace(interval, verdict=Verdict.NOT_IDENTIFIABLE)
     assert consistent(unknown, 14.99) == unknown
+
+
+def test_a_slope_that_the_study_does_not_state_is_averaged_with_the_calibrated_model(tmp_path: Path) -> None:
+    """Path loss rises by 6 dB per decade more than the paths explain."""
+    table, links = planted.campaign(noise_db=0.5), planted.links()
+    distance = np.linalg.norm(links[["rx_x", "rx_y"]].assign(z=-1.5), axis=1)
+    table = table.assign(path_loss_db=table["path_loss_db"] + 6 * np.log10(distance))
+    result = calibrate(planted.study(tmp_path, table, holdout={"blocks": 4}), engine=planted.engine())
+    model, errors = result.prediction.model, result.held_out.errors
+    assert model.name == Model.AVERAGE_SLOPE
+    assert errors[Model.AVERAGE_SLOPE] == pytest.approx(
+        (errors[Model.SLOPE] + errors[Model.CALIBRATED]) / 2, nan_ok=True
+    )
+    assert model.residual_db == pytest.approx(np.sqrt(np.nanmean(errors[Model.AVERAGE_SLOPE] ** 2)))
+    assert model.parameters == result.parameters
+    assert model.averaged != result.parameters
+    # The prediction is the mean of the predictions of both models.
+    alone = [
+        replace(model, averaged=None, parameters=values, terms=terms)
+        for values, terms in (
+            (model.parameters, ()),
+            (model.averaged, tuple(_doubled(term) for term in model.terms)),
+        )
+    ]
+    both = [replace(result, prediction=replace(result.prediction, model=one)).predict(links) for one in alone]
+    assert np.abs(both[0] - both[1]).max() > 0.3
+    assert result.predict(links) == pytest.approx(np.mean(both, axis=0), abs=1e-9)
+    assert result.links.predicted_db.to_numpy() == pytest.approx(result.predict(links), abs=1e-6)
+    half = result.predict_interval(links)
+    assert half["path_loss_db"].to_numpy() == pytest.approx(result.predict(links), abs=1e-9)
+    result.save(tmp_path / "out")
+    assert Result.load(tmp_path / "out").predict(links) == pytest.approx(result.predict(links), abs=1e-9)
+    assert "averaged" in prediction_text(result)
+    assert "average" in scene_alone_text(result)
+
+
+def _doubled(term: FittedTerm) -> FittedTerm:
+    return replace(term, coefficients={label: 2 * value for label, value in term.coefficients.items()})
+
+
+def test_the_mean_of_terms_keeps_groups_that_one_model_lacks() -> None:
+    offset = FittedTerm("offset", "constant", "street", {"a": 2.0, "b": 4.0}, 0.0, 3.0)
+    more = (
+        replace(offset, coefficients={"a": 6.0, "c": 1.0}),
+        FittedTerm("tx", "constant", "tx", {"1": 5.0}, 0.0, 4.0),
+    )
+    assert averaged_terms((offset,), more) == (
+        replace(offset, coefficients={"b": 4.0, "a": 4.0, "c": 1.0}),
+        FittedTerm("tx", "constant", "tx", {"1": 2.5}, 0.0, 2.0),
+    )

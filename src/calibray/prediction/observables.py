@@ -31,10 +31,14 @@ deviation from them is 9 %."""
 
 
 class Replayed(NamedTuple):
-    """An engine over new links, and the values of the prediction model, then of every draw [1 + draws, d]."""
+    """An engine over new links, the values of the prediction model, then of every draw [1 + draws, d].
+
+    If path loss is averaged over two sets of values, both precede the draws, and `averaged` is 2.
+    """
 
     engine: Engine
     values: NDArray[np.float64]
+    averaged: int = 1
 
 
 def observable_columns(study: Study, level: float | None) -> tuple[str, ...]:
@@ -57,7 +61,8 @@ def further_observables(
     sections = result.study.observables
     if not sections or replayed is None or not isinstance(replayed.engine, Observing):
         return {}
-    best, draws = replayed.values[:1], replayed.values[1:] if level is not None else replayed.values[:0]
+    best, draws = replayed.values[:1], replayed.values[replayed.averaged :]
+    draws = draws if level is not None else draws[:0]
     draws = draws[evenly_spaced(len(draws), MOST_DRAWS)]
     statistics = tuple(section.statistic for section in sections.values())
     answers = replayed.engine.respond(np.vstack([best, draws]), statistics).observed

@@ -269,7 +269,8 @@ def _replay(
     prediction, names = result.prediction, setup.parameters.names
     if prediction.model.parameters is None:
         return None
-    values = np.array([[prediction.model.parameters[name] for name in names]])
+    every = (prediction.model.parameters, prediction.model.averaged)
+    values = np.array([[each[name] for name in names] for each in every if each is not None])
     if draws:
         setup = with_constants(result, setup)
         names = setup.parameters.names
@@ -277,7 +278,9 @@ def _replay(
         drawn = np.stack([draws[name] for name in names], axis=1)
         values = np.vstack([np.hstack([values, scene_values]), drawn])
     return Replayed(
-        replay(setup, setup.trace(traced_materials(result, prediction.materials), progress)), values
+        replay(setup, setup.trace(traced_materials(result, prediction.materials), progress)),
+        values,
+        1 if prediction.model.averaged is None else 2,
     )
 
 
@@ -288,7 +291,9 @@ def _modelled(result: Record, links: Measurements, replayed: Replayed | None) ->
     path_loss_db = replayed.engine.path_loss(replayed.values)
     # Predictions of a model that validation chose end at the ceiling, as the model does in the validation.
     ceiling_db = None if result.held_out is None else result.study.objective.ceiling_db
-    return path_loss_db if ceiling_db is None else np.minimum(path_loss_db, ceiling_db)
+    path_loss_db = path_loss_db if ceiling_db is None else np.minimum(path_loss_db, ceiling_db)
+    mean_db = path_loss_db[: replayed.averaged].mean(axis=0, keepdims=True)
+    return np.vstack([mean_db, path_loss_db[replayed.averaged :]])
 
 
 def _residual_field(result: Record, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

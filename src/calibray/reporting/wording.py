@@ -32,6 +32,8 @@ def prediction_text(record: Record) -> str:
             if model.name != Model.INITIAL
             else "the initial materials"
         )
+    if model.averaged is not None:
+        source += ", averaged with a fit of other values and offsets,"
     terms = [term.name for term in model.terms]
     added = f" and the fitted {', '.join(terms)}" if terms else ""
     fallback = record.prediction.fallback
@@ -71,6 +73,7 @@ def scene_alone_text(record: Record) -> str:
         *(f"the facade {name}" for name in record.study.facades),
         *(f"the roughness of {name}" for name in dict.fromkeys((*record.study.roughness_mm, *rough))),
         *(term.name for term in model.terms),
+        *([] if model.averaged is None else ["the average with other materials"]),
     ]
     cause = ", ".join(missing) or "its ceiling"
     if model.parameters is None:

@@ -23,6 +23,9 @@ class Model(StrEnum):
     SLOPE = "calibrated with slope"
     OFFSETS = "calibrated with offsets"
     PRIOR_OFFSETS = "calibrated with prior and offsets"
+    AVERAGE_SLOPE = "average with slope"
+    AVERAGE_OFFSETS = "average with offsets"
+    AVERAGE_PRIOR_OFFSETS = "average with prior and offsets"
     RESIDUAL_FIELD = "calibrated with residual field"
     LOG_DISTANCE = "log-distance"
     OBSTRUCTION = "log-distance with obstruction"
@@ -43,6 +46,13 @@ FITTED: Final = (
     Model.PRIOR_OFFSETS,
 )
 """Models that calibrate materials and can make predictions anywhere."""
+
+AVERAGES: Final = {
+    Model.SLOPE: Model.AVERAGE_SLOPE,
+    Model.OFFSETS: Model.AVERAGE_OFFSETS,
+    Model.PRIOR_OFFSETS: Model.AVERAGE_PRIOR_OFFSETS,
+}
+"""Averages of the calibrated model and those of `FITTED` that have a slope or offsets in addition to the study's."""
 
 
 @dataclass(frozen=True)
@@ -181,6 +191,7 @@ class PredictionModel:
         links: Number of these links, or degrees of freedom if they are calibration links.
         sizes_db: Absolute held-out residuals, ascending, at most 400 quantiles of them [dB].
         blocks: These residuals in two levels; None if no links, or too few, were held out.
+        averaged: Further values of the parameters, if path loss is the average over both; otherwise None.
     """
 
     name: str
@@ -191,6 +202,7 @@ class PredictionModel:
     links: int = 1
     sizes_db: tuple[float, ...] = ()
     blocks: BlockErrors | None = None
+    averaged: dict[str, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -296,14 +296,23 @@ def judgement_text(judgement: Judgement) -> str:
     return f"Calibration {verb} on held-out links: {error}, {judgement.gain_db:.2f} dB less {baseline}."
 
 
-def choice_text(chosen: str, best: str) -> str:
-    """Which model predictions use, and why; `best` has the lowest held-out RMSE among those that predict anywhere."""
+def choice_text(chosen: str, best: str, *, averaged: bool = False) -> str:
+    """Which model predictions use, and why; `best` has the lowest held-out RMSE among those that predict anywhere.
+
+    `averaged` states whether the model is averaged with the calibrated one.
+    """
+    added = (
+        " It is averaged with the calibrated model, because a slope or offsets that the study does not state often do "
+        "not apply elsewhere."
+        if averaged
+        else ""
+    )
     if chosen == best:
-        return f"Predictions use the model {str(chosen)!r}, the best on held-out blocks."
+        return f"Predictions use the model {str(chosen)!r}, the best on held-out blocks.{added}"
     reason = "uses the scene" if best in WITHOUT_MATERIALS else "keeps the initial materials"
     return (
         f"Predictions use the model {str(chosen)!r}: it {reason} and is worse than {str(best)!r} by no more than the "
-        "bootstrap error or 5 %."
+        f"bootstrap error or 5 %.{added}"
     )
 
 

@@ -19,7 +19,14 @@ from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.materials import Material
-from calibray.result.held_out import WITHOUT_MATERIALS, BlockErrors, FittedTerm, Model, PredictionModel
+from calibray.result.held_out import (
+    AVERAGES,
+    WITHOUT_MATERIALS,
+    BlockErrors,
+    FittedTerm,
+    Model,
+    PredictionModel,
+)
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study.model import StudyModel
 from calibray.validation.models import (
@@ -85,6 +92,8 @@ def fit_prediction_model(
 ) -> FittedModel:
     """Fit the chosen model to all links that have a weight.
 
+    An average has the scene of the calibrated model, and the values of the other model as further ones.
+
     Args:
         problem: The problem.
         trail: Its search.
@@ -98,21 +107,24 @@ def fit_prediction_model(
     """
     setup, parameters = problem.setup, problem.parameters
     candidate, scene_db = trail.best, trail.best_modelled
-    objective, modelled = problem.objective, scene_db
+    objective, modelled, other = problem.objective, scene_db, None
     if name in WITHOUT_MATERIALS:
         make = log_distance if name == Model.LOG_DISTANCE else obstructed
         objective, modelled = make(setup.links, problem.objective, without_scene(setup.study, setup.links))
     elif name == Model.INITIAL:
         candidate, scene_db = parameters.start, problem.before
         objective, modelled = initial_objective(problem.objective, setup), scene_db
+    elif name in AVERAGES.values():
+        other = _fit_variant(problem, trail, next(each for each in AVERAGES if AVERAGES[each] == name))
     elif name != Model.CALIBRATED:
-        best = parameters.to_search(trail.best)
-        variant = variants(problem, best)[Model(name)]
-        point = find_minima(variant, best[None], SEARCHES)[0]
-        candidate, scene_db = parameters.from_search(point), variant.evaluate(point[None]).modelled[0]
+        variant = _fit_variant(problem, trail, Model(name))
+        candidate, scene_db = variant.candidate, variant.modelled
         objective, modelled = variant.objective, scene_db
     uses_scene = name not in WITHOUT_MATERIALS
-    terms = fitted_terms(objective, modelled, setup.study)
+    terms, path_loss_db = fitted_terms(objective, modelled, setup.study), objective.with_nuisance(modelled)
+    if other is not None:
+        terms = averaged_terms(terms, fitted_terms(other.objective, other.modelled, setup.study))
+        path_loss_db = (path_loss_db + other.objective.with_nuisance(other.modelled)) / 2
     model = PredictionModel(
         name,
         parameters.named(candidate) if uses_scene else None,
@@ -122,6 +134,7 @@ def fit_prediction_model(
         residuals.links,
         quantiles(np.sort(np.abs(residuals.errors_db))),
         residuals.blocks,
+        None if other is None else parameters.named(other.candidate),
     )
     materials = parameters.materials(candidate, problem.setup.scene.materials) if uses_scene else None
     if isinstance(problem.engine, Replay) and problem.engine.effects:
@@ -132,11 +145,46 @@ def fit_prediction_model(
         whole = parameters.materials(candidate, setup.scene.materials)
         whole |= {name: whole[section.of] for name, section in facades.items()}
         scene_db = path_loss(problem.engine.paths, whole, setup.radio.combining, setup.radio.bandwidth)
-    path_loss_db = objective.with_nuisance(modelled)
     if retrace_gap_db is not None and (candidate == trail.best).all():
         scene_db = traced_again(scene_db, retrace_gap_db)
         path_loss_db = traced_again(path_loss_db, retrace_gap_db) if uses_scene else path_loss_db
     return FittedModel(model, materials, path_loss_db, scene_db)
+
+
+@dataclass(frozen=True, eq=False)
+class _Variant:
+    """A variant fitted to the links with a weight: its values [d], objective, and path loss without nuisance [L]."""
+
+    candidate: NDArray[np.float64]
+    objective: Objective
+    modelled: NDArray[np.float64]
+
+
+def _fit_variant(problem: Problem, trail: Trail, name: Model) -> _Variant:
+    best = problem.parameters.to_search(trail.best)
+    variant = variants(problem, best)[name]
+    point = find_minima(variant, best[None], SEARCHES)[0]
+    modelled = variant.evaluate(point[None]).modelled[0]
+    return _Variant(problem.parameters.from_search(point), variant.objective, modelled)
+
+
+def averaged_terms(few: tuple[FittedTerm, ...], more: tuple[FittedTerm, ...]) -> tuple[FittedTerm, ...]:
+    """The mean of the terms of two models, of which the second has all terms of the first.
+
+    A term that the first lacks has half its coefficients. A group without a coefficient in one model has that of the
+    other.
+    """
+    known, averaged = {term.name: term for term in few}, []
+    for term in more:
+        spread_db, others = term.spread_db, dict.fromkeys(term.coefficients, 0.0)
+        if term.name in known:
+            others = known[term.name].coefficients
+        elif spread_db is not None:
+            spread_db = spread_db / 2
+        pairs = ({**others, **term.coefficients}, {**term.coefficients, **others})
+        means = {label: (pairs[0][label] + pairs[1][label]) / 2 for label in pairs[0]}
+        averaged.append(replace(term, coefficients=means, spread_db=spread_db))
+    return tuple(averaged)
 
 
 def with_prior_mean(terms: tuple[FittedTerm, ...], study: StudyModel) -> tuple[FittedTerm, ...]:

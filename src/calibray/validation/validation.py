@@ -3,7 +3,8 @@
 Predictions use the initial materials with fitted offsets until another model is better by more than the bootstrap error
 of the difference (the one-standard-error rule, L. Breiman et al., Classification and Regression Trees, 1984) and by 5 %
 of the RMSE. The best calibrated model is tried first, then the log-distance model, which uses no scene. A few blocks
-hardly distinguish models of similar accuracy, and a fitted model loses more if its fit does not apply elsewhere.
+hardly distinguish models of similar accuracy, and a fitted model loses more if its fit does not apply elsewhere. If the
+chosen model has a slope or offsets that the study does not state, it is averaged with the calibrated model.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from calibray.measurements import Measurements
 from calibray.result.held_out import (
+    AVERAGES,
     BASELINES,
     FITTED,
     WITHOUT_MATERIALS,
@@ -113,9 +115,10 @@ class Validation(HeldOutErrors):
     @property
     def choice(self) -> str:
         """Which model predictions use, with the reason."""
-        return choice_text(
-            self.chosen, least(self._on(self.judged), (Model.INITIAL, *FITTED, *WITHOUT_MATERIALS))
-        )
+        errors = self._on(self.judged)
+        name = choose(errors, self.position[self.judged])
+        best = least(errors, (Model.INITIAL, *FITTED, *WITHOUT_MATERIALS))
+        return choice_text(name, best, averaged=name != self.chosen)
 
     def scale(self, name: str) -> float:
         """Standard deviation of a model's residuals on new links [dB]: the root mean square of the held-out ones."""
@@ -168,7 +171,9 @@ class Validation(HeldOutErrors):
 
     def _choose(self, mask: NDArray[np.bool_]) -> str:
         """The prediction model that some links choose."""
-        return choose(self._on(mask), self.position[mask])
+        name = choose(self._on(mask), self.position[mask])
+        average = AVERAGES.get(Model(name), name)
+        return average if average in self.errors else name
 
     def _on(self, mask: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
         return {name: errors[mask] for name, errors in self.errors.items()}
