@@ -133,6 +133,7 @@ def test_a_slope_that_the_study_does_not_state_is_averaged_with_the_calibrated_m
     result = calibrate(planted.study(tmp_path, table, holdout={"blocks": 4}), engine=planted.engine())
     model, errors = result.prediction.model, result.held_out.errors
     assert model.name == Model.AVERAGE_SLOPE
+    assert Model.AVERAGE_SLOPE in result.held_out.table.index
     assert errors[Model.AVERAGE_SLOPE] == pytest.approx(
         (errors[Model.SLOPE] + errors[Model.CALIBRATED]) / 2, nan_ok=True
     )

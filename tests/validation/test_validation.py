@@ -172,6 +172,19 @@ def test_the_log_distance_model_is_chosen_where_it_is_clearly_better():
     assert "it uses the scene and is worse than 'log-distance'" in near.choice
 
 
+def test_a_model_with_more_offsets_than_the_study_is_averaged_with_the_calibrated_one():
+    size_db = {Model.INITIAL: 9.0, Model.CALIBRATED: 5.0, Model.OFFSETS: 2.0, Model.AVERAGE_OFFSETS: 3.0}
+    validation = synthetic_validation(size_db)
+    assert validation.chosen == Model.AVERAGE_OFFSETS
+    assert "'calibrated with offsets', the best on held-out blocks. It is averaged" in validation.choice
+    assert Model.AVERAGE_OFFSETS in validation.table.index
+    # The average of a model that is not chosen neither predicts nor has a row.
+    other = synthetic_validation(size_db | {Model.CALIBRATED: 1.0, Model.AVERAGE_OFFSETS: 0.5})
+    assert other.chosen == Model.CALIBRATED
+    assert "averaged" not in other.choice
+    assert Model.AVERAGE_OFFSETS not in other.table.index
+
+
 def test_the_one_standard_error_rule_beats_the_lowest_rmse_on_few_links():
     rmse_db, by_rule, by_rmse = {Model.INITIAL: 3.0, Model.CALIBRATED: 3.3, Model.SLOPE: 3.6}, [], []
     for seed in range(60):

@@ -152,7 +152,7 @@ def _colors(validation: Validation) -> list[tuple[str, str]]:
     others = iter((FAINT, *PALETTE, *PALETTE))
     return [
         (name, next(calibrated, INK) if name.startswith("calibrated") else next(others))
-        for name in validation.errors
+        for name in validation.table.index
     ]
 
 

@@ -80,8 +80,12 @@ class Validation(HeldOutErrors):
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """One row per model: RMSE, standard deviation [dB], log predictive density per link, and coverage."""
-        return pd.DataFrame({str(name): self._figures(name) for name in self.errors}).T
+        """One row per model: RMSE, standard deviation [dB], log predictive density per link, and coverage.
+
+        Of the averages, only a chosen one has a row.
+        """
+        names = [name for name in self.errors if name == self.chosen or name not in AVERAGES.values()]
+        return pd.DataFrame({str(name): self._figures(name) for name in names}).T
 
     @property
     def best(self) -> str:
