@@ -84,10 +84,7 @@ def coverage(problem: Problem, apart: np.ndarray) -> tuple[list[float], list[flo
     ]
     found = fit_models(part, fits)
     errors = {str(model): (loss - objective.measured)[apart] for model, loss in found.items()}
-    errors[CHOSEN] = errors[ALONE] = errors[name]
-    for alone, average in AVERAGES.items():
-        if name == average:
-            errors[ALONE] = errors[alone]
+    errors[CHOSEN], errors[ALONE] = errors[name], errors[AVERAGES.get(name, name)]
     finite = np.isfinite(errors[name])
     inside = [float(np.mean((np.abs(errors[name]) <= half)[finite])) for half in halves]
     return inside, [float(half.mean()) for half in halves], errors

@@ -271,6 +271,7 @@ def _replay(
         return None
     every = (prediction.model.parameters, prediction.model.averaged)
     values = np.array([[each[name] for name in names] for each in every if each is not None])
+    averaged = len(values)
     if draws:
         setup = with_constants(result, setup)
         names = setup.parameters.names
@@ -280,7 +281,7 @@ def _replay(
     return Replayed(
         replay(setup, setup.trace(traced_materials(result, prediction.materials), progress)),
         values,
-        1 if prediction.model.averaged is None else 2,
+        averaged,
     )
 
 

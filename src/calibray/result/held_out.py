@@ -47,12 +47,13 @@ FITTED: Final = (
 )
 """Models that calibrate materials and can make predictions anywhere."""
 
-AVERAGES: Final = {
-    Model.SLOPE: Model.AVERAGE_SLOPE,
-    Model.OFFSETS: Model.AVERAGE_OFFSETS,
-    Model.PRIOR_OFFSETS: Model.AVERAGE_PRIOR_OFFSETS,
+AVERAGES: Final[dict[str, Model]] = {
+    Model.AVERAGE_SLOPE: Model.SLOPE,
+    Model.AVERAGE_OFFSETS: Model.OFFSETS,
+    Model.AVERAGE_PRIOR_OFFSETS: Model.PRIOR_OFFSETS,
 }
-"""Averages of the calibrated model and those of `FITTED` that have a slope or offsets in addition to the study's."""
+"""The model of `FITTED` that each average takes together with the calibrated one: it has a slope or offsets in addition
+to the study's."""
 
 
 @dataclass(frozen=True)

@@ -114,8 +114,8 @@ def fit_prediction_model(
     elif name == Model.INITIAL:
         candidate, scene_db = parameters.start, problem.before
         objective, modelled = initial_objective(problem.objective, setup), scene_db
-    elif name in AVERAGES.values():
-        other = _fit_variant(problem, trail, next(each for each in AVERAGES if AVERAGES[each] == name))
+    elif name in AVERAGES:
+        other = _fit_variant(problem, trail, AVERAGES[name])
     elif name != Model.CALIBRATED:
         variant = _fit_variant(problem, trail, Model(name))
         candidate, scene_db = variant.candidate, variant.modelled
@@ -161,6 +161,7 @@ class _Variant:
 
 
 def _fit_variant(problem: Problem, trail: Trail, name: Model) -> _Variant:
+    """Search the minimum of a variant from the calibrated optimum and new starting points."""
     best = problem.parameters.to_search(trail.best)
     variant = variants(problem, best)[name]
     point = find_minima(variant, best[None], SEARCHES)[0]

@@ -182,7 +182,7 @@ def fit_models(
         name: variant.objective.with_nuisance(variant.modelled(minima[:1])[0])
         for name, (variant, minima) in fits.items()
     }
-    for name, average in AVERAGES.items():
+    for average, name in AVERAGES.items():
         if name in fits:
             path_loss_db[average] = (path_loss_db[name] + path_loss_db[Model.CALIBRATED]) / 2
     known_db = without_scene(setup.study, setup.links)

@@ -84,7 +84,7 @@ class Validation(HeldOutErrors):
 
         Of the averages, only a chosen one has a row.
         """
-        names = [name for name in self.errors if name == self.chosen or name not in AVERAGES.values()]
+        names = [name for name in self.errors if name == self.chosen or name not in AVERAGES]
         return pd.DataFrame({str(name): self._figures(name) for name in names}).T
 
     @property
@@ -119,10 +119,8 @@ class Validation(HeldOutErrors):
     @property
     def choice(self) -> str:
         """Which model predictions use, with the reason."""
-        errors = self._on(self.judged)
-        name = choose(errors, self.position[self.judged])
-        best = least(errors, (Model.INITIAL, *FITTED, *WITHOUT_MATERIALS))
-        return choice_text(name, best, averaged=name != self.chosen)
+        best = least(self._on(self.judged), (Model.INITIAL, *FITTED, *WITHOUT_MATERIALS))
+        return choice_text(AVERAGES.get(self.chosen, self.chosen), best, averaged=self.chosen in AVERAGES)
 
     def scale(self, name: str) -> float:
         """Standard deviation of a model's residuals on new links [dB]: the root mean square of the held-out ones."""
@@ -176,8 +174,8 @@ class Validation(HeldOutErrors):
     def _choose(self, mask: NDArray[np.bool_]) -> str:
         """The prediction model that some links choose."""
         name = choose(self._on(mask), self.position[mask])
-        average = AVERAGES.get(Model(name), name)
-        return average if average in self.errors else name
+        averages = {alone: average for average, alone in AVERAGES.items() if average in self.errors}
+        return averages.get(Model(name), name)
 
     def _on(self, mask: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
         return {name: errors[mask] for name, errors in self.errors.items()}
