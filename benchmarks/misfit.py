@@ -8,7 +8,8 @@ clusters of receivers apart, and calibrates the others as `calibray run` does. T
 for each district. Reported are how often 90 % sets contain the truth by verdict, how often a run with a wrong verdict
 (any but not identifiable, and the 95 % interval misses) has a warning, and what the model that held-out blocks choose
 loses at the cluster kept apart, compared with the best of the initial materials, the calibrated ones and the
-log-distance model there.
+log-distance model there; further what it loses without the average with the calibrated model, and what the calibrated
+models without and with a prior lose.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from scipy.cluster.vq import kmeans2
 from calibray.calibration.link_diagnostics import directions_remark
 from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares
-from calibray.result.held_out import Model
+from calibray.result.held_out import AVERAGES, Model
 from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.verdicts import credible_sets
@@ -100,7 +101,8 @@ def table(lines: list[dict[str, Any]]) -> Table:
         Column("the truth has"), numbers("runs"), numbers("identified or weakly"), numbers("in 90 % set"),
         numbers("identified"), numbers("in 90 % set"), numbers("ambiguous or at bound"), numbers("in 90 % set"),
         numbers("all, in 90 % set"), numbers("wrong runs"), numbers("of these warned"), numbers("warned"),
-        numbers("choice right"), numbers("regret", "dB"), numbers("CPU", "s"),
+        numbers("choice right"), numbers("regret", "dB"), numbers("not averaged", "dB"),
+        numbers("calibrated", "dB"), numbers("with prior", "dB"), numbers("CPU", "s"),
     )  # fmt: skip
     rows = []
     for world in dict.fromkeys(line["world"] for line in lines):
@@ -115,20 +117,26 @@ def table(lines: list[dict[str, Any]]) -> Table:
             if any(not held and verdict in IDENTIFIED + PARTLY
                    for verdict, held in zip(line["verdicts"], line["held"], strict=True))
         ]  # fmt: skip
-        regret = [_regret(line) for line in mine if "chosen" in line]
+        choices = [line for line in mine if "chosen" in line]
+        regret = [_regret(line, line["chosen"]) for line in choices]
+        rivals = [
+            [_regret(line, AVERAGES.get(line["chosen"], line["chosen"])) for line in choices],
+            *([_regret(line, name) for line in choices] for name in (Model.CALIBRATED, Model.PRIOR)),
+        ]
         rows.append((
             world, str(len(mine)), *cells, _share([held for _, held in values]), str(len(wrong)),
             _share([bool(line["remarks"]) for line in wrong]), _share([bool(line["remarks"]) for line in mine]),
-            _share([loss <= NEARLY_DB for loss in regret]), f"{np.mean(regret):.2f}" if regret else "-",
+            _share([loss <= NEARLY_DB for loss in regret]),
+            *(f"{np.mean(each):.2f}" if each else "-" for each in (regret, *rivals)),
             f"{np.mean([line['seconds'] for line in mine]):.1f}",
         ))  # fmt: skip
     return Table("Where the truth has what the scene lacks", columns, tuple(rows))
 
 
-def _regret(line: dict[str, Any]) -> float:
-    """RMSE of the chosen model at the cluster kept apart, minus that of the best simple one [dB]."""
+def _regret(line: dict[str, Any], name: str) -> float:
+    """RMSE of a model at the cluster kept apart, minus that of the best simple one [dB]."""
     simple = (Model.INITIAL, Model.CALIBRATED, Model.LOG_DISTANCE)
-    return line["far_db"][line["chosen"]] - min(line["far_db"].get(name, np.inf) for name in simple)
+    return line["far_db"][name] - min(line["far_db"].get(name, np.inf) for name in simple)
 
 
 def _share(values: list[bool]) -> str:
