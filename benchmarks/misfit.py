@@ -100,7 +100,8 @@ def table(lines: list[dict[str, Any]]) -> Table:
     columns = (
         Column("the truth has"), numbers("runs"), numbers("identified or weakly"), numbers("in 90 % set"),
         numbers("identified"), numbers("in 90 % set"), numbers("ambiguous or at bound"), numbers("in 90 % set"),
-        numbers("all, in 90 % set"), numbers("wrong runs"), numbers("of these warned"), numbers("warned"),
+        numbers("all, in 90 % set"), numbers("wrong runs"), numbers("of these warned"), numbers("warned or at bound"),
+        numbers("all runs, warned"),
         numbers("choice right"), numbers("regret", "dB"), numbers("not averaged", "dB"),
         numbers("calibrated", "dB"), numbers("with prior", "dB"), numbers("CPU", "s"),
     )  # fmt: skip
@@ -125,7 +126,9 @@ def table(lines: list[dict[str, Any]]) -> Table:
         ]
         rows.append((
             world, str(len(mine)), *cells, _share([held for _, held in values]), str(len(wrong)),
-            _share([bool(line["remarks"]) for line in wrong]), _share([bool(line["remarks"]) for line in mine]),
+            _share([bool(line["remarks"]) for line in wrong]),
+            _share([bool(line["remarks"]) or "at bound" in line["verdicts"] for line in wrong]),
+            _share([bool(line["remarks"]) for line in mine]),
             _share([loss <= NEARLY_DB for loss in regret]),
             *(f"{np.mean(each):.2f}" if each else "-" for each in (regret, *rivals)),
             f"{np.mean([line['seconds'] for line in mine]):.1f}",
