@@ -7,6 +7,7 @@ building and material becomes a separate material.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -62,9 +63,13 @@ class SplitReplay:
         return self.engine.respond(self._candidates(values, factors), wanted)
 
     def _candidates(self, values: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.clip(values[:, self.parameter_of] * factors, *self._bounds)
+
+    @cached_property
+    def _bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Smallest and largest possible value of every constant [c]."""
         bounds = [PARAMETER_BOUNDS[parameter.field] for parameter in self.engine.parameters]
-        lower, upper = [bound.lower for bound in bounds], [bound.upper for bound in bounds]
-        return np.clip(values[:, self.parameter_of] * factors, lower, upper)
+        return np.array([bound.lower for bound in bounds]), np.array([bound.upper for bound in bounds])
 
 
 def can_split(problem: Problem) -> bool:
