@@ -33,6 +33,7 @@ from calibray.uncertainty.emulator import emulate
 from calibray.uncertainty.joint_model import JointModel, has_offset, joint_model
 from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, HEAVY, OUT_OF_SIGHT
 from calibray.uncertainty.remarks import conflict, departures, fit_undeclared_offset, missed, outside_interval
+from calibray.uncertainty.repeats import average_repeats
 from calibray.uncertainty.sequential_monte_carlo import Posterior, draw_posterior, joined
 from calibray.uncertainty.verdicts import Axes, consistent, local_intervals, verdicts, with_reason
 from calibray.uncertainty.verdicts import Verdict as VerdictOnDraws
@@ -115,7 +116,8 @@ def certainty(
     with single_blas_thread(problem.objective.num_counted <= FEW_LINKS):
         if problem.differentiable:
             before = problem.engine.calls
-            assessment = _assess(problem, [problem], trail, progress)
+            averaged = average_repeats(problem, trail.best)
+            assessment = _assess(averaged, [averaged], trail, progress)
             draws = 0 if assessment.posterior is None else assessment.posterior.replays
             calls = problem.engine.calls - before + (draws if can_split(problem) else 0)
         else:
@@ -201,7 +203,7 @@ def _assess(
     most_probable = problem.parameters.named(problem.parameters.from_search(most_probable))
     remarks = [*offset.remarks, *departures(noise)]
     if problem in engines:
-        remarks += missed(problem, posterior.means, trail)
+        remarks += missed(problem, posterior.means, float(optimum.value[0]))
     remarks += outside_interval(problem, best, intervals, most_probable, log_odds, noise)
     intervals = {name: consistent(interval, best[name]) for name, interval in intervals.items()}
     if problem.observed:

@@ -21,7 +21,7 @@ from scipy.special import fdtrc, fdtri, ndtri, stdtr
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.preliminary_fits import with_estimated_errors
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import BASINS, Trail, least_squares
+from calibray.fitting.search import BASINS, least_squares
 from calibray.result.verdict import CONFIDENCE, Interval, Remark, RemarkKind, Value
 from calibray.result.wording import MOST_ODDS
 from calibray.uncertainty.draws import Draws
@@ -183,13 +183,13 @@ def departures(noise: Mapping[str, float]) -> tuple[Remark, ...]:
     return tuple(remarks)
 
 
-def missed(problem: Problem, posterior: Draws, trail: Trail) -> tuple[Remark, ...]:
-    """A remark if a draw has a lower objective than the best candidate of the method."""
+def missed(problem: Problem, posterior: Draws, best_value: float) -> tuple[Remark, ...]:
+    """A remark if a draw has a lower objective [dB] than the best candidate of the method."""
     top = posterior.point[np.argsort(-posterior.density)[:BEST_DRAWS]]
     lowest = float(problem.squares(top).value.min())
-    if lowest > trail.best_value - MISSED_DB:
+    if lowest > best_value - MISSED_DB:
         return ()
-    return (Remark(RemarkKind.MISSED_OPTIMUM, {"draws_db": lowest, "found_db": float(trail.best_value)}),)
+    return (Remark(RemarkKind.MISSED_OPTIMUM, {"draws_db": lowest, "found_db": best_value}),)
 
 
 def outside_interval(

@@ -1,0 +1,112 @@
+"""Rows that repeat a link count as one measurement."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import planted
+from calibray import engines
+from calibray.fitting.nuisance import Nuisance, make_term
+from calibray.fitting.problem import Problem
+from calibray.fitting.search import search
+from calibray.optimizers import LeastSquares
+from calibray.paths import take_links
+from calibray.study import Setup, Study
+from calibray.uncertainty.assessment import certainty
+from calibray.uncertainty.repeats import average_repeats
+from link_tables import links_from_frame
+
+ROWS = 3
+APART_M = 0.002
+
+NOISE_DB = 0.5 * np.random.default_rng(5).standard_normal(planted.LINKS)
+ROW_DB = 0.05 * np.random.default_rng(6).standard_normal((planted.LINKS, ROWS))
+
+
+def problem(rows: int, apart_m: float = APART_M, **sections) -> Problem:
+    """A problem with a number of rows per link whose receivers lie some distance apart."""
+    frame = planted.links()
+    again = frame.loc[np.repeat(frame.index, rows)].reset_index(drop=True)
+    again["rx_x"] += apart_m * np.tile(np.arange(rows), len(frame))
+    found = planted.engine()
+    kept = take_links(found.paths, np.repeat(np.arange(planted.LINKS), rows))
+    setup = Setup.open(
+        Study.from_content(planted.content("links.csv", **sections)), links=links_from_frame(again)
+    )
+    measured = np.repeat(planted.path_loss() + NOISE_DB, rows) + ROW_DB[:, :rows].ravel()
+    new = Problem.of(setup, engines.Replay(kept, found.parameters))
+    return replace(new, objective=replace(new.objective, measured=measured))
+
+
+def start(rows: Problem) -> np.ndarray:
+    return rows.parameters.start
+
+
+def offsets(rows: Problem, device: np.ndarray) -> Nuisance:
+    """An offset for each of two devices."""
+    links = rows.setup.links
+    return Nuisance(len(links), (make_term(links, "device", labels=np.where(device, "b", "a")),))
+
+
+def test_rows_of_one_link_are_replaced_by_their_mean():
+    rows = problem(ROWS)
+    averaged = average_repeats(rows, start(rows)).objective
+    counted = averaged.weight > 0
+    assert counted.tolist() == np.tile([True, False, False], planted.LINKS).tolist()
+    assert averaged.weight[counted] == pytest.approx(rows.objective.weight[counted])
+    assert averaged.measured[counted] == pytest.approx(
+        rows.objective.measured.reshape(-1, ROWS).mean(axis=1), abs=1e-12
+    )
+
+
+def test_a_row_without_weight_is_not_averaged():
+    rows = problem(ROWS)
+    weight = np.where(np.arange(len(rows.objective.weight)) % ROWS == 0, 0.0, 1.0)
+    lighter = replace(rows, objective=replace(rows.objective, weight=weight))
+    averaged = average_repeats(lighter, start(rows)).objective
+    counted = np.flatnonzero(averaged.weight)
+    assert (counted % ROWS).tolist() == planted.LINKS * [1]
+    assert averaged.measured[counted] == pytest.approx(
+        rows.objective.measured.reshape(-1, ROWS)[:, 1:].mean(axis=1), abs=1e-12
+    )
+
+
+@pytest.mark.parametrize("apart_m", [0.02, 5.0])
+def test_rows_at_other_positions_stay(apart_m):
+    rows = problem(ROWS, apart_m)
+    assert average_repeats(rows, start(rows)) is rows
+
+
+def test_rows_of_another_group_or_path_loss_stay():
+    rows = problem(ROWS)
+    device = np.arange(len(rows.objective.weight)) % ROWS == 2
+    nuisance = offsets(rows, device)
+    grouped = replace(rows, objective=replace(rows.objective, nuisance=nuisance))
+    counted = np.flatnonzero(average_repeats(grouped, start(rows)).objective.weight)
+    assert sorted(set((counted % ROWS).tolist())) == [0, 2]
+    # Rows at the same positions, but with the paths of other links, as of another antenna.
+    found, index = planted.engine(), np.repeat(np.arange(planted.LINKS), ROWS)
+    index[ROWS - 1 :: ROWS] = np.roll(np.arange(planted.LINKS), 1)
+    other = replace(rows, engine=engines.Replay(take_links(found.paths, index), found.parameters))
+    counted = np.flatnonzero(average_repeats(other, start(rows)).objective.weight)
+    assert sorted(set((counted % ROWS).tolist())) == [0, 2]
+
+
+def test_intervals_are_those_of_the_means():
+    """Negative control: intervals of rows that count as independent are narrower."""
+    rows, once = problem(ROWS), problem(1)
+    means = rows.objective.measured.reshape(-1, ROWS).mean(axis=1)
+    once = replace(once, objective=replace(once.objective, measured=means))
+    apart = problem(ROWS, 0.02)
+    lower, upper = once.parameters.search_bounds
+
+    def widths(one: Problem) -> np.ndarray:
+        intervals = certainty(one, search(one, LeastSquares(lower, upper, starts=16))).intervals
+        return np.array([interval.upper - interval.lower for interval in intervals.values()])
+
+    reference = widths(once)
+    assert widths(rows) == pytest.approx(reference, rel=0.05)
+    assert (widths(apart) < 0.9 * reference).any()
