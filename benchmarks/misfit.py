@@ -5,11 +5,14 @@
 
 A repetition draws a truth from the bounds, computes path loss in its world, adds 3 dB of noise, keeps one of four
 clusters of receivers apart, and calibrates the others as `calibray run` does. The true paths of a world are traced once
-for each district. Reported are how often 90 % sets contain the truth by verdict, how often a run with a wrong verdict
-(any but not identifiable, and the 95 % interval misses) has a warning, and what the model that held-out blocks choose
-loses at the cluster kept apart, compared with the best of the initial materials, the calibrated ones and the
-log-distance model there; further what it loses without the average with the calibrated model, and what the calibrated
-models without and with a prior lose.
+for each district.
+
+Reported are how often 90 % sets contain the truth by verdict, and how often a run with a wrong verdict (any but not
+identifiable, and the 95 % interval misses) has a warning, or a value at a bound, which the report explains as a
+possible defect of the model. The regret is what the model that held-out blocks choose loses at the cluster kept apart,
+compared with the best of the initial materials, the calibrated ones and the log-distance model there. The same is
+reported for the choice without the average with the calibrated model, and for the calibrated models without and with a
+prior.
 """
 
 from __future__ import annotations
@@ -101,8 +104,7 @@ def table(lines: list[dict[str, Any]]) -> Table:
         Column("the truth has"), numbers("runs"), numbers("identified or weakly"), numbers("in 90 % set"),
         numbers("identified"), numbers("in 90 % set"), numbers("ambiguous or at bound"), numbers("in 90 % set"),
         numbers("all, in 90 % set"), numbers("wrong runs"), numbers("of these warned"), numbers("warned or at bound"),
-        numbers("all runs, warned"),
-        numbers("choice right"), numbers("regret", "dB"), numbers("not averaged", "dB"),
+        numbers("all runs, warned"), numbers("choice right"), numbers("regret", "dB"), numbers("not averaged", "dB"),
         numbers("calibrated", "dB"), numbers("with prior", "dB"), numbers("CPU", "s"),
     )  # fmt: skip
     rows = []

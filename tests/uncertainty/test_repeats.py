@@ -26,23 +26,21 @@ NOISE_DB = 0.5 * np.random.default_rng(5).standard_normal(planted.LINKS)
 ROW_DB = 0.05 * np.random.default_rng(6).standard_normal((planted.LINKS, ROWS))
 
 
-def problem(rows: int, apart_m: float = APART_M, **sections) -> Problem:
+def problem(rows: int, apart_m: float = APART_M) -> Problem:
     """A problem with a number of rows per link whose receivers lie some distance apart."""
     frame = planted.links()
     again = frame.loc[np.repeat(frame.index, rows)].reset_index(drop=True)
     again["rx_x"] += apart_m * np.tile(np.arange(rows), len(frame))
     found = planted.engine()
     kept = take_links(found.paths, np.repeat(np.arange(planted.LINKS), rows))
-    setup = Setup.open(
-        Study.from_content(planted.content("links.csv", **sections)), links=links_from_frame(again)
-    )
+    setup = Setup.open(Study.from_content(planted.content("links.csv")), links=links_from_frame(again))
     measured = np.repeat(planted.path_loss() + NOISE_DB, rows) + ROW_DB[:, :rows].ravel()
     new = Problem.of(setup, engines.Replay(kept, found.parameters))
     return replace(new, objective=replace(new.objective, measured=measured))
 
 
-def start(rows: Problem) -> np.ndarray:
-    return rows.parameters.start
+def averaged(rows: Problem) -> Problem:
+    return average_repeats(rows, rows.parameters.start)
 
 
 def offsets(rows: Problem, device: np.ndarray) -> Nuisance:
@@ -53,11 +51,11 @@ def offsets(rows: Problem, device: np.ndarray) -> Nuisance:
 
 def test_rows_of_one_link_are_replaced_by_their_mean():
     rows = problem(ROWS)
-    averaged = average_repeats(rows, start(rows)).objective
-    counted = averaged.weight > 0
+    found = averaged(rows).objective
+    counted = found.weight > 0
     assert counted.tolist() == np.tile([True, False, False], planted.LINKS).tolist()
-    assert averaged.weight[counted] == pytest.approx(rows.objective.weight[counted])
-    assert averaged.measured[counted] == pytest.approx(
+    assert found.weight[counted] == pytest.approx(rows.objective.weight[counted])
+    assert found.measured[counted] == pytest.approx(
         rows.objective.measured.reshape(-1, ROWS).mean(axis=1), abs=1e-12
     )
 
@@ -66,10 +64,10 @@ def test_a_row_without_weight_is_not_averaged():
     rows = problem(ROWS)
     weight = np.where(np.arange(len(rows.objective.weight)) % ROWS == 0, 0.0, 1.0)
     lighter = replace(rows, objective=replace(rows.objective, weight=weight))
-    averaged = average_repeats(lighter, start(rows)).objective
-    counted = np.flatnonzero(averaged.weight)
+    found = averaged(lighter).objective
+    counted = np.flatnonzero(found.weight)
     assert (counted % ROWS).tolist() == planted.LINKS * [1]
-    assert averaged.measured[counted] == pytest.approx(
+    assert found.measured[counted] == pytest.approx(
         rows.objective.measured.reshape(-1, ROWS)[:, 1:].mean(axis=1), abs=1e-12
     )
 
@@ -77,7 +75,7 @@ def test_a_row_without_weight_is_not_averaged():
 @pytest.mark.parametrize("apart_m", [0.02, 5.0])
 def test_rows_at_other_positions_stay(apart_m):
     rows = problem(ROWS, apart_m)
-    assert average_repeats(rows, start(rows)) is rows
+    assert averaged(rows) is rows
 
 
 def test_rows_of_another_group_or_path_loss_stay():
@@ -85,14 +83,23 @@ def test_rows_of_another_group_or_path_loss_stay():
     device = np.arange(len(rows.objective.weight)) % ROWS == 2
     nuisance = offsets(rows, device)
     grouped = replace(rows, objective=replace(rows.objective, nuisance=nuisance))
-    counted = np.flatnonzero(average_repeats(grouped, start(rows)).objective.weight)
+    counted = np.flatnonzero(averaged(grouped).objective.weight)
     assert sorted(set((counted % ROWS).tolist())) == [0, 2]
     # Rows at the same positions, but with the paths of other links, as of another antenna.
     found, index = planted.engine(), np.repeat(np.arange(planted.LINKS), ROWS)
     index[ROWS - 1 :: ROWS] = np.roll(np.arange(planted.LINKS), 1)
     other = replace(rows, engine=engines.Replay(take_links(found.paths, index), found.parameters))
-    counted = np.flatnonzero(average_repeats(other, start(rows)).objective.weight)
+    counted = np.flatnonzero(averaged(other).objective.weight)
     assert sorted(set((counted % ROWS).tolist())) == [0, 2]
+
+
+def test_rows_that_a_candidate_leaves_without_a_path_are_averaged_with_each_other():
+    rows = problem(ROWS)
+    lost = take_links(planted.engine(True).paths, np.repeat(np.arange(planted.LINKS), ROWS))
+    rows = replace(rows, engine=engines.Replay(lost, rows.parameters))
+    assert np.isinf(rows.modelled(rows.parameters.to_search(rows.parameters.start)[None])).sum() == ROWS
+    counted = np.flatnonzero(averaged(rows).objective.weight)
+    assert (counted % ROWS).tolist() == planted.LINKS * [0]
 
 
 def test_intervals_are_those_of_the_means():

@@ -49,7 +49,7 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     candidates = np.stack([parameters.to_search(best), parameters.to_search(parameters.start)])
     terms = objective.nuisance.terms
     columns = np.array([
-        *problem.modelled(candidates)[:, counted] / REPEAT_DB,
+        *np.nan_to_num(problem.modelled(candidates)[:, counted] / REPEAT_DB),  # inf without a path
         *(term.value[counted] / REPEAT_UNIT for term in terms),
         *(term.group[counted] * 2.0 for term in terms),
     ])  # fmt: skip
@@ -59,7 +59,6 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
             near = np.array(tree.query_ball_point(position[row], REPEAT_M))
             equal = (np.abs(columns[:, near] - columns[:, [row]]) <= 1.0).all(axis=0) & (first[near] < 0)
             first[near[equal]] = row
-            first[row] = row
     rows, weights = np.bincount(first), np.bincount(first, weights=objective.weight[counted])
     total = np.bincount(first, weights=(objective.weight * objective.measured)[counted])
     kept = np.flatnonzero(rows)
