@@ -2,6 +2,7 @@
 
     python benchmarks/misfit.py --repetitions 5 --districts judging
     python benchmarks/misfit.py --worlds "nothing,thickness" --no-choice --constants-spread 0 --out exact.jsonl
+    python benchmarks/misfit.py --repetitions 2 --districts judging --no-draws
 
 A repetition draws a truth from the bounds, computes path loss in its world, adds 3 dB of noise, keeps one of four
 clusters of receivers apart, and calibrates the others as `calibray run` does. The true paths of a world are traced once
@@ -30,7 +31,8 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 
 from calibray.calibration.link_diagnostics import directions_remark
-from calibray.fitting.search import search
+from calibray.fitting.problem import Problem
+from calibray.fitting.search import Trail, search
 from calibray.optimizers import LeastSquares
 from calibray.result.held_out import AVERAGES, Model
 from calibray.tables import Column, Table, numbers, render
@@ -51,8 +53,8 @@ IDENTIFIED = ("identified", "weakly identified")
 PARTLY = ("ambiguous", "at bound")
 
 
-def repetition(world: World, seed: int, choice: bool, spread: float | None) -> dict[str, Any]:
-    """Calibrate one truth: verdicts, whether their sets contain it, remarks, and errors far away."""
+def repetition(world: World, seed: int, spread: float | None, *, draws: bool, choice: bool) -> dict[str, Any]:
+    """Calibrate one truth: with draws, verdicts and whether their sets contain it; with a choice, errors far away."""
     started, drawn = time.process_time(), world.planted(seed)
     problem, loss, random = drawn.problem, drawn.loss_db, np.random.default_rng([seed, 4])
     weight, far = problem.objective.weight.copy(), np.zeros(len(loss), dtype=bool)
@@ -66,27 +68,17 @@ def repetition(world: World, seed: int, choice: bool, spread: float | None) -> d
         noise = study.noise.model_copy(update={"constants_spread": spread})
         setup = replace(setup, study=study.model_copy(update={"noise": noise}))
     planted = replace(problem, setup=setup, objective=replace(problem.objective, weight=weight))
-    parameters = problem.parameters
-    lower, upper = parameters.search_bounds
+    lower, upper = problem.parameters.search_bounds
     trail = search(planted, LeastSquares(lower, upper, starts=32, seed=seed))
-    assessed = certainty(planted, trail)
-    if assessed.posterior is None:
-        raise RuntimeError(f"no draws; {assessed.remarks}")
-    means, inside, widths = assessed.posterior.means, [], []
-    for k, value in enumerate(drawn.truth):
-        pieces = credible_sets(means.point[:, k], means.weight, lower[k], upper[k], [LEVEL])[0]
-        inside.append(any(low <= value <= high for low, high in pieces))
-        widths.append(sum(high - low for low, high in pieces) / (upper[k] - lower[k]))
-    truth = parameters.from_search(drawn.truth)
-    held = [each.contains(v) for each, v in zip(assessed.intervals.values(), truth, strict=True)]
-    remarks = (*assessed.remarks, *directions_remark(planted, trail.best))
     line: dict[str, Any] = {
-        "names": parameters.names,
-        "verdicts": [str(interval.verdict) for interval in assessed.intervals.values()],
-        "inside": inside, "widths": widths, "held": held, "remarks": [str(remark.kind) for remark in remarks],
-        "noise": assessed.noise, "rmse_db": trail.best_value, "links": int((weight > 0).sum()),
-        "agree": means.agree, "certainty": assessed.seconds, "calls": assessed.calls,
-    }  # fmt: skip
+        "links": int((weight > 0).sum()),
+        "verdicts": [],
+        "inside": [],
+        "held": [],
+        "remarks": [],
+    }
+    if draws:
+        line |= intervals(planted, trail, drawn.truth)
     if choice and far.any():
         part = replace(planted, setup=planted.setup.with_obstruction())
         minima = {Model.CALIBRATED: trail.minima}
@@ -96,6 +88,29 @@ def repetition(world: World, seed: int, choice: bool, spread: float | None) -> d
         sizes = {name: float(np.sqrt(np.mean(e**2))) for name, e in errors.items() if np.isfinite(e).all()}
         line |= {"chosen": chosen, "far_db": sizes}
     return line | {"seconds": time.process_time() - started}
+
+
+def intervals(planted: Problem, trail: Trail, point: np.ndarray) -> dict[str, Any]:
+    """Verdicts and remarks of a calibration, and whether its sets and intervals contain the truth [d]."""
+    parameters, (lower, upper) = planted.parameters, planted.parameters.search_bounds
+    assessed = certainty(planted, trail)
+    if assessed.posterior is None:
+        raise RuntimeError(f"no draws; {assessed.remarks}")
+    means, inside, widths = assessed.posterior.means, [], []
+    for k, value in enumerate(point):
+        pieces = credible_sets(means.point[:, k], means.weight, lower[k], upper[k], [LEVEL])[0]
+        inside.append(any(low <= value <= high for low, high in pieces))
+        widths.append(sum(high - low for low, high in pieces) / (upper[k] - lower[k]))
+    truth = parameters.from_search(point)
+    held = [each.contains(v) for each, v in zip(assessed.intervals.values(), truth, strict=True)]
+    remarks = (*assessed.remarks, *directions_remark(planted, trail.best))
+    return {
+        "names": parameters.names,
+        "verdicts": [str(interval.verdict) for interval in assessed.intervals.values()],
+        "inside": inside, "widths": widths, "held": held, "remarks": [str(remark.kind) for remark in remarks],
+        "noise": assessed.noise, "rmse_db": trail.best_value, "agree": means.agree,
+        "certainty": assessed.seconds, "calls": assessed.calls,
+    }  # fmt: skip
 
 
 def table(lines: list[dict[str, Any]]) -> Table:
@@ -108,8 +123,8 @@ def table(lines: list[dict[str, Any]]) -> Table:
         numbers("calibrated", "dB"), numbers("with prior", "dB"), numbers("CPU", "s"),
     )  # fmt: skip
     rows = []
-    for world in dict.fromkeys(line["world"] for line in lines):
-        mine = [line for line in lines if line["world"] == world]
+    for world in (*dict.fromkeys(line["world"] for line in lines), "all"):
+        mine = [line for line in lines if world in (line["world"], "all")]
         values = [each for line in mine for each in zip(line["verdicts"], line["inside"], strict=True)]
         cells = []
         for verdicts in (IDENTIFIED, IDENTIFIED[:1], PARTLY):
@@ -159,6 +174,7 @@ def main() -> None:
         "--constants-spread", type=float, help="how well constants are known; the default if absent"
     )
     parser.add_argument("--no-choice", action="store_true", help="leave validation out")
+    parser.add_argument("--no-draws", action="store_true", help="leave verdicts and intervals out")
     parser.add_argument("--out", type=Path, help="file of lines, one a repetition; goes on where it stands")
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "calibray-districts")
     given = parser.parse_args()
@@ -176,8 +192,9 @@ def main() -> None:
         print(f"{name}: {time.process_time() - started:.0f} s of CPU to make its worlds", file=sys.stderr)
         for world, turn in missing:
             line = repetition(
-                made[world], 1000 * given.seed + turn, not given.no_choice, given.constants_spread
-            )
+                made[world], 1000 * given.seed + turn, given.constants_spread,
+                draws=not given.no_draws, choice=not given.no_choice,
+            )  # fmt: skip
             lines.append(line | {"district": name, "world": world, "repetition": turn})
             if given.out is not None:
                 with given.out.open("a") as file:

@@ -132,8 +132,8 @@ def test_a_calibrated_model_is_chosen_only_if_it_is_clearly_better():
     assert near.chosen == Model.INITIAL
     assert near.best == Model.KRIGING
     assert near.choice == (
-        "Predictions use the model 'initial materials': it keeps the initial materials and is worse than 'calibrated' "
-        "by no more than the bootstrap error or 5 %."
+        "Predictions use the model 'initial materials', which keeps the initial materials. The model 'calibrated' is "
+        "better on held-out blocks, but not clearly enough."
     )
     assert near.choice in near.summary()[2]
     assert near.content()["chosen"] == Model.INITIAL
@@ -169,7 +169,39 @@ def test_the_log_distance_model_is_chosen_where_it_is_clearly_better():
     )
     assert near.table.loc[Model.LOG_DISTANCE, "rmse_db"] < near.table.loc[Model.CALIBRATED, "rmse_db"]
     assert near.chosen == Model.CALIBRATED
-    assert "it uses the scene and is worse than 'log-distance'" in near.choice
+    assert near.choice == (
+        "Predictions use the model 'calibrated'. The model 'log-distance' is better on held-out blocks, but not "
+        "clearly enough."
+    )
+
+
+def test_a_strong_prior_replaces_the_initial_materials_if_it_is_better_by_five_per_cent():
+    """The bootstrap error of 20 links is larger than both gains."""
+    base = synthetic_validation({Model.INITIAL: 3.0}, count=20)
+    errors = base.errors[Model.INITIAL]
+    uneven = np.where(np.arange(20) < 10, 0.6, 1.25) * errors
+
+    def chosen(strong: float, **more: np.ndarray) -> str:
+        several = {Model.INITIAL: errors, Model.CALIBRATED: 2 * errors, Model.STRONG_PRIOR: strong * uneven}
+        return replace(base, errors=several).chosen
+
+    share = np.sqrt(np.mean(errors**2) / np.mean(uneven**2))
+    assert not compare(uneven * share * 0.94, {"": errors}, base.position).helped
+    assert chosen(0.94 * share) == Model.STRONG_PRIOR
+    assert chosen(0.96 * share) == Model.INITIAL
+    # The same gain without a prior is too uncertain.
+    free = {Model.INITIAL: errors, Model.CALIBRATED: 0.94 * share * uneven}
+    assert replace(base, errors=free).chosen == Model.INITIAL
+
+
+def test_the_calibrated_model_must_be_significantly_better_than_the_one_with_a_prior():
+    sizes = {Model.INITIAL: 9.0, Model.CALIBRATED: 2.0, Model.PRIOR: 2.1}
+    uncertain = synthetic_validation(sizes, count=60, seed=1)
+    assert uncertain.best == Model.CALIBRATED
+    assert uncertain.chosen == Model.PRIOR
+    assert "which stays near the initial materials. The model 'calibrated' is better" in uncertain.choice
+    clear = synthetic_validation(sizes | {Model.PRIOR: 4.0}, count=60, seed=1)
+    assert clear.chosen == Model.CALIBRATED
 
 
 def test_a_model_with_more_offsets_than_the_study_is_averaged_with_the_calibrated_one():

@@ -1,7 +1,8 @@
-"""Variants of a model: offsets of transmitters and of links out of sight, and starting points of searches."""
+"""Variants of a model: offsets of transmitters and of links out of sight, priors, and starting points of searches."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,13 +10,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import planted
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import Objective
+from calibray.fitting.problem import Problem
 from calibray.measurements import Measurements, SourceTable
 from calibray.result.held_out import Model
 from calibray.scenes.obstruction import OUT_OF_SIGHT
+from calibray.study import Setup, Study
 from calibray.validation import models
 from calibray.validation.models import TX_OFFSET, with_offsets
+from link_tables import links_from_frame
 
 COUNT = 120
 
@@ -70,6 +75,23 @@ def test_without_groups_and_obstruction_there_is_no_such_variant() -> None:
     table, tx, _ = links(out_of_sight=False)
     grouped = make_term(table, "offset", labels=tx.astype(str))
     assert with_offsets(Objective(plain.measured, plain.weight, Nuisance(COUNT, (grouped,))), table) is None
+
+
+def test_the_stronger_the_prior_the_nearer_are_the_materials_to_the_initial_ones() -> None:
+    setup = Setup.open(
+        Study.from_content(planted.content("links.csv")), links=links_from_frame(planted.links())
+    )
+    part = Problem.of(setup, planted.engine())
+    noise_db = 3 * np.random.default_rng(2).standard_normal(planted.LINKS)
+    part = replace(part, objective=replace(part.objective, measured=planted.path_loss() + noise_db))
+    start = part.parameters.to_search(part.parameters.start)
+    fits = models.fit_variants(part)
+    strong, prior, free = (
+        np.linalg.norm(fits[name][1][0] - start)
+        for name in (Model.STRONG_PRIOR, Model.PRIOR, Model.CALIBRATED)
+    )
+    assert 0 < strong < 0.7 * prior
+    assert prior < 0.7 * free
 
 
 @pytest.mark.parametrize(("searches", "additional"), [(16, 1), (32, 2), (512, 4)])

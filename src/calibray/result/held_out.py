@@ -19,6 +19,7 @@ class Model(StrEnum):
 
     INITIAL = "initial materials"
     CALIBRATED = "calibrated"
+    STRONG_PRIOR = "calibrated with strong prior"
     PRIOR = "calibrated with prior"
     SLOPE = "calibrated with slope"
     OFFSETS = "calibrated with offsets"
@@ -40,6 +41,7 @@ BASELINES: Final = (Model.INITIAL, *WITHOUT_MATERIALS, Model.KRIGING)
 
 FITTED: Final = (
     Model.CALIBRATED,
+    Model.STRONG_PRIOR,
     Model.PRIOR,
     Model.SLOPE,
     Model.OFFSETS,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
-from calibray.result.held_out import WITHOUT_MATERIALS, Judgement, Model
+from calibray.result.held_out import Judgement, Model
 from calibray.result.record import Record
 from calibray.result.verdict import Cause, Interval, Reason, ReasonKind, Remark, RemarkKind
 from calibray.support.messages import percent
@@ -296,6 +296,13 @@ def judgement_text(judgement: Judgement) -> str:
     return f"Calibration {verb} on held-out links: {error}, {judgement.gain_db:.2f} dB less {baseline}."
 
 
+_KEPT: Final[dict[str, str]] = {
+    Model.INITIAL: ", which keeps the initial materials",
+    Model.STRONG_PRIOR: ", which stays near the initial materials",
+    Model.PRIOR: ", which stays near the initial materials",
+}
+
+
 def choice_text(chosen: str, best: str, *, averaged: bool = False) -> str:
     """Which model predictions use, and why; `best` has the lowest held-out RMSE among those that predict anywhere.
 
@@ -309,10 +316,9 @@ def choice_text(chosen: str, best: str, *, averaged: bool = False) -> str:
     )
     if chosen == best:
         return f"Predictions use the model {str(chosen)!r}, the best on held-out blocks.{added}"
-    reason = "uses the scene" if best in WITHOUT_MATERIALS else "keeps the initial materials"
     return (
-        f"Predictions use the model {str(chosen)!r}: it {reason} and is worse than {str(best)!r} by no more than the "
-        f"bootstrap error or 5 %.{added}"
+        f"Predictions use the model {str(chosen)!r}{_KEPT.get(chosen, '')}. The model {str(best)!r} is better on "
+        f"held-out blocks, but not clearly enough.{added}"
     )
 
 

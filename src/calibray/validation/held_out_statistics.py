@@ -117,21 +117,33 @@ def choose(errors: Errors, position: NDArray[np.float64]) -> str:
     """Choose the model for predictions by held-out residuals [n], [dB], `Model.INITIAL` among them.
 
     The initial materials are kept until another model is better by more than the bootstrap error of the difference, and
-    by more than `LEAST_GAIN`. Kriging is never chosen, because it predicts well only near the measured links.
+    by more than `LEAST_GAIN`. A strong prior keeps the materials near the initial ones, so it needs only the latter.
+    The calibrated model is chosen only if it is significantly better than the one with a prior. Kriging is never
+    chosen, because it predicts well only near the measured links.
     """
     chosen: str = Model.INITIAL
+    if Model.STRONG_PRIOR in errors:
+        strong_db, initial_db = (_rmse(errors[name]) for name in (Model.STRONG_PRIOR, Model.INITIAL))
+        chosen = Model.STRONG_PRIOR if strong_db < (1 - LEAST_GAIN) * initial_db else chosen
     for name in (least(errors, FITTED), *WITHOUT_MATERIALS):
         if name in errors:
             comparison = compare(errors[name], {chosen: errors[chosen]}, position)
             error_db = np.inf if comparison.error_db is None else comparison.error_db
             margin_db = max(error_db, LEAST_GAIN * comparison.baseline_rmse_db)
             chosen = name if comparison.gain_db > margin_db else chosen
+    if chosen == Model.CALIBRATED and Model.PRIOR in errors:
+        with_prior = {Model.PRIOR: errors[Model.PRIOR]}
+        chosen = chosen if compare(errors[chosen], with_prior, position).helped else Model.PRIOR
     return chosen
 
 
 def least(errors: Errors, names: tuple[str, ...]) -> str:
     """The model with the lowest RMSE among those names that have residuals by model [n], [dB]."""
-    return min((name for name in names if name in errors), key=lambda name: float(np.mean(errors[name] ** 2)))
+    return min((name for name in names if name in errors), key=lambda name: _rmse(errors[name]))
+
+
+def _rmse(errors: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
 
 
 def two_levels(

@@ -174,6 +174,10 @@ def kriging(links: Measurements, objective: Objective, trend_db: NDArray[np.floa
 PRIOR_SPREAD: Final = 0.3
 """Standard deviation of a parameter's logarithm around its initial value, in the variants with priors."""
 
+STRONG_PRIOR_SPREAD: Final = 0.15
+"""The same in the variant with a strong prior. With 0.2, predictions in clusters of Boulder kept apart are 0.1 dB worse
+(docs/measurements/predictions.md)."""
+
 OFFSET_PRIOR_DB: Final = 10.0
 """Standard deviation of the prior, around zero, of a transmitter's offset from that of all links, and of the offset of
 links out of sight [dB]; in downtown Boulder, links out of sight lack 11.7 dB."""
@@ -241,12 +245,16 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
     noise_db = float(part.squares(best[None]).rmse_db[0]) * np.sqrt(
         objective.num_counted / max(part.freedom, 1)
     )
-    with_prior = replace(
-        part, priors=_priors_around_start(part), objective=replace(objective, noise_db=noise_db)
+    strong, with_prior = (
+        replace(
+            part, priors=_priors_around_start(part, spread), objective=replace(objective, noise_db=noise_db)
+        )
+        for spread in (STRONG_PRIOR_SPREAD, PRIOR_SPREAD)
     )
     problems = {
         Model.INITIAL: replace(part, objective=initial_objective(objective, setup)),
         Model.CALIBRATED: part,
+        Model.STRONG_PRIOR: strong,
         Model.PRIOR: with_prior,
         Model.SLOPE: replace(part, objective=_with_term(objective, LOG_DISTANCE, setup.links)),
     }
@@ -312,12 +320,12 @@ def _with_term(
     return replace(objective, nuisance=Nuisance(len(links), terms))
 
 
-def _priors_around_start(problem: Problem) -> LogNormal:
-    """The study's priors, and one around the initial value of every other positive parameter."""
+def _priors_around_start(problem: Problem, spread: float) -> LogNormal:
+    """The study's priors, and one of this spread around the initial value of every other positive parameter."""
     parameters, priors = problem.parameters, problem.priors
     added = [
         index
         for index, parameter in enumerate(parameters)
         if index not in priors.index and parameter.lower > 0 and parameter.start > 0
     ]
-    return priors.extended(added, [float(parameters.start[index]) for index in added], PRIOR_SPREAD)
+    return priors.extended(added, [float(parameters.start[index]) for index in added], spread)

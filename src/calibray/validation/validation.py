@@ -3,8 +3,10 @@
 Predictions use the initial materials with fitted offsets until another model is better by more than the bootstrap error
 of the difference (the one-standard-error rule, L. Breiman et al., Classification and Regression Trees, 1984) and by 5 %
 of the RMSE. The best calibrated model is tried first, then the log-distance model, which uses no scene. A few blocks
-hardly distinguish models of similar accuracy, and a fitted model loses more if its fit does not apply elsewhere. If the
-chosen model has a slope or offsets that the study does not state, it is averaged with the calibrated model.
+hardly distinguish models of similar accuracy, and a fitted model loses more if its fit does not apply elsewhere. A
+strong prior around the initial materials therefore needs no more than the 5 %, and the calibrated model without a prior
+must be significantly better than the one with a prior. If the chosen model has a slope or offsets that the study does
+not state, it is averaged with the calibrated model.
 """
 
 from __future__ import annotations
