@@ -130,7 +130,9 @@ def test_predictions_and_the_page_show_the_rays_of_the_program(
     predicted = result.predict(new)
     assert calls(folder) == before + 1
     setup = cb.Setup.open(result.study, links=result.study.places(_rows(new)))
-    answered = cb.engines.make(setup).path_loss(np.array([list(result.parameters.values())]))[0]
+    used = result.prediction.model.parameters
+    assert used is not None
+    answered = cb.engines.make(setup).path_loss(np.array([list(used.values())]))[0]
     np.testing.assert_allclose(predicted, answered, atol=1e-6)
     before = calls(folder)
     assert run("report", folder / "out", "-o", tmp_path / "report.html").exit_code == 0
