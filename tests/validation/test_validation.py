@@ -132,8 +132,8 @@ def test_a_calibrated_model_is_chosen_only_if_it_is_clearly_better():
     assert near.chosen == Model.INITIAL
     assert near.best == Model.KRIGING
     assert near.choice == (
-        "Predictions use the model 'initial materials', which keeps the initial materials. The model 'calibrated' is "
-        "better on held-out blocks, but not clearly enough."
+        "Predictions use the model 'initial materials'. The model 'calibrated' is better on held-out blocks, but not "
+        "clearly enough."
     )
     assert near.choice in near.summary()[2]
     assert near.content()["chosen"] == Model.INITIAL
@@ -181,7 +181,7 @@ def test_a_strong_prior_replaces_the_initial_materials_if_it_is_better_by_five_p
     errors = base.errors[Model.INITIAL]
     uneven = np.where(np.arange(20) < 10, 0.6, 1.25) * errors
 
-    def chosen(strong: float, **more: np.ndarray) -> str:
+    def chosen(strong: float) -> str:
         several = {Model.INITIAL: errors, Model.CALIBRATED: 2 * errors, Model.STRONG_PRIOR: strong * uneven}
         return replace(base, errors=several).chosen
 

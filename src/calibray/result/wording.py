@@ -296,13 +296,6 @@ def judgement_text(judgement: Judgement) -> str:
     return f"Calibration {verb} on held-out links: {error}, {judgement.gain_db:.2f} dB less {baseline}."
 
 
-_KEPT: Final[dict[str, str]] = {
-    Model.INITIAL: ", which keeps the initial materials",
-    Model.STRONG_PRIOR: ", which stays near the initial materials",
-    Model.PRIOR: ", which stays near the initial materials",
-}
-
-
 def choice_text(chosen: str, best: str, *, averaged: bool = False) -> str:
     """Which model predictions use, and why; `best` has the lowest held-out RMSE among those that predict anywhere.
 
@@ -316,9 +309,10 @@ def choice_text(chosen: str, best: str, *, averaged: bool = False) -> str:
     )
     if chosen == best:
         return f"Predictions use the model {str(chosen)!r}, the best on held-out blocks.{added}"
+    near = ", which stays near the initial materials" if chosen in (Model.STRONG_PRIOR, Model.PRIOR) else ""
     return (
-        f"Predictions use the model {str(chosen)!r}{_KEPT.get(chosen, '')}. The model {str(best)!r} is better on "
-        f"held-out blocks, but not clearly enough.{added}"
+        f"Predictions use the model {str(chosen)!r}{near}. The model {str(best)!r} is better on held-out blocks, but "
+        f"not clearly enough.{added}"
     )
 
 
