@@ -70,13 +70,8 @@ def repetition(world: World, seed: int, spread: float | None, *, draws: bool, ch
     planted = replace(problem, setup=setup, objective=replace(problem.objective, weight=weight))
     lower, upper = problem.parameters.search_bounds
     trail = search(planted, LeastSquares(lower, upper, starts=32, seed=seed))
-    line: dict[str, Any] = {
-        "links": int((weight > 0).sum()),
-        "verdicts": [],
-        "inside": [],
-        "held": [],
-        "remarks": [],
-    }
+    line: dict[str, Any] = {"links": int((weight > 0).sum())}
+    line |= dict.fromkeys(("verdicts", "inside", "held", "remarks"), ())
     if draws:
         line |= intervals(planted, trail, drawn.truth)
     if choice and far.any():

@@ -26,16 +26,16 @@ NOISE_DB = 0.5 * np.random.default_rng(5).standard_normal(planted.LINKS)
 ROW_DB = 0.05 * np.random.default_rng(6).standard_normal((planted.LINKS, ROWS))
 
 
-def problem(rows: int, apart_m: float = APART_M) -> Problem:
+def problem(rows: int, apart_m: float = APART_M, **sections) -> Problem:
     """A problem with a number of rows per link whose receivers lie some distance apart."""
     frame = planted.links()
     again = frame.loc[np.repeat(frame.index, rows)].reset_index(drop=True)
     again["rx_x"] += apart_m * np.tile(np.arange(rows), len(frame))
-    found = planted.engine()
-    kept = take_links(found.paths, np.repeat(np.arange(planted.LINKS), rows))
-    setup = Setup.open(Study.from_content(planted.content("links.csv")), links=links_from_frame(again))
+    kept = take_links(planted.engine().paths, np.repeat(np.arange(planted.LINKS), rows))
+    study = Study.from_content(planted.content("links.csv", **sections))
+    setup = Setup.open(study, links=links_from_frame(again))
     measured = np.repeat(planted.path_loss() + NOISE_DB, rows) + ROW_DB[:, :rows].ravel()
-    new = Problem.of(setup, engines.Replay(kept, found.parameters))
+    new = Problem.of(setup, engines.Replay(kept, setup.parameters))
     return replace(new, objective=replace(new.objective, measured=measured))
 
 
@@ -91,6 +91,23 @@ def test_rows_of_another_group_or_path_loss_stay():
     other = replace(rows, engine=engines.Replay(take_links(found.paths, index), found.parameters))
     counted = np.flatnonzero(averaged(other).objective.weight)
     assert sorted(set((counted % ROWS).tolist())) == [0, 2]
+
+
+def test_rows_that_only_the_initial_values_make_equal_stay():
+    """Marble and wood are equal at first; the third row of a link meets one in place of the other."""
+    equal = {"relative_permittivity": 5.0, "conductivity": 0.01, "thickness": 0.1}
+    rows = problem(ROWS, materials={"marble": equal, "wood": equal})
+    paths = replace(rows.engine.paths, materials=rows.setup.scene.materials)
+    names, third = list(paths.materials), np.arange(len(rows.objective.weight)) % ROWS == 2
+    swapped = paths.material.copy()
+    marble, wood = names.index("marble"), names.index("wood")
+    swapped[paths.material == marble], swapped[paths.material == wood] = wood, marble
+    at_third = np.repeat(third[paths.link], np.diff(paths.first))
+    paths = replace(paths, material=np.where(at_third, swapped, paths.material))
+    rows = replace(rows, engine=engines.Replay(paths, rows.setup.parameters))
+    assert set((np.flatnonzero(averaged(rows).objective.weight) % ROWS).tolist()) == {0}
+    best = np.array(list(planted.TRUTH.values()))
+    assert set((np.flatnonzero(average_repeats(rows, best).objective.weight) % ROWS).tolist()) == {0, 2}
 
 
 def test_rows_that_a_candidate_leaves_without_a_path_are_averaged_with_each_other():

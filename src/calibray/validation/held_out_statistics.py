@@ -122,9 +122,9 @@ def choose(errors: Errors, position: NDArray[np.float64]) -> str:
     chosen, because it predicts well only near the measured links.
     """
     chosen: str = Model.INITIAL
-    if Model.STRONG_PRIOR in errors:
-        strong_db, initial_db = (_rmse(errors[name]) for name in (Model.STRONG_PRIOR, Model.INITIAL))
-        chosen = Model.STRONG_PRIOR if strong_db < (1 - LEAST_GAIN) * initial_db else chosen
+    strong = errors.get(Model.STRONG_PRIOR)
+    if strong is not None and _rmse(strong) < (1 - LEAST_GAIN) * _rmse(errors[Model.INITIAL]):
+        chosen = Model.STRONG_PRIOR
     for name in (least(errors, FITTED), *WITHOUT_MATERIALS):
         if name in errors:
             comparison = compare(errors[name], {chosen: errors[chosen]}, position)
@@ -133,7 +133,8 @@ def choose(errors: Errors, position: NDArray[np.float64]) -> str:
             chosen = name if comparison.gain_db > margin_db else chosen
     if chosen == Model.CALIBRATED and Model.PRIOR in errors:
         with_prior = {Model.PRIOR: errors[Model.PRIOR]}
-        chosen = chosen if compare(errors[chosen], with_prior, position).helped else Model.PRIOR
+        if not compare(errors[chosen], with_prior, position).helped:
+            chosen = Model.PRIOR
     return chosen
 
 
