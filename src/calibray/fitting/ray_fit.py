@@ -95,7 +95,9 @@ def understand(
     if not ratios:
         return first
     if not len(model.start):
-        return replace(first, misfit_db=float(np.linalg.norm(_errors(first, ratios, last)[0])))
+        return replace(
+            first, misfit_db=float(np.linalg.norm(_errors(first, ratios, _tables(model, ratios, last))[0]))
+        )
     if before is not None and before.model.assumed == model.assumed:
         before = refined(replace(before, model=model), ratios, last, EVALUATIONS[1])
         if before.misfit_db <= KNOWN_DB:
@@ -215,8 +217,8 @@ def _polarized(fit: Understanding, slants: tuple[float | None, float | None]) ->
 def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: int) -> Understanding:
     """Least squares on all ratios, starting from an explanation; values that change no ratio keep their value."""
     lower, upper = fit.model.bounds
-    start = np.clip(fit.values, lower, upper)
-    size = np.linalg.norm(_errors(replace(fit, values=start), ratios, last)[1], axis=0)
+    start, tables = np.clip(fit.values, lower, upper), _tables(fit.model, ratios, last)
+    size = np.linalg.norm(_errors(replace(fit, values=start), ratios, tables)[1], axis=0)
     free = np.flatnonzero(size > 1e-9 * size.max(initial=1e-9))
     lower, upper, values = lower[free] - 1e-9, upper[free] + 1e-9, start[free]
     kept: dict[bytes, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
@@ -229,7 +231,7 @@ def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: in
     def evaluate(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         if (key := values.tobytes()) not in kept:
             kept.clear()
-            errors, slopes = _errors(replace(fit, values=complete(values)), ratios, last)
+            errors, slopes = _errors(replace(fit, values=complete(values)), ratios, tables)
             kept[key] = errors, slopes[:, free]
         return kept[key]
 
@@ -246,15 +248,21 @@ def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: in
     return replace(fit, values=complete(values), misfit_db=misfit)
 
 
+def _tables(model: RayModel, ratios: list[Ratio], last: Call) -> NDArray[np.float64]:
+    """Constants at the last call and at the earlier ones, which are replayed on the paths of the last one."""
+    return model.tables([last.candidate, *(ratio.call.candidate for ratio in ratios)])
+
+
 def _errors(
-    fit: Understanding, ratios: list[Ratio], last: Call
+    fit: Understanding, ratios: list[Ratio], tables: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Weighted errors of the ratios [m], [dB], and their derivatives by the values [m, k]."""
-    level, slope = fit.model.level_and_slope(last.candidate, fit.values, fit.linear)
+    """Weighted errors of the ratios [m], [dB], and their derivatives by the values [m, k].
+
+    `tables` are those of the last call and of each ratio's call, see `_tables`.
+    """
+    (level, *others), (slope, *other_slopes) = fit.model.levels_and_slopes(tables, fit.values, fit.linear)
     residuals, slopes = [], []
-    for ratio in ratios:
-        # The earlier call is replayed on the paths of the last one.
-        other, other_slope = fit.model.level_and_slope(ratio.call.candidate, fit.values, fit.linear)
+    for ratio, other, other_slope in zip(ratios, others, other_slopes, strict=True):
         root = np.sqrt(ratio.weight)
         residuals.append(root * ((level - other)[ratio.here] - ratio.observed))
         slopes.append(root[:, None] * (slope - other_slope)[ratio.here])

@@ -181,13 +181,12 @@ def _most_informative(problem: Problem, call: Call, random: np.random.Generator)
     drawn = np.tile(model.start, (DRAWS, 1))
     drawn[:, :count] += np.log(DRAWN) * random.uniform(-1.0, 1.0, (DRAWS, count))
     weight = np.sqrt(call.export.weight)[:, None] / SIGMA_DB
-    information = np.zeros(PROBES)
+    information, tables = np.zeros(PROBES), model.tables([call.candidate, *probes])
     for values in drawn:
-        _, first = model.level_and_slope(call.candidate, values, (False, False))
-        for number, probe in enumerate(probes):
-            slope = model.level_and_slope(probe, values, (False, False))[1] - first
-            slope = (slope * weight)[:, :count]
-            information[number] += np.linalg.slogdet(np.eye(count) + slope.T @ slope)[1]
+        _, (first, *slopes) = model.levels_and_slopes(tables, values, (False, False))
+        for number, slope in enumerate(slopes):
+            part = ((slope - first) * weight)[:, :count]
+            information[number] += np.linalg.slogdet(np.eye(count) + part.T @ part)[1]
     return probes[int(np.argmax(information))]
 
 

@@ -8,7 +8,7 @@ of its axis (3GPP TR 38.901, eq. 7.3-4/5), which may be tilted.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final, NamedTuple
@@ -19,10 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.rays.export import Export
-from calibray.fields import GroupedProgram, Layout, jax_settings, layout, program_gains
-from calibray.fields.propagation import path_power
+from calibray.fields import (
+    EffectBatch,
+    GroupedProgram,
+    Layout,
+    jax_settings,
+    layout,
+    path_losses_and_slopes,
+    path_losses_and_slopes_with_effects,
+    program_gains,
+)
+from calibray.fields.effects import with_antenna_fields
+from calibray.fields.slab import FIELD_COLUMN
 from calibray.fitting.cheap_replay import METAL
-from calibray.materials import FIELDS, Material
+from calibray.materials import Material
 from calibray.parameters import Parameters
 from calibray.paths import Paths
 from calibray.paths.chains import spherical_basis
@@ -41,6 +51,14 @@ TILT: Final = 0.3
 
 ANGLES: Final = 3
 """Slant and two tilts of an end."""
+
+BATCH: Final = 8
+"""Number of candidates that are evaluated at once; the program is compiled for it."""
+
+LEAST_DB: Final = -300.0
+"""Least power of a path [dB]."""
+
+_COLUMNS: Final = tuple(FIELD_COLUMN[field] for field in (*RANGES, "relative_permittivity"))
 
 Ends = tuple[bool, bool]
 """Whether the antenna is linearly polarized, at the transmitter and at the receiver."""
@@ -106,23 +124,42 @@ class RayModel:
         lower, upper = np.array(pairs).reshape(-1, 2).T
         return np.minimum(lower, self.start), np.maximum(upper, self.start)
 
-    def level_and_slope(
-        self, candidate: NDArray[np.float64], values: NDArray[np.float64], linear: Ends
+    def tables(self, candidates: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Constants of the materials with the parameters of n candidates [d]: [n, M, 8]."""
+        return np.stack([self.paths.material_table(self.materials(each)) for each in candidates])
+
+    def levels_and_slopes(
+        self, tables: NDArray[np.float64], values: NDArray[np.float64], linear: Ends
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Power of every path [P], [dB], and its derivatives by the values [P, k], for values [k]."""
-        names = list(self.paths.materials)
-        order = [] if self.known else self._layout.order
-        frame = _Frame(
-            self.paths.material_table(self.materials(candidate)),
-            np.array([names.index(name) for name, _ in self.assumed], dtype=np.int64),
-            np.array([FIELDS.index(field) for _, field in self.assumed], dtype=np.int64),
-            self.bases[0][order],
-            self.bases[1][order],
-            np.array([0.0 if end else 1.0 for end in linear]),
-        )
-        with jax_settings():
-            level, slope = _level_and_slope(self._layout.program, frame, values)
-            return np.asarray(level)[self._order], np.asarray(slope)[self._order]
+        """Power of every path [n, P], [dB], and its derivatives by the values [n, P, k].
+
+        They are of n candidates, given by their constants [n, M, 8], all with the same values [k].
+        """
+        (program, polarized), names, count = self._by_path, list(self.paths.materials), len(self.assumed)
+        rows = [names.index(name) for name, _ in self.assumed]
+        fields = [FIELD_COLUMN[field] for _, field in self.assumed]
+        columns = [_COLUMNS.index(field) for field in fields]
+        tables = tables.copy()
+        tables[:, rows, fields] = np.exp(values[:count])
+        angles = np.tile(values[count:], (BATCH, 1))
+        ends = np.array([0.0 if end else 1.0 for end in linear])
+        levels, slopes = [], []
+        for start in range(0, len(tables), BATCH):
+            part = tables[start : start + BATCH]
+            batch = np.concatenate([part, np.repeat(part[:1], BATCH - len(part), axis=0)])
+            if self.known:
+                loss, by_material, _ = path_losses_and_slopes(program, batch, _COLUMNS, count=len(part))
+                by_angle = np.zeros((*loss.shape, 0))
+            else:
+                effects = EffectBatch((replace(polarized, crossed=ends),), angles)
+                loss, by_material, by_angle = path_losses_and_slopes_with_effects(
+                    program, batch, effects, _COLUMNS, count=len(part)
+                )
+            by_constant = by_material[:, :, rows, columns] * np.exp(values[:count])
+            level, slope = -loss, -np.concatenate([by_constant, by_angle], axis=-1)
+            levels.append(np.maximum(level, LEAST_DB))
+            slopes.append(np.where(level[..., None] > LEAST_DB, slope, 0.0))
+        return np.concatenate(levels), np.concatenate(slopes)
 
     def gains(self, candidate: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Gain of every path between the ports [P, R, T], with the constants of values [k]."""
@@ -171,25 +208,52 @@ class RayModel:
     def _order(self) -> NDArray[np.int64]:
         return np.argsort(self._layout.order)
 
+    @cached_property
+    def _by_path(self) -> tuple[GroupedProgram, Polarized]:
+        """The program with each path as a link of its own, and the polarization of its antennas."""
+        count = self.paths.num_paths
+        nowhere = np.zeros((count, 3))
+        plan = layout(
+            replace(self.paths, link=np.arange(count), tx_position=nowhere, rx_position=nowhere), phases=False
+        )
+        return plan.program, Polarized(*self.bases, np.ones(2)).ordered(plan.order)
 
-class _Frame(NamedTuple):
-    """What a level is computed with.
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Polarized:
+    """Polarization of antennas with the ports V and H; its parameters are slant and two tilts of each end [rad].
 
     Attributes:
-        table: Constants of the materials [M, 8].
-        rows: Rows of the assumed constants in it [q].
-        columns: Their columns [q].
-        tx: Axes of the fields at the transmitter [P, 2, 3]; empty if the antennas are known.
+        tx: Axes of the fields at the transmitter [P, 2, 3].
         rx: Those at the receiver.
         crossed: Weight of the port orthogonal to the polarization at both ends [2]: 0 for a linear one, otherwise 1.
     """
 
-    table: NDArray[np.float64]
-    rows: NDArray[np.int64]
-    columns: NDArray[np.int64]
     tx: NDArray[np.float64]
     rx: NDArray[np.float64]
     crossed: NDArray[np.float64]
+
+    def ordered(self, order: NDArray[np.int64]) -> Polarized:
+        """See `Effect.ordered`."""
+        return replace(self, tx=self.tx[order], rx=self.rx[order])
+
+    def apply(self, program: GroupedProgram, values: jax.Array) -> GroupedProgram:
+        """See `Effect.apply`."""
+        weights = [
+            ports(basis, angles, jnp) * jnp.stack([jnp.ones(()), self.crossed[end]])[:, None]
+            for end, (basis, angles) in enumerate([(self.tx, values[:ANGLES]), (self.rx, values[ANGLES:])])
+        ]
+        fields, first = [], 0
+        for group in program.groups:
+            own = slice(first, first + group.size)
+            tx, rx = (
+                jnp.einsum("nab,xbcn->xacn", weight[own], field)
+                for weight, field in zip(weights, (group.tx, group.rx), strict=True)
+            )
+            fields.append((tx, rx))
+            first += group.size
+        return with_antenna_fields(program, fields)
 
 
 def _basis(zenith_azimuth: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -223,27 +287,3 @@ def ports(basis: Any, angles: Any, xp: Any = np) -> Any:
     phi = xp.stack([-theta[:, 1], theta[:, 0]], axis=1)
     cos, sin = xp.cos(angles[0]), xp.sin(angles[0])
     return xp.stack([cos * theta + sin * phi, cos * phi - sin * theta], axis=1)
-
-
-@jax.jit
-def _level_and_slope(
-    program: GroupedProgram, frame: _Frame, values: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Powers [P], [dB], and derivatives [P, k], in the order of the program."""
-    count = len(frame.rows)
-
-    def level(values: jax.Array) -> jax.Array:
-        table = jnp.asarray(frame.table).at[frame.rows, frame.columns].set(jnp.exp(values[:count]))
-        gain = program_gains(program, table)
-        if len(frame.tx):
-            gain = (_polarized(frame, gain[0], values[count:]), _polarized(frame, gain[1], values[count:]))
-        return 10 * jnp.log10(jnp.maximum(path_power(gain), 1e-30))
-
-    return level(values), jax.jacfwd(level)(values)
-
-
-def _polarized(frame: _Frame, gain: jax.Array, angles: jax.Array) -> jax.Array:
-    """One part of the gains [R, T, P] between ports along and orthogonal to the polarizations."""
-    tx, rx = ports(frame.tx, angles[:ANGLES], jnp), ports(frame.rx, angles[ANGLES:], jnp)
-    weight = [jnp.stack([jnp.ones(()), frame.crossed[end]]) for end in range(2)]
-    return jnp.einsum("pab,pcd,bdp,a,c->acp", rx, tx, gain, weight[1], weight[0])
