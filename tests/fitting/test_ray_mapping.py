@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+import synthetic
 import two_ray
 from calibray.engines import Replay
 from calibray.engines.rays.compile import RaySetting, compile_rays, powers, rays_of
@@ -17,8 +18,9 @@ from calibray.fitting import ray_fit, ray_scan
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_fit import understand
 from calibray.fitting.ray_mapping import RayMap, map_rays
-from calibray.fitting.ray_model import ANGLES, HALF_SPACE, Call, RayModel
+from calibray.fitting.ray_model import ANGLES, BATCH, HALF_SPACE, Call, Ends, RayModel
 from calibray.materials import Material
+from calibray.parameters import Parameter, Parameters
 from calibray.paths import Paths
 from calibray.paths.chains import spherical_basis
 from calibray.study import Setup
@@ -108,6 +110,35 @@ def test_values_that_no_ratio_shows_stay(foreign: Foreign) -> None:
     refined = ray_fit.refined(fit, ray_fit.ratios_of(calls), calls[-1], 12)
     np.testing.assert_array_equal(refined.values[slants], 0.3)
     assert not np.array_equal(refined.values, start)
+
+
+@pytest.mark.parametrize("linear", [(False, False), (True, False), (False, True), (True, True)])
+def test_levels_are_those_of_the_replay_and_slopes_their_differences(linear: Ends) -> None:
+    """With a constant for the number of ports; with every kind of interaction."""
+    parameters = Parameters((Parameter("walls.relative_permittivity", 1.5, 12.0, 4.0),))
+    candidates = [np.array([3.3]), np.array([7.1])]
+    model = RayModel.of(parameters, synthetic.program(synthetic.EVERY_KIND, seed=5, ports=(2, 2)), False)
+    values = model.start + 0.1 * np.random.default_rng(0).uniform(-1, 1, len(model.start))
+    tables = model.tables(candidates)
+    level, slope = model.levels_and_slopes(tables, values, linear)
+    for candidate, mine in zip(candidates, level, strict=True):
+        replayed = 10 * np.log10(powers(model.replay_paths(candidate, values, linear)))
+        np.testing.assert_allclose(mine - replayed, -10 * np.log10(2) * linear[0], atol=1e-10)
+    for index in range(len(values)):
+        step = 1e-5 * np.eye(len(values))[index]
+        above, below = (model.levels_and_slopes(tables, values + sign * step, linear)[0] for sign in (1, -1))
+        np.testing.assert_allclose(slope[..., index], (above - below) / 2e-5, atol=1e-5)
+
+
+def test_many_candidates_have_the_levels_of_each() -> None:
+    parameters = Parameters((Parameter("walls.relative_permittivity", 1.5, 12.0, 4.0),))
+    model = RayModel.of(parameters, synthetic.program(synthetic.EVERY_KIND, seed=5, ports=(2, 2)), False)
+    tables = model.tables([np.array([value]) for value in np.linspace(2.0, 11.0, BATCH + 3)])
+    together = model.levels_and_slopes(tables, model.start, (True, True))
+    for number, table in enumerate(tables):
+        alone = model.levels_and_slopes(table[None], model.start, (True, True))
+        for whole, part in zip(together, alone, strict=True):
+            np.testing.assert_allclose(whole[number], part[0], rtol=1e-12)
 
 
 def test_a_ray_of_power_zero_is_absent(foreign: Foreign) -> None:

@@ -142,7 +142,6 @@ class RayModel:
         tables = tables.copy()
         tables[:, rows, fields] = np.exp(values[:count])
         angles = np.tile(values[count:], (BATCH, 1))
-        ends = np.array([0.0 if end else 1.0 for end in linear])
         levels, slopes = [], []
         for start in range(0, len(tables), BATCH):
             part = tables[start : start + BATCH]
@@ -151,7 +150,7 @@ class RayModel:
                 loss, by_material, _ = path_losses_and_slopes(program, batch, _COLUMNS, count=len(part))
                 by_angle = np.zeros((*loss.shape, 0))
             else:
-                effects = EffectBatch((replace(polarized, crossed=ends),), angles)
+                effects = EffectBatch((replace(polarized, linear=np.array(linear)),), angles)
                 loss, by_material, by_angle = path_losses_and_slopes_with_effects(
                     program, batch, effects, _COLUMNS, count=len(part)
                 )
@@ -216,7 +215,7 @@ class RayModel:
         plan = layout(
             replace(self.paths, link=np.arange(count), tx_position=nowhere, rx_position=nowhere), phases=False
         )
-        return plan.program, Polarized(*self.bases, np.ones(2)).ordered(plan.order)
+        return plan.program, Polarized(*self.bases, np.zeros(2, dtype=bool)).ordered(plan.order)
 
 
 @jax.tree_util.register_dataclass
@@ -227,12 +226,12 @@ class Polarized:
     Attributes:
         tx: Axes of the fields at the transmitter [P, 2, 3].
         rx: Those at the receiver.
-        crossed: Weight of the port orthogonal to the polarization at both ends [2]: 0 for a linear one, otherwise 1.
+        linear: Whether the antenna is linearly polarized, at both ends [2]; otherwise it receives both components.
     """
 
     tx: NDArray[np.float64]
     rx: NDArray[np.float64]
-    crossed: NDArray[np.float64]
+    linear: NDArray[np.bool_]
 
     def ordered(self, order: NDArray[np.int64]) -> Polarized:
         """See `Effect.ordered`."""
@@ -240,9 +239,12 @@ class Polarized:
 
     def apply(self, program: GroupedProgram, values: jax.Array) -> GroupedProgram:
         """See `Effect.apply`."""
+        # The second port, orthogonal to a linear polarization, receives nothing.
         weights = [
-            ports(basis, angles, jnp) * jnp.stack([jnp.ones(()), self.crossed[end]])[:, None]
-            for end, (basis, angles) in enumerate([(self.tx, values[:ANGLES]), (self.rx, values[ANGLES:])])
+            jnp.where(linear, ports(basis, angles, jnp) * jnp.array([[1.0], [0.0]]), jnp.eye(2))
+            for linear, basis, angles in zip(
+                self.linear, (self.tx, self.rx), values.reshape(2, -1), strict=True
+            )
         ]
         fields, first = [], 0
         for group in program.groups:

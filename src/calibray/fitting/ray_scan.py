@@ -13,18 +13,21 @@ one end's slant and tilts, for the other end as fitted and upright. Its best poi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import epsilon_0, speed_of_light
 from scipy.optimize import least_squares
 
 from calibray.fields import jax_settings
+from calibray.fields.arithmetic import materialize
 from calibray.fields.slab import coefficients, loss_term
 from calibray.fitting.ray_model import ANGLES, HALF_SPACE, TILT, ports, tilted_theta
-from calibray.materials import FIELDS, Material
+from calibray.materials import Material
 from calibray.paths import Kind, Paths
 
 CONDUCTIVITIES: Final = 10.0 ** np.arange(-3.5, 1.1, 0.5)
@@ -54,6 +57,8 @@ KEPT: Final = 3
 
 BATCH: Final = 512
 """Number of points that are evaluated at once."""
+
+_COLUMNS: Final = ("relative_permittivity", "conductivity", "thickness")
 
 SLANTS: Final = (0.0, np.pi / 2, np.pi / 4, -np.pi / 4)
 """Slants of a linear polarization [rad]: vertical, horizontal, and both diagonals."""
@@ -117,16 +122,15 @@ def scan(
     """
     everything = [materials[name] for materials in (last, *(call.materials for call in calls))]
     grid = _grid(fields, everything, paths.materials[name].thickness, paths.frequency)
-    square, weight = [], sum(call.weight.sum() for call in calls)
-    for start in range(0, len(grid), BATCH):
-        part = np.exp(grid[start : start + BATCH])
-        level = _levels(paths, last, name, fields, part, known)
-        total = np.zeros(level.shape[:2])
-        for call in calls:
-            error = (level - _levels(paths, call.materials, name, fields, part, known) - call.change_db) ** 2
-            total += (error / (1 + error / ROBUST_DB**2)) @ call.weight  # Geman and McClure's loss
-        square.append(total / weight)
-    return Scan(*_minima(grid, np.concatenate(square), fields))
+    pairs = 1 if known else len(POLARIZATIONS)
+    columns, parts = tuple(_COLUMNS.index(field) for field in fields), [np.zeros((0, pairs))]
+    with jax_settings():
+        program = jax.device_put(_scanned(paths, name, last, calls))
+        for start in range(0, len(grid), BATCH):
+            points = np.exp(grid[start : start + BATCH])
+            padded = np.concatenate([points, np.repeat(points[:1], BATCH - len(points), axis=0)])
+            parts.append(np.asarray(_losses(program, padded, columns, known))[: len(points)])
+    return Scan(*_minima(grid, np.concatenate(parts), fields))
 
 
 def chosen(paths: Paths, subset: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -178,78 +182,119 @@ def _minima(
     return values, misfit
 
 
-def _levels(
-    paths: Paths,
-    materials: dict[str, Material],
-    name: str,
-    fields: list[str],
-    points: NDArray[np.float64],
-    known: bool,
-) -> NDArray[np.float64]:
-    """Powers [n, H, P], [dB] up to a constant, with constants of one material [n, c]."""
-    gain = _gains(paths, materials, name, fields, points)  # [n, P, R, T]
-    if known:
-        power = (np.abs(gain) ** 2).sum(axis=(2, 3))[:, None]
-    else:
-        ends = np.array([[np.cos(slant), np.sin(slant)] for slant in SLANTS])
-        square = np.abs(np.einsum("ar,nprt,bt->nbap", ends, gain, ends, optimize=True)) ** 2
-        # Without polarization, both components of the wave count.
-        square = np.concatenate([square[:, :2].sum(axis=1, keepdims=True), square], axis=1)
-        square = np.concatenate([square[:, :, :2].sum(axis=2, keepdims=True), square], axis=2)
-        power = square.reshape(len(points), -1, paths.num_paths)
-    return _level(power)
+class _Scanned(NamedTuple):
+    """The paths of a scan, P of at most D interactions, at the last call and at C earlier ones.
+
+    P is `SCANNED`, so that few functions are compiled. Absent paths have weight 0.
+
+    Attributes:
+        exists: Whether a path has so many interactions [D, P].
+        here: Whether an interaction is on the scanned material [D, P].
+        cosine: Cosine of the angle of incidence [D, P].
+        through: Whether it is a transmission [D, P].
+        rotation: Cosine and sine of the rotation into the frame of incidence [D, 2, P].
+        constants: Permittivity, conductivity and thickness at every call, the last one first [C + 1, 3, D, P].
+        tx: Fields at the transmitter [T, 2, P].
+        rx: Conjugate fields at the receiver [R, 2, P].
+        wavelength: [m].
+        weight: Weights of the ratios [C, P], of sum 1.
+        change_db: The ratios [C, P].
+    """
+
+    exists: NDArray[np.bool_]
+    here: NDArray[np.bool_]
+    cosine: NDArray[np.float64]
+    through: NDArray[np.bool_]
+    rotation: NDArray[np.float64]
+    constants: NDArray[np.float64]
+    tx: NDArray[np.complex128]
+    rx: NDArray[np.complex128]
+    wavelength: float
+    weight: NDArray[np.float64]
+    change_db: NDArray[np.float64]
 
 
-def _gains(
-    paths: Paths, materials: dict[str, Material], name: str, fields: list[str], points: NDArray[np.float64]
-) -> NDArray[np.complex128]:
-    """Gains [n, P, R, T] up to a real factor of each path: E_rx^H J_K ... J_1 E_tx."""
-    table = np.array([[getattr(item, field) for field in FIELDS] for item in materials.values()])
-    constants = np.tile(table[paths.material], (len(points), 1, 1))  # [n, I, 8]
-    here = paths.material == list(materials).index(name)
-    for column, field in enumerate(fields):
-        constants[:, here, FIELDS.index(field)] = points[:, None, column]
-    te, tm = _coefficients(paths, constants)
-    depth = np.diff(paths.first)
-    field = np.broadcast_to(
-        paths.tx_field.swapaxes(1, 2), (len(points), paths.num_paths, 2, paths.tx_field.shape[1])
+def _scanned(paths: Paths, name: str, last: dict[str, Material], calls: list[Observed]) -> _Scanned:
+    depth, index = np.diff(paths.first), np.arange(SCANNED) % paths.num_paths
+    steps = np.arange(int(depth.max(initial=0)))[:, None]
+    exists = steps < depth[index]
+    at = np.where(exists, paths.first[index] + steps, 0)
+    tables = [
+        np.array([[getattr(item, field) for item in materials.values()] for field in _COLUMNS])
+        for materials in (last, *(call.materials for call in calls))
+    ]
+    present = np.arange(SCANNED) < paths.num_paths
+    weight = np.stack([np.where(present, call.weight[index], 0.0) for call in calls])
+    return _Scanned(
+        exists,
+        exists & (paths.material[at] == list(last).index(name)),
+        paths.cos_incidence[at],
+        paths.kind[at] == Kind.REFRACTION,
+        np.moveaxis(paths.rotation[at], -1, 1),
+        np.stack([table[:, paths.material[at]] for table in tables]),
+        np.moveaxis(paths.tx_field[index], 0, -1),
+        np.moveaxis(paths.rx_field[index].conj(), 0, -1),
+        speed_of_light / paths.frequency,
+        weight / weight.sum(),
+        np.stack([call.change_db[index] for call in calls]),
     )
-    for step in range(int(depth.max(initial=0))):
-        on = np.flatnonzero(depth > step)
-        at = paths.first[:-1][on] + step
-        cos, sin = paths.rotation[at].T[:, :, None]
-        first, second = field[:, on, 0], field[:, on, 1]
-        field = field.copy()
-        field[:, on, 0] = te[:, at, None] * (cos * first + sin * second)
-        field[:, on, 1] = tm[:, at, None] * (cos * second - sin * first)
-    return np.einsum("prc,npct->nprt", paths.rx_field.conj(), field)
 
 
-def _coefficients(
-    paths: Paths, constants: NDArray[np.float64]
-) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """Coefficients of all interactions [n, I], with their constants [n, I, 8]; padded, so that few are compiled."""
-    count, size = len(constants), paths.num_interactions
-    padded = np.ones((BATCH, -(-size // 64) * 64, 3))
-    columns = [FIELDS.index(field) for field in ("relative_permittivity", "conductivity", "thickness")]
-    padded[:count, :size] = constants[..., columns]
-    cosine, through = np.ones(padded.shape[1]), np.zeros(padded.shape[1], dtype=bool)
-    cosine[:size], through[:size] = paths.cos_incidence, paths.kind == Kind.REFRACTION
-    with jax_settings():
-        pairs = _slab(*jax.device_put((cosine, padded, speed_of_light / paths.frequency, through)))
+@partial(jax.jit, static_argnums=(2, 3))
+def _losses(program: _Scanned, points: jax.Array, columns: tuple[int, ...], known: bool) -> jax.Array:
+    """Mean loss of the ratios [n, H] with constants `columns` of one material [n, c]."""
+    last, *earlier = (_powers(program, each, points, columns, known) for each in program.constants)
+    total = jnp.zeros(last.shape[:2])
+    for power, weight, change_db in zip(earlier, program.weight, program.change_db, strict=True):
+        # Single precision is enough for a logarithm, and takes a third of the time.
+        ratio = (jnp.maximum(last, 1e-30) / jnp.maximum(power, 1e-30)).astype(jnp.float32)
+        error = (10 * jnp.log10(ratio) - change_db.astype(jnp.float32)) ** 2
+        # Geman and McClure's loss
+        total += (error / (1 + error / ROBUST_DB**2) * weight.astype(jnp.float32)).sum(axis=-1)
+    return total
+
+
+def _powers(
+    program: _Scanned, constants: jax.Array, points: jax.Array, columns: tuple[int, ...], known: bool
+) -> jax.Array:
+    """Powers [n, H, P] up to a factor of each path, with constants at one call [3, D, P]."""
+    values = list(jnp.broadcast_to(constants[:, None], (3, len(points), *constants.shape[1:])))
+    for index, column in enumerate(columns):
+        values[column] = jnp.where(program.here, points[:, index, None, None], values[column])
     te, tm = (
-        np.asarray(real)[:count, :size] + 1j * np.asarray(imaginary)[:count, :size]
-        for real, imaginary in pairs
+        jnp.where(program.exists, real + 1j * imaginary, 1.0)
+        for real, imaginary in coefficients(
+            program.cosine, values[0], loss_term(values[1], program.wavelength), values[2], program.wavelength,
+            program.through,
+        )
+    )  # fmt: skip
+    # The gain is E_rx^H J_K ... J_1 E_tx, up to a real factor.
+    first, second = program.tx[:, 0], program.tx[:, 1]  # [n, T, P]
+    for step, (cos, sin) in enumerate(program.rotation):
+        cos, sin = jnp.where(program.exists[step], cos, 1.0), jnp.where(program.exists[step], sin, 0.0)
+        first, second = (
+            te[:, None, step] * (cos * first + sin * second),
+            tm[:, None, step] * (cos * second - sin * first),
+        )
+    shape = (len(points), program.tx.shape[0], program.tx.shape[2])
+    first, second = jnp.broadcast_to(first, shape)[:, None], jnp.broadcast_to(second, shape)[:, None]
+    gain = program.rx[:, None, 0] * first + program.rx[:, None, 1] * second  # [n, R, T, P]
+    if known:
+        return _square(gain).sum(axis=(1, 2))[:, None]
+    gain = materialize(gain, program.wavelength)
+    ends = [(np.cos(slant), np.sin(slant)) for slant in SLANTS]
+    received = jnp.stack([cos * gain[:, 0] + sin * gain[:, 1] for cos, sin in ends], axis=1)  # [n, 4, T, P]
+    square = _square(
+        jnp.stack([cos * received[:, :, 0] + sin * received[:, :, 1] for cos, sin in ends], axis=1)
     )
-    return te, tm
+    # Without polarization, both components of the wave count.
+    square = jnp.concatenate([square[:, :2].sum(axis=1, keepdims=True), square], axis=1)
+    square = jnp.concatenate([square[:, :, :2].sum(axis=2, keepdims=True), square], axis=2)
+    return materialize(square.reshape(len(points), -1, square.shape[-1]), program.wavelength)
 
 
-@jax.jit
-def _slab(
-    cosine: jax.Array, constants: jax.Array, wavelength: jax.Array, through: jax.Array
-) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
-    loss = loss_term(constants[..., 1], wavelength)
-    return coefficients(cosine, constants[..., 0], loss, constants[..., 2], wavelength, through)
+def _square(gain: jax.Array) -> jax.Array:
+    return gain.real**2 + gain.imag**2
 
 
 class Gains(NamedTuple):
