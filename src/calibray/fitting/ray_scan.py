@@ -125,7 +125,7 @@ def scan(
     pairs = 1 if known else len(POLARIZATIONS)
     columns, parts = tuple(_COLUMNS.index(field) for field in fields), [np.zeros((0, pairs))]
     with jax_settings():
-        program = jax.device_put(_scanned(paths, name, last, calls))
+        program = _scanned(paths, name, last, calls)
         for start in range(0, len(grid), BATCH):
             points = np.exp(grid[start : start + BATCH])
             padded = np.concatenate([points, np.repeat(points[:1], BATCH - len(points), axis=0)])
@@ -201,17 +201,17 @@ class _Scanned(NamedTuple):
         change_db: The ratios [C, P].
     """
 
-    exists: NDArray[np.bool_]
-    here: NDArray[np.bool_]
-    cosine: NDArray[np.float64]
-    through: NDArray[np.bool_]
-    rotation: NDArray[np.float64]
-    constants: NDArray[np.float64]
-    tx: NDArray[np.complex128]
-    rx: NDArray[np.complex128]
-    wavelength: float
-    weight: NDArray[np.float64]
-    change_db: NDArray[np.float64]
+    exists: jax.Array
+    here: jax.Array
+    cosine: jax.Array
+    through: jax.Array
+    rotation: jax.Array
+    constants: jax.Array
+    tx: jax.Array
+    rx: jax.Array
+    wavelength: jax.Array
+    weight: jax.Array
+    change_db: jax.Array
 
 
 def _scanned(paths: Paths, name: str, last: dict[str, Material], calls: list[Observed]) -> _Scanned:
@@ -225,7 +225,7 @@ def _scanned(paths: Paths, name: str, last: dict[str, Material], calls: list[Obs
     ]
     present = np.arange(SCANNED) < paths.num_paths
     weight = np.stack([np.where(present, call.weight[index], 0.0) for call in calls])
-    return _Scanned(
+    arrays = (
         exists,
         exists & (paths.material[at] == list(last).index(name)),
         paths.cos_incidence[at],
@@ -238,6 +238,7 @@ def _scanned(paths: Paths, name: str, last: dict[str, Material], calls: list[Obs
         weight / weight.sum(),
         np.stack([call.change_db[index] for call in calls]),
     )
+    return _Scanned(*jax.device_put(arrays))
 
 
 @partial(jax.jit, static_argnums=(2, 3))
