@@ -25,7 +25,7 @@ from calibray.engines.replay import Replay
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_fit import Understanding, common, understand
 from calibray.fitting.ray_model import Call, RayModel
-from calibray.fitting.search import AUTO, SEARCHES, Trail, least_squares, local_searches
+from calibray.fitting.search import AUTO, Trail, least_squares, local_searches
 from calibray.optimizers.sampling import design
 from calibray.result.verdict import Remark, RemarkKind
 from calibray.study import Setup
@@ -139,7 +139,8 @@ def map_rays(
         understanding = understand(parameters, calls, known, understanding)
         replay = understanding.replay(parameters, calls[-1])
         starts = parameters.to_search(np.array([candidate for candidate, _ in calls]))
-        minimum = least_squares(with_engine(problem, replay), SEARCHES, starts).best.x
+        searches = local_searches(replay.interactions)  # a call costs more than many searches
+        minimum = least_squares(with_engine(problem, replay), searches, starts).best.x
         calls.append(call(parameters.from_search(minimum)))
         gap = _gap(replay, calls[-1])
         if gap <= tolerance_db or len(calls) >= most_calls:
