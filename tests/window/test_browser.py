@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import shutil
 import tomllib
 from pathlib import Path
@@ -50,8 +51,10 @@ def walked(tmp_path_factory):
         with served(folder) as address:
             page = opened(browser, address)
             finished(page)
-            add(page, "Measurements", [EXAMPLES / "rss.csv", EXAMPLES / "access_points.csv"])
+            add(page, "Measurements", [EXAMPLES / "rss.csv"])
             page.get_by_label("Carrier frequency [Hz]").fill("2.44e9")
+            # The step is shown again, and keeps what was entered.
+            add(page, "Measurements", [EXAMPLES / "access_points.csv"])
             press(page, "Measurements", "Draft the study")
             page.locator("#plan[data-links='84']").wait_for()
             yield folder, page, browser, address
@@ -175,3 +178,18 @@ def test_a_hostile_upload_is_refused(walked, tmp_path):
     step(page, "Map or plan").locator("input[type=file]").first.set_input_files(bad)
     page.get_by_text("use letters, digits").wait_for()
     assert not (folder / "<b>x.csv").exists()
+
+
+def test_the_chosen_result_is_exported_and_stays_chosen(walked):
+    folder, _, browser, address = walked
+    shutil.copytree(folder / "result", folder / "result-2")
+    page = opened(browser, address)
+    predict = step(page, "Predict and use")
+    assert predict.get_by_label("Result").input_value() == "result-2"
+    predict.get_by_label("Result").click()
+    page.get_by_role("option", name="result", exact=True).click()
+    predict.get_by_role("button", name="Export").click()
+    page.get_by_text(re.compile(r"calibray export result --out exported-result")).first.wait_for()
+    page.wait_for_timeout(600)
+    assert predict.get_by_label("Result").input_value() == "result"
+    page.context.close()

@@ -15,10 +15,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from nicegui import ui
+from nicegui.elements.mixins.value_element import ValueElement
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
@@ -39,6 +40,8 @@ MESHES: Final = (".ply", ".obj")
 PARTS: Final = (".shx", ".dbf", ".prj", ".cpg", ".tif", ".tiff", ".gpx", ".xml", ".json", ".msi")
 LARGEST: Final = 2**30
 """Largest size of an uploaded file [bytes]; put larger files into the folder."""
+
+Control = TypeVar("Control", bound=ValueElement)
 
 _NAME: Final = re.compile(r"[\w][\w .()+-]{0,119}")
 
@@ -204,6 +207,7 @@ class Desk:
         transmitters: Transmitters of the measured links, x, y, z [m].
         findings: Suspicions about the links.
         solid: The scene that is shown in 3-D.
+        entered: Values that the user entered, by the label of their control.
         refresh: Shows all steps again.
     """
 
@@ -214,6 +218,7 @@ class Desk:
     transmitters: list[list[float]] = field(default_factory=list)
     findings: list[str] = field(default_factory=list)
     solid: Solid | None = None
+    entered: dict[str, Any] = field(default_factory=dict)
     refresh: Callable[[], None] = lambda: None
 
     def __post_init__(self) -> None:
@@ -225,6 +230,14 @@ class Desk:
             job = self.jobs.start([str(word) for word in words])
             ui.notify(f"Started: {job.command}", type="info", color="primary")
             self.refresh()
+
+    def keep(self, control: Control) -> Control:
+        """The control, with the value that the user entered before its step was last shown, if it can have it."""
+        name = control.text if isinstance(control, ui.switch) else str(control.props["label"])
+        if name in self.entered and self.entered[name] in getattr(control, "options", [self.entered[name]]):
+            control.set_value(self.entered[name])
+        control.on_value_change(lambda event: self.entered.update({name: event.value}))
+        return control
 
     @contextmanager
     def messages(self) -> Iterator[None]:

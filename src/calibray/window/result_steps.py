@@ -32,8 +32,10 @@ def show_run(desk: Desk) -> None:
     """Draw the step of the runs: calibrate, validate, and everything that has run or is running in the folder."""
     if desk.folder.study_file.is_file():
         with ui.row():
-            out = ui.input("Name of the result", value="result")
-            blocks = ui.number("Blocks to validate by", value=4, min=2, max=100, step=1, format="%d")
+            out = desk.keep(ui.input("Name of the result", value="result"))
+            blocks = desk.keep(
+                ui.number("Blocks to validate by", value=4, min=2, max=100, step=1, format="%d")
+            )
 
         def start(words: list[object]) -> None:
             if not re.fullmatch(r"\w[\w-]*", out.value or ""):
@@ -158,8 +160,8 @@ def _comparison(desk: Desk, names: list[str]) -> None:
     else:
         ui.label("None: the studies have the same settings.").classes("quiet")
     with ui.row():
-        first = ui.select(names, label="Compare", value=names[0])
-        second = ui.select(names, label="with", value=names[-1])
+        first = desk.keep(ui.select(names, label="Compare", value=names[0]))
+        second = desk.keep(ui.select(names, label="with", value=names[-1]))
 
     async def judge() -> None:
         with desk.messages():
@@ -268,10 +270,10 @@ def show_prediction(desk: Desk) -> None:
         return
     sites = {json.dumps(site): f"{site[0]:g}, {site[1]:g}, {site[2]:g}" for site in desk.transmitters}
     with ui.row():
-        chosen = ui.select(names, label="Result", value=names[-1])
-        tx = ui.select(sites, label="Transmitter x, y, z [m]", value=next(iter(sites), None))
-        height = ui.number("Height of the receiver [m]", value=1.5, step=0.1)
-        cell = ui.number("Width of a cell [m]", value=5.0, min=0.1, step=1)
+        chosen = desk.keep(ui.select(names, label="Result", value=names[-1]))
+        tx = desk.keep(ui.select(sites, label="Transmitter x, y, z [m]", value=next(iter(sites), None)))
+        height = desk.keep(ui.number("Height of the receiver [m]", value=1.5, step=0.1))
+        cell = desk.keep(ui.number("Width of a cell [m]", value=5.0, min=0.1, step=1))
     x, y = desk.point or (None, None)
     with ui.row():
         east = ui.number("x [m]", value=x, format="%.1f")
@@ -315,12 +317,14 @@ def show_prediction(desk: Desk) -> None:
             )
             desk.start(["suggest", chosen.value, CANDIDATES, "--count", 5, "--out", SUGGESTED])
 
+    def export() -> None:
+        desk.start(["export", chosen.value, "--out", f"exported-{chosen.value}", "--copy"])
+
     with ui.row():
         ui.button("Predict here", on_click=predict)
         ui.button("Map the area", on_click=cover)
         ui.button("Suggest places", on_click=suggest)
-        export = ["export", chosen.value, "--out", f"exported-{chosen.value}", "--copy"]
-        ui.button("Export", on_click=lambda: desk.start(export)).props("outline")
+        ui.button("Export", on_click=export).props("outline")
     ui.label(f"Area: {desk.area or 'the whole scene'}").classes("quiet")
     _predicted(desk)
     _suggested(desk)

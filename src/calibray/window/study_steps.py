@@ -45,19 +45,25 @@ def show_scene(desk: Desk) -> None:
     sources, terrain = desk.folder.files(MAPS), desk.folder.files((".tif", ".tiff"))
     if sources:
         with ui.row():
-            source = ui.select(sources, label="Map, footprints or plan", value=_likely_map(sources)).classes(
-                "wide"
+            source = desk.keep(
+                ui.select(sources, label="Map, footprints or plan", value=_likely_map(sources)).classes(
+                    "wide"
+                ),
             )
-            kind = ui.select(["osm", "footprints", "plan"], label="Kind", value=_kind(source.value))
+            kind = desk.keep(
+                ui.select(["osm", "footprints", "plan"], label="Kind", value=_kind(source.value)),
+            )
             source.on_value_change(lambda event: kind.set_value(_kind(event.value)))
         with ui.expansion("Settings of the scene").classes("wide"), ui.row():
-            height = ui.input("Height: a column, or metres", value="3")
-            wall = ui.select(ITU, label="Walls (ITU-R P.2040)", value="concrete")
-            thickness = ui.number("Thickness of walls [m]", value=0.3, min=0.001, max=10, step=0.01)
-            ground = ui.select(ITU, label="Ground", value="concrete")
-            unit = ui.number("Unit of a plan [m]", value=1.0, min=1e-6)
-            relief = ui.select(["", *terrain], label="Height model of the ground", value="")
-            apart = ui.switch("One mesh per building")
+            height = desk.keep(ui.input("Height: a column, or metres", value="3"))
+            wall = desk.keep(ui.select(ITU, label="Walls (ITU-R P.2040)", value="concrete"))
+            thickness = desk.keep(
+                ui.number("Thickness of walls [m]", value=0.3, min=0.001, max=10, step=0.01),
+            )
+            ground = desk.keep(ui.select(ITU, label="Ground", value="concrete"))
+            unit = desk.keep(ui.number("Unit of a plan [m]", value=1.0, min=1e-6))
+            relief = desk.keep(ui.select(["", *terrain], label="Height model of the ground", value=""))
+            apart = desk.keep(ui.switch("One mesh per building"))
 
         def make() -> None:
             words: list[object] = ["scene", kind.value, source.value, "--out", "scene"]
@@ -123,11 +129,17 @@ def show_measurements(desk: Desk) -> None:
         ui.label("Add a table of measured links: CSV, Excel or Parquet.").classes("quiet")
         return
     with ui.row():
-        links = ui.select(tables, label="Table of links", value=_likely_links(tables)).classes("wide")
-        sites = ui.select(["", *tables], label="Table of transmitters", value=_sites(tables)).classes("wide")
-        track = ui.select(["", *tracks], label="Track", value=tracks[0] if tracks else "").classes("wide")
-        frequency = ui.input("Carrier frequency [Hz]", placeholder="3.5e9, unless a column has it")
-        tx = ui.input("Transmitter x,y,z [m]", placeholder="unless a table has it")
+        links = desk.keep(
+            ui.select(tables, label="Table of links", value=_likely_links(tables)).classes("wide"),
+        )
+        sites = desk.keep(
+            ui.select(["", *tables], label="Table of transmitters", value=_sites(tables)).classes("wide"),
+        )
+        track = desk.keep(
+            ui.select(["", *tracks], label="Track", value=tracks[0] if tracks else "").classes("wide"),
+        )
+        frequency = desk.keep(ui.input("Carrier frequency [Hz]", placeholder="3.5e9, unless a column has it"))
+        tx = desk.keep(ui.input("Transmitter x,y,z [m]", placeholder="unless a table has it"))
 
     def draft() -> None:
         if desk.scene is None:
