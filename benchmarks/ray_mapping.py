@@ -201,10 +201,9 @@ class Foreign:
         return Export.of_table(replace(self.table, power=powers(paths)), self.setting)
 
 
-def repetition(place: Place, name: str, seed: int) -> dict[str, Any]:
+def repetition(place: Place, foreign: Foreign, name: str, seed: int) -> dict[str, Any]:
     """One planted truth on one engine."""
     started, random = time.process_time(), np.random.default_rng([seed, 30])
-    foreign = Foreign(place, name)
     parameters = foreign.parameters
     truth = parameters.from_search(random.uniform(*parameters.search_bounds))
     loss = foreign.replay.path_loss(truth[None])[0]
@@ -223,11 +222,15 @@ def repetition(place: Place, name: str, seed: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _attempt(place: Place, name: str, seed: int) -> dict[str, Any]:
-    """A repetition; one that fails counts as not solved and states the error."""
+def _attempt(place: Place, name: str, seed: int) -> dict[str, Any] | None:
+    """A repetition; one that fails counts as not solved and states the error. None if the engine has no path at all."""
     started = time.process_time()
+    foreign = Foreign(place, name)
+    if not foreign.paths.num_paths:
+        print(f"{place.name}, {name} left out: no path", flush=True)
+        return None
     try:
-        return repetition(place, name, seed)
+        return repetition(place, foreign, name, seed)
     except Exception as error:
         return {
             "place": place.name, "engine": name, "seed": seed, "calls": FAILED, "made": 0, "excess_db": [],
@@ -274,7 +277,9 @@ def main() -> None:
                     continue
                 if (place := made.get(make, number, name == "scattering")) is None:
                     continue
-                rows.append(_attempt(place, name, seed))
+                if (row := _attempt(place, name, seed)) is None:
+                    continue
+                rows.append(row)
                 print(json.dumps(rows[-1]), flush=True)
                 if options.out is not None:
                     with options.out.open("a") as file:

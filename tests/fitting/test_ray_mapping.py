@@ -141,6 +141,16 @@ def test_many_candidates_have_the_levels_of_each() -> None:
             np.testing.assert_allclose(whole[number], part[0], rtol=1e-12)
 
 
+def test_values_at_the_bounds_make_materials() -> None:
+    """Foam with half its permittivity would have less than that of a vacuum."""
+    parameters = Parameters((Parameter("walls.relative_permittivity", 1.5, 12.0, 4.0),))
+    materials = synthetic.MATERIALS | {"ground": Material(1.2, 0.001, 0.1)}
+    paths = synthetic.program(synthetic.EVERY_KIND, seed=5, ports=(2, 2), materials=materials)
+    model = RayModel.of(parameters, paths, False)
+    for values in model.bounds:
+        assert model.materials(np.array([3.3]), values)["ground"].relative_permittivity >= 1.0
+
+
 def test_a_ray_of_power_zero_is_absent(foreign: Foreign) -> None:
     table = foreign.rays(np.array([4.0]))
     power = table.power.copy()

@@ -245,7 +245,7 @@ def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: in
             loss=loss, f_scale=scale, max_nfev=evaluations, xtol=1e-10, ftol=1e-8,
         ).x  # fmt: skip
     misfit = float(np.linalg.norm(evaluate(values)[0]) / np.sqrt(weights.sum()))
-    return replace(fit, values=complete(values), misfit_db=misfit)
+    return replace(fit, values=np.clip(complete(values), *fit.model.bounds), misfit_db=misfit)
 
 
 def _tables(model: RayModel, ratios: list[Ratio], last: Call) -> NDArray[np.float64]:

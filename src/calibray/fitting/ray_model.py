@@ -117,7 +117,7 @@ class RayModel:
         """Bounds of the values."""
         factor = np.log(PERMITTIVITY_FACTOR)
         pairs = [
-            np.log(RANGES[field]) if field in RANGES else (value - factor, value + factor)
+            np.log(RANGES[field]) if field in RANGES else (max(value - factor, 0.0), value + factor)
             for (_, field), value in zip(self.assumed, self.start, strict=False)
         ]
         pairs += [] if self.known else 2 * [(-np.pi, np.pi), (-TILT, TILT), (-TILT, TILT)]
