@@ -180,7 +180,7 @@ def test_a_hostile_upload_is_refused(walked, tmp_path):
     assert not (folder / "<b>x.csv").exists()
 
 
-def test_the_chosen_result_is_exported_and_stays_chosen(walked):
+def test_the_chosen_result_is_exported_and_nothing_entered_is_lost(walked):
     folder, _, browser, address = walked
     shutil.copytree(folder / "result", folder / "result-2")
     page = opened(browser, address)
@@ -188,8 +188,11 @@ def test_the_chosen_result_is_exported_and_stays_chosen(walked):
     assert predict.get_by_label("Result").input_value() == "result-2"
     predict.get_by_label("Result").click()
     page.get_by_role("option", name="result", exact=True).click()
+    lowest = step(page, "Parameters").get_by_label("Lowest").first
+    lowest.fill("1.7")
     predict.get_by_role("button", name="Export").click()
     page.get_by_text(re.compile(r"calibray export result --out exported-result")).first.wait_for()
     page.wait_for_timeout(600)
     assert predict.get_by_label("Result").input_value() == "result"
+    assert lowest.input_value() == "1.7"
     page.context.close()

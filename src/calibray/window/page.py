@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from nicegui import events, run, ui
 
-from calibray.window.desk import RADIUS, Desk, Solid, solid
+from calibray.window.desk import RADIUS, TABLES, Desk, Solid, solid
 from calibray.window.jobs import Stage, stages
 from calibray.window.result_steps import show_prediction, show_result, show_run
 from calibray.window.study_steps import findings, show_measurements, show_parameters, show_scene
@@ -56,9 +56,19 @@ def build(desk: Desk) -> None:
                     heading(f"{number}. {name}", 2)
                     show(desk)
 
+    def contents() -> dict[str, object]:
+        """What the steps with unsaved changes show; they are shown again only if it changes."""
+        text = desk.folder.text()
+        return {"Measurements": (text, desk.folder.files((*TABLES, ".gpx"))), "Parameters": text}
+
+    shown = contents()
+
     def refresh() -> None:
-        for _, show in STEPS:
-            show.refresh()
+        now = contents()
+        for name, show in STEPS:
+            if name not in now or now[name] != shown[name]:
+                show.refresh()
+        shown.update(now)
         activity.refresh()
         reload_map()
 
