@@ -184,6 +184,8 @@ def test_the_chosen_result_is_exported_and_nothing_entered_is_lost(walked):
     folder, _, browser, address = walked
     shutil.copytree(folder / "result", folder / "result-2")
     page = opened(browser, address)
+    page.locator("#plan[data-links='84']").wait_for()
+    page.wait_for_timeout(600)
     predict = step(page, "Predict and use")
     assert predict.get_by_label("Result").input_value() == "result-2"
     predict.get_by_label("Result").click()

@@ -87,7 +87,7 @@ def show_result(desk: Desk) -> None:
     if len(names) > 1:
         with desk.messages():
             _comparison(desk, names)
-    chosen = ui.select(names, label="Report", value=names[-1]).classes("wide")
+    chosen = desk.keep(ui.select(names, label="Report", value=names[-1]).classes("wide"))
     frame = ui.element("iframe").classes("report").props('sandbox="allow-scripts" title="Report"')
 
     def point() -> None:
@@ -278,6 +278,13 @@ def show_prediction(desk: Desk) -> None:
     with ui.row():
         east = ui.number("x [m]", value=x, format="%.1f")
         north = ui.number("y [m]", value=y, format="%.1f")
+
+    def placed() -> None:
+        if east.value is not None and north.value is not None:
+            desk.point = east.value, north.value
+
+    for coordinate in (east, north):
+        coordinate.on_value_change(placed)
 
     def site() -> list[float]:
         if tx.value is None:
