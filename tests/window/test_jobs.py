@@ -53,6 +53,14 @@ def test_a_command_that_was_killed_has_died(tmp_path):
     assert jobs.wait(job, 20).state == "died"
 
 
+def test_a_log_without_a_record_blocks_no_command(tmp_path):
+    """A server that was killed while it started a command leaves one."""
+    (tmp_path / FOLDER).mkdir()
+    (tmp_path / FOLDER / "0001.log").touch()
+    jobs = Jobs(tmp_path)
+    assert jobs.wait(jobs.start(["--version"]), 30).state == "done"
+
+
 def test_records_of_others_are_passed_over_and_their_processes_are_not_touched(tmp_path):
     folder = tmp_path / FOLDER
     folder.mkdir()

@@ -85,7 +85,9 @@ class Jobs:
             raise InputError(f"{self._folder}: is a link; remove it")
         try:
             self._folder.mkdir(exist_ok=True)
-            number = max((job.number for job in self.list()), default=0) + 1
+            # Of all files: a command that was never recorded may have left its log.
+            used = (int(file.stem) for file in self._folder.glob("[0-9]*.*") if file.stem.isdecimal())
+            number = max(used, default=0) + 1
             stem = self._folder / f"{number:04d}"
             arguments = [sys.executable, "-m", "calibray.window.jobs", f"{stem}.exit", *words]
             # The command writes while it runs; an exclusive file follows no link and replaces nothing.
