@@ -247,7 +247,7 @@ def _losses(program: _Scanned, points: jax.Array, columns: tuple[int, ...], know
     last, *earlier = (_powers(program, each, points, columns, known) for each in program.constants)
     total = jnp.zeros(last.shape[:2])
     for power, weight, change_db in zip(earlier, program.weight, program.change_db, strict=True):
-        # Single precision is enough for a logarithm, and takes a third of the time.
+        # Single precision is enough for a logarithm.
         ratio = (jnp.maximum(last, 1e-30) / jnp.maximum(power, 1e-30)).astype(jnp.float32)
         error = (10 * jnp.log10(ratio) - change_db.astype(jnp.float32)) ** 2
         # Geman and McClure's loss
