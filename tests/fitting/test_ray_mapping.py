@@ -18,10 +18,10 @@ from calibray.fitting import ray_fit, ray_scan
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_fit import understand
 from calibray.fitting.ray_mapping import RayMap, map_rays
-from calibray.fitting.ray_model import ANGLES, BATCH, HALF_SPACE, Call, Ends, RayModel
+from calibray.fitting.ray_model import ANGLES, BATCH, HALF_SPACE, LEAST_DB, Call, Ends, RayModel
 from calibray.materials import Material
 from calibray.parameters import Parameter, Parameters
-from calibray.paths import Paths
+from calibray.paths import Kind, Paths
 from calibray.paths.chains import spherical_basis
 from calibray.study import Setup
 from calibray.tracing.settings import Antenna
@@ -139,6 +139,43 @@ def test_many_candidates_have_the_levels_of_each() -> None:
         alone = model.levels_and_slopes(table[None], model.start, (True, True))
         for whole, part in zip(together, alone, strict=True):
             np.testing.assert_allclose(whole[number], part[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_loss_of_a_scan_is_that_of_the_model_at_its_minima(known: bool) -> None:
+    """For all polarizations of upright antennas, with fewer paths than a scan has room for."""
+    random = np.random.default_rng(4)
+    kinds = [(), (Kind.SPECULAR,), (Kind.REFRACTION, Kind.SPECULAR), (Kind.SPECULAR,) * 3, (Kind.REFRACTION,)]
+    paths = synthetic.program(2 * kinds, seed=6, ports=(2, 2))
+    parameters = Parameters((Parameter("walls.relative_permittivity", 1.5, 12.0, 4.0),))
+    model, candidates = RayModel.of(parameters, paths, known), [np.array([3.3]), np.array([7.1])]
+    last, earlier = (model.materials(each) for each in candidates)
+    weight, change_db = random.random(len(paths.link)), random.normal(0.0, 2.0, len(paths.link))
+    fields = ["thickness", "conductivity"]
+    observed = ray_scan.Observed(earlier, weight, change_db)
+    found = ray_scan.scan(paths, "walls", fields, last, [observed], known)
+    for pair, slants in enumerate([(None, None)] if known else ray_scan.POLARIZATIONS):
+        angles = [part for slant in slants for part in (slant or 0.0, 0.0, 0.0)]
+        values = model.start.copy() if known else np.concatenate([model.start[: len(model.assumed)], angles])
+        for field, value in zip(fields, found.values[pair, 0], strict=True):
+            values[model.assumed.index(("walls", field))] = value
+        linear = slants[0] is not None, slants[1] is not None
+        now, before = model.levels_and_slopes(model.tables(candidates), values, linear)[0]
+        square = (now - before - change_db) ** 2
+        loss = np.average(square / (1 + square / ray_scan.ROBUST_DB**2), weights=weight)
+        assert found.misfit[pair, 0] == pytest.approx(loss, rel=1e-4)
+
+
+def test_a_path_without_power_has_the_least_level_and_no_slope() -> None:
+    parameters = Parameters((Parameter("walls.relative_permittivity", 1.5, 12.0, 4.0),))
+    paths = synthetic.program(synthetic.EVERY_KIND, seed=5, ports=(2, 2))
+    silent = paths.tx_field.copy()
+    silent[1] = 0.0
+    model = RayModel.of(parameters, replace(paths, tx_field=silent), False)
+    level, slope = model.levels_and_slopes(model.tables([np.array([3.3])]), model.start, (True, True))
+    assert level[0, 1] == LEAST_DB
+    assert not slope[0, 1].any()
+    assert (level[0, [0, *range(2, len(level[0]))]] > LEAST_DB).all()
 
 
 def test_values_at_the_bounds_make_materials() -> None:
