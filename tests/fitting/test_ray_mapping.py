@@ -166,11 +166,12 @@ def test_the_loss_of_a_scan_is_that_of_the_model_at_its_minima(known: bool) -> N
         assert found.misfit[pair, 0] == pytest.approx(loss, rel=1e-4)
 
 
-def test_a_path_without_power_has_the_least_level_and_no_slope() -> None:
+@pytest.mark.parametrize("amplitude", [0.0, 1e-20])
+def test_a_path_without_power_has_the_least_level_and_no_slope(amplitude: float) -> None:
     parameters = Parameters((Parameter("walls.relative_permittivity", 1.5, 12.0, 4.0),))
     paths = synthetic.program(synthetic.EVERY_KIND, seed=5, ports=(2, 2))
     silent = paths.tx_field.copy()
-    silent[1] = 0.0
+    silent[1] *= amplitude
     model = RayModel.of(parameters, replace(paths, tx_field=silent), False)
     level, slope = model.levels_and_slopes(model.tables([np.array([3.3])]), model.start, (True, True))
     assert level[0, 1] == LEAST_DB
