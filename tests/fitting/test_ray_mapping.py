@@ -99,6 +99,21 @@ def test_a_slab_is_found_among_its_resonances(foreign: Foreign) -> None:
     assert constants["ground.conductivity"] == pytest.approx(0.004, rel=0.05)
 
 
+@pytest.mark.parametrize(("ground", "same"), [(None, True), (Material(3.0, 0.004, 0.437), False)])
+def test_other_antennas_alone_need_no_scan(
+    foreign: Foreign, monkeypatch: pytest.MonkeyPatch, ground: Material | None, same: bool
+) -> None:
+    """The study's constants are among the starts of the search, with the polarizations that suit them."""
+    monkeypatch.setattr(ray_fit, "_scanned", lambda *_: [])
+    declared = foreign.problem.setup.scene.materials["ground"]
+    paths = replace(foreign.paths, materials={**foreign.paths.materials, "ground": ground or declared})
+    calls = [
+        Call(np.array([value]), replace(foreign, paths=paths)(np.array([value]))) for value in (4.0, 9.0)
+    ]
+    found = understand(foreign.problem.parameters, calls, known=False)
+    assert (found.misfit_db < 1e-6) == same
+
+
 def test_values_that_no_ratio_shows_stay(foreign: Foreign) -> None:
     """Without polarization no power depends on a slant; a value that drifts would be where the next scan starts."""
     calls = [Call(np.array([value]), foreign(np.array([value]))) for value in (4.0, 9.0)]

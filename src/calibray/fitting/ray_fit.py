@@ -110,7 +110,7 @@ def _search(
 ) -> Understanding:
     """Add one material after the other, then scan all of them again."""
     meets, order = _meetings(first.model)
-    fits, done = [first], np.zeros(meets.shape[1], dtype=bool)
+    fits, done = [first, *_with_the_constants_of(first, ratios, last)], np.zeros(meets.shape[1], dtype=bool)
     for material in order:
         done[material] = True
         shown = np.logical_not((meets & ~done).any(axis=1))
@@ -128,6 +128,22 @@ def _search(
         new = _scanned(fits[:1], ratios, last, material, meets[:, material])
         fits = _best([*fits, *(refined(fit, ratios, last, EVALUATIONS[1]) for fit in new)])
     return fits[0]
+
+
+def _with_the_constants_of(fit: Understanding, ratios: list[Ratio], last: Call) -> list[Understanding]:
+    """Explanations with the same constants and the best polarizations of upright antennas, if these are unknown.
+
+    Many engines differ from the study in their antennas only.
+    """
+    if fit.model.known:
+        return []
+    tables = _tables(fit.model, ratios, last)
+    turned = [_polarized(fit, slants) for slants in ray_scan.POLARIZATIONS]
+    errors = [_errors(each, ratios, tables)[0] for each in turned]
+    scale = ray_scan.ROBUST_DB**2 * np.concatenate([ratio.weight for ratio in ratios])
+    # Geman and McClure's loss: paths near a null count less.
+    loss = [float(np.sum(error**2 / (1 + error**2 / scale))) for error in errors]
+    return [turned[index] for index in np.argsort(loss, kind="stable")[:KEPT].tolist()]
 
 
 def _best(fits: list[Understanding]) -> list[Understanding]:
