@@ -2,8 +2,9 @@
 
 Materials are added one after the other. Each is scanned (`ray_scan.py`) on paths that meet no material that is added
 later. The best points, with several polarizations, are refined together with the values so far, by least squares with
-exact derivatives on all these paths. The best few go on. If a misfit remains at the end, linear polarizations are
-searched with the materials fixed, and then each material is scanned again on all its paths.
+exact derivatives on all these paths. The best few go on. The study's constants are refined as well, with the
+polarizations that suit them best. If a misfit remains at the end, linear polarizations are searched with the materials
+fixed, and then each material is scanned again on all its paths.
 """
 
 from __future__ import annotations

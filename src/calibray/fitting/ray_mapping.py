@@ -50,8 +50,8 @@ UNDERSTOOD_DB: Final = 0.05
 """Largest gap at the last call of an engine that counts as understood [dB]."""
 
 MISFIT_DB: Final = 0.2
-"""Largest misfit of the ratios of such an engine [dB]. Wrong minima had 0.8 dB and more. With 0.08 to 0.13 dB, weak
-paths differed, and the optimum was reached to 0.001 dB (docs/measurements/expensive-engines.md)."""
+"""Largest misfit of the ratios of such an engine [dB]. Wrong minima had 0.8 dB and more. With 0.07 to 0.19 dB, the
+optimum was reached to 0.006 dB (docs/measurements/expensive-engines.md)."""
 
 MOST_CALLS: Final = 10
 """Number of calls after which ray mapping ends in any case."""
