@@ -225,12 +225,12 @@ def repetition(place: Place, foreign: Foreign, name: str, seed: int) -> dict[str
 def _attempt(place: Place, name: str, seed: int) -> dict[str, Any] | None:
     """A repetition; one that fails counts as not solved and states the error. None if the engine has no path at all."""
     started = time.process_time()
-    foreign = Foreign(place, name)
-    if not foreign.paths.num_paths:
+    try:
+        foreign = Foreign(place, name)
+        if foreign.paths.num_paths:
+            return repetition(place, foreign, name, seed)
         print(f"{place.name}, {name} left out: no path", flush=True)
         return None
-    try:
-        return repetition(place, foreign, name, seed)
     except Exception as error:
         return {
             "place": place.name, "engine": name, "seed": seed, "calls": FAILED, "made": 0, "excess_db": [],

@@ -27,6 +27,7 @@ from calibray.study import Setup
 from calibray.tracing.settings import Antenna
 
 TRUTH = 7.7
+WALLS = Parameters((Parameter("walls.relative_permittivity", 1.5, 12.0, 4.0),))
 
 
 @dataclass(frozen=True)
@@ -130,9 +131,8 @@ def test_values_that_no_ratio_shows_stay(foreign: Foreign) -> None:
 @pytest.mark.parametrize("linear", [(False, False), (True, False), (False, True), (True, True)])
 def test_levels_are_those_of_the_replay_and_slopes_their_differences(linear: Ends) -> None:
     """With a constant for the number of ports; with every kind of interaction."""
-    parameters = Parameters((Parameter("walls.relative_permittivity", 1.5, 12.0, 4.0),))
     candidates = [np.array([3.3]), np.array([7.1])]
-    model = RayModel.of(parameters, synthetic.program(synthetic.EVERY_KIND, seed=5, ports=(2, 2)), False)
+    model = RayModel.of(WALLS, synthetic.program(synthetic.EVERY_KIND, seed=5, ports=(2, 2)), False)
     values = model.start + 0.1 * np.random.default_rng(0).uniform(-1, 1, len(model.start))
     tables = model.tables(candidates)
     level, slope = model.levels_and_slopes(tables, values, linear)
@@ -146,8 +146,7 @@ def test_levels_are_those_of_the_replay_and_slopes_their_differences(linear: End
 
 
 def test_many_candidates_have_the_levels_of_each() -> None:
-    parameters = Parameters((Parameter("walls.relative_permittivity", 1.5, 12.0, 4.0),))
-    model = RayModel.of(parameters, synthetic.program(synthetic.EVERY_KIND, seed=5, ports=(2, 2)), False)
+    model = RayModel.of(WALLS, synthetic.program(synthetic.EVERY_KIND, seed=5, ports=(2, 2)), False)
     tables = model.tables([np.array([value]) for value in np.linspace(2.0, 11.0, BATCH + 3)])
     together = model.levels_and_slopes(tables, model.start, (True, True))
     for number, table in enumerate(tables):
@@ -162,8 +161,7 @@ def test_the_loss_of_a_scan_is_that_of_the_model_at_its_minima(known: bool) -> N
     random = np.random.default_rng(4)
     kinds = [(), (Kind.SPECULAR,), (Kind.REFRACTION, Kind.SPECULAR), (Kind.SPECULAR,) * 3, (Kind.REFRACTION,)]
     paths = synthetic.program(2 * kinds, seed=6, ports=(2, 2))
-    parameters = Parameters((Parameter("walls.relative_permittivity", 1.5, 12.0, 4.0),))
-    model, candidates = RayModel.of(parameters, paths, known), [np.array([3.3]), np.array([7.1])]
+    model, candidates = RayModel.of(WALLS, paths, known), [np.array([3.3]), np.array([7.1])]
     last, earlier = (model.materials(each) for each in candidates)
     weight, change_db = random.random(len(paths.link)), random.normal(0.0, 2.0, len(paths.link))
     fields = ["thickness", "conductivity"]
@@ -183,11 +181,10 @@ def test_the_loss_of_a_scan_is_that_of_the_model_at_its_minima(known: bool) -> N
 
 @pytest.mark.parametrize("amplitude", [0.0, 1e-20])
 def test_a_path_without_power_has_the_least_level_and_no_slope(amplitude: float) -> None:
-    parameters = Parameters((Parameter("walls.relative_permittivity", 1.5, 12.0, 4.0),))
     paths = synthetic.program(synthetic.EVERY_KIND, seed=5, ports=(2, 2))
     silent = paths.tx_field.copy()
     silent[1] *= amplitude
-    model = RayModel.of(parameters, replace(paths, tx_field=silent), False)
+    model = RayModel.of(WALLS, replace(paths, tx_field=silent), False)
     level, slope = model.levels_and_slopes(model.tables([np.array([3.3])]), model.start, (True, True))
     assert level[0, 1] == LEAST_DB
     assert not slope[0, 1].any()
@@ -196,10 +193,9 @@ def test_a_path_without_power_has_the_least_level_and_no_slope(amplitude: float)
 
 def test_values_at_the_bounds_make_materials() -> None:
     """Foam with half its permittivity would have less than that of a vacuum."""
-    parameters = Parameters((Parameter("walls.relative_permittivity", 1.5, 12.0, 4.0),))
     materials = synthetic.MATERIALS | {"ground": Material(1.2, 0.001, 0.1)}
     paths = synthetic.program(synthetic.EVERY_KIND, seed=5, ports=(2, 2), materials=materials)
-    model = RayModel.of(parameters, paths, False)
+    model = RayModel.of(WALLS, paths, False)
     for values in model.bounds:
         assert model.materials(np.array([3.3]), values)["ground"].relative_permittivity >= 1.0
 

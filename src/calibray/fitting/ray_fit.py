@@ -138,12 +138,10 @@ def _with_the_constants_of(fit: Understanding, ratios: list[Ratio], last: Call) 
     """
     if fit.model.known:
         return []
-    tables = _tables(fit.model, ratios, last)
+    tables, weight = _tables(fit.model, ratios, last), np.concatenate([ratio.weight for ratio in ratios])
     turned = [_polarized(fit, slants) for slants in ray_scan.POLARIZATIONS]
-    errors = [_errors(each, ratios, tables)[0] for each in turned]
-    scale = ray_scan.ROBUST_DB**2 * np.concatenate([ratio.weight for ratio in ratios])
-    # Geman and McClure's loss: paths near a null count less.
-    loss = [float(np.sum(error**2 / (1 + error**2 / scale))) for error in errors]
+    squares = [_errors(each, ratios, tables)[0] ** 2 / weight for each in turned]
+    loss = [float(weight @ ray_scan.robust(square)) for square in squares]
     return [turned[index] for index in np.argsort(loss, kind="stable")[:KEPT].tolist()]
 
 

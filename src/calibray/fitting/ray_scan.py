@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -74,6 +74,11 @@ TILTS: Final = np.linspace(-TILT, TILT, 15)
 
 FINE_SLANTS: Final = np.pi * (np.arange(80) / 80 - 0.5)
 """Slants of a scan [rad]; a linear polarization has the period pi."""
+
+
+def robust(square: Any) -> Any:
+    """Geman and McClure's loss of squared errors of ratios [...], [dB^2], of NumPy or JAX."""
+    return square / (1 + square / ROBUST_DB**2)
 
 
 class Observed(NamedTuple):
@@ -249,9 +254,8 @@ def _losses(program: _Scanned, points: jax.Array, columns: tuple[int, ...], know
     for power, weight, change_db in zip(earlier, program.weight, program.change_db, strict=True):
         # Single precision is enough for a logarithm.
         ratio = (jnp.maximum(last, 1e-30) / jnp.maximum(power, 1e-30)).astype(jnp.float32)
-        error = (10 * jnp.log10(ratio) - change_db.astype(jnp.float32)) ** 2
-        # Geman and McClure's loss
-        total += (error / (1 + error / ROBUST_DB**2) * weight.astype(jnp.float32)).sum(axis=-1)
+        square = (10 * jnp.log10(ratio) - change_db.astype(jnp.float32)) ** 2
+        total += (robust(square) * weight.astype(jnp.float32)).sum(axis=-1)
     return total
 
 
@@ -375,8 +379,7 @@ def _scan_angles(parts: list[Gains], end: int, other: NDArray[np.float64]) -> li
             levels.append(
                 _level(cos**2 * np.abs(first) ** 2 + sin**2 * np.abs(second) ** 2 + 2 * cos * sin * cross)
             )
-        error = (levels[0] - levels[1] - part.observed) ** 2
-        loss = loss + (error / (1 + error / ROBUST_DB**2)) @ part.weight  # Geman and McClure's loss
+        loss = loss + robust((levels[0] - levels[1] - part.observed) ** 2) @ part.weight
     tilt, slant = np.unravel_index(np.argsort(np.ravel(loss))[:STARTS], (len(axis), len(FINE_SLANTS)))
     return [np.array([FINE_SLANTS[j], *axis[i, :2]]) for i, j in zip(tilt, slant, strict=True)]
 
