@@ -9,8 +9,7 @@ of the links at either end of the longer axis. The other links are validated on 
 errors. Four intervals of 90 % are compared at the links kept apart: by the ranks of all errors, in two levels (within
 and between blocks), these also wider out of sight, and these with the error between blocks counted twice. Clusters that
 hold all links of an offset's group are left out. A second table has the RMSE of every model on the links kept apart,
-and of the model that was chosen without them. If this is an average, the model that is averaged with the calibrated one
-is listed too.
+and of the model that was chosen without them. If this is an average, the RMSE of the chosen model alone is listed too.
 
 With `--worlds`, the truth differs from each district's study (`misfit_worlds.py`). One of four blocks is kept apart;
 the regret is the RMSE there of the chosen model minus that of the best. "Of few" is the regret against the best of the
@@ -35,7 +34,7 @@ import districts
 import misfit_worlds
 from calibray.errors import InputError
 from calibray.fitting.problem import Problem
-from calibray.result.held_out import AVERAGES, FITTED, WITHOUT_MATERIALS, Model
+from calibray.result.held_out import AVERAGE_OF, FITTED, WITHOUT_MATERIALS, Model
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.tables import Column, Table, numbers, render
 from calibray.validation.held_out_statistics import (
@@ -56,6 +55,7 @@ USED = WAYS.index("wider out of sight")
 
 CHOSEN = "chosen without them"
 ALONE = "this, not averaged"
+NOT_AVERAGED = {average: name for name, average in AVERAGE_OF.items()}
 FEW = (Model.INITIAL, Model.CALIBRATED, Model.LOG_DISTANCE)
 CLOSE_DB = 0.3
 """Regret up to which the choice counts as right."""
@@ -84,7 +84,7 @@ def coverage(problem: Problem, apart: np.ndarray) -> tuple[list[float], list[flo
     ]
     found = fit_models(part, fits)
     errors = {str(model): (loss - objective.measured)[apart] for model, loss in found.items()}
-    errors[CHOSEN], errors[ALONE] = errors[name], errors[AVERAGES.get(name, name)]
+    errors[CHOSEN], errors[ALONE] = errors[name], errors[NOT_AVERAGED.get(name, name)]
     finite = np.isfinite(errors[name])
     inside = [float(np.mean((np.abs(errors[name]) <= half)[finite])) for half in halves]
     return inside, [float(half.mean()) for half in halves], errors

@@ -12,8 +12,7 @@ Reported are how often 90 % sets contain the truth by verdict, and how often a r
 identifiable, and the 95 % interval misses) has a warning, or a value at a bound, which the report explains as a
 possible defect of the model. The regret is what the model that held-out blocks choose loses at the cluster kept apart,
 compared with the best of the initial materials, the calibrated ones and the log-distance model there. The same is
-reported for the choice without the average with the calibrated model, and for the calibrated models without and with a
-prior.
+reported for the choice without averaging, and for the calibrated models without and with a prior.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from calibray.calibration.link_diagnostics import directions_remark
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, search
 from calibray.optimizers import LeastSquares
-from calibray.result.held_out import AVERAGES, Model
+from calibray.result.held_out import AVERAGE_OF, Model
 from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.verdicts import credible_sets
@@ -51,6 +50,7 @@ NEARLY_DB = 0.3
 """Loss compared with the best model up to which a choice is right."""
 IDENTIFIED = ("identified", "weakly identified")
 PARTLY = ("ambiguous", "at bound")
+NOT_AVERAGED = {average: name for name, average in AVERAGE_OF.items()}
 
 
 def repetition(world: World, seed: int, spread: float | None, *, draws: bool, choice: bool) -> dict[str, Any]:
@@ -133,7 +133,7 @@ def table(lines: list[dict[str, Any]]) -> Table:
         choices = [line for line in mine if "chosen" in line]
         regret = [_regret(line, line["chosen"]) for line in choices]
         rivals = [
-            [_regret(line, AVERAGES.get(line["chosen"], line["chosen"])) for line in choices],
+            [_regret(line, NOT_AVERAGED.get(line["chosen"], line["chosen"])) for line in choices],
             *([_regret(line, name) for line in choices] for name in (Model.CALIBRATED, Model.PRIOR)),
         ]
         rows.append((

@@ -125,21 +125,24 @@ def test_a_verdict_never_contradicts_its_value() -> None:
     assert consistent(unknown, 14.99) == unknown
 
 
-def test_a_slope_that_the_study_does_not_state_is_averaged_with_the_calibrated_model(tmp_path: Path) -> None:
-    """Path loss rises by 6 dB per decade more than the paths explain."""
-    table, links = planted.campaign(noise_db=0.5), planted.links()
-    distance = np.linalg.norm(links[["rx_x", "rx_y"]].assign(z=-1.5), axis=1)
-    table = table.assign(path_loss_db=table["path_loss_db"] + 6 * np.log10(distance))
+def test_initial_materials_that_blocks_choose_are_averaged_with_the_model_with_a_prior(
+    tmp_path: Path,
+) -> None:
+    """The true materials are the initial ones."""
+    parameters, links = planted.engine().parameters, planted.links()
+    initial = dict(zip(parameters.names, parameters.start.tolist(), strict=True))
+    noise_db = 2 * np.random.default_rng(1).standard_normal(len(links))
+    table = links.assign(path_loss_db=planted.path_loss(initial) + noise_db)
     result = calibrate(planted.study(tmp_path, table, holdout={"blocks": 4}), engine=planted.engine())
     model, errors = result.prediction.model, result.held_out.errors
-    assert model.name == Model.AVERAGE_SLOPE
-    assert Model.AVERAGE_SLOPE in result.held_out.table.index
-    assert errors[Model.AVERAGE_SLOPE] == pytest.approx(
-        (errors[Model.SLOPE] + errors[Model.CALIBRATED]) / 2, nan_ok=True
+    assert model.name == Model.AVERAGE_INITIAL
+    assert Model.AVERAGE_INITIAL in result.held_out.table.index
+    assert errors[Model.AVERAGE_INITIAL] == pytest.approx(
+        (errors[Model.INITIAL] + errors[Model.PRIOR]) / 2, nan_ok=True
     )
-    assert model.residual_db == pytest.approx(np.sqrt(np.nanmean(errors[Model.AVERAGE_SLOPE] ** 2)))
-    assert model.parameters == result.parameters
-    assert model.averaged != result.parameters
+    assert model.residual_db == pytest.approx(np.sqrt(np.nanmean(errors[Model.AVERAGE_INITIAL] ** 2)))
+    assert model.averaged == pytest.approx(initial)
+    assert min(abs(model.parameters[name] - value) for name, value in initial.items()) > 0.01
     # The prediction is the mean of the predictions of both models.
     alone = [
         replace(model, averaged=None, parameters=values, terms=terms)
@@ -156,7 +159,7 @@ def test_a_slope_that_the_study_does_not_state_is_averaged_with_the_calibrated_m
     assert half["path_loss_db"].to_numpy() == pytest.approx(result.predict(links), abs=1e-9)
     result.save(tmp_path / "out")
     assert Result.load(tmp_path / "out").predict(links) == pytest.approx(result.predict(links), abs=1e-9)
-    assert "averaged" in prediction_text(result)
+    assert "other values than the calibrated ones, averaged with the initial ones," in prediction_text(result)
     assert "average" in scene_alone_text(result)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibray.result.held_out import Model
+from calibray.result.held_out import AVERAGES, Model
 from calibray.result.wording import judgement_text
 from calibray.validation.held_out_statistics import MOST_CLUSTERS, compare, spatial_blocks
 from calibray.validation.validation import Validation
@@ -175,25 +175,6 @@ def test_the_log_distance_model_is_chosen_where_it_is_clearly_better():
     )
 
 
-def test_a_strong_prior_replaces_the_initial_materials_if_it_is_better_by_five_per_cent():
-    """The bootstrap error of 20 links is larger than both gains."""
-    base = synthetic_validation({Model.INITIAL: 3.0}, count=20)
-    errors = base.errors[Model.INITIAL]
-    uneven = np.where(np.arange(20) < 10, 0.6, 1.25) * errors
-
-    def chosen(strong: float) -> str:
-        several = {Model.INITIAL: errors, Model.CALIBRATED: 2 * errors, Model.STRONG_PRIOR: strong * uneven}
-        return replace(base, errors=several).chosen
-
-    share = np.sqrt(np.mean(errors**2) / np.mean(uneven**2))
-    assert not compare(uneven * share * 0.94, {"": errors}, base.position).helped
-    assert chosen(0.94 * share) == Model.STRONG_PRIOR
-    assert chosen(0.96 * share) == Model.INITIAL
-    # The same gain without a prior is too uncertain.
-    free = {Model.INITIAL: errors, Model.CALIBRATED: 0.94 * share * uneven}
-    assert replace(base, errors=free).chosen == Model.INITIAL
-
-
 def test_the_calibrated_model_must_be_significantly_better_than_the_one_with_a_prior():
     sizes = {Model.INITIAL: 9.0, Model.CALIBRATED: 2.0, Model.PRIOR: 2.1}
     uncertain = synthetic_validation(sizes, count=60, seed=1)
@@ -204,21 +185,34 @@ def test_the_calibrated_model_must_be_significantly_better_than_the_one_with_a_p
     assert clear.chosen == Model.CALIBRATED
 
 
-def test_a_model_with_more_offsets_than_the_study_is_averaged_with_the_calibrated_one():
-    size_db = {Model.INITIAL: 9.0, Model.CALIBRATED: 5.0, Model.OFFSETS: 2.0, Model.AVERAGE_OFFSETS: 3.0}
-    validation = synthetic_validation(size_db)
-    assert validation.chosen == Model.AVERAGE_OFFSETS
-    assert "'calibrated with offsets', the best on held-out blocks. It is averaged" in validation.choice
-    assert Model.AVERAGE_OFFSETS in validation.table.index
-    # The average of a model that is not chosen neither predicts nor has a row.
-    other = synthetic_validation(size_db | {Model.CALIBRATED: 1.0, Model.AVERAGE_OFFSETS: 0.5})
-    assert other.chosen == Model.CALIBRATED
-    assert "averaged" not in other.choice
-    assert Model.AVERAGE_OFFSETS not in other.table.index
+@pytest.mark.parametrize(
+    ("best", "partner", "average"),
+    [
+        (Model.INITIAL, Model.PRIOR, Model.AVERAGE_INITIAL),
+        (Model.CALIBRATED, Model.PRIOR, Model.AVERAGE_CALIBRATED),
+        (Model.OFFSETS, Model.CALIBRATED, Model.AVERAGE_OFFSETS),
+    ],
+)
+def test_the_average_of_the_chosen_model_and_a_second_one_predicts(best, partner, average):
+    size_db = dict.fromkeys((Model.INITIAL, Model.CALIBRATED, Model.PRIOR, Model.OFFSETS), 9.0)
+    validation = synthetic_validation(size_db | dict.fromkeys(AVERAGES, 9.0) | {best: 2.0, average: 3.0})
+    assert validation.chosen == average
+    assert validation.nested_rmse_db == pytest.approx(3.0, rel=0.1)
+    assert f"{str(best)!r}, the best on held-out blocks. It is averaged" in validation.choice
+    assert f"with the model {str(partner)!r}" in validation.choice
+    assert set(validation.table.index) == {*map(str, size_db), str(average)}
+
+
+def test_a_model_with_a_prior_or_without_a_scene_is_not_averaged():
+    sizes = dict.fromkeys((Model.INITIAL, Model.CALIBRATED, Model.PRIOR, Model.LOG_DISTANCE, *AVERAGES), 9.0)
+    for best in (Model.PRIOR, Model.LOG_DISTANCE):
+        validation = synthetic_validation(sizes | {best: 2.0})
+        assert validation.chosen == best
+        assert "averaged" not in validation.choice
 
 
 def test_the_one_standard_error_rule_beats_the_lowest_rmse_on_few_links():
-    rmse_db, by_rule, by_rmse = {Model.INITIAL: 3.0, Model.CALIBRATED: 3.3, Model.SLOPE: 3.6}, [], []
+    rmse_db, by_rule, by_rmse = {Model.INITIAL: 3.0, Model.CALIBRATED: 3.3, Model.OFFSETS: 3.6}, [], []
     for seed in range(60):
         validation = synthetic_validation(rmse_db, count=24, seed=seed)
         by_rule.append(rmse_db[validation.chosen])

@@ -77,7 +77,7 @@ def test_without_groups_and_obstruction_there_is_no_such_variant() -> None:
     assert with_offsets(Objective(plain.measured, plain.weight, Nuisance(COUNT, (grouped,))), table) is None
 
 
-def test_the_stronger_the_prior_the_nearer_are_the_materials_to_the_initial_ones() -> None:
+def test_a_prior_keeps_the_materials_near_the_initial_ones() -> None:
     setup = Setup.open(
         Study.from_content(planted.content("links.csv")), links=links_from_frame(planted.links())
     )
@@ -86,12 +86,8 @@ def test_the_stronger_the_prior_the_nearer_are_the_materials_to_the_initial_ones
     part = replace(part, objective=replace(part.objective, measured=planted.path_loss() + noise_db))
     start = part.parameters.to_search(part.parameters.start)
     fits = models.fit_variants(part)
-    strong, prior, free = (
-        np.linalg.norm(fits[name][1][0] - start)
-        for name in (Model.STRONG_PRIOR, Model.PRIOR, Model.CALIBRATED)
-    )
-    assert 0 < strong < 0.7 * prior
-    assert prior < 0.7 * free
+    prior, free = (np.linalg.norm(fits[name][1][0] - start) for name in (Model.PRIOR, Model.CALIBRATED))
+    assert 0 < prior < 0.7 * free
 
 
 @pytest.mark.parametrize(("searches", "additional"), [(16, 1), (32, 2), (512, 4)])
@@ -107,9 +103,9 @@ def test_a_large_program_has_fewer_additional_starts(
     known = np.zeros((1, 2))
     monkeypatch.setattr(models, "local_searches", lambda _: searches)
     monkeypatch.setattr(models, "find_minima", without_search)
-    monkeypatch.setattr(models, "variants", lambda part, best: {Model.CALIBRATED: part, Model.SLOPE: part})
+    monkeypatch.setattr(models, "variants", lambda part, best: {Model.CALIBRATED: part, Model.PRIOR: part})
     part: Any = SimpleNamespace(engine=None)
     models.fit_variants(part, {Model.CALIBRATED: known})
-    models.fit_variants(part, {Model.CALIBRATED: known, Model.SLOPE: known})
+    models.fit_variants(part, {Model.CALIBRATED: known, Model.PRIOR: known})
     # A variant without minima over more links starts from those of the study's own model, and gets all.
     assert used == [additional, 4, additional, additional]

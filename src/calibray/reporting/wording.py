@@ -33,7 +33,8 @@ def prediction_text(record: Record) -> str:
             else "the initial materials"
         )
     if model.averaged is not None:
-        source += ", averaged with a fit of other values and offsets,"
+        averaged = "the initial ones" if model.name == Model.AVERAGE_INITIAL else "those of another fit"
+        source += f", averaged with {averaged},"
     terms = [term.name for term in model.terms]
     added = f" and the fitted {', '.join(terms)}" if terms else ""
     fallback = record.prediction.fallback

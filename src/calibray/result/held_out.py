@@ -19,14 +19,11 @@ class Model(StrEnum):
 
     INITIAL = "initial materials"
     CALIBRATED = "calibrated"
-    STRONG_PRIOR = "calibrated with strong prior"
     PRIOR = "calibrated with prior"
-    SLOPE = "calibrated with slope"
-    OFFSETS = "calibrated with offsets"
-    PRIOR_OFFSETS = "calibrated with prior and offsets"
-    AVERAGE_SLOPE = "average with slope"
-    AVERAGE_OFFSETS = "average with offsets"
-    AVERAGE_PRIOR_OFFSETS = "average with prior and offsets"
+    OFFSETS = "calibrated with prior and offsets"
+    AVERAGE_INITIAL = "average of prior and initial materials"
+    AVERAGE_CALIBRATED = "average of calibrated and prior"
+    AVERAGE_OFFSETS = "average of calibrated and offsets"
     RESIDUAL_FIELD = "calibrated with residual field"
     LOG_DISTANCE = "log-distance"
     OBSTRUCTION = "log-distance with obstruction"
@@ -39,23 +36,22 @@ WITHOUT_MATERIALS: Final = (Model.LOG_DISTANCE, Model.OBSTRUCTION)
 BASELINES: Final = (Model.INITIAL, *WITHOUT_MATERIALS, Model.KRIGING)
 """Models that calibrate no material."""
 
-FITTED: Final = (
-    Model.CALIBRATED,
-    Model.STRONG_PRIOR,
-    Model.PRIOR,
-    Model.SLOPE,
-    Model.OFFSETS,
-    Model.PRIOR_OFFSETS,
-)
+FITTED: Final = (Model.CALIBRATED, Model.PRIOR, Model.OFFSETS)
 """Models that calibrate materials and can make predictions anywhere."""
 
-AVERAGES: Final[dict[str, Model]] = {
-    Model.AVERAGE_SLOPE: Model.SLOPE,
-    Model.AVERAGE_OFFSETS: Model.OFFSETS,
-    Model.AVERAGE_PRIOR_OFFSETS: Model.PRIOR_OFFSETS,
+AVERAGES: Final[dict[str, tuple[Model, Model]]] = {
+    Model.AVERAGE_INITIAL: (Model.PRIOR, Model.INITIAL),
+    Model.AVERAGE_CALIBRATED: (Model.CALIBRATED, Model.PRIOR),
+    Model.AVERAGE_OFFSETS: (Model.CALIBRATED, Model.OFFSETS),
 }
-"""The model of `FITTED` that each average takes together with the calibrated one: it has a slope or offsets in addition
-to the study's."""
+"""The two models whose path loss each average takes. An exported scene has the materials of the first."""
+
+AVERAGE_OF: Final[dict[str, Model]] = {
+    Model.INITIAL: Model.AVERAGE_INITIAL,
+    Model.CALIBRATED: Model.AVERAGE_CALIBRATED,
+    Model.OFFSETS: Model.AVERAGE_OFFSETS,
+}
+"""The average that predicts if blocks choose a model."""
 
 
 @dataclass(frozen=True)

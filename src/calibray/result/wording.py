@@ -296,20 +296,20 @@ def judgement_text(judgement: Judgement) -> str:
     return f"Calibration {verb} on held-out links: {error}, {judgement.gain_db:.2f} dB less {baseline}."
 
 
-def choice_text(chosen: str, best: str, *, averaged: bool = False) -> str:
+def choice_text(chosen: str, best: str, partner: str | None = None) -> str:
     """Which model predictions use, and why; `best` has the lowest held-out RMSE among those that predict anywhere.
 
-    `averaged` states whether the model is averaged with the calibrated one.
+    `partner` is the model with which the chosen one is averaged.
     """
     added = (
-        " It is averaged with the calibrated model, because a slope or offsets that the study does not state often do "
-        "not apply elsewhere."
-        if averaged
-        else ""
+        ""
+        if partner is None
+        else f" It is averaged with the model {str(partner)!r}, because the best model on a few blocks is often not "
+        "the best elsewhere."
     )
     if chosen == best:
         return f"Predictions use the model {str(chosen)!r}, the best on held-out blocks.{added}"
-    near = ", which stays near the initial materials" if chosen in (Model.STRONG_PRIOR, Model.PRIOR) else ""
+    near = ", which stays near the initial materials" if chosen == Model.PRIOR else ""
     return (
         f"Predictions use the model {str(chosen)!r}{near}. The model {str(best)!r} is better on held-out blocks, but "
         f"not clearly enough.{added}"

@@ -92,7 +92,7 @@ def fit_prediction_model(
 ) -> FittedModel:
     """Fit the chosen model to all links that have a weight.
 
-    An average has the scene of the calibrated model, and the values of the other model as further ones.
+    An average has the scene of its first model, and the values of the second as further ones.
 
     Args:
         problem: The problem.
@@ -106,23 +106,16 @@ def fit_prediction_model(
         The fitted model. Predictions and exports trace with its materials, so its values at the links contain the gap.
     """
     setup, parameters = problem.setup, problem.parameters
-    candidate, scene_db = trail.best, trail.best_modelled
-    objective, modelled, other = problem.objective, scene_db, None
-    if name in WITHOUT_MATERIALS:
+    uses_scene = name not in WITHOUT_MATERIALS
+    names = AVERAGES.get(name, (Model(name) if uses_scene else Model.CALIBRATED,))
+    variant, *others = (_fit_variant(problem, trail, each) for each in names)
+    candidate, scene_db = variant.candidate, variant.modelled
+    objective, modelled = variant.objective, scene_db
+    if not uses_scene:
         make = log_distance if name == Model.LOG_DISTANCE else obstructed
         objective, modelled = make(setup.links, problem.objective, without_scene(setup.study, setup.links))
-    elif name == Model.INITIAL:
-        candidate, scene_db = parameters.start, problem.before
-        objective, modelled = initial_objective(problem.objective, setup), scene_db
-    elif name in AVERAGES:
-        other = _fit_variant(problem, trail, AVERAGES[name])
-    elif name != Model.CALIBRATED:
-        variant = _fit_variant(problem, trail, Model(name))
-        candidate, scene_db = variant.candidate, variant.modelled
-        objective, modelled = variant.objective, scene_db
-    uses_scene = name not in WITHOUT_MATERIALS
     terms, path_loss_db = fitted_terms(objective, modelled, setup.study), objective.with_nuisance(modelled)
-    if other is not None:
+    for other in others:
         terms = averaged_terms(terms, fitted_terms(other.objective, other.modelled, setup.study))
         path_loss_db = (path_loss_db + other.objective.with_nuisance(other.modelled)) / 2
     model = PredictionModel(
@@ -134,7 +127,7 @@ def fit_prediction_model(
         residuals.links,
         quantiles(np.sort(np.abs(residuals.errors_db))),
         residuals.blocks,
-        None if other is None else parameters.named(other.candidate),
+        parameters.named(others[0].candidate) if others else None,
     )
     materials = parameters.materials(candidate, problem.setup.scene.materials) if uses_scene else None
     if isinstance(problem.engine, Replay) and problem.engine.effects:
@@ -161,7 +154,12 @@ class _Variant:
 
 
 def _fit_variant(problem: Problem, trail: Trail, name: Model) -> _Variant:
-    """Search the minimum of a variant from the calibrated optimum and new starting points."""
+    """Search the minimum of a variant from the calibrated optimum and new starting points, where it has any."""
+    if name == Model.INITIAL:
+        objective = initial_objective(problem.objective, problem.setup)
+        return _Variant(problem.parameters.start, objective, problem.before)
+    if name == Model.CALIBRATED:
+        return _Variant(trail.best, problem.objective, trail.best_modelled)
     best = problem.parameters.to_search(trail.best)
     variant = variants(problem, best)[name]
     point = find_minima(variant, best[None], SEARCHES)[0]

@@ -117,14 +117,10 @@ def choose(errors: Errors, position: NDArray[np.float64]) -> str:
     """Choose the model for predictions by held-out residuals [n], [dB], `Model.INITIAL` among them.
 
     The initial materials are kept until another model is better by more than the bootstrap error of the difference, and
-    by more than `LEAST_GAIN`. A strong prior keeps the materials near the initial ones, so it needs only the latter.
-    The calibrated model is chosen only if it is significantly better than the one with a prior. Kriging is never
-    chosen, because it predicts well only near the measured links.
+    by more than `LEAST_GAIN`. The calibrated model is chosen only if it is significantly better than the one with a
+    prior. Kriging is never chosen, because it predicts well only near the measured links.
     """
     chosen: str = Model.INITIAL
-    strong = errors.get(Model.STRONG_PRIOR)
-    if strong is not None and _rmse(strong) < (1 - LEAST_GAIN) * _rmse(errors[Model.INITIAL]):
-        chosen = Model.STRONG_PRIOR
     for name in (least(errors, FITTED), *WITHOUT_MATERIALS):
         if name in errors:
             comparison = compare(errors[name], {chosen: errors[chosen]}, position)

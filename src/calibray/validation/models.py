@@ -2,10 +2,10 @@
 
 The baselines are the log-distance model, also with the obstruction of the direct line, and kriging.
 
-The variants are the study's own model, its initial materials, priors around the initial values, a slope over distance,
-and offsets per transmitter and out of sight: what an engineer would try by hand. The best variant differs between
+The variants are the study's own model, its initial materials, a prior around the initial values, and with this prior
+offsets per transmitter and out of sight: what an engineer would try by hand. The best variant differs between
 campaigns, so held-out links decide (`validate.py`). Both offsets have a prior around zero, which keeps them small where
-the links do not need them. One variant therefore has both, instead of one variant for each
+the links do not need them. One variant therefore has both. Further variants make the choice worse
 (docs/measurements/predictions.md).
 """
 
@@ -172,11 +172,7 @@ def kriging(links: Measurements, objective: Objective, trend_db: NDArray[np.floa
 
 
 PRIOR_SPREAD: Final = 0.3
-"""Standard deviation of a parameter's logarithm around its initial value, in the variants with priors."""
-
-STRONG_PRIOR_SPREAD: Final = 0.15
-"""The same in the variant with a strong prior. With 0.2, predictions in clusters of Boulder kept apart are 0.1 dB worse
-(docs/measurements/predictions.md)."""
+"""Standard deviation of a parameter's logarithm around its initial value, in the variants with a prior."""
 
 OFFSET_PRIOR_DB: Final = 10.0
 """Standard deviation of the prior, around zero, of a transmitter's offset from that of all links, and of the offset of
@@ -245,24 +241,17 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
     noise_db = float(part.squares(best[None]).rmse_db[0]) * np.sqrt(
         objective.num_counted / max(part.freedom, 1)
     )
-    strong, with_prior = (
-        replace(
-            part, priors=_priors_around_start(part, spread), objective=replace(objective, noise_db=noise_db)
-        )
-        for spread in (STRONG_PRIOR_SPREAD, PRIOR_SPREAD)
-    )
+    priors = _priors_around_start(part)
     problems = {
         Model.INITIAL: replace(part, objective=initial_objective(objective, setup)),
         Model.CALIBRATED: part,
-        Model.STRONG_PRIOR: strong,
-        Model.PRIOR: with_prior,
-        Model.SLOPE: replace(part, objective=_with_term(objective, LOG_DISTANCE, setup.links)),
+        Model.PRIOR: replace(part, priors=priors, objective=replace(objective, noise_db=noise_db)),
     }
     with_both = with_offsets(objective, setup.links)
     if with_both is not None:
-        with_both = replace(with_both, noise_db=noise_db)
-        problems[Model.OFFSETS] = replace(part, objective=with_both)
-        problems[Model.PRIOR_OFFSETS] = replace(with_prior, objective=with_both)
+        problems[Model.OFFSETS] = replace(
+            part, priors=priors, objective=replace(with_both, noise_db=noise_db)
+        )
     return problems
 
 
@@ -320,12 +309,12 @@ def _with_term(
     return replace(objective, nuisance=Nuisance(len(links), terms))
 
 
-def _priors_around_start(problem: Problem, spread: float) -> LogNormal:
-    """The study's priors, and one of this spread around the initial value of every other positive parameter."""
+def _priors_around_start(problem: Problem) -> LogNormal:
+    """The study's priors, and one around the initial value of every other positive parameter."""
     parameters, priors = problem.parameters, problem.priors
     added = [
         index
         for index, parameter in enumerate(parameters)
         if index not in priors.index and parameter.lower > 0 and parameter.start > 0
     ]
-    return priors.extended(added, [float(parameters.start[index]) for index in added], spread)
+    return priors.extended(added, [float(parameters.start[index]) for index in added], PRIOR_SPREAD)

@@ -182,9 +182,9 @@ def fit_models(
         name: variant.objective.with_nuisance(variant.modelled(minima[:1])[0])
         for name, (variant, minima) in fits.items()
     }
-    for average, name in AVERAGES.items():
-        if name in fits:
-            path_loss_db[average] = (path_loss_db[name] + path_loss_db[Model.CALIBRATED]) / 2
+    for average, (first, second) in AVERAGES.items():
+        if {first, second} <= fits.keys():
+            path_loss_db[average] = (path_loss_db[first] + path_loss_db[second]) / 2
     known_db = without_scene(setup.study, setup.links)
     path_loss_db[Model.LOG_DISTANCE] = log_distance(setup.links, objective, known_db).path_loss_db()
     if has_obstruction(setup.links):

@@ -3,10 +3,9 @@
 Predictions use the initial materials with fitted offsets until another model is better by more than the bootstrap error
 of the difference (the one-standard-error rule, L. Breiman et al., Classification and Regression Trees, 1984) and by 5 %
 of the RMSE. The best calibrated model is tried first, then the log-distance model, which uses no scene. A few blocks
-hardly distinguish models of similar accuracy, and a fitted model loses more if its fit does not apply elsewhere. A
-strong prior around the initial materials therefore needs no more than the 5 %, and the calibrated model without a prior
-must be significantly better than the one with a prior. If the chosen model has a slope or offsets that the study does
-not state, it is averaged with the calibrated model.
+hardly distinguish models of similar accuracy, and a fitted model loses more if its fit does not apply elsewhere. The
+calibrated model without a prior must therefore be significantly better than the one with a prior. The chosen model is
+averaged with a second one, because the best model on a few blocks is often not the best elsewhere.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from calibray.measurements import Measurements
 from calibray.result.held_out import (
+    AVERAGE_OF,
     AVERAGES,
     BASELINES,
     FITTED,
@@ -97,14 +97,14 @@ class Validation(HeldOutErrors):
     @cached_property
     def chosen(self) -> str:
         """The prediction model; never kriging or the residual field, which help only near measured links."""
-        return self._choose(self.judged)
+        return self._predicting(self.judged)
 
     @cached_property
     def nested_rmse_db(self) -> float:
         """RMSE when each block is predicted by the model that the other blocks choose [dB]."""
         errors = np.full(len(self.block), np.nan)
         for block in self._blocks():
-            errors[block] = self.errors[self._choose(self.judged & ~block)][block]
+            errors[block] = self.errors[self._predicting(self.judged & ~block)][block]
         return float(np.sqrt(np.nanmean(errors**2)))
 
     @cached_property
@@ -121,8 +121,11 @@ class Validation(HeldOutErrors):
     @property
     def choice(self) -> str:
         """Which model predictions use, with the reason."""
-        best = least(self._on(self.judged), (Model.INITIAL, *FITTED, *WITHOUT_MATERIALS))
-        return choice_text(AVERAGES.get(self.chosen, self.chosen), best, averaged=self.chosen in AVERAGES)
+        errors = self._on(self.judged)
+        best = least(errors, (Model.INITIAL, *FITTED, *WITHOUT_MATERIALS))
+        chosen = choose(errors, self.position[self.judged])
+        partner = next((name for name in AVERAGES.get(self.chosen, ()) if name != chosen), None)
+        return choice_text(chosen, best, partner)
 
     def scale(self, name: str) -> float:
         """Standard deviation of a model's residuals on new links [dB]: the root mean square of the held-out ones."""
@@ -173,11 +176,11 @@ class Validation(HeldOutErrors):
             **({"observables": observables} if observables else {}),
         }
 
-    def _choose(self, mask: NDArray[np.bool_]) -> str:
-        """The prediction model that some links choose."""
+    def _predicting(self, mask: NDArray[np.bool_]) -> str:
+        """The prediction model if some links choose: the average of the model that they choose, if there is one."""
         name = choose(self._on(mask), self.position[mask])
-        averages = {alone: average for average, alone in AVERAGES.items() if average in self.errors}
-        return averages.get(Model(name), name)
+        average = AVERAGE_OF.get(name, name)
+        return average if average in self.errors else name
 
     def _on(self, mask: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
         return {name: errors[mask] for name, errors in self.errors.items()}
