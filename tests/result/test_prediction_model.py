@@ -113,6 +113,21 @@ def test_a_filter_of_held_out_links_chooses_the_model_too(tmp_path: Path) -> Non
     assert result.predict(links) == pytest.approx(30 + 35 * np.log10(distance), abs=3.0)
 
 
+def test_initial_materials_that_a_filter_chooses_are_averaged_too(tmp_path: Path) -> None:
+    parameters, links = planted.engine().parameters, planted.links()
+    initial = dict(zip(parameters.names, parameters.start.tolist(), strict=True))
+    noise_db = 2 * np.random.default_rng(1).standard_normal(len(links))
+    table = links.assign(path_loss_db=planted.path_loss(initial) + noise_db, part=np.arange(len(links)) % 3)
+    result = calibrate(planted.study(tmp_path, table, holdout={"where": "part > 0"}), engine=planted.engine())
+    model = result.prediction.model
+    assert model.name == Model.AVERAGE_INITIAL
+    assert model.averaged == pytest.approx(initial)
+    assert min(abs(model.parameters[name] - value) for name, value in initial.items()) > 0.01
+    held_out = result.links[result.links.held_out]
+    error_db = held_out.predicted_db - held_out.measured_db
+    assert model.residual_db == pytest.approx(np.sqrt(np.mean(error_db**2)))
+
+
 def test_a_verdict_never_contradicts_its_value() -> None:
     interval = Interval(0.1, 1.5, 4.123, Verdict.IDENTIFIED)
     assert consistent(interval, 3.0) == interval

@@ -21,17 +21,18 @@ from calibray.result.held_out import FittedTerm, Model, PredictionModel
 from calibray.result.record import Accuracy
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study.calibration_sections import DEFAULT_BLOCKS
-from calibray.validation.choice import HeldOutResiduals, fitted_terms, quantiles
+from calibray.validation.choice import HeldOutResiduals, fit_variant, fitted_terms, quantiles
 from calibray.validation.held_out_statistics import (
-    choose,
     compare,
     held_out_gaps,
     observable_errors,
     out_of_sight_ratio,
+    predicting,
     spatial_blocks,
     two_levels,
 )
 from calibray.validation.models import (
+    averages,
     has_obstruction,
     initial_objective,
     log_distance,
@@ -108,7 +109,7 @@ def _choice(
 ) -> tuple[str, HeldOutResiduals]:
     """The model that held-out links choose, and its residuals there; with too few links, the calibrated model."""
     objective, setup = problem.objective, problem.setup
-    modelled = {
+    modelled: dict[str, NDArray[np.float64]] = {
         Model.INITIAL: initial_objective(objective, setup).with_nuisance(problem.before),
         Model.CALIBRATED: models.calibrated,
         Model.LOG_DISTANCE: models.log_distance,
@@ -116,13 +117,15 @@ def _choice(
     if has_obstruction(setup.links):
         known_db = without_scene(setup.study, setup.links)
         modelled[Model.OBSTRUCTION] = obstructed(setup.links, objective, known_db).path_loss_db()
-    errors: dict[str, NDArray[np.float64]] = {
-        name: (path_loss_db - objective.measured)[judged] for name, path_loss_db in modelled.items()
-    }
+    if problem.differentiable and np.count_nonzero(judged) >= FEW:
+        variant = fit_variant(problem, trail, Model.PRIOR)
+        modelled[Model.PRIOR] = variant.objective.with_nuisance(variant.modelled)
+        modelled |= averages(modelled)
+    errors = {name: (path_loss_db - objective.measured)[judged] for name, path_loss_db in modelled.items()}
     finite = np.isfinite(np.stack(list(errors.values()))).all(axis=0)
     errors, count = {name: values[finite] for name, values in errors.items()}, int(finite.sum())
     if count >= FEW:
-        name = choose(errors, setup.links.rx[judged][finite])
+        name = predicting(errors, setup.links.rx[judged][finite])
         rms_db, basis = float(np.sqrt(np.mean(errors[name] ** 2))), f"errors of {count} links held out"
         basis = basis if name == Model.CALIBRATED else f"{name}, {basis}"
         position = np.hstack([setup.links.tx, setup.links.rx])[judged][finite]

@@ -108,7 +108,7 @@ def fit_prediction_model(
     setup, parameters = problem.setup, problem.parameters
     uses_scene = name not in WITHOUT_MATERIALS
     names = AVERAGES.get(name, (Model(name) if uses_scene else Model.CALIBRATED,))
-    variant, *others = (_fit_variant(problem, trail, each) for each in names)
+    variant, *others = (fit_variant(problem, trail, each) for each in names)
     candidate, scene_db = variant.candidate, variant.modelled
     objective, modelled = variant.objective, scene_db
     if not uses_scene:
@@ -145,7 +145,7 @@ def fit_prediction_model(
 
 
 @dataclass(frozen=True, eq=False)
-class _Variant:
+class FittedVariant:
     """A variant fitted to the links with a weight: its values [d], objective, and path loss without nuisance [L]."""
 
     candidate: NDArray[np.float64]
@@ -153,18 +153,18 @@ class _Variant:
     modelled: NDArray[np.float64]
 
 
-def _fit_variant(problem: Problem, trail: Trail, name: Model) -> _Variant:
+def fit_variant(problem: Problem, trail: Trail, name: Model) -> FittedVariant:
     """Search the minimum of a variant from the calibrated optimum and new starting points, where it has any."""
     if name == Model.INITIAL:
         objective = initial_objective(problem.objective, problem.setup)
-        return _Variant(problem.parameters.start, objective, problem.before)
+        return FittedVariant(problem.parameters.start, objective, problem.before)
     if name == Model.CALIBRATED:
-        return _Variant(trail.best, problem.objective, trail.best_modelled)
+        return FittedVariant(trail.best, problem.objective, trail.best_modelled)
     best = problem.parameters.to_search(trail.best)
     variant = variants(problem, best)[name]
     point = find_minima(variant, best[None], SEARCHES)[0]
     modelled = variant.evaluate(point[None]).modelled[0]
-    return _Variant(problem.parameters.from_search(point), variant.objective, modelled)
+    return FittedVariant(problem.parameters.from_search(point), variant.objective, modelled)
 
 
 def averaged_terms(few: tuple[FittedTerm, ...], more: tuple[FittedTerm, ...]) -> tuple[FittedTerm, ...]:

@@ -26,6 +26,7 @@ from calibray.fitting.problem import Problem
 from calibray.measurements import Measurements
 from calibray.measurements.observables import ROUND_TRIP, TIME_OF_FLIGHT
 from calibray.result.held_out import (
+    AVERAGE_OF,
     FITTED,
     WITHOUT_MATERIALS,
     BlockErrors,
@@ -132,6 +133,13 @@ def choose(errors: Errors, position: NDArray[np.float64]) -> str:
         if not compare(errors[chosen], with_prior, position).helped:
             chosen = Model.PRIOR
     return chosen
+
+
+def predicting(errors: Errors, position: NDArray[np.float64]) -> str:
+    """The prediction model if held-out residuals choose: the average of the model that they choose, if it has one."""
+    name = choose(errors, position)
+    average = AVERAGE_OF.get(name, name)
+    return average if average in errors else name
 
 
 def least(errors: Errors, names: tuple[str, ...]) -> str:

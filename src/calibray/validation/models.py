@@ -36,7 +36,7 @@ from calibray.fitting.search import STARTS, least_squares, local_searches
 from calibray.measurements import Measurements
 from calibray.optimizers.least_squares import CATCH_UP, NEARER
 from calibray.parameters import LogNormal
-from calibray.result.held_out import Model
+from calibray.result.held_out import AVERAGES, Model
 from calibray.scenes.obstruction import OUT_OF_SIGHT, WALLS
 from calibray.study import Setup
 from calibray.study.model import StudyModel
@@ -261,6 +261,15 @@ def find_minima(problem: Problem, starts: NDArray[np.float64], new_starts: int) 
     return least_squares(
         problem, new_starts, starts[:MOST_STARTS], tolerance=TOLERANCE, catch_up=catch_up
     ).minima
+
+
+def averages(path_loss_db: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
+    """Path loss of every average whose two models are among those given, by name [links], [dB]."""
+    return {
+        average: (path_loss_db[first] + path_loss_db[second]) / 2
+        for average, (first, second) in AVERAGES.items()
+        if {first, second} <= path_loss_db.keys()
+    }
 
 
 def _searches(problem: Problem) -> int:

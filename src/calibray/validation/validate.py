@@ -18,7 +18,7 @@ from calibray.fitting.preliminary_fits import estimate_noise, leave_out_near_flo
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_mapping import maps_rays, search_rays
 from calibray.fitting.search import AUTO
-from calibray.result.held_out import AVERAGES, Model
+from calibray.result.held_out import Model
 from calibray.study import Setup, Study
 from calibray.study.calibration_sections import DEFAULT_BLOCKS, MOST_BLOCKS
 from calibray.study.model import StudyModel
@@ -28,6 +28,7 @@ from calibray.tracing.protocol import TracerFactory
 from calibray.validation.held_out_statistics import MODELS, held_out_gaps, observable_errors, spatial_blocks
 from calibray.validation.models import (
     NO_MINIMA,
+    averages,
     fit_variants,
     has_obstruction,
     kriging,
@@ -182,9 +183,7 @@ def fit_models(
         name: variant.objective.with_nuisance(variant.modelled(minima[:1])[0])
         for name, (variant, minima) in fits.items()
     }
-    for average, (first, second) in AVERAGES.items():
-        if {first, second} <= fits.keys():
-            path_loss_db[average] = (path_loss_db[first] + path_loss_db[second]) / 2
+    path_loss_db |= averages(path_loss_db)
     known_db = without_scene(setup.study, setup.links)
     path_loss_db[Model.LOG_DISTANCE] = log_distance(setup.links, objective, known_db).path_loss_db()
     if has_obstruction(setup.links):

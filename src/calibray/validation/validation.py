@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from calibray.measurements import Measurements
 from calibray.result.held_out import (
-    AVERAGE_OF,
     AVERAGES,
     BASELINES,
     FITTED,
@@ -35,7 +34,14 @@ from calibray.result.held_out import (
 from calibray.result.wording import choice_text, judgement_text
 from calibray.support.messages import percent
 from calibray.tables import Column, Table, numbers, short_html, short_text
-from calibray.validation.held_out_statistics import choose, compare, interval_half_width, least, two_levels
+from calibray.validation.held_out_statistics import (
+    choose,
+    compare,
+    interval_half_width,
+    least,
+    predicting,
+    two_levels,
+)
 
 
 def observables_table(observables: Mapping[str, ObservableErrors]) -> Table:
@@ -97,14 +103,15 @@ class Validation(HeldOutErrors):
     @cached_property
     def chosen(self) -> str:
         """The prediction model; never kriging or the residual field, which help only near measured links."""
-        return self._predicting(self.judged)
+        return predicting(self._on(self.judged), self.position[self.judged])
 
     @cached_property
     def nested_rmse_db(self) -> float:
         """RMSE when each block is predicted by the model that the other blocks choose [dB]."""
         errors = np.full(len(self.block), np.nan)
         for block in self._blocks():
-            errors[block] = self.errors[self._predicting(self.judged & ~block)][block]
+            others = self.judged & ~block
+            errors[block] = self.errors[predicting(self._on(others), self.position[others])][block]
         return float(np.sqrt(np.nanmean(errors**2)))
 
     @cached_property
@@ -175,12 +182,6 @@ class Validation(HeldOutErrors):
             "sentence": self.sentence,
             **({"observables": observables} if observables else {}),
         }
-
-    def _predicting(self, mask: NDArray[np.bool_]) -> str:
-        """The prediction model if some links choose: the average of the model that they choose, if there is one."""
-        name = choose(self._on(mask), self.position[mask])
-        average = AVERAGE_OF.get(name, name)
-        return average if average in self.errors else name
 
     def _on(self, mask: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
         return {name: errors[mask] for name, errors in self.errors.items()}
