@@ -55,7 +55,7 @@ USED = WAYS.index("wider out of sight")
 
 CHOSEN = "chosen without them"
 ALONE = "this, not averaged"
-NOT_AVERAGED = {average: name for name, average in AVERAGE_OF.items()}
+NOT_AVERAGED = {str(average): name for name, average in AVERAGE_OF.items()}
 FEW = (Model.INITIAL, Model.CALIBRATED, Model.LOG_DISTANCE)
 CLOSE_DB = 0.3
 """Regret up to which the choice counts as right."""

@@ -50,7 +50,7 @@ NEARLY_DB = 0.3
 """Loss compared with the best model up to which a choice is right."""
 IDENTIFIED = ("identified", "weakly identified")
 PARTLY = ("ambiguous", "at bound")
-NOT_AVERAGED = {average: name for name, average in AVERAGE_OF.items()}
+NOT_AVERAGED = {str(average): name for name, average in AVERAGE_OF.items()}
 
 
 def repetition(world: World, seed: int, spread: float | None, *, draws: bool, choice: bool) -> dict[str, Any]:

@@ -174,7 +174,10 @@ def test_initial_materials_that_blocks_choose_are_averaged_with_the_model_with_a
     assert half["path_loss_db"].to_numpy() == pytest.approx(result.predict(links), abs=1e-9)
     result.save(tmp_path / "out")
     assert Result.load(tmp_path / "out").predict(links) == pytest.approx(result.predict(links), abs=1e-9)
-    assert "other values than the calibrated ones, averaged with the initial ones," in prediction_text(result)
+    assert (
+        "materials calibrated with a prior, averaged with the initial ones, and the fitted constant"
+        in prediction_text(result)
+    )
     assert "average" in scene_alone_text(result)
 
 

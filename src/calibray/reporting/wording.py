@@ -28,13 +28,10 @@ def prediction_text(record: Record) -> str:
         source = "the calibrated materials"
     else:
         source = (
-            "other values than the calibrated ones"
-            if model.name != Model.INITIAL
-            else "the initial materials"
+            "materials calibrated with a prior" if model.name != Model.INITIAL else "the initial materials"
         )
     if model.averaged is not None:
-        averaged = "the initial ones" if model.name == Model.AVERAGE_INITIAL else "those of another fit"
-        source += f", averaged with {averaged},"
+        source += f", averaged with {_AVERAGED[Model(model.name)]},"
     terms = [term.name for term in model.terms]
     added = f" and the fitted {', '.join(terms)}" if terms else ""
     fallback = record.prediction.fallback
@@ -43,6 +40,13 @@ def prediction_text(record: Record) -> str:
         return text
     error = "" if fallback.residual_db is None else f", with an error of {fallback.residual_db:.1f} dB (RMS)"
     return f"{text} For links without a path, predictions use the log-distance model{error}, and are marked."
+
+
+_AVERAGED: Final = {
+    Model.AVERAGE_INITIAL: "the initial ones",
+    Model.AVERAGE_CALIBRATED: "those of a fit with a prior",
+    Model.AVERAGE_OFFSETS: "those of a fit with a prior and offsets",
+}
 
 
 def scene_alone_text(record: Record) -> str:
