@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import planted
@@ -113,11 +114,17 @@ def test_a_filter_of_held_out_links_chooses_the_model_too(tmp_path: Path) -> Non
     assert result.predict(links) == pytest.approx(30 + 35 * np.log10(distance), abs=3.0)
 
 
-def test_initial_materials_that_a_filter_chooses_are_averaged_too(tmp_path: Path) -> None:
+def initial_campaign() -> tuple[dict[str, float], pd.DataFrame]:
+    """The initial values of the parameters, and links whose true materials have these, with 2 dB of noise."""
     parameters, links = planted.engine().parameters, planted.links()
     initial = dict(zip(parameters.names, parameters.start.tolist(), strict=True))
     noise_db = 2 * np.random.default_rng(1).standard_normal(len(links))
-    table = links.assign(path_loss_db=planted.path_loss(initial) + noise_db, part=np.arange(len(links)) % 3)
+    return initial, links.assign(path_loss_db=planted.path_loss(initial) + noise_db)
+
+
+def test_initial_materials_that_a_filter_chooses_are_averaged_too(tmp_path: Path) -> None:
+    initial, table = initial_campaign()
+    table = table.assign(part=np.arange(len(table)) % 3)
     result = calibrate(planted.study(tmp_path, table, holdout={"where": "part > 0"}), engine=planted.engine())
     model = result.prediction.model
     assert model.name == Model.AVERAGE_INITIAL
@@ -143,11 +150,7 @@ def test_a_verdict_never_contradicts_its_value() -> None:
 def test_initial_materials_that_blocks_choose_are_averaged_with_the_model_with_a_prior(
     tmp_path: Path,
 ) -> None:
-    """The true materials are the initial ones."""
-    parameters, links = planted.engine().parameters, planted.links()
-    initial = dict(zip(parameters.names, parameters.start.tolist(), strict=True))
-    noise_db = 2 * np.random.default_rng(1).standard_normal(len(links))
-    table = links.assign(path_loss_db=planted.path_loss(initial) + noise_db)
+    (initial, table), links = initial_campaign(), planted.links()
     result = calibrate(planted.study(tmp_path, table, holdout={"blocks": 4}), engine=planted.engine())
     model, errors = result.prediction.model, result.held_out.errors
     assert model.name == Model.AVERAGE_INITIAL
