@@ -15,13 +15,14 @@ from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.constants import speed_of_light
 from scipy.optimize import least_squares
 
 from calibray.engines.rays.compile import powers
 from calibray.engines.rays.surfaces import TOLERANCE
 from calibray.engines.replay import Replay
 from calibray.fitting import ray_scan
-from calibray.fitting.ray_model import Call, Ends, RayModel
+from calibray.fitting.ray_model import ANGLES, RANGES, TILT, Call, Ends, RayModel
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take
 
@@ -35,8 +36,17 @@ KNOWN_DB: Final = 0.02
 """Misfit below which the explanation of earlier calls is kept for the next one [dB]; wrong minima had 0.1 dB and
 more."""
 
-EVALUATIONS: Final = (12, 30)
-"""Number of evaluations of a refinement between scans and of the last one, with each loss."""
+EVALUATIONS: Final = (6, 12, 30)
+"""Number of evaluations of a trial, of a refinement between scans, and of the last one, with each loss."""
+
+TRIALS: Final = 300
+"""Number of trials of basin hopping."""
+
+PROMISING: Final = 3.0
+"""Ratio of a trial's misfit to that of the explanations so far up to which it is refined further."""
+
+MOST_HOPS: Final = 30
+"""Largest change of a thickness in a trial [half wavelengths in the slab]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +110,7 @@ def understand(
             first, misfit_db=float(np.linalg.norm(_errors(first, ratios, _tables(model, ratios, last))[0]))
         )
     if before is not None and before.model.assumed == model.assumed:
-        before = refined(replace(before, model=model), ratios, last, EVALUATIONS[1])
+        before = refined(replace(before, model=model), ratios, last, EVALUATIONS[2])
         if before.misfit_db <= KNOWN_DB:
             return before
     return _search(first, ratios, last, before)
@@ -118,17 +128,62 @@ def _search(
         part = [ratio for each in ratios if len((ratio := each.on(shown)).here)]
         new = _scanned(fits, part, last, material, meets[:, material] & shown)
         if part:
-            fits = _best([refined(fit, part, last, EVALUATIONS[0]) for fit in [*fits, *new]])
-    fits = _best([refined(fit, ratios, last, EVALUATIONS[1]) for fit in fits] + ([before] if before else []))
+            fits = _best([refined(fit, part, last, EVALUATIONS[1]) for fit in [*fits, *new]])
+    fits = _best([refined(fit, ratios, last, EVALUATIONS[2]) for fit in fits] + ([before] if before else []))
     if fits[0].misfit_db > EXACT_DB and all(fits[0].linear) and not fits[0].model.known:
         new = _turned(fits[0], ratios, last)
-        fits = _best([*fits, *(refined(fit, ratios, last, EVALUATIONS[1]) for fit in new)])
+        fits = _best([*fits, *(refined(fit, ratios, last, EVALUATIONS[2]) for fit in new)])
     for material in order:
         if fits[0].misfit_db <= EXACT_DB:
             break
         new = _scanned(fits[:1], ratios, last, material, meets[:, material])
-        fits = _best([*fits, *(refined(fit, ratios, last, EVALUATIONS[1]) for fit in new)])
-    return fits[0]
+        fits = _best([*fits, *(refined(fit, ratios, last, EVALUATIONS[2]) for fit in new)])
+    return _hopped(fits, ratios, last)[0]
+
+
+def _hopped(fits: list[Understanding], ratios: list[Ratio], last: Call) -> list[Understanding]:
+    """Basin hopping: refine perturbed explanations until one is exact."""
+    random = np.random.default_rng(len(ratios))
+    for _ in range(TRIALS if fits[0].model.assumed else 0):
+        if fits[0].misfit_db <= EXACT_DB:
+            break
+        start = _perturbed(fits[random.integers(len(fits))], last, random)
+        trial = refined(start, ratios, last, EVALUATIONS[0])
+        if trial.misfit_db < PROMISING * fits[-1].misfit_db:
+            trial = refined(trial, ratios, last, EVALUATIONS[2])
+        if not np.isclose(trial.misfit_db, [fit.misfit_db for fit in fits], rtol=1e-3).any():
+            fits = _best([*fits, trial])
+    return fits
+
+
+def _perturbed(fit: Understanding, last: Call, random: np.random.Generator) -> Understanding:
+    """An explanation with other constants of one or two materials.
+
+    A thickness changes by some half wavelengths in the slab, after which it resonates again. The conductivity keeps its
+    value, keeps the attenuation through the slab, or changes at random. One of three trials has antennas with other
+    tilts, too.
+    """
+    model, values = fit.model, fit.values.copy()
+    materials, names = (
+        model.materials(last.candidate, fit.values),
+        sorted({name for name, _ in model.assumed}),
+    )
+    for name in random.choice(names, min(len(names), random.integers(1, 3)), replace=False).tolist():
+        longer = 0.0
+        if (name, "thickness") in model.assumed:
+            root = np.sqrt(materials[name].relative_permittivity)
+            step = speed_of_light / model.paths.frequency / (2 * root)
+            change = random.choice([-1, 1]) * round(np.exp(random.uniform(0, np.log(MOST_HOPS)))) * step
+            at = model.assumed.index((name, "thickness"))
+            longer = np.log(np.clip(abs(np.exp(values[at]) + change), *RANGES["thickness"])) - values[at]
+            values[at] += longer
+        if (name, "conductivity") in model.assumed:
+            at = model.assumed.index((name, "conductivity"))
+            values[at] += random.choice([0.0, -longer, random.normal()])
+    if not model.known and random.integers(3) == 0:
+        slant = np.pi / 2 * np.round(values[len(model.assumed) :: ANGLES] / (np.pi / 2))
+        values[len(model.assumed) :] = np.stack([slant, *random.uniform(-TILT, TILT, (2, 2))], axis=1).ravel()
+    return replace(fit, values=values)
 
 
 def _with_the_constants_of(fit: Understanding, ratios: list[Ratio], last: Call) -> list[Understanding]:
