@@ -14,7 +14,7 @@ import calibray as cb
 import two_ray
 from calibray.calibration.result import Result
 from calibray.errors import EngineError, InputError
-from calibray.fitting import ray_mapping
+from calibray.fitting import ray_fit, ray_mapping
 from calibray.study.toml_file import study_text
 from commands import run
 
@@ -145,6 +145,7 @@ def test_a_program_of_other_physics_is_not_understood(
 ) -> None:
     """Ray mapping ends after two calls here; the search for an explanation takes longer after each."""
     monkeypatch.setattr(ray_mapping, "map_rays", partial(ray_mapping.map_rays, most_calls=2))
+    monkeypatch.setattr(ray_fit, "TRIALS", 10)
     method = {"name": "auto", "options": {"budget": 3}}
     antennas = {"tx": ISOTROPIC, "rx": ISOTROPIC}
     study = write_study(tmp_path / "study", RIPPLE, antennas, method=method, holdout=None)

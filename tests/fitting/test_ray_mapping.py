@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.constants import speed_of_light
 from scipy.optimize import least_squares
 
 import synthetic
@@ -100,12 +101,37 @@ def test_a_slab_is_found_among_its_resonances(foreign: Foreign) -> None:
     assert constants["ground.conductivity"] == pytest.approx(0.004, rel=0.05)
 
 
+@pytest.mark.parametrize(("trials", "exact"), [(100, True), (0, False)])
+def test_another_resonance_leads_to_the_truth(
+    foreign: Foreign, monkeypatch: pytest.MonkeyPatch, trials: int, exact: bool
+) -> None:
+    """The search starts in a wrong minimum, three half wavelengths from the true thickness."""
+    paths = replace(
+        foreign.paths, materials={**foreign.paths.materials, "ground": Material(3.0, 0.004, 0.437)}
+    )
+    calls = [
+        Call(np.array([value]), replace(foreign, paths=paths)(np.array([value]))) for value in (4.0, 9.0)
+    ]
+    truth = understand(foreign.problem.parameters, calls, known=False)
+    values, at = truth.values.copy(), truth.model.assumed.index(("ground", "thickness"))
+    values[at] = np.log(0.437 + 3 * speed_of_light / paths.frequency / (2 * np.sqrt(3.0)))
+    ratios = ray_fit.ratios_of(calls)
+    wrong = ray_fit.refined(replace(truth, values=values), ratios, calls[-1], 30)
+    assert wrong.misfit_db > 0.02
+    monkeypatch.setattr(ray_fit, "TRIALS", trials)
+    found = ray_fit._hopped([wrong], ratios, calls[-1])[0]
+    assert (found.misfit_db <= ray_fit.EXACT_DB) == exact
+    if exact:
+        assert np.exp(found.values[at]) == pytest.approx(0.437, rel=1e-2)
+
+
 @pytest.mark.parametrize(("ground", "same"), [(None, True), (Material(3.0, 0.004, 0.437), False)])
 def test_other_antennas_alone_need_no_scan(
     foreign: Foreign, monkeypatch: pytest.MonkeyPatch, ground: Material | None, same: bool
 ) -> None:
     """The study's constants are among the starts of the search, with the polarizations that suit them."""
     monkeypatch.setattr(ray_fit, "_scanned", lambda *_: [])
+    monkeypatch.setattr(ray_fit, "TRIALS", 0)
     declared = foreign.problem.setup.scene.materials["ground"]
     paths = replace(foreign.paths, materials={**foreign.paths.materials, "ground": ground or declared})
     calls = [
@@ -237,7 +263,10 @@ def test_tilted_antennas_are_found_among_the_minima_near_their_nulls(slant: floa
     np.testing.assert_allclose(difference, 0.0, atol=1e-6)
 
 
-def test_an_engine_of_other_physics_is_not_understood(foreign: Foreign) -> None:
+def test_an_engine_of_other_physics_is_not_understood(
+    foreign: Foreign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ray_fit, "TRIALS", 20)
     strange = map_rays(foreign.problem, replace(foreign, ripple=0.1), most_calls=3)
     assert not strange.understood
     assert strange.understanding.misfit_db > 0.2

@@ -4,7 +4,8 @@ Materials are added one after the other. Each is scanned (`ray_scan.py`) on path
 later. The best points, with several polarizations, are refined together with the values so far, by least squares with
 exact derivatives on all these paths. The best few go on. The study's constants are refined as well, with the
 polarizations that suit them best. If a misfit remains at the end, linear polarizations are searched with the materials
-fixed, and then each material is scanned again on all its paths.
+fixed, and then each material is scanned again on all its paths. Basin hopping (Wales and Doye, 1997) comes last: it
+refines explanations in which one or two materials have other resonances.
 """
 
 from __future__ import annotations
@@ -164,10 +165,8 @@ def _perturbed(fit: Understanding, last: Call, random: np.random.Generator) -> U
     tilts, too.
     """
     model, values = fit.model, fit.values.copy()
-    materials, names = (
-        model.materials(last.candidate, fit.values),
-        sorted({name for name, _ in model.assumed}),
-    )
+    materials = model.materials(last.candidate, fit.values)
+    names = sorted({name for name, _ in model.assumed})
     for name in random.choice(names, min(len(names), random.integers(1, 3)), replace=False).tolist():
         longer = 0.0
         if (name, "thickness") in model.assumed:
