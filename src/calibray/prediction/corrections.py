@@ -1,7 +1,7 @@
 """What is added to the modelled path loss of new links: nuisance and residual field, and the fallback without a path.
 
-The nuisance is uncertain for groups without measurements. The fallback is the log-distance model, marked, with its own
-interval.
+The nuisance is uncertain for groups without measurements. A link without a path gets the log-distance model with its
+own interval, and its prediction is marked.
 
 The residual field is the correlated part of the calibration residuals, kriged to nearby links. Clutter that the scene
 lacks affects neighbouring links in the same way, so the residual near a measured link is partly known. The correlated

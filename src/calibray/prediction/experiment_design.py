@@ -183,7 +183,7 @@ def choose_candidates(
 def initial_range_probability(piece: NDArray[np.int64]) -> NDArray[np.float64]:
     """Probability [d] that two draws lie in the same range of a parameter, before any candidate is measured.
 
-    `piece` is the range of every draw [n, d].
+    `piece` numbers the ranges in which the draws lie [n, d].
     """
     return _range_probability(piece, np.zeros((len(piece), len(piece))))
 
