@@ -151,6 +151,10 @@ def test_contrast_names_and_roles_meet_wcag_aa(walked, size, scheme):
 
 def test_the_keyboard_alone_saves_bounds_and_chooses_a_place(walked):
     folder, page, _, _ = walked
+    # A value of another step is saved too, as that step is shown again.
+    scene = step(page, "Measurements").get_by_role("button", name="scene", exact=False).first
+    scene.click()
+    step(page, "Measurements").get_by_label("frequency", exact=True).fill("2.45e9")
     page.locator("#plan").focus()
     before = int(page.locator("#plan").get_attribute("data-drawn"))
     for key in ("ArrowLeft", "+", "Enter"):
@@ -169,6 +173,7 @@ def test_the_keyboard_alone_saves_bounds_and_chooses_a_place(walked):
     page.get_by_text("Saved").first.wait_for()
     study = tomllib.loads((folder / "study.toml").read_text())
     assert next(iter(study["parameters"].values()))["bounds"] == [1.5, 9.0]
+    assert study["scene"]["frequency"] == 2.45e9
 
 
 def test_a_hostile_upload_is_refused(walked, tmp_path):

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
-from nicegui import ui
+from nicegui import run, ui
 from nicegui.elements.mixins.value_element import ValueElement
 from numpy.typing import NDArray
 
@@ -208,6 +208,7 @@ class Desk:
         findings: Suspicions about the links.
         solid: The scene that is shown in 3-D.
         entered: Values that the user entered, by the label of their control.
+        edits: Functions that write what a step shows into the study's content, by tab and step.
         refresh: Shows all steps again.
     """
 
@@ -219,6 +220,7 @@ class Desk:
     findings: list[str] = field(default_factory=list)
     solid: Solid | None = None
     entered: dict[str, Any] = field(default_factory=dict)
+    edits: dict[tuple[str, str], Callable[[dict[str, Any]], None]] = field(default_factory=dict)
     refresh: Callable[[], None] = lambda: None
 
     def __post_init__(self) -> None:
@@ -238,6 +240,21 @@ class Desk:
             control.set_value(self.entered[name])
         control.on_value_change(lambda event: self.entered.update({name: event.value}))
         return control
+
+    def edit(self, step: str, write: Callable[[dict[str, Any]], None]) -> None:
+        """Let a step of this tab write what it shows when the study is saved."""
+        self.edits[ui.context.client.id, step] = write
+
+    async def save(self) -> None:
+        """Save the study with what all steps of this tab show."""
+        with self.messages():
+            content = self.folder.content()
+            for (client, _), write in self.edits.items():
+                if client == ui.context.client.id:
+                    write(content)
+            await run.io_bound(self.folder.save, content)
+            ui.notify("Saved", type="positive")
+            self.refresh()
 
     @contextmanager
     def messages(self) -> Iterator[None]:

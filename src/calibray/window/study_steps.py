@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from nicegui import events, run, ui
+from nicegui import events, ui
 
 from calibray.errors import InputError
 from calibray.materials import DEFAULT_REVISION, ITU_MATERIALS
@@ -180,13 +180,11 @@ def _assumptions(desk: Desk) -> None:
                     if reason := reasons.get(f"{section}.{key}"):
                         ui.label(reason).classes("quiet")
 
-    async def save() -> None:
-        with desk.messages():
-            for section, key, read in edits:
-                content[section][key] = read()
-            await run.io_bound(desk.folder.save, content)
-            ui.notify("Saved", type="positive")
-            desk.refresh()
+    def write(changed: dict[str, Any]) -> None:
+        for section, key, read in edits:
+            changed.setdefault(section, {})[key] = read()
+
+    desk.edit("measurements", write)
 
     def again() -> None:
         with desk.messages():
@@ -194,7 +192,7 @@ def _assumptions(desk: Desk) -> None:
             desk.refresh()
 
     with ui.row():
-        ui.button("Save changes", on_click=save)
+        ui.button("Save changes", on_click=desk.save)
         ui.button("Draft again", on_click=again).props("outline").tooltip(
             "Keeps this study under another name"
         )
@@ -260,22 +258,18 @@ def _is_sites(name: str) -> bool:
 @ui.refreshable
 def show_parameters(desk: Desk) -> None:
     """Draw the step of the parameters: what is calibrated, within which bounds, and with which prior."""
-    content = desk.folder.content()
-    parameters = content.get("parameters")
+    parameters = desk.folder.content().get("parameters")
     if not isinstance(parameters, dict):
         ui.label("Draft the study first.").classes("quiet")
         return
     edits = {name: _entry(name, entry) for name, entry in parameters.items() if isinstance(entry, dict)}
 
-    async def save() -> None:
-        with desk.messages():
-            kept = {name: read() for name, read in edits.items()}
-            changed = {name: entry for name, entry in kept.items() if entry is not None}
-            await run.io_bound(desk.folder.save, {**content, "parameters": changed})
-            ui.notify("Saved", type="positive")
-            desk.refresh()
+    def write(changed: dict[str, Any]) -> None:
+        shown = {name: read() for name, read in edits.items()}
+        changed["parameters"] = {name: entry for name, entry in shown.items() if entry is not None}
 
-    ui.button("Save parameters", on_click=save)
+    desk.edit("parameters", write)
+    ui.button("Save parameters", on_click=desk.save)
 
 
 def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | None]:
