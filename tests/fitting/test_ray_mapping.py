@@ -101,9 +101,11 @@ def test_a_slab_is_found_among_its_resonances(foreign: Foreign) -> None:
     assert constants["ground.conductivity"] == pytest.approx(0.004, rel=0.05)
 
 
-@pytest.mark.parametrize(("trials", "exact"), [(100, True), (0, False)])
+@pytest.mark.parametrize(
+    ("limit", "number", "exact"), [("TRIALS", 100, True), ("TRIALS", 0, False), ("TRIED_PATHS", 59, False)]
+)
 def test_another_resonance_leads_to_the_truth(
-    foreign: Foreign, monkeypatch: pytest.MonkeyPatch, trials: int, exact: bool
+    foreign: Foreign, monkeypatch: pytest.MonkeyPatch, limit: str, number: int, exact: bool
 ) -> None:
     """The search starts in a wrong minimum, three half wavelengths from the true thickness."""
     paths = replace(
@@ -118,7 +120,7 @@ def test_another_resonance_leads_to_the_truth(
     ratios = ray_fit.ratios_of(calls)
     wrong = ray_fit.refined(replace(truth, values=values), ratios, calls[-1], 30)
     assert wrong.misfit_db > 0.02
-    monkeypatch.setattr(ray_fit, "TRIALS", trials)
+    monkeypatch.setattr(ray_fit, limit, number)
     found = ray_fit._hopped([wrong], ratios, calls[-1])[0]
     assert (found.misfit_db <= ray_fit.EXACT_DB) == exact
     if exact:

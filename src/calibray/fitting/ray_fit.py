@@ -41,7 +41,10 @@ EVALUATIONS: Final = (6, 12, 30)
 """Number of evaluations of a trial, of a refinement between scans, and of the last one, with each loss."""
 
 TRIALS: Final = 300
-"""Number of trials of basin hopping."""
+"""Largest number of trials of basin hopping."""
+
+TRIED_PATHS: Final = 500_000
+"""Target for trials times paths on a large program, which keeps the time of basin hopping constant."""
 
 PROMISING: Final = 3.0
 """Ratio of a trial's misfit to that of the explanations so far up to which it is refined further."""
@@ -144,8 +147,8 @@ def _search(
 
 def _hopped(fits: list[Understanding], ratios: list[Ratio], last: Call) -> list[Understanding]:
     """Basin hopping: refine perturbed explanations until one is exact."""
-    random = np.random.default_rng(len(ratios))
-    for _ in range(TRIALS if fits[0].model.assumed else 0):
+    random, model = np.random.default_rng(len(ratios)), fits[0].model
+    for _ in range(min(TRIALS, TRIED_PATHS // model.paths.num_paths) if model.assumed else 0):
         if fits[0].misfit_db <= EXACT_DB:
             break
         start = _perturbed(fits[random.integers(len(fits))], last, random)
