@@ -145,7 +145,7 @@ def test_a_program_of_other_physics_is_not_understood(
 ) -> None:
     """Ray mapping ends after two calls here; the search for an explanation takes longer after each."""
     monkeypatch.setattr(ray_mapping, "map_rays", partial(ray_mapping.map_rays, most_calls=2))
-    monkeypatch.setattr(ray_fit, "TRIALS", 10)
+    monkeypatch.setattr(ray_fit, "TRIALS", 5)
     method = {"name": "auto", "options": {"budget": 3}}
     antennas = {"tx": ISOTROPIC, "rx": ISOTROPIC}
     study = write_study(tmp_path / "study", RIPPLE, antennas, method=method, holdout=None)

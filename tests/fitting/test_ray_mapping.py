@@ -268,7 +268,7 @@ def test_tilted_antennas_are_found_among_the_minima_near_their_nulls(slant: floa
 def test_an_engine_of_other_physics_is_not_understood(
     foreign: Foreign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ray_fit, "TRIALS", 20)
+    monkeypatch.setattr(ray_fit, "TRIALS", 5)
     strange = map_rays(foreign.problem, replace(foreign, ripple=0.1), most_calls=3)
     assert not strange.understood
     assert strange.understanding.misfit_db > 0.2
