@@ -28,6 +28,7 @@ from calibray.study import Setup
 from calibray.tracing.settings import Antenna
 
 TRUTH = 7.7
+SLAB = Material(3.0, 0.004, 0.437)
 WALLS = Parameters((Parameter("walls.relative_permittivity", 1.5, 12.0, 4.0),))
 
 
@@ -70,6 +71,14 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Foreign:
     return Foreign(replace(problem, objective=replace(problem.objective, measured=measured)), bare, table)
 
 
+def two_calls(foreign: Foreign, ground: Material) -> list[Call]:
+    """Two calls of the engine with another ground."""
+    engine = replace(
+        foreign, paths=replace(foreign.paths, materials={**foreign.paths.materials, "ground": ground})
+    )
+    return [Call(np.array([value]), engine(np.array([value]))) for value in (4.0, 9.0)]
+
+
 @pytest.fixture(scope="module")
 def mapped(foreign: Foreign) -> RayMap:
     return map_rays(foreign.problem, foreign)
@@ -88,17 +97,12 @@ def test_three_calls_find_the_truth_of_an_engine_that_differs(mapped: RayMap, fo
 
 def test_a_slab_is_found_among_its_resonances(foreign: Foreign) -> None:
     """The study assumes 1 m and 0.5 S/m, where no wave comes back through the slab."""
-    paths = replace(
-        foreign.paths, materials={**foreign.paths.materials, "ground": Material(3.0, 0.004, 0.437)}
-    )
-    calls = [
-        Call(np.array([value]), replace(foreign, paths=paths)(np.array([value]))) for value in (4.0, 9.0)
-    ]
+    calls = two_calls(foreign, SLAB)
     found = understand(foreign.problem.parameters, calls, known=False)
     constants = dict(found.model.described(found.values))
     assert found.misfit_db < 0.01
-    assert constants["ground.thickness"] == pytest.approx(0.437, rel=1e-3)
-    assert constants["ground.conductivity"] == pytest.approx(0.004, rel=0.05)
+    assert constants["ground.thickness"] == pytest.approx(SLAB.thickness, rel=1e-3)
+    assert constants["ground.conductivity"] == pytest.approx(SLAB.conductivity, rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -108,26 +112,24 @@ def test_another_resonance_leads_to_the_truth(
     foreign: Foreign, monkeypatch: pytest.MonkeyPatch, limit: str, number: int, exact: bool
 ) -> None:
     """The search starts in a wrong minimum, three half wavelengths from the true thickness."""
-    paths = replace(
-        foreign.paths, materials={**foreign.paths.materials, "ground": Material(3.0, 0.004, 0.437)}
-    )
-    calls = [
-        Call(np.array([value]), replace(foreign, paths=paths)(np.array([value]))) for value in (4.0, 9.0)
-    ]
+    calls = two_calls(foreign, SLAB)
     truth = understand(foreign.problem.parameters, calls, known=False)
     values, at = truth.values.copy(), truth.model.assumed.index(("ground", "thickness"))
-    values[at] = np.log(0.437 + 3 * speed_of_light / paths.frequency / (2 * np.sqrt(3.0)))
+    values[at] = np.log(
+        SLAB.thickness
+        + 3 * speed_of_light / foreign.paths.frequency / (2 * np.sqrt(SLAB.relative_permittivity))
+    )
     ratios = ray_fit.ratios_of(calls)
     wrong = ray_fit.refined(replace(truth, values=values), ratios, calls[-1], 30)
     assert wrong.misfit_db > 0.02
     monkeypatch.setattr(ray_fit, limit, number)
-    found = ray_fit._hopped([wrong], ratios, calls[-1])[0]
+    found = ray_fit._hopped([wrong], ratios, calls[-1])
     assert (found.misfit_db <= ray_fit.EXACT_DB) == exact
     if exact:
-        assert np.exp(found.values[at]) == pytest.approx(0.437, rel=1e-2)
+        assert np.exp(found.values[at]) == pytest.approx(SLAB.thickness, rel=1e-2)
 
 
-@pytest.mark.parametrize(("ground", "same"), [(None, True), (Material(3.0, 0.004, 0.437), False)])
+@pytest.mark.parametrize(("ground", "same"), [(None, True), (SLAB, False)])
 def test_other_antennas_alone_need_no_scan(
     foreign: Foreign, monkeypatch: pytest.MonkeyPatch, ground: Material | None, same: bool
 ) -> None:
@@ -135,10 +137,7 @@ def test_other_antennas_alone_need_no_scan(
     monkeypatch.setattr(ray_fit, "_scanned", lambda *_: [])
     monkeypatch.setattr(ray_fit, "TRIALS", 0)
     declared = foreign.problem.setup.scene.materials["ground"]
-    paths = replace(foreign.paths, materials={**foreign.paths.materials, "ground": ground or declared})
-    calls = [
-        Call(np.array([value]), replace(foreign, paths=paths)(np.array([value]))) for value in (4.0, 9.0)
-    ]
+    calls = two_calls(foreign, ground or declared)
     found = understand(foreign.problem.parameters, calls, known=False)
     assert (found.misfit_db < 1e-6) == same
 

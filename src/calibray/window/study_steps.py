@@ -189,6 +189,7 @@ def _assumptions(desk: Desk) -> None:
     def again() -> None:
         with desk.messages():
             desk.folder.set_aside()
+            desk.edits.clear()
             desk.refresh()
 
     with ui.row():
