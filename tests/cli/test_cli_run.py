@@ -196,7 +196,7 @@ def test_predict_adds_a_column_to_the_table(folder, ran, tmp_path):
     cost, _, warnings = outcome.stderr.partition("\n")
     assert cost.startswith("Tracing 12 links: ")
     assert warnings == (
-        f"Warning: no path leads to {lost}Warning: receiver inside a building: {lost}"
+        f"Warning: no path: {lost}Warning: receiver inside a building: {lost}"
         "The log-distance model predicts the links without a path; see the column basis\n"
     )
 

@@ -171,7 +171,7 @@ def test_links_are_shown_in_the_quantity_that_was_measured(result):
     content = result.study.content()
     content["links"]["quantity"], content["offset"] = "rsrp", {"per": "half"}
     study = cb.Study.from_content(content, result.study.path)
-    links = result.links.assign(measured_rsrp_db=-result.links.measured_db)
+    links = result.links.assign(measured_rsrp_dbm=-result.links.measured_db)
     received = replace(result, study=study, links=links)
     power, residuals = in_measured_quantity(received, "predicted"), survey(received).residual_db
     reached = links.has_path.to_numpy(bool)

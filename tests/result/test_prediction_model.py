@@ -54,9 +54,7 @@ def test_the_tables_say_which_values_predictions_use(other: Result) -> None:
     assert "in predictions" in text
     assert "7.25" in text
     assert {value.name: value.predicted for value in values(other)}[NAME] == "7.25"
-    assert summary(other)[0].text.startswith(
-        "Predictions, maps and exports use the model 'calibrated with prior'"
-    )
+    assert summary(other)[0].text.startswith("Predictions and maps use the model 'calibrated with prior'")
 
 
 def test_the_residuals_of_the_report_are_those_of_predictions(other: Result) -> None:

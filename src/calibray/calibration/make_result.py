@@ -263,7 +263,7 @@ def _as_measured(
         return {}
     # The reference is 0 dB for path gain, and the transmitted power for received power.
     reference = links.frame[column].to_numpy(float) + links.path_loss_db
-    unit = "dbm" if quantity == "received_power" else "db"
+    unit = "db" if quantity == "path_gain" else "dbm"
     return {
         f"{name}_{quantity}_{unit}": reference - table[f"{name}_db"].to_numpy()
         for name in ("measured", "before", "after")

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 PREDICTIONS: Final = ("path_loss_db", "lower_db", "upper_db")
 """Columns that `predict` adds; all except the first need --level. Other measured quantities add more."""
 
-UNREACHED: Final = "no path leads to"
+UNREACHED: Final = "no path"
 """The warning about links without a path."""
 
 TEXTS: Final = ("basis", "remark")
@@ -113,7 +113,7 @@ def predict(
                 append(links.frame.rename(columns=renamed).assign(**columns, **measured, **remark))
                 _collect_warnings(warnings, links.row, predictions)
     for warning in sorted(warnings, key=lambda text: (text != UNREACHED, text)):
-        _warn(warning if warning == UNREACHED else f"{warning}:", warnings[warning], table.rows)
+        _warn(warning, warnings[warning], table.rows)
     if UNREACHED in warnings and result.prediction.fallback is not None:
         echo("The log-distance model predicts the links without a path; see the column basis", err=True)
 
@@ -154,7 +154,7 @@ def _warn(warning: str, rows: Sequence[int], count: int) -> None:
     from calibray.tables import rows_text
 
     if rows:
-        echo(f"Warning: {warning} {len(rows)} of {count} links, {rows_text(rows)}", err=True)
+        echo(f"Warning: {warning}: {len(rows)} of {count} links, {rows_text(rows)}", err=True)
 
 
 def _renamed_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -> dict[str, str]:
@@ -235,7 +235,7 @@ def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
         *(numbers(name, "m") for name in POSITION_COLUMNS),
         *(Column(name) for name in grouped),
         numbers("path loss", "dB"),
-        numbers("draws differ by", "dB"),
+        numbers("spread of draws", "dB"),
     )
     rows, gains = [], []
     for rank, row in enumerate(suggestions.to_dict("records"), start=1):

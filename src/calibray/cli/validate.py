@@ -118,7 +118,8 @@ def compare(
     parsed = parse_methods(names, runs.budget)
     calls = runs.seeds * sum(method.budget for method in parsed)
     echo(
-        f"{runs.seeds * len(parsed):,} runs with {calls:,} RT calls in total; runs are kept in {out} are not repeated",
+        f"{runs.seeds * len(parsed):,} runs with {calls:,} RT calls in total; "
+        f"runs that are kept in {out} are not repeated",
         err=True,
     )
     with progress_bars(log()) as progress:

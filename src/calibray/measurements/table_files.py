@@ -302,7 +302,7 @@ class PiecedTable:
 
 def _read_parquet(path: Path) -> SourceTable:
     if find_spec("pyarrow") is None:
-        raise InputError(f"{path}: Parquet needs pyarrow; install it with: pip install calibray[parquet]")
+        raise InputError(f"{path}: Parquet needs pyarrow; install it with: pip install 'calibray[parquet]'")
     with _open_parquet(path) as file:
         groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
     size = _check_size(path, groups, LARGEST_TABLE, "the table")

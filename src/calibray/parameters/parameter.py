@@ -208,7 +208,7 @@ def split_name(name: str) -> tuple[str, str]:
     allowed = EFFECTS[name.partition(":")[0]] if _of_kind(name) else (*CONSTANT_OF_FIELD, ROUGHNESS)
     if not material:
         raise InputError(
-            f"parameter {name!r}: must be a material and a field, as 'walls.relative_permittivity'"
+            f"parameter {name!r}: must be a material and a field, such as 'walls.relative_permittivity'"
         )
     if field not in allowed:
         raise InputError(f"parameter {name!r}: no field {field!r}; {did_you_mean(field, allowed)}")
@@ -225,7 +225,7 @@ def start_value(
     """Determine the start value of a scene's parameter, in the field's unit.
 
     Args:
-        name: Material and field, as "walls.relative_permittivity".
+        name: Material and field, such as "walls.relative_permittivity".
         start: A value in the field's unit; "itu:concrete" or "itu:concrete@P.2040-1" for the ITU-R value;
             None for the scene's value.
         base: The scene's materials by name.
@@ -270,7 +270,7 @@ def itu_start(name: str, start: str, frequency: float) -> float:
         raise InputError(f"{name}: {start!r}: ITU-R P.2040 gives materials only; give a number")
     if not start.startswith(_ITU_PREFIX):
         raise InputError(
-            f"{name}: start = {start!r}: must be a number or 'itu:NAME', as 'itu:concrete@P.2040-1'"
+            f"{name}: start = {start!r}: must be a number or 'itu:NAME', such as 'itu:concrete@P.2040-1'"
         )
     if CONSTANT_OF_FIELD.get(field) not in LAWS:
         raise InputError(f"{name}: start = {start!r}: ITU-R P.2040 gives no {field}; give a number")

@@ -70,7 +70,9 @@ class Parameters:
     def __post_init__(self) -> None:
         object.__setattr__(self, "items", tuple(self.items))
         if not self.items:
-            raise InputError('parameters: none given; name at least one, as "walls.relative_permittivity"')
+            raise InputError(
+                'parameters: none given; name at least one, such as "walls.relative_permittivity"'
+            )
         if len(self.items) > MAX_PARAMETERS:
             raise InputError(
                 f"parameters: {len(self.items)}, must be at most {MAX_PARAMETERS}; let objects share a material"

@@ -159,7 +159,7 @@ def interval(
         table = table.assign(**further_observables(result, replayed))
         return fill_missing(result.prediction, result.study, setup.links, table)
     if not 0 < level < 1:
-        raise InputError(f"level = {level:g}: must be between 0 and 1, as 0.9")
+        raise InputError(f"level = {level:g}: must be between 0 and 1, such as 0.9")
     setup = _with_columns(result, setup)
     links, field, model = setup.links, result.prediction.residual_field, result.prediction.model
     if model.residual_db is None:
@@ -216,9 +216,9 @@ def _quantiles(model: PredictionModel, level: float) -> tuple[float, float]:
 def _residual_db(result: Record, links: Measurements, ratio: float) -> NDArray[np.float64]:
     """Standard deviation of the prediction model's errors at new links [links], [dB]; between blocks times a ratio.
 
-    Beyond the distance that held-out links had from the others, the error between blocks counts up to twice: a place
-    that far away differs from the blocks as these differ from each other. The contribution of random effects to these
-    errors is subtracted, because `nuisance_shift` adds their spread where a link's group is new.
+    Beyond the distance that held-out links had from the others, the variance between blocks is raised by a factor of
+    up to two: a place that far away differs from the blocks as these differ from each other. The contribution of random
+    effects to these errors is subtracted, because `nuisance_shift` adds their spread where a link's group is new.
     """
     model, ends = result.prediction.model, result.ends
     if model.blocks is None or ends is None:

@@ -89,7 +89,7 @@ def in_measured_quantity(result: Record, name: str) -> NDArray[np.float64]:
 
 def _column(result: Record) -> str:
     quantity = result.study.links.quantity
-    return f"measured_{quantity}_{'dbm' if quantity == 'received_power' else 'db'}"
+    return f"measured_{quantity}_{'db' if quantity == 'path_gain' else 'dbm'}"
 
 
 def residual(table: pd.DataFrame, sign: int) -> NDArray[np.float64]:

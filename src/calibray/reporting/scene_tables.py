@@ -149,7 +149,8 @@ def last_round(settings: Mapping[str, object], tolerance_db: float) -> str:
     tolerance = f"(fidelity.tolerance_db = {tolerance_db:g})"
     if change <= tolerance_db:
         return f"Converged: {text} no link by more than {max(change, 0.01):.2f} dB {tolerance}."
-    return f"Not converged: {text} a link by {change:.2f} dB {tolerance}."
+    remedy = "increase trace.samples, or reduce trace.max_depth"
+    return f"Not converged: {text} a link by {change:.2f} dB {tolerance}; {remedy}."
 
 
 def _summary(change: Convergence, row: NDArray[np.int64]) -> Table:

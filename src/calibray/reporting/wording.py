@@ -35,7 +35,7 @@ def prediction_text(record: Record) -> str:
     terms = [term.name for term in model.terms]
     added = f" and the fitted {', '.join(terms)}" if terms else ""
     fallback = record.prediction.fallback
-    text = f"Predictions, maps and exports use the model {str(model.name)!r}: {source}{added}."
+    text = f"Predictions and maps use the model {str(model.name)!r}, with {source}{added}."
     if fallback is None:
         return text
     error = "" if fallback.residual_db is None else f", with an error of {fallback.residual_db:.1f} dB (RMS)"

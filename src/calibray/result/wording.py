@@ -23,7 +23,7 @@ NOT_JUDGED: Final = (
 
 
 def interval_text(interval: Interval) -> str:
-    """The ends of an interval, or of each piece if there are few, as "2.1 to 3.4"."""
+    """The ends of an interval, or of each piece if there are few, such as "2.1 to 3.4"."""
     hull = ((interval.lower, interval.upper),)
     pieces = interval.pieces if 1 < len(interval.pieces) <= SHOWN_PIECES else hull
     return ", ".join(f"{low:.4g} to {high:.4g}" for low, high in pieces)
@@ -96,7 +96,7 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
     ),
     ReasonKind.CONFOUNDED: lambda values, _: (
         f"links change by up to {values['change_db']:.1f} dB over its range, but other unknowns can compensate: an "
-        "offset, or noise that links share"
+        "offset, or errors that links share"
     ),
     ReasonKind.NOISE: lambda values, _: (
         f"links change by up to {values['change_db']:.1f} dB over its range, too little compared with noise of "
@@ -132,8 +132,8 @@ def _noise_remark(finding: str) -> Callable[[dict[str, Any]], str]:
 
 
 _CAUSES: Final = {
-    "correlated": "neighbouring links share part of their noise, so that many links count as few",
-    "out_of_sight": "weak links out of sight count less if the twin lacks paths to them",
+    "correlated": "neighbouring links share part of their errors, so that many links count as few",
+    "out_of_sight": "weak links out of sight count less if the scene lacks paths to them",
     "student-t": "outliers count less if noise has heavy tails",
     "heterogeneous": "links that depend on single buildings count less if buildings differ",
     "gaussian": "their noise model differs from the one that RMSE assumes",
@@ -171,8 +171,8 @@ def _approximate_intervals(values: dict[str, Any]) -> str:
     replay = ", with the corrected replay of its scene" if values["replay"] else ""
     return (
         f"The intervals are approximate: the engine {values['engine']!r} gives no derivatives, so an emulator was "
-        f"fitted to {values['calls']} of its calls{replay}. In cross-validation, it predicts the better half of these "
-        f"calls to {values['error_db']:.2g} dB."
+        f"fitted to {values['calls']} of its calls{replay}. In cross-validation, it predicts calls whose RMSE is below "
+        f"the median to {values['error_db']:.2g} dB."
     )
 
 
@@ -188,8 +188,9 @@ def _conflict(values: dict[str, Any]) -> str:
             f"{answers}. Check that the values belong to these links and this scene, and the receiver's range."
         )
     return (
-        f"Path loss and {observables} require different parameters, by {values['standard_errors']:.1f} standard "
-        f"errors: {answers}. Check units, the receiver's range and the scene; the common fit explains neither."
+        f"Path loss and {observables} require parameter values that differ by "
+        f"{values['standard_errors']:.1f} standard errors: {answers}. Check units, the receiver's range and "
+        "the scene; the common fit explains neither."
     )
 
 
@@ -205,7 +206,9 @@ def _unreached_links(values: dict[str, Any]) -> str:
             f"{text} No setting of [trace] gives any of {values['sample']} sampled links a path: check their "
             "positions."
         )
-    return f"{text} Of {values['sample']} sampled links, {reached}: change [trace]."
+    return (
+        f"{text} Of {values['sample']} sampled links, {reached}: change these keys of [trace] in the study."
+    )
 
 
 def _antenna_directions(values: dict[str, Any]) -> str:
@@ -250,14 +253,14 @@ def _ray_mapping(values: dict[str, Any]) -> str:
 
 
 _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
-    RemarkKind.CORRELATED_NOISE: _noise_remark("Neighbouring links share part of their noise"),
+    RemarkKind.CORRELATED_NOISE: _noise_remark("Neighbouring links share part of their errors"),
     RemarkKind.HEAVY_TAILS: _noise_remark("The noise has heavy tails, as with outliers"),
     RemarkKind.ERRORS_OUT_OF_SIGHT: _noise_remark(
-        "Errors of weak links out of sight are larger than those of the others, as if the twin lacked paths to them. "
+        "Errors of weak links out of sight are larger than those of the others, as if the scene lacked paths to them. "
         "Trace with refraction and diffraction"
     ),
     RemarkKind.HETEROGENEITY: _noise_remark(
-        "The noise is larger where materials matter more, as if buildings of one material differed"
+        "Errors are larger on links that depend more on the materials, as if buildings of one material differed"
     ),
     RemarkKind.UNDECLARED_OFFSET: lambda values: (
         f"The data show an undeclared offset of {values['offset_db']:+.1f} dB, standard error {values['error_db']:.1f} "
@@ -266,7 +269,8 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     ),
     RemarkKind.MISSED_OPTIMUM: lambda values: (
         f"The method missed the optimum: posterior draws reach an RMSE of {values['draws_db']:.2f} dB, but the "
-        f"method reached {values['found_db']:.2f} dB. The intervals are around the optimum."
+        f"method reached {values['found_db']:.2f} dB. The intervals are around the optimum: use the "
+        "method 'auto', or give the method a larger budget."
     ),
     RemarkKind.OUTSIDE_INTERVAL: _outside_interval,
     RemarkKind.FEW_DRAWS: lambda values: (

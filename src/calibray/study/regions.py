@@ -199,7 +199,7 @@ def _heights(
         values = np.full(count, np.nan)
     if (wrong := np.flatnonzero(~np.isfinite(values))).size:
         raise InputError(
-            f"{path}: {key}: column {shortened(height)!r} is no number [m] at polygon {wrong[0] + 1}"
+            f"{path}: {key}: column {shortened(height)!r} is not a number [m] at polygon {wrong[0] + 1}"
         )
     return values
 

@@ -75,7 +75,7 @@ class Study(StudyModel):
                 nothing was measured; or a DataFrame with names of transmitters as rows and of receivers as columns.
             folder: Folder to write the scene, the links and `study.toml` into, for `Study.load`; a temporary folder if
                 None.
-            **sections: Sections of the study file in place of the defaults, as ``trace={"max_depth": 5}`` or
+            **sections: Sections of the study file in place of the defaults, such as ``trace={"max_depth": 5}`` or
                 ``links={"quantity": "received_power"}``. Without `parameters`, the permittivity of every material is
                 calibrated.
 
@@ -258,7 +258,7 @@ def _matrix(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> NDArray[np.f
             if unknown := [str(label) for label in labels if label not in names]:
                 kind = "transmitter" if what == "row" else "receiver"
                 raise InputError(
-                    f"measured: {what} {unknown[0]!r} is no {kind} of the scene; rows are transmitters, "
+                    f"measured: {what} {unknown[0]!r} is not a {kind} of the scene; rows are transmitters, "
                     "columns receivers"
                 )
         measured = measured.reindex(index=list(live.tx), columns=list(live.rx))

@@ -137,7 +137,7 @@ def read_rays(
         frequency: Carrier frequency [Hz]; without a study.
         antennas: Transmit and receive antenna, if the engine used these; otherwise the correction contains the
             antennas.
-        axes: The table's axes along x, y and z of the scene, as "x -z y" for a table whose y axis points up.
+        axes: The table's axes along x, y and z of the scene, such as "x -z y" for a table whose y axis points up.
         tx_power_dbm: Transmitted power of a file that states received power [dBm]: Wireless InSite.
 
     Returns:

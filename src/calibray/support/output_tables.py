@@ -112,7 +112,7 @@ def _parquet(partial: Path, target: Path) -> Iterator[Callable[[pd.DataFrame], N
         from pyarrow import parquet
     except ImportError:
         raise InputError(
-            f"{target}: Parquet needs pyarrow; install it with: pip install calibray[parquet]"
+            f"{target}: Parquet needs pyarrow; install it with: pip install 'calibray[parquet]'"
         ) from None
     with ExitStack() as stack:
         writers: list[parquet.ParquetWriter] = []

@@ -104,7 +104,7 @@ def read_two_cuts(path: str | Path) -> TwoCuts:
         if key not in cuts:
             raise InputError(f"{path}: no line {key} with the number of its angles; export both cuts")
     if gain is None:
-        raise InputError(f"{path}: no line GAIN; add the antenna's gain, as 'GAIN 17.5 dBi'")
+        raise InputError(f"{path}: no line GAIN; add the antenna's gain, such as 'GAIN 17.5 dBi'")
     return TwoCuts(gain, cuts["HORIZONTAL"], cuts["VERTICAL"])
 
 
@@ -112,7 +112,7 @@ def _gain_dbi(place: str, words: list[str]) -> float:
     joined = re.fullmatch(rf"({_NUMBER.pattern})\s*(dbi|dbd)?(?:\s.*)?", " ".join(words), re.IGNORECASE)
     if joined is None:
         raise InputError(
-            f"{place}: GAIN {shortened(' '.join(words))!r}: must be a number, as 'GAIN 17.5 dBi'"
+            f"{place}: GAIN {shortened(' '.join(words))!r}: must be a number, such as 'GAIN 17.5 dBi'"
         )
     value = float(joined.group(1).replace(",", "."))
     unit = (joined.groups()[-1] or "dbd").lower()
@@ -267,8 +267,8 @@ def read_gain_table(path: str | Path) -> GainTable:
     step = (last - first) / (count - 1)
     if not closed and abs(last - first + step - 360) > _STEP_TOLERANCE * step:
         raise InputError(
-            f"{path}: azimuth_deg runs from {first:g} to {last:g} in steps of {step:g}, must cover a full turn, as "
-            "-180 to 180 or 0 to 360; add the missing directions (principal cuts alone are not enough)"
+            f"{path}: azimuth_deg runs from {first:g} to {last:g} in steps of {step:g}, must cover a full turn, "
+            "such as -180 to 180 or 0 to 360; add the missing directions (principal cuts alone are not enough)"
         )
     gains = np.full((row.max() + 1, count), np.nan)
     gains[row, column] = gain

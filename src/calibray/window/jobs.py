@@ -189,7 +189,7 @@ class Stage:
         share: Share that is done, 0 to 1; None if unknown.
         seconds: How long it has taken [s].
         left: Remaining time [s]; None if unknown.
-        best: The best value so far, as "best RMSE 3.10 dB"; empty if the log has none.
+        best: The best value so far, such as "best RMSE 3.10 dB"; empty if the log has none.
     """
 
     name: str

@@ -247,9 +247,9 @@ def better(first: str, second: str, folder: Path) -> str:
     )
     certainty = "" if judgement.error_db is None else f", standard error {judgement.error_db:.2f} dB"
     blocks = len(np.unique(one.block[judged]))
-    clearly = "" if judgement.helped else "not clearly "
+    verb = "predicts" if judgement.helped else "does not predict significantly"
     return (
-        f"{best} predicts {clearly}better than {worst}: RMSE {judgement.rmse_db:.2f} against "
+        f"{best} {verb} better than {worst}: RMSE {judgement.rmse_db:.2f} against "
         f"{judgement.baseline_rmse_db:.2f} dB on {judgement.links} held-out links (difference "
         f"{judgement.gain_db:.2f} dB{certainty}); lower in {lower} of {blocks} blocks of {first}."
     )

@@ -82,7 +82,9 @@ class Recorded:
             InputError: Derivatives are wanted.
         """
         if derivatives:
-            raise InputError(f"engine {self._name!r}: gives no derivatives; use a method without")
+            raise InputError(
+                f"engine {self._name!r}: gives no derivatives; use a method that needs none, such as 'auto'"
+            )
         answers, first = self._all_answers(candidates)
         return gather_responses(answers, (len(candidates), self._engine.num_links), len(wanted), first)
 

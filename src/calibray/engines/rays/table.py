@@ -76,7 +76,7 @@ class RayTable:
 
     @classmethod
     def of(cls, table: SourceTable, axes: str = "x y z") -> RayTable:
-        """Read rows into paths; `axes` names the table's axes that are the scene's x, y and z, as "x -z y".
+        """Read rows into paths; `axes` names the table's axes that are the scene's x, y and z, such as "x -z y".
 
         Raises:
             InputError: A column is missing or malformed, a path is incomplete, or a value is impossible.
@@ -187,7 +187,7 @@ def _positions(table: SourceTable, axes: str) -> NDArray[np.float64]:
     words = axes.split()
     if sorted(word.lstrip("-") for word in words) != ["x", "y", "z"] or not re.fullmatch("[-xyz ]*", axes):
         raise InputError(
-            f"axes = {axes!r}: must name the table's axes that are x, y and z of the scene, as 'x y z' or 'x -z y'"
+            f"axes = {axes!r}: must name the table's axes that are x, y and z of the scene, such as 'x y z' or 'x -z y'"
         )
     sign = [-1.0 if word.startswith("-") else 1.0 for word in words]
     return np.stack([table.numbers(word.lstrip("-")) for word in words], axis=1) * sign
