@@ -220,6 +220,56 @@ def test_paths_of_a_study_belong_to_its_links(tmp_path: Path) -> None:
         cb.read_rays(moved[moved.path % 2 == 0].assign(delay=np.nan).drop(columns="delay"), study)
 
 
+def test_a_path_that_comes_twice_is_refused(yard: Tracer, rows: pd.DataFrame) -> None:
+    """As in merged exports, which would double its power."""
+    twice = pd.concat([rows, rows[rows.path == 2].assign(path=1000)])
+    with pytest.raises(InputError, match=r"paths 2 and 1000 have the same points and types \(1 of \d+ paths"):
+        read(twice, yard)
+
+
+def test_an_offset_of_all_direct_paths_is_named(yard: Tracer, rows: pd.DataFrame, caplog) -> None:
+    weaker = rows.assign(power_db=rows.power_db - 12)
+    with pytest.raises(InputError, match=r"12\.0 dB below free space .*all direct paths differ by this"):
+        read(weaker, yard)
+    one = int(rows.path[rows.type == "reflection"].iloc[0])
+    direct = rows.groupby("path").point.transform("max") == 1
+    number = int(rows.path[direct].iloc[0])
+    with pytest.raises(InputError, match=rf"path {number}, a direct one, is 12\.0 dB below"):
+        read(rows.assign(power_db=rows.power_db - 12 * (rows.path == number) - 90 * (rows.path == one)), yard)
+    read(rows, yard, antennas=None)
+    assert not caplog.records
+    read(rows.assign(power_db=rows.power_db + 30), yard, antennas=None)  # dBm
+    assert "check that power_db is the path gain" in caplog.text
+
+
+def test_antennas_of_a_study_are_those_of_the_table(tmp_path: Path) -> None:
+    study = two_ray.study(tmp_path, links=8)
+    cb.write_rays(cb.Setup.open(study, tracer=two_ray.TwoRay).trace(), tmp_path / "rays.csv")
+    np.testing.assert_allclose(cb.read_rays(tmp_path / "rays.csv", study).correction, 1, atol=1e-4)
+    bare = two_ray.study(tmp_path, links=8, antennas={})
+    assert np.abs(cb.read_rays(tmp_path / "rays.csv", bare).correction - 1).max() > 0.1
+    isotropic = {end: {"pattern": "iso", "polarization": "V"} for end in ("tx", "rx")}
+    for known, expected in ((None, False), (True, True), (False, False)):
+        antennas = isotropic if known is None else isotropic | {"known": known}
+        setup = cb.Setup.open(two_ray.study(tmp_path, links=8, antennas=antennas), tracer=two_ray.TwoRay)
+        assert (setup.known_antennas is not None) == expected
+
+
+def test_a_table_goes_with_one_carrier(tmp_path: Path) -> None:
+    study = two_ray.study(tmp_path, links=8)
+    content = study.content()
+    content["links"]["frequency"] = "frequency"
+    links = pd.read_csv(tmp_path / content["links"]["file"])
+    links.assign(frequency=content["scene"]["frequency"]).to_csv(
+        tmp_path / content["links"]["file"], index=False
+    )
+    cb.write_rays(cb.Setup.open(study, tracer=two_ray.TwoRay).trace(), tmp_path / "rays.csv")
+    with pytest.raises(InputError, match="powers at one carrier"):
+        cb.read_rays(tmp_path / "rays.csv", cb.Study.from_content(content, study.path))
+    with pytest.raises(InputError, match=r"engine\.rays with links\.frequency"):
+        cb.Study.from_content(content | {"engine": {"name": "replay", "rays": "rays.csv"}}, study.path)
+
+
 def test_a_study_replays_the_rays_of_another_engine(tmp_path: Path) -> None:
     """Nothing is traced: the table has the paths of all links, and of those that are predicted."""
     traced = cb.Setup.open(two_ray.study(tmp_path), tracer=two_ray.TwoRay).trace()

@@ -276,3 +276,21 @@ def test_an_engine_of_other_physics_is_not_understood(
     np.testing.assert_allclose(
         strange.engine.path_loss(last.candidate[None])[0], last.export.path_loss_db, atol=1e-6
     )
+
+
+def test_an_engine_whose_strong_paths_come_and_go_is_not_understood(foreign: Foreign) -> None:
+    """It lacks both paths of the first link after its first call."""
+    calls = 0
+
+    def ask(candidate: np.ndarray) -> Export:
+        nonlocal calls
+        calls += 1
+        table = foreign.rays(candidate)
+        kept = np.flatnonzero(foreign.paths.link > 0) if calls > 1 else np.arange(len(table.path))
+        return Export.of_table(table.take(kept), RaySetting.of(foreign.problem.setup))
+
+    mapped = map_rays(foreign.problem, ask, most_calls=3)
+    assert mapped.understanding.misfit_db < 0.2
+    assert mapped.gap_db < 0.05
+    assert (mapped.changed, mapped.lost) == (2, 1)
+    assert not mapped.understood

@@ -53,6 +53,10 @@ MISFIT_DB: Final = 0.2
 """Largest misfit of the ratios of such an engine [dB]. Wrong minima had 0.8 dB and more. With 0.07 to 0.19 dB, the
 optimum was reached to 0.006 dB (docs/measurements/expensive-engines.md)."""
 
+CHANGED_DB: Final = 0.5
+"""Largest change of a link's path loss without the paths that another call lacks, for such an engine [dB]. Paths that
+appear between calls may be missing at the optimum of their replay."""
+
 MOST_CALLS: Final = 10
 """Number of calls after which ray mapping ends in any case."""
 
@@ -67,8 +71,9 @@ class RayMap:
         best: The call of least objective.
         understanding: What explains the engine.
         gap_db: Root mean square over the links of the answered minus the predicted path loss at the last call [dB].
-        changed: Number of paths of the best call that another call lacks.
-        changed_db: Largest change of a link's path loss without them [dB].
+        changed: Largest number of paths that the best call or another one has alone.
+        changed_db: Largest change of a link's path loss without them, of links that keep a path [dB].
+        lost: Number of links that keep none.
     """
 
     engine: Replay
@@ -78,11 +83,13 @@ class RayMap:
     gap_db: float
     changed: int
     changed_db: float
+    lost: int
 
     @property
     def understood(self) -> bool:
-        """Whether the model explains all calls and predicted the last one."""
-        return self.understanding.misfit_db <= MISFIT_DB and self.gap_db <= UNDERSTOOD_DB
+        """Whether the model explains all calls and predicted the last one, and the calls have the same strong paths."""
+        explained = self.understanding.misfit_db <= MISFIT_DB and self.gap_db <= UNDERSTOOD_DB
+        return explained and self.changed_db <= CHANGED_DB and not self.lost
 
 
 def maps_rays(setup: Setup) -> bool:
@@ -148,8 +155,7 @@ def map_rays(
     best = min(calls, key=lambda each: _objective(problem, each))
     ordered = [*(each for each in calls if each is not best), best]
     final = understand(parameters, ordered, known, understanding)
-    changed, changed_db = _changes(ordered)
-    return RayMap(final.replay(parameters, best), tuple(calls), best, final, gap, changed, changed_db)
+    return RayMap(final.replay(parameters, best), tuple(calls), best, final, gap, *_changes(ordered))
 
 
 def with_engine(problem: Problem, replay: Replay) -> Problem:
@@ -191,15 +197,23 @@ def _most_informative(problem: Problem, call: Call, random: np.random.Generator)
     return probes[int(np.argmax(information))]
 
 
-def _changes(calls: list[Call]) -> tuple[int, float]:
-    """Paths of the last call that another one lacks, and the largest change of path loss without them [dB]."""
-    last = calls[-1].export
-    kept = np.ones(last.paths.num_paths, dtype=bool)
+def _changes(calls: list[Call]) -> tuple[int, float, int]:
+    """Largest number of paths that the last call or another one has alone, and what links lose without them.
+
+    The second result is the largest change of path loss [dB], and the third one the number of links without any path.
+    """
+    last, changed, change_db, lost = calls[-1].export, 0, 0.0, 0
     for call in calls[:-1]:
-        kept &= np.isin(np.arange(len(kept)), common(last.paths, call.export.paths)[0])
-    power, link = 10 ** (last.level_db / 10), last.paths.link
-    share = np.bincount(link, power * ~kept) / np.maximum(np.bincount(link, power), 1e-300)
-    return int((~kept).sum()), float(-10 * np.log10(max(1 - share.max(initial=0.0), 1e-12)))
+        pairs = zip((last, call.export), common(last.paths, call.export.paths), strict=True)
+        for export, shared in pairs:
+            kept = np.isin(np.arange(export.paths.num_paths), shared)
+            power, link = 10 ** (export.level_db / 10), export.paths.link
+            before, after = np.bincount(link, power), np.bincount(link, power * kept)
+            share = after[after > 0] / before[after > 0]
+            changed = max(changed, int((~kept).sum()))
+            change_db = max(change_db, float(-10 * np.log10(share.min(initial=1.0))))
+            lost = max(lost, int((before[after == 0] > 0).sum()))
+    return changed, change_db, lost
 
 
 def _remark(mapped: RayMap) -> Remark:
@@ -215,6 +229,7 @@ def _remark(mapped: RayMap) -> Remark:
             "calls": len(mapped.calls),
             "changed": mapped.changed,
             "changed_db": mapped.changed_db,
+            "lost": mapped.lost,
             "half_space": slabs and not any(name.endswith(".thickness") for name in constants),
             "names": list(constants),
             "values": list(constants.values()),

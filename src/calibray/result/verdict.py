@@ -118,7 +118,8 @@ class RemarkKind(StrEnum):
     )
     FEW_DRAWS = "few draws"
     APPROXIMATE_INTERVALS = "approximate intervals"  # engine, calls, error_db, replay
-    # understood, misfit_db, gap_db, calls, changed (paths) and changed_db, half_space; names and values of constants
+    # understood, misfit_db, gap_db, calls, changed (paths), changed_db and lost (links), half_space; names and values
+    # of constants
     RAY_MAPPING = "ray mapping"
     NO_CHEAP_MODEL = "no cheap model"  # cause
     NOT_JUDGED = "not judged"

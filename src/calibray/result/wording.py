@@ -246,9 +246,10 @@ def _ray_mapping(values: dict[str, Any]) -> str:
         )
     if values["changed"]:
         text += (
-            f" {values['changed']} paths of the best call are absent from another call; without them, the path loss of "
-            f"a link changes by up to {values['changed_db']:.2f} dB."
+            f" Up to {values['changed']} paths of one call are absent from another; without them, the path loss of a "
+            f"link changes by up to {values['changed_db']:.2f} dB"
         )
+        text += f", and {values['lost']} links have no path." if values.get("lost") else "."
     return text
 
 

@@ -133,6 +133,11 @@ class StudyContent(Section, ABC):
             "coefficients of laws": any(".itu_" in name for name in self.parameters),
         }
         key = _first_stated(refused)
+        if isinstance(getattr(self.engine, "rays", None), str) and self.links.frequency is not None:
+            raise InputError(
+                "engine.rays with links.frequency: a ray table states powers at one carrier; leave out "
+                "links.frequency, or make a study and an export for each carrier"
+            )
         if self.engine.exports_rays and key is not None:
             raise InputError(
                 "engine.rays = true: powers of rays are compared at one carrier and add up, so it does not go with "

@@ -323,8 +323,11 @@ class AntennasSection(Section):
         tx: The transmit antenna.
         rx: The receive antenna.
         types: Further antennas by name, for ``links.tx_antenna.type`` and ``links.rx_antenna.type``.
+        known: Whether an engine that exports rays used these antennas. By default, isotropic vertical ones at both
+            ends, which a draft assumes, count as unknown.
     """
 
     tx: _Antenna = Field(default_factory=_Antenna)  # type: ignore[valid-type]
     rx: _Antenna = Field(default_factory=_Antenna)  # type: ignore[valid-type]
     types: dict[str, _Antenna] = Field(default_factory=dict)  # type: ignore[valid-type]
+    known: bool | None = None

@@ -229,7 +229,9 @@ class Setup:
     @property
     def known_antennas(self) -> tuple[Antenna, Antenna] | None:
         """Transmit and receive antenna, if the study states them; otherwise those of an engine are unknown."""
-        return self.radio.antennas if self.study.antennas != AntennasSection() else None
+        section = self.study.antennas
+        known = section != AntennasSection() if section.known is None else section.known
+        return self.radio.antennas if known else None
 
     @property
     def trace_settings(self) -> TraceSettings:

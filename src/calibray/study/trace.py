@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -135,8 +136,8 @@ def read_rays(
         scene: Mitsuba XML file, `sionna:NAME`, or a scene already read, with the constants that the engine used.
             Alternatively a study, which states carrier and links; its start values must be those that the engine used.
         frequency: Carrier frequency [Hz]; without a study.
-        antennas: Transmit and receive antenna, if the engine used these; otherwise the correction contains the
-            antennas.
+        antennas: Transmit and receive antenna, if the engine used these. By default those of the study, if it states
+            them; otherwise the correction contains the antennas.
         axes: The table's axes along x, y and z of the scene, such as "x -z y" for a table whose y axis points up.
         tx_power_dbm: Transmitted power of a file that states received power [dBm]: Wireless InSite.
 
@@ -157,7 +158,10 @@ def read_rays(
         if frequency is not None:
             raise InputError("read_rays: the study states the frequency; change it there")
         setup = scene.opened()
-        setting = RaySetting(setup.scene, setup.radio.frequency, antennas, setup.links)
+        if setup.links.frequency is not None:
+            raise InputError("read_rays: a ray table states powers at one carrier; leave out links.frequency")
+        setting = RaySetting.of(setup)
+        setting = setting if antennas is None else replace(setting, antennas=antennas)
     elif frequency is None:
         raise InputError("read_rays: without a study, give frequency, the carrier in Hz")
     else:

@@ -41,6 +41,10 @@ DIRECT_GAIN_DB: Final = 60.0
 """Largest total gain of both antennas of a direct path [dB]: two dishes of 30 dBi."""
 
 
+HIGH_GAIN_DB: Final = 25.0
+"""Gain of both antennas above which a warning follows [dB]: a sector antenna of 18 dBi and a receiver of 7 dBi."""
+
+
 @dataclass(frozen=True, eq=False)
 class RaySetting:
     """The context in which the paths of a table are read.
@@ -79,6 +83,7 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
     ends, link, chosen = _assign_links(table, setting.links)
     order = np.argsort(link, kind="stable")[(link < 0).sum() :]
     table, link = table.take(order), link[order]
+    _check_repeats(table, link)
     chains, distance = _chains(table, scene)
     _check_delays(table, chains)
     antennas = setting.antennas or (UNKNOWN, UNKNOWN)
@@ -268,6 +273,19 @@ def _assign_links(
     return LinkPositions(ends[:, :3], ends[:, 3:]), np.where(lost, -1, link), chosen.reshape(-1)
 
 
+def _check_repeats(table: RayTable, link: NDArray[np.int64]) -> None:
+    """Refuse two paths of a link with the same types and points, as in merged exports: their powers would add up."""
+    rows = np.column_stack([link, table.kind, np.round(table.vertex, 3).reshape(len(link), -1)])
+    _, first, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    original = first[group.reshape(-1)]
+    if (repeated := original != np.arange(len(link))).any():
+        number = int(np.argmax(repeated))
+        raise InputError(
+            f"{table.source}: paths {table.path[original[number]]} and {table.path[number]} have the same points and "
+            f"types ({repeated.sum()} of {len(link)} paths are repeats); keep each path once"
+        )
+
+
 def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], known: bool) -> None:
     """Refuse a direct path whose power no antenna explains."""
     direct = np.diff(paths.first) == 0
@@ -276,15 +294,27 @@ def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], kno
     )
     with np.errstate(divide="ignore"):
         off = 10 * np.log10(power / replayed)
-    wrong = np.abs(off) > FREE_SPACE_DB if known else off > DIRECT_GAIN_DB
-    if (wrong & direct).any():
-        worst = int(np.argmax(np.where(direct, np.abs(off), 0)))
+    wrong = direct & (np.abs(off) > FREE_SPACE_DB if known else off > DIRECT_GAIN_DB)
+    if wrong.any():
+        worst = int(np.argmax(np.where(wrong, np.abs(off), 0)))
+        side = "above" if off[worst] > 0 else "below"
         what = "with the antennas stated" if known else "between isotropic antennas"
+        common = ""
+        if np.ptp(off[direct]) < FREE_SPACE_DB and direct.sum() > 1:
+            common = (
+                "; all direct paths differ by this, as by the transmitted power or a cable loss: subtract it"
+            )
         raise InputError(
-            f"{table.source}: a direct path of link {paths.link[worst]} is {off[worst]:.1f} dB above free space "
-            f"{what}; power_db must be the path gain, received minus transmitted power, with antenna gains"
+            f"{table.source}: path {table.path[worst]}, a direct one, is {abs(off[worst]):.1f} dB {side} free space "
+            f"{what}; power_db must be the path gain, received minus transmitted power, with antenna gains{common}"
             + ("; omit the antennas if they are not those of the engine" if known else "")
         )
+    if direct.any() and (typical := float(np.median(off[direct]))) > HIGH_GAIN_DB:
+        _LOG.warning(
+            "%s: direct paths are %.0f dB above free space between isotropic antennas (median): check that power_db is "
+            "the path gain, not received power, an amplitude in dB or path loss",
+            table.source, typical,
+        )  # fmt: skip
 
 
 def _correction(table: RayTable, paths: Paths, power: NDArray[np.float64]) -> NDArray[np.float64]:
