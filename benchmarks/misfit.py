@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
-from calibray.calibration.link_diagnostics import directions_remark
+from calibray.calibration.link_diagnostics import directions_remark, region_remark
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, search
 from calibray.optimizers import LeastSquares
@@ -98,7 +98,8 @@ def intervals(planted: Problem, trail: Trail, point: np.ndarray) -> dict[str, An
         widths.append(sum(high - low for low, high in pieces) / (upper[k] - lower[k]))
     truth = parameters.from_search(point)
     held = [each.contains(v) for each, v in zip(assessed.intervals.values(), truth, strict=True)]
-    remarks = (*assessed.remarks, *directions_remark(planted, trail.best))
+    own = directions_remark(planted, trail.best) or region_remark(planted, trail.best)
+    remarks = (*assessed.remarks, *own)
     return {
         "names": parameters.names,
         "verdicts": [str(interval.verdict) for interval in assessed.intervals.values()],

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from calibray import engines
-from calibray.calibration.link_diagnostics import directions_remark, unreached_remark
+from calibray.calibration.link_diagnostics import directions_remark, region_remark, unreached_remark
 from calibray.calibration.make_result import Run, Timing, make_result
 from calibray.calibration.result import Result
 from calibray.engines.cluster.workers import Workers
@@ -128,7 +128,8 @@ def calibrate(
         starts = {Model.CALIBRATED: trail.minima} if many else NO_MINIMA
         validation = validate_problem(problem, progress=progress, known_minima=starts)
     on_links = unreached_remark(problem, progress) if can_trace and exporting is None else ()
-    on_links += directions_remark(problem, trail.best)
+    # A wrong direction looks like a loss on one side of a transmitter.
+    on_links += directions_remark(problem, trail.best) or region_remark(problem, trail.best)
     run = Run(problem, trail, gap_db, cheap, enclosed, (*of_rays, *on_links), timing)
     result = make_result(run, assessment, validation)
     if out is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -15,12 +15,15 @@ from calibray.engines.replay import Replay
 from calibray.fields import path_gains
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.materials import Material
+from calibray.measurements import Measurements
 from calibray.paths import Kind, Paths
 from calibray.result.verdict import Remark, RemarkKind, Value
+from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study import Setup, Study
 from calibray.study.link_checks import LINKS_PER_UNKNOWN
 from calibray.support.progress import Progress
 from calibray.tracing.antennas import EVERY, POSE
+from calibray.uncertainty.missing_region import missing_region
 
 DENSE: Final = 20_000_000
 """Number of entries of a nuisance's design up to which leverage is computed; the dense matrix then takes 160 MB."""
@@ -198,6 +201,26 @@ class Direction(NamedTuple):
     azimuth_error: float
     downtilt: float
     downtilt_error: float
+
+
+def region_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Remark, ...]:
+    """Test whether the loss of a region, such as trees without a map, would explain residuals at calibrated values [d].
+
+    Positions of the links must be known. Residuals that are larger out of sight are explained by that first.
+    """
+    links, count = problem.setup.links, problem.objective.num_counted
+    if not isinstance(links, Measurements) or not problem.differentiable:
+        return ()
+    counted = np.flatnonzero(problem.objective.weight > 0)
+    residual_db = problem.evaluate(problem.parameters.to_search(best)[None]).residuals[0, :count]
+    known = [links.table.numbers(OUT_OF_SIGHT)[counted]] if OUT_OF_SIGHT in links.table.frame else []
+    region = missing_region(links.tx[counted], links.rx[counted], -residual_db, known)
+    if region is None or not region.significant:
+        return ()
+    values = asdict(region)
+    sides = dict(zip(("west", "south", "east", "north"), values.pop("box"), strict=True))
+    del values["significant"]
+    return (Remark(RemarkKind.MISSING_REGION, sides | values),)
 
 
 def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Remark, ...]:

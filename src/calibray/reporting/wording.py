@@ -220,9 +220,8 @@ def _missing_region_text(tables: dict[str, pd.DataFrame]) -> str:
         return "no region of extra loss, such as trees, would explain more of the residuals than chance"
     return (
         f"losses of {row['attenuation']:.2g} dB/m within x = {row['west']:.0f} to {row['east']:.0f} m, "
-        f"y = {row['south']:.0f} to {row['north']:.0f} m, up to z = {row['height']:.0f} m, on the straight line of "
-        f"{row['links']} links, would explain {percent(float(row['share']))} of the mean square of the residuals "
-        f"(chance alone {percent(float(row['chance']))}): check whether there are trees, and state them under [regions]"
+        f"y = {row['south']:.0f} to {row['north']:.0f} m would explain {percent(float(row['share']))} of the mean "
+        f"square of the residuals (chance alone {percent(float(row['chance']))})"
     )
 
 

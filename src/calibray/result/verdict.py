@@ -123,6 +123,7 @@ class RemarkKind(StrEnum):
     RAY_MAPPING = "ray mapping"
     NO_CHEAP_MODEL = "no cheap model"  # cause
     NOT_JUDGED = "not judged"
+    MISSING_REGION = "missing region"  # west, south, east, north, height, attenuation, links, share, chance
     # transmitters; azimuth_deg and downtilt_deg, what to add to their stated angles, and azimuth_error_deg,
     # downtilt_error_deg
     ANTENNA_DIRECTIONS = "antenna directions"

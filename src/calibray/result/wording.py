@@ -253,6 +253,17 @@ def _ray_mapping(values: dict[str, Any]) -> str:
     return text
 
 
+def _missing_region(values: dict[str, Any]) -> str:
+    return (
+        f"Losses of {values['attenuation']:.2g} dB/m within x = {values['west']:.0f} to {values['east']:.0f} m, "
+        f"y = {values['south']:.0f} to {values['north']:.0f} m, up to z = {values['height']:.0f} m, on the straight "
+        f"line of {values['links']} links, would explain {percent(values['share'])} of the mean square of the "
+        f"residuals (chance alone {percent(values['chance'])}). The materials may have absorbed part of these losses, "
+        "and the verdicts assume that nothing is missing there. Check whether there are trees, and state them under "
+        "[regions]."
+    )
+
+
 _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.CORRELATED_NOISE: _noise_remark("Neighbouring links share part of their errors"),
     RemarkKind.HEAVY_TAILS: _noise_remark("The noise has heavy tails, as with outliers"),
@@ -282,6 +293,7 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.RAY_MAPPING: _ray_mapping,
     RemarkKind.NO_CHEAP_MODEL: lambda values: f"No cheap model is used: {values['cause']}.",
     RemarkKind.NOT_JUDGED: lambda values: NOT_JUDGED,
+    RemarkKind.MISSING_REGION: _missing_region,
     RemarkKind.UNREACHED_LINKS: _unreached_links,
     RemarkKind.ANTENNA_DIRECTIONS: _antenna_directions,
     RemarkKind.CONFLICT: _conflict,

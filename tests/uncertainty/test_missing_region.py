@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import shapely
 
-from calibray.reporting.diagnostics import missing_region
 from calibray.scenes.regions import Region
+from calibray.uncertainty.missing_region import missing_region
 
 BELT = shapely.box(-42, -90, -30, -10)
 

@@ -1,0 +1,201 @@
+"""A missing region, such as trees without a map, would explain most of the residuals by its extra loss.
+
+All rectangles of a grid are tried, at several heights: the residuals are regressed on the length of the straight lines
+inside each. The same search over residuals in random order shows the effect of chance (a scan statistic; M. Kulldorff,
+Communications in Statistics 26, 1997).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.measurements import FEW
+
+GRID: Final = 20
+"""Number of cells along the longer side of the area."""
+
+SAMPLES: Final = 128
+"""Number of points along each line, several in each cell that it crosses."""
+
+HEIGHTS: Final = (5.0, 10.0, 20.0)
+"""Heights above the lowest antenna up to which the rectangles reach [m]: hedges, street trees, tall trees."""
+
+FEWEST_LINKS: Final = 30
+"""Fewest links that are searched."""
+
+MOST: Final = 20_000
+"""Largest number of links that are searched; of more, every second, third, ... one is taken."""
+
+SHUFFLES: Final = 99
+"""Number of random orders of the residuals; a rectangle is reported if none of them has a better one."""
+
+
+NEGLIGIBLE: Final = 1e-6
+"""Sum of squares of a rectangle's column, relative to the largest, below which rounding dominates."""
+
+
+class Explained(NamedTuple):
+    """The best rectangle of a width.
+
+    Attributes:
+        explained: Sum of squares that it explains.
+        attenuation: Its attenuation [dB/m].
+        cells: Its corners, counted in cells [2, 2].
+        chance: Sum of squares that the best rectangle of this width explains for residuals in random order [k - 1].
+    """
+
+    explained: float
+    attenuation: float
+    cells: NDArray[np.int64]
+    chance: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MissingRegion:
+    """A rectangle whose extra loss would explain residuals.
+
+    Attributes:
+        box: West, south, east and north in the scene's frame [m].
+        height: Height at which it ends [m].
+        attenuation: Loss per length inside [dB/m].
+        links: Number of links whose straight line crosses it.
+        share: Share of the mean square of the residuals that it explains.
+        chance: Median share that the best rectangle explains if residuals are in random order.
+        significant: Whether it explains more than in any random order.
+    """
+
+    box: tuple[float, float, float, float]
+    height: float
+    attenuation: float
+    links: int
+    share: float
+    chance: float
+    significant: bool
+
+
+def missing_region(
+    tx: NDArray[np.float64],
+    rx: NDArray[np.float64],
+    excess_db: NDArray[np.float64],
+    known: Sequence[NDArray[np.float64]] = (),
+) -> MissingRegion | None:
+    """Search the rectangle whose extra loss explains most of the residuals.
+
+    Args:
+        tx: Transmitters [n, 3], [m].
+        rx: Receivers [n, 3], [m].
+        excess_db: Measured minus predicted path loss [n], [dB].
+        known: Columns that explain residuals in another way, such as whether a link is out of sight [n].
+
+    Returns:
+        The rectangle; None if there are too few links, or no extra loss explains anything.
+    """
+    step = -(-len(excess_db) // MOST)
+    tx, rx, excess_db = tx[::step], rx[::step], excess_db[::step]
+    distance = np.log10(np.maximum(np.linalg.norm(rx - tx, axis=1), 1.0))
+    design = np.column_stack([np.ones(len(distance)), distance, *(column[::step] for column in known)])
+    basis, sizes, _ = np.linalg.svd(design, full_matrices=False)
+    basis = basis[:, sizes > 1e-9 * sizes[0]]
+    if len(excess_db) < FEWEST_LINKS:
+        return None
+    residual = excess_db - basis @ (basis.T @ excess_db)
+    square = float(residual @ residual)
+    if square <= 0:
+        return None
+    random = np.random.default_rng(0)
+    orders = np.stack([residual, *(random.permutation(residual) for _ in range(SHUFFLES))])
+    orders -= (orders @ basis) @ basis.T
+    corner, cell = _grid(tx, rx)
+    lowest = float(min(tx[:, 2].min(), rx[:, 2].min()))
+    best, chance = None, np.zeros(SHUFFLES)
+    for height in HEIGHTS:
+        length = _lengths(tx, rx, corner, cell, lowest + height)
+        inside = length - basis @ (basis.T @ length)
+        rectangles = list(_rectangles(inside.T @ orders.T, inside.T @ inside))
+        chance = np.maximum(chance, np.max([rectangle.chance for rectangle in rectangles], axis=0))
+        top = max(rectangles, key=lambda rectangle: rectangle.explained)
+        if top.explained / square > (0.0 if best is None else best.share):
+            (west, south), (east, north) = (corner + cell * top.cells).tolist()
+            crossing = length.reshape(-1, GRID, GRID)[:, slice(*top.cells[:, 0]), slice(*top.cells[:, 1])]
+            best = MissingRegion(
+                (west, south, east, north),
+                lowest + height,
+                top.attenuation,
+                int((crossing.sum(axis=(1, 2)) > 0).sum()),
+                top.explained / square,
+                0.0,
+                False,
+            )
+    if best is None:
+        return None
+    return replace(
+        best,
+        chance=float(np.median(chance)) / square,
+        significant=bool(best.share * square > chance.max()) and best.links >= FEW,
+    )
+
+
+def _grid(tx: NDArray[np.float64], rx: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """South-western corner [2] and width of the cells of a square grid over all links [m]."""
+    ends = np.concatenate([tx, rx])[:, :2]
+    low, high = ends.min(axis=0), ends.max(axis=0)
+    cell = max(float((high - low).max()) / GRID, 1e-3)
+    return (low + high) / 2 - cell * GRID / 2, cell
+
+
+def _lengths(
+    tx: NDArray[np.float64], rx: NDArray[np.float64], corner: NDArray[np.float64], cell: float, top: float
+) -> NDArray[np.float64]:
+    """Length of every line below a height in every cell of the grid [n, cells], [m]."""
+    share = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    point = tx[:, None] + share[:, None] * (rx - tx)[:, None]
+    index = np.clip(((point[..., :2] - corner) / cell).astype(np.int64), 0, GRID - 1)
+    number = np.arange(len(tx))[:, None] * GRID**2 + index[..., 0] * GRID + index[..., 1]
+    piece = np.linalg.norm(rx - tx, axis=1)[:, None] / SAMPLES * (point[..., 2] < top)
+    counts = np.bincount(number.reshape(-1), piece.reshape(-1), len(tx) * GRID**2)
+    return counts.reshape(len(tx), GRID**2).astype(np.float64)
+
+
+def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> Iterator[Explained]:
+    """The best rectangle of the grid, width by width.
+
+    The arguments are products of residuals and the columns of the cells, with the residuals in order first [cells, k],
+    and products of the columns of the cells [cells, cells].
+    """
+    moment = _summed(moments.reshape(GRID, GRID, -1), (0, 1))
+    total = _summed(products.reshape((GRID,) * 4), (0, 1, 2, 3))
+    largest = float(np.max(np.diagonal(products), initial=0.0))
+    south, north = np.triu_indices(GRID + 1, 1)
+    for columns in range(1, GRID + 1):
+        west = np.arange(GRID + 1 - columns)
+        east = west + columns
+        strip = total[east, :, east] - total[east, :, west] - total[west, :, east] + total[west, :, west]
+        square = (
+            strip[:, north, north] - strip[:, north, south] - strip[:, south, north] + strip[:, south, south]
+        )
+        band = moment[columns:] - moment[:-columns]
+        used = square > NEGLIGIBLE * largest
+        root = np.where(used, 1.0 / np.sqrt(np.where(used, square, 1.0)), 0.0)
+        loss = band[:, north]
+        loss -= band[:, south]
+        loss *= root[..., None]
+        at, rows = np.unravel_index(np.argmax(loss[..., 0]), root.shape)
+        explained = np.maximum(loss.max(axis=(0, 1)), 0.0) ** 2
+        yield Explained(
+            float(explained[0]),
+            float(max(loss[at, rows, 0], 0.0) * root[at, rows]),
+            np.array([[west[at], south[rows]], [east[at], north[rows]]]),
+            explained[1:],
+        )
+
+
+def _summed(values: NDArray[np.float64], axes: Sequence[int]) -> NDArray[np.float64]:
+    """Cumulative sums along axes, starting at 0, so that sums over ranges are differences."""
+    for axis in axes:
+        values = np.insert(np.cumsum(values, axis=axis), 0, 0.0, axis=axis)
+    return values
