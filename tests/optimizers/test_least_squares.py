@@ -11,7 +11,7 @@ from calibray.optimizers import LeastSquares
 from calibray.optimizers import least_squares as module
 from calibray.optimizers.derivative_free import improving_point
 from calibray.optimizers.descent import descend
-from calibray.optimizers.least_squares import COMBINATIONS, SPACE, recombine, returns
+from calibray.optimizers.least_squares import COMBINATIONS, SPACE, hops, recombine, returns
 from calibray.optimizers.sampling import design
 from problem_families.landscapes import blocks, hall, rosenbrock, tones, within
 
@@ -301,6 +301,32 @@ def test_combinations_keep_a_distance_from_minima_and_from_each_other():
     assert len(points) > 10
     distance = np.linalg.norm(np.concatenate([points, minima])[None] - points[:, None], axis=2)
     assert np.sort(distance, axis=1)[:, 1].min() > SPACE
+
+
+def test_basin_hopping_finds_the_best_of_many_minima(monkeypatch):
+    """Few starts come near the best of 729 minima, but each of its coordinates can be changed alone."""
+    monkeypatch.setattr(module, "COMBINATIONS", 0)
+    assert sum(search_ladder(seed, starts=128).best.y < 1e-6 for seed in range(8)) >= 6
+    monkeypatch.setattr(module, "PATIENCE", 0)
+    assert sum(search_ladder(seed, starts=128).best.y < 1e-6 for seed in range(8)) <= 2
+
+
+def test_less_than_a_round_of_starts_is_too_few_for_basin_hopping(monkeypatch):
+    """Each evaluation of a large program takes long."""
+    spent = search_ladder(0, starts=32).evaluations, search_ladder(0, starts=64).evaluations
+    monkeypatch.setattr(module, "PATIENCE", 0)
+    assert search_ladder(0, starts=32).evaluations == spent[0]
+    assert search_ladder(0, starts=64).evaluations < spent[1]
+
+
+def test_hops_change_one_or_two_coordinates():
+    best = np.array([0.2, 0.4, 0.6])
+    points = hops(best, 400, np.random.default_rng(0))
+    changed = points != best
+    assert sorted(np.unique(changed.sum(axis=1))) == [1, 2]
+    assert changed.mean(axis=0) == pytest.approx(np.full(3, 0.5), abs=0.1)
+    assert ((points >= 0.0) & (points <= 1.0)).all()
+    assert (hops(best[:1], 8, np.random.default_rng(0)) != best[:1]).all()
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,10 @@ Problems with narrower basins use all their starting points. (The Bayesian rule 
 Programming 37, 1987, counts the different minima, which requires every search to be followed to its end.)
 
 If too few searches have ended in the best minimum, minima are combined into new starting points (`recombine`). Searches
-start from those that fit best, until they find no better minimum.
+start from those that fit best, until they find no better minimum. With a full round of starting points, basin hopping
+follows (Wales and Doye, Journal of Physical Chemistry A 101, 1997): searches start from the best minimum with one or
+two new coordinates. A resonating slab repeats minima along its own coordinate, and materials act nearly independently,
+so a lower minimum often differs in few coordinates.
 """
 
 from __future__ import annotations
@@ -54,6 +57,13 @@ SPACE = 0.05
 ROUND = 64
 """Starts of a round."""
 
+HOPS = 8
+"""Number of starting points for each search of a round of basin hopping."""
+
+PATIENCE = 6
+"""Rounds without a lower minimum that end basin hopping. In 24 problems of development that use all starting points, 14
+searches ended above the lowest known minimum without it, nine with three rounds, and two with six."""
+
 RETURNS = 10
 """Number of searches that end in the best minimum before no more are started."""
 
@@ -74,8 +84,8 @@ class LeastSquares(Optimizer):
     Args:
         seed: Seed of the scrambled Sobol points that the searches start from.
         starts: Largest number of these points; powers of two are spread best. Each costs about ten evaluations. If all
-            are used, combinations of the minima need some hundred more. The best point passed to `tell` before the
-            first `ask`, if any, is a further starting point.
+            are used, combinations of the minima and basin hopping need about as many again. The best point
+            passed to `tell` before the first `ask`, if any, is a further starting point.
         x0: Further starting points, [d] or [k, d].
         iterations: Largest number of steps of each search.
         tolerance: A search has converged if its model predicts less than this relative decrease of the mean square, or
@@ -141,6 +151,7 @@ class LeastSquares(Optimizer):
         if ended is not None and len(ended.cost):
             if returns(ended) < RETURNS:
                 ended = yield from self._recombined(ended)
+                ended = yield from self._hopped(ended)
             self._session.minima = box.from_unit(distinct(ended, APART).unit)
 
     def _recombined(self, ended: Starts) -> Generator[NDArray[np.float64], Evaluations, Starts]:
@@ -152,6 +163,15 @@ class LeastSquares(Optimizer):
             if not len(unit):
                 break
             ended = yield from self._descended(unit, ended, min(NEARER, self.catch_up), followed)
+        return ended
+
+    def _hopped(self, ended: Starts) -> Generator[NDArray[np.float64], Evaluations, Starts]:
+        failures = 0
+        while self.starts >= ROUND and failures < PATIENCE:
+            best, before = ended.unit[ended.cost.argmin()], ended.cost.min() - _slack(ended)
+            unit = hops(best, self.starts // HOPS, self._rng)
+            ended = yield from self._descended(unit, ended, self.catch_up)
+            failures = 0 if ended.cost.min() < before else failures + 1
         return ended
 
     def _descended(
@@ -204,6 +224,15 @@ def recombine(minima: NDArray[np.float64], number: int) -> NDArray[np.float64]:
         if (np.linalg.norm(kept - point, axis=1) > SPACE).all():
             kept = np.vstack([kept, point])
     return kept
+
+
+def hops(best: NDArray[np.float64], number: int, random: np.random.Generator) -> NDArray[np.float64]:
+    """Copies of a point of the unit cube [d], each with one or two coordinates drawn anew [number, d]."""
+    points = np.repeat(best[None], number, axis=0)
+    for point in points:
+        count = min(len(best), random.integers(1, 3))
+        point[random.choice(len(best), count, replace=False)] = random.random(count)
+    return points
 
 
 def _new(points: NDArray[np.float64], minima: NDArray[np.float64]) -> NDArray[np.float64]:
