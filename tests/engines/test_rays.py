@@ -15,7 +15,7 @@ import calibray as cb
 import two_ray
 from calibray.engines.rays import table as ray_table
 from calibray.engines.rays.compile import RaySetting, compile_rays
-from calibray.engines.rays.table import RayTable, read_ray_file
+from calibray.engines.rays.table import RayTable, parse_rays, read_ray_file
 from calibray.errors import InputError
 from calibray.fields import path_gains, path_loss
 from calibray.measurements import SourceTable
@@ -135,6 +135,47 @@ WRONG = {
         lambda t: t.replace({"type": {"reflection": "diffraction"}}),
         "no edge of the scene",
     ),
+    "a column of power in other units": (
+        lambda t: t.rename(columns={"power_db": "power_dbm"}),
+        "did you mean 'power_db'",
+    ),
+    "a column of path gain": (
+        lambda t: t.rename(columns={"power_db": "path_gain_db"}),
+        "did you mean 'power_db'",
+    ),
+    "one column of complex gain": (
+        lambda t: t.drop(columns="power_db").assign(gain=1e-4j),
+        "'gain' .*did you mean 'power_db'",
+    ),
+    "a column of delay with its unit": (
+        lambda t: t.rename(columns={"delay": "delay_s"}),
+        "did you mean 'delay'",
+    ),
+    "a column of materials": (
+        lambda t: t.rename(columns={"material": "materials"}),
+        "did you mean 'material'",
+    ),
+    "a misspelt column": (lambda t: t.rename(columns={"link": "lnk"}), "'lnk' .*did you mean 'link'"),
+    "a column twice": (lambda t: t.assign(**{" Path": t.path}), "2 columns 'path'; keep one"),
+    "a path without power": (
+        lambda t: t.assign(power_db=t.power_db.where(t.path != 3)),
+        "path 3 states no power_db; add it, or -inf for a path without power",
+    ),
+    "a path without delay": (
+        lambda t: t.assign(delay=t.delay.where(t.path != 3)),
+        "path 3 states no delay; add it, or remove the column",
+    ),
+    "a path without link": (
+        lambda t: t.assign(link=t.link.where(t.path != 3)),
+        "path 3 states no link; add it",
+    ),
+    "numbers that restart in every link": (
+        lambda t: t.assign(path=t.path - t.groupby("link").path.transform("min")),
+        "0 is the number of several paths .*unique in the table",
+    ),
+    "no rows": (lambda t: t.iloc[:0], "contains no rows"),
+    "nothing": (lambda t: None, "is a NoneType; must be a DataFrame"),
+    "a list": (lambda t: t.path.tolist(), "is a list; must be a DataFrame"),
     "a vertex off the surface": (lambda t: t.assign(z=t.z + 0.05 * (t.type == "reflection")), "lies 0.05 m"),
 }
 
@@ -144,6 +185,40 @@ def test_a_wrong_table_is_refused(yard: Tracer, rows: pd.DataFrame, fault: str) 
     change, message = WRONG[fault]
     with pytest.raises(InputError, match=message):
         read(change(rows), yard)
+
+
+def test_letter_case_and_blanks_of_names_and_types_do_not_matter(
+    yard: Tracer, traced: Paths, rows: pd.DataFrame
+) -> None:
+    loud = rows.rename(columns=lambda name: f" {name.upper()}")
+    loud[" TYPE"] = [f" {name.capitalize()} " for name in rows.type]
+    np.testing.assert_array_equal(read(loud, yard).kind, traced.kind)
+    np.testing.assert_array_equal(path_loss(read(loud, yard)), path_loss(read(rows, yard)))
+
+
+def test_columns_that_resemble_no_absent_one_are_ignored(yard: Tracer, rows: pd.DataFrame) -> None:
+    more = rows.assign(power_dbm=7.0, delay_spread=1.0, material_id=3, line="a", phase=0.0)
+    np.testing.assert_array_equal(path_loss(read(more, yard)), path_loss(read(rows, yard)))
+
+
+def test_a_dictionary_of_columns_is_a_table_and_paths_are_not(
+    yard: Tracer, traced: Paths, rows: pd.DataFrame
+) -> None:
+    columns = {name: rows[name].tolist() for name in rows}
+    np.testing.assert_array_equal(path_loss(read(columns, yard)), path_loss(read(rows, yard)))
+    with pytest.raises(InputError, match="not a ray table"):
+        read(columns | {"x": [1.0]}, yard)
+    with pytest.raises(InputError, match="already"):
+        read(traced, yard)
+
+
+def test_a_response_that_is_not_a_table_names_the_format(rows: pd.DataFrame, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"begins with 'path,.*must be JSON or HDF5, not CSV"):
+        parse_rays(rows.to_csv(index=False).encode(), "its response")
+    with h5py.File(tmp_path / "grouped.h5", "w") as content:
+        content["rays/path"] = rows.path.to_numpy()
+    with pytest.raises(InputError, match="must be at the root of the file; found group 'rays'"):
+        parse_rays((tmp_path / "grouped.h5").read_bytes(), "its response")
 
 
 def test_the_correction_takes_the_power_of_the_engine(

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from difflib import get_close_matches
 from io import BytesIO
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import h5py
 import numpy as np
@@ -37,8 +39,24 @@ TYPES: Final = {
 ENDS: Final = ("transmitter", "receiver")
 """Values of `type` of the first and the last point of a path."""
 
+REQUIRED: Final = ("path", "point", "type", "x", "y", "z")
+POWERS: Final = ("power_db", "gain_real", "gain_imag")
+OPTIONAL: Final = ("material", "object", "link", "delay", *POWERS)
+"""Columns that a table may lack: a misspelt one would be ignored."""
+
+QUANTITIES: Final = {
+    "power": "power_db", "gain": "power_db", "loss": "power_db", "delay": "delay", "material": "material",
+}  # fmt: skip
+"""Beginnings of names, with the column that such a name states."""
+
+MISSPELT: Final = 0.8
+"""Smallest similarity at which an unknown column counts as a misspelt one: `line` is not `link`."""
+
 MOST_POINTS: Final = RANGES["max_depth"][1] + 2
 """Largest number of points of a path: the most interactions of a trace, and both ends."""
+
+NO_POWER: Final = {"power_db": "-inf", "gain_real": "0", "gain_imag": "0"}
+"""What columns state for a path without power."""
 
 POWER_ZERO_DB: Final = -10_000.0
 """Level in place of -inf [dB]: its power is 0 in double precision."""
@@ -81,11 +99,11 @@ class RayTable:
         Raises:
             InputError: A column is missing or malformed, a path is incomplete, or a value is impossible.
         """
+        table = _with_known_names(_checked_rows(table))
         path, point = _names(table, "path"), table.numbers("point")
         order = np.lexsort((point, path))
-        table = SourceTable(
-            table.frame.iloc[order].reset_index(drop=True), table.row[order], table.source, table.changes
-        )
+        frame = table.frame.assign(path=path).iloc[order].reset_index(drop=True)
+        table = SourceTable(frame, table.row[order], table.source, table.changes)
         label, first, row_path = np.unique(path[order], return_index=True, return_inverse=True)
         row_path, step = row_path.reshape(-1), np.arange(len(table)) - first[row_path.reshape(-1)]
         count = np.bincount(row_path)
@@ -159,15 +177,58 @@ class RayTable:
         return pd.DataFrame(columns).iloc[np.lexsort((step, path))].reset_index(drop=True)
 
 
+def _checked_rows(table: SourceTable) -> SourceTable:
+    if table.frame.empty:
+        raise InputError(f"{table.source}: contains no rows; a ray table needs at least one path")
+    return table
+
+
+def _with_known_names(table: SourceTable) -> SourceTable:
+    """The table with the names of its known columns as documented; refuses a name that seems to be misspelt."""
+    known = (*REQUIRED, *OPTIONAL)
+    given = [str(name) for name in table.frame]
+    names = [name if (name := text.strip().casefold()) in known else text for text in given]
+    absent = {*OPTIONAL} - {*names}
+    if len(absent & {*POWERS}) < len(POWERS):
+        absent -= {*POWERS}
+    for text, name in zip(given, names, strict=True):
+        if name in known and names.count(name) > 1:
+            raise InputError(f"{table.source}: has {names.count(name)} columns {name!r}; keep one of them")
+        if name not in known and (meant := _meant(name.strip().casefold(), absent)):
+            raise InputError(
+                f"{table.source}: column {shortened(text)!r} is unknown and would be ignored; did you mean {meant!r} "
+                "(docs/reference/ray-table.md)? Name it so, in its unit, or remove it"
+            )
+    return replace(table, frame=table.frame.set_axis(names, axis=1))
+
+
+def _meant(name: str, absent: set[str]) -> str | None:
+    """The column that a table lacks and an unknown name seems to state, or None."""
+    quantity = re.match(rf"(?:path_?|received_?)?({'|'.join(QUANTITIES)})", name)
+    if quantity and (known := QUANTITIES[quantity[1]]) in absent:
+        return known
+    return next(iter(get_close_matches(shortened(name), sorted(absent), n=1, cutoff=MISSPELT)), None)
+
+
 def _kinds(
     table: SourceTable, row_path: NDArray[np.int64], step: NDArray[np.int64], count: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """Kind of every row, 0 at the ends [rows]; refuses unknown types, and paths without their ends."""
-    kinds = table.labels("type")
+    stated = table.labels("type")
+    kinds = np.char.lower(np.char.strip(stated))
     known = [*ENDS, *TYPES]
-    if unknown := sorted(set(kinds.tolist()) - set(known)):
-        row = int(np.flatnonzero(kinds == unknown[0])[0])
-        raise InputError(f"{table.cell(row, 'type')}: {unknown[0]!r}; {did_you_mean(unknown[0], known)}")
+    if (unknown := ~np.isin(kinds, known)).any():
+        row = int(np.argmax(unknown))
+        word = shortened(str(stated[row]))
+        raise InputError(f"{table.cell(row, 'type')}: {word!r}; {did_you_mean(word, known)}")
+    sources, targets = (np.bincount(row_path[kinds == end], minlength=len(count)) for end in ENDS)
+    if (shared := np.minimum(sources, targets) > 1).any():
+        row = int(np.argmax(shared[row_path]))
+        raise InputError(
+            f"{table.cell(row, 'path')}: {table.frame['path'].iloc[row]} is the number of several paths "
+            f"({sources[row_path[row]]} transmitters); numbers must be unique in the table, also between links: number "
+            "all paths anew, or remove repeated rows"
+        )
     last = step == count[row_path] - 1
     wrong = (
         ((kinds == ENDS[0]) != (step == 0)) | ((kinds == ENDS[1]) != last) | (count[row_path] > MOST_POINTS)
@@ -223,8 +284,14 @@ def _per_path(table: SourceTable, name: str, row_path: NDArray[np.int64]) -> NDA
 def _stated(table: SourceTable, name: str, row_path: NDArray[np.int64]) -> pd.Series:
     """A value of the whole path, which must be the same in all rows that state it [P]."""
     groups = table.column(name).groupby(row_path)
-    if (differing := groups.nunique() != 1).any():
-        row = int(np.argmax(row_path == int(np.argmax(differing.to_numpy()))))
+    number = groups.nunique().to_numpy()
+    row = int(np.argmax((number != 1)[row_path]))
+    if number[row_path[row]] == 0:
+        otherwise = f"{NO_POWER[name]} for a path without power" if name in NO_POWER else "remove the column"
+        raise InputError(
+            f"{table.cell(row, name)}: path {table.frame['path'].iloc[row]} states no {name}; add it, or {otherwise}"
+        )
+    if number[row_path[row]] > 1:
         raise InputError(
             f"{table.cell(row, name)}: all rows of a path must state the same {name}; correct them"
         )
@@ -288,24 +355,37 @@ def parse_rays(content: bytes, source: str) -> SourceTable:
     Raises:
         InputError: The content is malformed.
     """
-    return _parsed(
-        BytesIO(content) if content.startswith(HDF5) else content.decode("utf-8", "replace"), source
-    )
+    if content.startswith(HDF5):
+        return _parsed(BytesIO(content), source)
+    text = content.decode("utf-8", "replace")
+    header = text.lstrip("\ufeff \r\n\t").partition("\n")[0].strip()
+    if re.match(r"[^\[{]*[,;\t]", header):
+        raise InputError(f"{source}: begins with {shortened(header)!r}; must be JSON or HDF5, not CSV")
+    return _parsed(text, source)
 
 
-def _parsed(content: Path | BytesIO | str, source: str) -> SourceTable:
+def columns_table(columns: Mapping[Any, Any], source: str) -> SourceTable:
+    """The rows of a table in memory, as an object with one list per column.
+
+    Raises:
+        InputError: The columns have different lengths, or no rows.
+    """
+    return _parsed(columns, source)
+
+
+def _parsed(content: Path | BytesIO | str | Mapping[Any, Any], source: str) -> SourceTable:
     try:
-        is_json = isinstance(content, str)
-        frame = pd.DataFrame(json.loads(content)) if is_json else _read_hdf5(content, source)
+        if isinstance(content, Path | BytesIO):
+            frame = _read_hdf5(content, source)
+        else:
+            frame = pd.DataFrame(json.loads(content) if isinstance(content, str) else content)
     except InputError:
         raise
     # A text nested too deeply is a RuntimeError.
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         fault = shortened(str(error))
         raise InputError(f"{source}: not a ray table ({fault}); see docs/reference/ray-table.md") from None
-    if frame.empty:
-        raise InputError(f"{source}: contains no rows; a ray table needs at least one path")
-    return SourceTable(frame, source=source)
+    return _checked_rows(SourceTable(frame, source=source))
 
 
 def write_ray_file(file: str | Path, frame: pd.DataFrame, overwrite: bool = False) -> None:
@@ -335,10 +415,18 @@ def write_ray_file(file: str | Path, frame: pd.DataFrame, overwrite: bool = Fals
 def _read_hdf5(content: Path | BytesIO, source: str) -> pd.DataFrame:
     with h5py.File(content, "r") as file:
         columns: dict[str, h5py.Dataset] = {}
+        groups: list[str] = []
         for name in map(str, file):
             is_here = isinstance(file.get(name, getlink=True), h5py.HardLink)
             if is_here and isinstance(item := file[name], h5py.Dataset):
                 columns[name] = item
+            elif is_here:
+                groups.append(name)
+        if groups and not columns:
+            raise InputError(
+                f"{source}: datasets must be at the root of the file; found group {shortened(groups[0])!r}: store "
+                "one dataset per column outside groups"
+            )
         for name, item in columns.items():
             if item.is_virtual or item.external is not None:
                 raise InputError(
