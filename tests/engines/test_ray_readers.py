@@ -15,7 +15,7 @@ from scipy.io import savemat
 
 import calibray as cb
 from calibray.engines.rays.compile import powers
-from calibray.engines.rays.other_programs import Polyline, read_sionna_paths, rows_of
+from calibray.engines.rays.other_programs import Polyline, check_carrier, read_sionna_paths, rows_of
 from calibray.errors import InputError
 from calibray.paths import Paths
 
@@ -87,7 +87,7 @@ def test_arrays_of_several_places_are_refused() -> None:
         read(found)
 
 
-def write_insite(lines: list[Polyline], folder: Path) -> Path:
+def write_insite(lines: list[Polyline], folder: Path, phase: str = "31.9 ") -> Path:
     letters = {"reflection": "R", "diffraction": "D", "transmission": "T", "diffuse": "DS"}
     groups = by_receiver(lines)
     text = ["# <receiver> <paths>", str(len(groups) + 1)]
@@ -95,7 +95,9 @@ def write_insite(lines: list[Polyline], folder: Path) -> Path:
         text += [f"{number} {len(group)}", "-80.0 1e-7 1e-8"]
         for path, line in enumerate(group, 1):
             level = line.power_db + TX_POWER_DBM
-            text.append(f"{path} {len(line.types)} {level:.12g} 31.9 {line.delay:.12g} 84.0 40.3 90.9 -13.4")
+            text.append(
+                f"{path} {len(line.types)} {level:.12g} {phase}{line.delay:.12g} 84.0 40.3 90.9 -13.4"
+            )
             text.append("-".join(["Tx", *(letters[name] for name in line.types), "Rx"]))
             text += [" ".join(f"{value:.9g}" for value in point) for point in line.points]
     text.append(f"{len(groups) + 1} 0")
@@ -104,7 +106,9 @@ def write_insite(lines: list[Polyline], folder: Path) -> Path:
     return file
 
 
-def write_aodt(lines: list[Polyline], folder: Path) -> Path:
+def write_aodt(
+    lines: list[Polyline], folder: Path, element_as: Callable[[int], object] = int, transmitting: int = 1
+) -> Path:
     rays, gains = [], []
     for ue, group in enumerate(by_receiver(lines)):
         pair = {"time_idx": 0, "ru_id": 1, "ue_id": ue}
@@ -113,10 +117,11 @@ def write_aodt(lines: list[Polyline], folder: Path) -> Path:
             points = [dict(zip("123", point, strict=True)) for point in (100 * line.points).tolist()]
             rays.append(pair | {"points": points, "interaction_types": types})
         amplitude = 10 ** (np.array([line.power_db for line in group]) / 20)
-        for element, share in enumerate((0.6, 0.8)):
+        for number, share in enumerate((0.6, 0.8) * transmitting):
+            source, element = element_as(number // 2), element_as(number % 2)
             gains.append(
                 pair
-                | {"ru_ant_el": 0, "ue_ant_el": element, "cir_re": (share * amplitude).tolist(),
+                | {"ru_ant_el": source, "ue_ant_el": element, "cir_re": (share * amplitude).tolist(),
                    "cir_im": (0 * amplitude).tolist(), "cir_delay": [line.delay for line in group]}
             )  # fmt: skip
     for name, rows in (("raypaths", rays), ("cirs", gains)):
@@ -178,7 +183,14 @@ def write_matlab(lines: list[Polyline], folder: Path) -> Path:
 
 WRITERS: dict[str, Callable[[list[Polyline], Path], Path]] = {
     "InSite": write_insite,
+    "InSite without phases": lambda lines, folder: write_insite(lines, folder, phase=""),
     "AODT": write_aodt,
+    "AODT, elements as structs": lambda lines, folder: write_aodt(
+        lines, folder, lambda number: {"row": 0, "column": number, "port": 1}, transmitting=2
+    ),
+    "AODT, elements as lists": lambda lines, folder: write_aodt(
+        lines, folder, lambda number: [0, number, 1], transmitting=2
+    ),
     "DeepMIMO": write_deepmimo,
     "DeepMIMO npz": lambda lines, folder: write_deepmimo(lines, folder, "npz"),
     "MATLAB": write_matlab,
@@ -190,7 +202,7 @@ def test_every_program_gives_the_powers_of_sionna_back(
     lines: list[Polyline], tmp_path: Path, program: str
 ) -> None:
     source = WRITERS[program](lines, tmp_path)
-    program_read = read(source, tx_power_dbm=TX_POWER_DBM if program == "InSite" else None)
+    program_read = read(source, tx_power_dbm=TX_POWER_DBM if program.startswith("InSite") else None)
     true = [sorted(10 ** (line.power_db / 10) for line in group) for group in by_receiver(lines)]
     ends = np.lexsort(program_read.rx_position.T[::-1])
     mine = [np.sort(powers(program_read)[program_read.link == link]) for link in ends]
@@ -214,6 +226,8 @@ def test_axes_and_units_of_another_convention_are_refused_or_named(
 
 REFUSED = {
     "no transmitted power": (write_insite, lambda file: None, {}, "give tx_power_dbm"),
+    "a text as transmitted power": (write_insite, lambda file: None, {"tx_power_dbm": "13"}, "'13': must be a finite"),
+    "no number as transmitted power": (write_insite, lambda file: None, {"tx_power_dbm": np.nan}, "must be a finite"),
     "a cut file": (
         write_insite,
         lambda file: file.write_text(file.read_text()[:-60]),
@@ -265,6 +279,13 @@ def test_a_wrong_file_is_refused(lines: list[Polyline], tmp_path: Path, fault: s
     spoil(source)
     with pytest.raises(InputError, match=message):
         read(source, **arguments)
+
+
+def test_paths_of_sionna_at_another_carrier_are_refused(paths: rt.Paths) -> None:
+    check_carrier(paths, FREQUENCY)
+    check_carrier("rays.csv", 28e9)
+    with pytest.raises(InputError, match=r"solved at 3\.5 GHz, must be at 28 GHz"):
+        check_carrier(paths, 28e9)
 
 
 def test_a_folder_without_paths_is_refused(tmp_path: Path) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from numbers import Real
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 from zipfile import BadZipFile, ZipFile
@@ -13,9 +14,10 @@ from numpy.typing import NDArray
 from scipy.io import loadmat, whosmat
 from scipy.io.matlab import MatReadError
 
-from calibray.engines.rays.table import ENDS, LARGEST_ARRAYS, TYPES, read_ray_file
+from calibray.engines.rays.table import ENDS, LARGEST_ARRAYS, TYPES, columns_table, read_ray_file
 from calibray.errors import InputError
 from calibray.measurements import SourceTable, read_table
+from calibray.paths import Paths
 from calibray.support.messages import did_you_mean, first_line, shortened
 
 
@@ -67,12 +69,23 @@ def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
     """The rows of a ray table, a file of one, or the paths of another program.
 
     Raises:
-        InputError: The file or folder is malformed or not of a known kind.
+        InputError: The file or folder is malformed or not of a known kind, or the power is not a number.
     """
+    if tx_power_dbm is not None and not (isinstance(tx_power_dbm, Real) and np.isfinite(tx_power_dbm)):
+        raise InputError(f"tx_power_dbm = {tx_power_dbm!r}: must be a finite number, in dBm")
     if isinstance(rays, pd.DataFrame):
         return SourceTable(rays)
+    if isinstance(rays, Mapping):
+        return columns_table(rays, "table")
     if is_sionna_paths(rays):
         return read_sionna_paths(rays)
+    if isinstance(rays, Paths):
+        raise InputError("rays: these are Paths of Calibray already; use them without read_rays")
+    if not isinstance(rays, str | Path):
+        raise InputError(
+            f"rays: is a {type(rays).__name__}; must be a DataFrame, a dict with one list per column, the name of a "
+            "file or folder, or the Paths of Sionna RT"
+        )
     path = Path(rays)
     if path.suffix.lower() == ".p2m" and path.is_file():
         return read_insite(path, tx_power_dbm)
@@ -97,8 +110,8 @@ def read_insite(file: Path, tx_power_dbm: float | None) -> SourceTable:
 
     Lines that begin with # are comments. The first line is the number of receivers. For each receiver, its number and
     its number of paths follow and, if there are any paths, a line of sums. A path has a line of nine numbers (number,
-    number of interactions, received power [dBm], phase [deg], time of arrival [s], four angles [deg]), a line such as
-    Tx-R-D-Rx, and a line for each point.
+    number of interactions, received power [dBm], phase [deg], time of arrival [s], four angles [deg]) or of eight
+    without the phase, a line such as Tx-R-D-Rx, and a line for each point.
 
     Raises:
         InputError: The transmitted power is missing, the file is malformed, or a path crosses foliage.
@@ -129,7 +142,7 @@ def _insite_paths(file: Path, rest: Iterator[tuple[int, str]], tx_power_dbm: flo
         if count:
             next(rest)
         for _ in range(int(count)):
-            _, depth, power, _, delay, *_ = _insite_numbers(file, next(rest), 9)
+            _, depth, power, *_, delay, _, _, _, _ = _insite_numbers(file, next(rest), 8, 9)
             number, text = next(rest)
             names = text.split("-")[1:-1]
             if unknown := [name for name in names if name not in INSITE_TYPES]:
@@ -144,16 +157,16 @@ def _insite_paths(file: Path, rest: Iterator[tuple[int, str]], tx_power_dbm: flo
     return paths
 
 
-def _insite_numbers(file: Path, line: tuple[int, str], count: int) -> list[float]:
+def _insite_numbers(file: Path, line: tuple[int, str], *counts: int) -> list[float]:
     number, text = line
     try:
         values = [float(word) for word in text.split()]
     except ValueError:
         values = []
-    if len(values) != count or not np.isfinite(values).all():
+    if len(values) not in counts or not np.isfinite(values).all():
         raise InputError(
-            f"{file}, line {number}: {shortened(text)!r}, must be {count} numbers; this is not a paths file of "
-            f"Wireless InSite (project.paths.t001_01.r002.p2m)"
+            f"{file}, line {number}: {shortened(text)!r}, must be {' or '.join(map(str, counts))} numbers; this is not "
+            "a paths file of Wireless InSite (project.paths.t001_01.r002.p2m)"
         )
     return values
 
@@ -163,7 +176,7 @@ AODT_UNIT: Final = 0.01
 """Unit of lengths [m]."""
 
 AODT_PAIR: Final = ["ru_id", "ue_id"]
-AODT_ELEMENTS: Final = ["ru_ant_el", "ue_ant_el"]
+AODT_ELEMENT: Final = "ru_ant_el"
 AODT_TYPES: Final = {
     "reflection": "reflection", "diffraction": "diffraction", "transmission": "transmission", "diffuse": "diffuse",
     "scattering": "diffuse",
@@ -220,8 +233,15 @@ def _aodt_response(
             "tables of the same run"
         )
     real, imaginary, delay = (np.array(column) for column in lists)
-    transmitting = len(np.unique(rows[AODT_ELEMENTS[0]])) if AODT_ELEMENTS[0] in rows else 1
+    transmitting = len({_aodt_element(item) for item in rows[AODT_ELEMENT]}) if AODT_ELEMENT in rows else 1
     return (real**2 + imaginary**2).sum(axis=0) / transmitting, delay[0]
+
+
+def _aodt_element(element: Any) -> Any:
+    """An antenna element, of which exports state a number, a list or a dictionary, such as row, column and port."""
+    if isinstance(element, dict):
+        return tuple(element.values())
+    return tuple(element) if np.ndim(element) else element
 
 
 def _aodt_points(points: Any) -> NDArray[np.float64]:
@@ -339,6 +359,23 @@ SIONNA_PATHS: Final = "the paths of Sionna RT"
 def is_sionna_paths(value: object) -> bool:
     """Whether a value is Sionna's `Paths`."""
     return type(value).__module__.startswith("sionna.rt") and hasattr(value, "interactions")
+
+
+def check_carrier(rays: Any, frequency: float) -> None:
+    """Refuse paths of Sionna RT that were solved at another carrier than `frequency` [Hz]; other rays state none.
+
+    Raises:
+        InputError: The carriers differ.
+    """
+    solved = (
+        float(np.array(getattr(rays, "_frequency", frequency)).item()) if is_sionna_paths(rays) else frequency
+    )
+    # Sionna RT stores the carrier in single precision.
+    if not np.isclose(solved, frequency, rtol=1e-6):
+        raise InputError(
+            f"{SIONNA_PATHS}: were solved at {solved / 1e9:g} GHz, must be at {frequency / 1e9:g} GHz, the carrier of "
+            "the study or of the argument frequency; set scene.frequency and solve again"
+        )
 
 
 def read_sionna_paths(paths: Any) -> SourceTable:
