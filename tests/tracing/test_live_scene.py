@@ -69,6 +69,9 @@ def test_sionna_and_the_study_agree_and_materials_are_set(study: cb.Study, measu
     apply_materials(scene, planted)
     np.testing.assert_allclose(path_loss_db(scene), measured, atol=1e-4)
     np.testing.assert_allclose(cb.path_loss(paths, planted).reshape(measured.shape), measured, atol=0.001)
+    scene.frequency = scene.frequency
+    for name, value in PLANTED.items():
+        assert np.array(scene.radio_materials[name].relative_permittivity).item() == pytest.approx(value)
     with pytest.raises(InputError, match="no material 'walls'"):
         apply_materials(scene, {"walls": planted["marble"]})
 
@@ -145,6 +148,61 @@ def test_values_may_be_named_missing_or_received_power(measured: np.ndarray, tmp
     assert list(study.parameters) == [f"{name}.relative_permittivity" for name in study.materials]
 
 
+def missing_of(form: str, measured: np.ndarray) -> object:
+    """Measured values of which the last one of the first transmitter is missing."""
+    last = np.zeros(measured.shape, dtype=bool)
+    last[0, -1] = True
+    frame = pd.DataFrame(measured, ["tx0", "tx1"], [f"rx{number}" for number in range(measured.shape[1])])
+    return {
+        "masked": np.ma.masked_array(np.where(last, 40.0, measured), mask=last),
+        "pd.NA in a table": frame.astype("Float64").mask(last),
+        "pd.NA in a list": np.where(last, pd.NA, measured.astype(object)).tolist(),
+        "None": np.where(last, None, measured.astype(object)),
+    }[form]
+
+
+@pytest.mark.parametrize("form", ["masked", "pd.NA in a table", "pd.NA in a list", "None"])
+def test_masked_and_missing_values_are_not_measured(measured: np.ndarray, tmp_path: Path, form: str) -> None:
+    links = cb.Study.from_sionna(street(), missing_of(form, measured), tmp_path).measurements()
+    np.testing.assert_allclose(links.path_loss_db, np.delete(measured.ravel(), measured.shape[1] - 1))
+
+
+@pytest.mark.parametrize(
+    "pattern", [rt.BackscatteringPattern(alpha_r=4, alpha_i=3, lambda_=0.7), rt.DirectivePattern(alpha_r=5)]
+)
+def test_scattering_patterns_are_those_of_the_scene(
+    measured: np.ndarray, tmp_path: Path, pattern: rt.BackscatteringPattern
+) -> None:
+    scene = street()
+    scene.radio_materials["marble"].scattering_coefficient = 0.3
+    scene.radio_materials["marble"].scattering_pattern = pattern
+    material = cb.Study.from_sionna(scene, measured, tmp_path).opened().scene.materials["marble"]
+    assert f"{material.scattering_pattern.capitalize()}Pattern" == type(pattern).__name__
+    assert material.alpha_r == pattern.alpha_r
+    if isinstance(pattern, rt.DirectivePattern):
+        return
+    assert material.alpha_i == 3
+    assert material.lambda_ == pytest.approx(0.7)
+
+
+def test_what_is_not_a_matrix_of_path_loss_is_refused(measured: np.ndarray, tmp_path: Path) -> None:
+    def refused(values: object, message: str, **sections: dict) -> None:
+        with pytest.raises(InputError, match=message):
+            cb.Study.from_sionna(street(), values, tmp_path, **sections)
+
+    first = np.zeros(measured.shape, dtype=bool)
+    first[0, 0] = True
+    frame = pd.DataFrame(measured, ["tx0", "tx1"], [f"rx{number}" for number in range(measured.shape[1])])
+    refused(np.where(first, np.inf, measured), "tx0, rx0: inf, must be a finite real number")
+    refused(measured + 1j, r"tx0, rx0: \(.*j\), must be a finite real number")
+    refused(frame.astype(object).mask(first, "-"), "tx0, rx0: '-', must be")
+    refused("measured.csv", "read a file first")
+    refused([[1.0, 2.0], [3.0]], "not a matrix of numbers")
+    refused(frame.iloc[[0, 0]], "row 'tx0' is repeated; give one row for each transmitter")
+    refused(frame.iloc[:, [2, 2]], "column 'rx2' is repeated")
+    refused(measured, "set scene.frequency there", scene={"frequency": 28e9})
+
+
 def test_what_a_study_cannot_state_is_refused(measured: np.ndarray, tmp_path: Path) -> None:
     def refused(scene: object, message: str, values: object = measured) -> None:
         with pytest.raises(InputError, match=message):
@@ -152,7 +210,7 @@ def test_what_a_study_cannot_state_is_refused(measured: np.ndarray, tmp_path: Pa
 
     refused("street", "must be a scene of sionna.rt")
     refused(street(), r"shape \(8, 2\), must be \(2, 8\)", measured.T)
-    refused(street(), "column 'r' is no receiver", pd.DataFrame(measured[:, :1], ["tx0", "tx1"], ["r"]))
+    refused(street(), "column 'r' is not a receiver", pd.DataFrame(measured[:, :1], ["tx0", "tx1"], ["r"]))
     scene = street()
     scene.tx_array = rt.PlanarArray(num_rows=2, num_cols=1, pattern="iso", polarization="V")
     refused(scene, "has 2 elements")

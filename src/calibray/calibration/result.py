@@ -187,6 +187,8 @@ class Result(Record):
     def apply(self, scene: object) -> None:
         """Set the calibrated materials in a `sionna.rt.Scene` in memory, at the study's carrier.
 
+        Their constants then stay when `scene.frequency` is set, although ITU materials otherwise change with it.
+
         Raises:
             InputError: The object is not a scene of Sionna RT, or the scene lacks a material.
         """

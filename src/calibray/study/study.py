@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from numbers import Real
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any, Final, final
@@ -32,6 +33,7 @@ from calibray.study.model import StudyModel
 from calibray.study.row_steps import position_steps, row_track, study_links
 from calibray.study.setup import Setup
 from calibray.study.toml_file import study_text
+from calibray.support.messages import first_line, shortened
 from calibray.support.output_files import check_folder, write_text
 from calibray.support.output_tables import write_table
 from calibray.tables import Column, Table, hertz, numbers, short_html, short_text
@@ -65,7 +67,7 @@ class Study(StudyModel):
 
     @classmethod
     def from_sionna(
-        cls, scene: object, measured: Any, folder: str | Path | None = None, **sections: Mapping[str, Any]
+        cls, scene: object, /, measured: Any, folder: str | Path | None = None, **sections: Mapping[str, Any]
     ) -> Study:
         """A study of a Sionna RT scene in memory, with its carrier, transmitters, receivers, arrays and materials.
 
@@ -73,6 +75,7 @@ class Study(StudyModel):
             scene: The `sionna.rt.Scene`.
             measured: Path loss [tx, rx], [dB], in the order of the scene's transmitters and receivers, with NaN where
                 nothing was measured; or a DataFrame with names of transmitters as rows and of receivers as columns.
+                Masked values and pd.NA count as NaN.
             folder: Folder to write the scene, the links and `study.toml` into, for `Study.load`; a temporary folder if
                 None.
             **sections: Sections of the study file in place of the defaults, such as ``trace={"max_depth": 5}`` or
@@ -198,6 +201,8 @@ def _write_live_study(
     """
     from calibray.tracing.sionna.live_scene import LiveScene
 
+    if "scene" in sections:
+        raise InputError("scene: is the scene in memory, which states the carrier; set scene.frequency there")
     live = LiveScene.of(scene)
     links = dict(sections.get("links", {}))
     table = _links(live, measured)
@@ -237,7 +242,7 @@ def _links(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> pd.DataFrame:
     """One row for each measured value, with the ends by name."""
     values = _matrix(live, measured)
     tx, rx = (np.array(list(ends.values())) for ends in (live.tx, live.rx))
-    row, column = np.nonzero(np.isfinite(values))
+    row, column = np.nonzero(~np.isnan(values))
     if not len(row):
         raise InputError(
             "measured: no value is a number; give one for each transmitter and receiver, NaN if none"
@@ -255,16 +260,37 @@ def _matrix(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> NDArray[np.f
     """Measured values [tx, rx] in the order of the scene; NaN where nothing was measured."""
     if isinstance(measured, pd.DataFrame):
         for what, labels, names in (("row", measured.index, live.tx), ("column", measured.columns, live.rx)):
+            kind = "transmitter" if what == "row" else "receiver"
+            if labels.has_duplicates:
+                label = str(labels[labels.duplicated()][0])
+                raise InputError(f"measured: {what} {label!r} is repeated; give one {what} for each {kind}")
             if unknown := [str(label) for label in labels if label not in names]:
-                kind = "transmitter" if what == "row" else "receiver"
                 raise InputError(
                     f"measured: {what} {unknown[0]!r} is not a {kind} of the scene; rows are transmitters, "
                     "columns receivers"
                 )
-        measured = measured.reindex(index=list(live.tx), columns=list(live.rx))
-    values = np.asarray(measured, dtype=float)
-    if values.shape != (shape := (len(live.tx), len(live.rx))):
+        measured = measured.reindex(index=list(live.tx), columns=list(live.rx)).to_numpy()
+    elif isinstance(measured, str | Path):
         raise InputError(
-            f"measured: shape {values.shape}, must be {shape}: a row for each transmitter, a column for each receiver"
+            f"measured: is the text {shortened(str(measured))!r}, must be values; read a file first, for instance by "
+            "pandas.read_csv(file, index_col=0)"
         )
+    try:
+        given = np.ma.asanyarray(measured)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"measured: is not a matrix of numbers ({first_line(error)})") from None
+    if given.shape != (shape := (len(live.tx), len(live.rx))):
+        raise InputError(
+            f"measured: shape {given.shape}, must be {shape}: a row for each transmitter, a column for each receiver"
+        )
+    present = ~(np.ma.getmaskarray(given) | pd.isna(np.ma.getdata(given)))
+    values, stated = np.full(shape, np.nan), np.ma.getdata(given).astype(object)
+    for tx, rx in np.argwhere(present).tolist():
+        value = stated[tx, rx]
+        if not (isinstance(value, Real) and np.isfinite(float(value))):
+            raise InputError(
+                f"measured: {list(live.tx)[tx]}, {list(live.rx)[rx]}: {shortened(repr(value))}, must be a finite real "
+                "number in decibels, or NaN where nothing was measured"
+            )
+        values[tx, rx] = value
     return values

@@ -85,6 +85,9 @@ class LiveScene:
 def apply_materials(scene: object, materials: Mapping[str, Material]) -> None:
     """Set the constants of a scene's materials by name.
 
+    They hold at one carrier. ITU materials no longer compute theirs when `scene.frequency` is set, which would replace
+    the calibrated ones.
+
     Raises:
         InputError: The object is not a scene of Sionna RT, or the scene lacks a material; nothing is set then.
     """
@@ -97,6 +100,7 @@ def apply_materials(scene: object, materials: Mapping[str, Material]) -> None:
             )
     for name, material in materials.items():
         target = live.radio_materials[name]
+        target.frequency_update_callback = None
         for constant in SCALAR_CONSTANTS:
             setattr(target, constant, getattr(material, constant))
         target.scattering_pattern = scattering_pattern(material)
@@ -137,7 +141,7 @@ def _material(material: Any) -> Material:
         )
     pattern = material.scattering_pattern
     lobes = {
-        name: float(getattr(pattern, name))
+        name: _number(getattr(pattern, name))
         for name in ("alpha_r", "alpha_i", "lambda_")
         if hasattr(pattern, name)
     }
