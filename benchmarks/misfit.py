@@ -98,7 +98,7 @@ def intervals(planted: Problem, trail: Trail, point: np.ndarray) -> dict[str, An
         widths.append(sum(high - low for low, high in pieces) / (upper[k] - lower[k]))
     truth = parameters.from_search(point)
     held = [each.contains(v) for each, v in zip(assessed.intervals.values(), truth, strict=True)]
-    own = directions_remark(planted, trail.best) or region_remark(planted, trail.best)
+    own = directions_remark(planted, trail.best) or region_remark(planted, trail)
     remarks = (*assessed.remarks, *own)
     return {
         "names": parameters.names,

@@ -14,6 +14,7 @@ import two_ray
 from calibray.calibration.link_diagnostics import leverage, region_remark
 from calibray.engines import Replay
 from calibray.fitting.problem import Problem
+from calibray.fitting.search import Trail
 from calibray.result.verdict import RemarkKind
 from calibray.result.wording import remark_text
 from calibray.scenes.regions import Region
@@ -57,7 +58,8 @@ def test_a_loss_where_the_scene_has_nothing_is_a_remark_only_if_planted(tmp_path
 
     def remarks(loss_db_per_m: float) -> tuple:
         loss = engine.path_loss(truth[None])[0] + random.normal(0, 3, 200) + loss_db_per_m * length
-        return region_remark(replace(problem, objective=replace(problem.objective, measured=loss)), truth)
+        trail = Trail(best=truth, best_modelled=engine.path_loss(truth[None])[0])
+        return region_remark(replace(problem, objective=replace(problem.objective, measured=loss)), trail)
 
     assert remarks(0.0) == ()
     (remark,) = remarks(0.8)

@@ -330,6 +330,21 @@ def test_antennas_of_a_study_are_those_of_the_table(tmp_path: Path) -> None:
         assert (setup.known_antennas is not None) == expected
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"frequency": "3.5e9"}, "frequency = '3.5e9': must be a positive number of Hz"),
+        ({"antennas": ("iso", "iso")}, "must be two Antenna"),
+        ({"tx_power_dbm": 30.0}, "is for files of Wireless InSite"),
+    ],
+)
+def test_arguments_that_do_not_go_with_a_table_are_refused(
+    yard: Tracer, rows: pd.DataFrame, arguments: dict, message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        cb.read_rays(rows, yard.scene, **{"frequency": FREQUENCY, **arguments})
+
+
 def test_a_table_goes_with_one_carrier(tmp_path: Path) -> None:
     study = two_ray.study(tmp_path, links=8)
     content = study.content()

@@ -129,7 +129,7 @@ def calibrate(
         validation = validate_problem(problem, progress=progress, known_minima=starts)
     on_links = unreached_remark(problem, progress) if can_trace and exporting is None else ()
     # A wrong direction looks like a loss on one side of a transmitter.
-    on_links += directions_remark(problem, trail.best) or region_remark(problem, trail.best)
+    on_links += directions_remark(problem, trail.best) or region_remark(problem, trail)
     run = Run(problem, trail, gap_db, cheap, enclosed, (*of_rays, *on_links), timing)
     result = make_result(run, assessment, validation)
     if out is not None:

@@ -14,6 +14,7 @@ from calibray.engines.kinds.replay import replay
 from calibray.engines.replay import Replay
 from calibray.fields import path_gains
 from calibray.fitting.problem import Evaluation, Problem
+from calibray.fitting.search import Trail
 from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.paths import Kind, Paths
@@ -203,8 +204,8 @@ class Direction(NamedTuple):
     downtilt_error: float
 
 
-def region_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Remark, ...]:
-    """Test whether the loss of a region, such as trees without a map, would explain residuals at calibrated values [d].
+def region_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
+    """Test whether the loss of a region, such as trees without a map, would explain the residuals of a calibration.
 
     Positions of the links must be known. Residuals that are larger out of sight are explained by that first.
     """
@@ -212,7 +213,7 @@ def region_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Remark, 
     if not isinstance(links, Measurements) or not problem.differentiable:
         return ()
     counted = np.flatnonzero(problem.objective.weight > 0)
-    residual_db = problem.evaluate(problem.parameters.to_search(best)[None]).residuals[0, :count]
+    residual_db = problem.residuals(trail.best[None], trail.best_modelled[None])[0, :count]
     known = [links.table.numbers(OUT_OF_SIGHT)[counted]] if OUT_OF_SIGHT in links.table.frame else []
     region = missing_region(links.tx[counted], links.rx[counted], -residual_db, known)
     if region is None or not region.significant:

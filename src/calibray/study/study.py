@@ -220,7 +220,10 @@ def _write_live_study(
             for name, item in live.materials.items()
         },
         "antennas": {
-            end: asdict(antenna) | {"orientation": list(antenna.orientation)} for end, antenna in antennas
+            **{
+                end: asdict(antenna) | {"orientation": list(antenna.orientation)} for end, antenna in antennas
+            },
+            "known": True,
         },
         "parameters": _parameters(live.materials),
         **sections,

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from numbers import Real
 from pathlib import Path
 from typing import Any, overload
 
+import numpy as np
 import pandas as pd
 
 from calibray.engines.rays.compile import RaySetting, compile_rays, rays_of
-from calibray.engines.rays.other_programs import ray_rows
+from calibray.engines.rays.other_programs import check_carrier, ray_rows
 from calibray.engines.rays.table import RayTable, write_ray_file
 from calibray.errors import InputError
 from calibray.materials import Material
@@ -153,6 +155,16 @@ def read_rays(
         >>> study = Study.load(demo_study_path())
         >>> read_rays("rays.csv", study)  # doctest: +SKIP
     """
+    if frequency is not None and not (isinstance(frequency, Real) and 0 < frequency < np.inf):
+        raise InputError(
+            f"read_rays: frequency = {frequency!r}: must be a positive number of Hz, such as 3.5e9"
+        )
+    if antennas is not None and not (
+        len(antennas) == 2 and all(isinstance(each, Antenna) for each in antennas)
+    ):
+        raise InputError(
+            f"read_rays: antennas = {antennas!r}: must be two Antenna, for transmitter and receiver"
+        )
     rows = ray_rows(rays, tx_power_dbm)
     if isinstance(scene, Study | Setup):
         if frequency is not None:
@@ -167,6 +179,7 @@ def read_rays(
     else:
         scene = scene if isinstance(scene, Scene) else read_scene(scene, frequency)
         setting = RaySetting(scene, frequency, antennas)
+    check_carrier(rays, setting.frequency)
     return compile_rays(RayTable.of(rows, axes), setting)
 
 

@@ -73,6 +73,12 @@ def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
     """
     if tx_power_dbm is not None and not (isinstance(tx_power_dbm, Real) and np.isfinite(tx_power_dbm)):
         raise InputError(f"tx_power_dbm = {tx_power_dbm!r}: must be a finite number, in dBm")
+    insite = isinstance(rays, str | Path) and Path(rays).suffix.lower() == ".p2m"
+    if tx_power_dbm is not None and not insite:
+        raise InputError(
+            f"tx_power_dbm = {tx_power_dbm:g}: is for files of Wireless InSite (.p2m); in a table, subtract it from "
+            "the received power, so that power_db is the path gain"
+        )
     if isinstance(rays, pd.DataFrame):
         return SourceTable(rays)
     if isinstance(rays, Mapping):
@@ -87,7 +93,7 @@ def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
             "file or folder, or the Paths of Sionna RT"
         )
     path = Path(rays)
-    if path.suffix.lower() == ".p2m" and path.is_file():
+    if insite and path.is_file():
         return read_insite(path, tx_power_dbm)
     if not path.is_dir():
         return read_ray_file(path)
