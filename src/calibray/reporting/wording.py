@@ -87,9 +87,12 @@ def scene_alone_text(record: Record) -> str:
             f"calibrated materials; its path loss differs from the predictions by {rms_db:.2f} dB (RMS over "
             f"{len(difference)} links).{near}"
         )
+    group = links["group"].to_numpy()[both] if "group" in links else np.zeros(len(difference))
+    means = pd.Series(difference).groupby(group, dropna=False).transform("mean").to_numpy()
+    spread_db = float(np.sqrt(np.mean((difference - means) ** 2)))
     return (
-        f"The exported scene alone differs from the predictions by {rms_db:.2f} dB (RMS over {len(difference)} links): "
-        f"a scene cannot contain {cause}.{near}"
+        f"The exported scene alone differs from the predictions by {rms_db:.2f} dB (RMS over {len(difference)} links; "
+        f"{spread_db:.2f} dB without the mean of each group): a scene cannot contain {cause}.{near}"
     )
 
 
