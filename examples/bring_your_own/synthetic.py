@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from calibray import trace
 from calibray.fields import path_gains
-from calibray.tracing.default_tracer import trace
 
 ANTENNA = {"pattern": "iso", "polarization": "V"}
 

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
+import runpy
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from calibray import trace
 from calibray.fields import path_loss
 from calibray.measurements import Averaging, LinkColumns, Preparation, measured_links, read_table
 from calibray.scenes.authoring import make_scene, read_openstreetmap
 from calibray.scenes.checks import building_outlines, move_outside
+from small_scenes import write_scene
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "bring_your_own"
 
@@ -78,3 +81,16 @@ def test_planted_walls_and_phones_are_found_from_a_map_and_a_log(tmp_path):
     for name, offset in offsets.items():
         cell, device = name.split()
         assert abs(offset - truth["eirp_dbm"][cell] - truth["phone_db"][device]) < 1.0
+
+
+def test_the_makers_amplitudes_are_those_of_the_planted_materials(tmp_path):
+    """A planted perfect conductor reflects everything: the amplitudes decrease with the lengths of the paths."""
+    corners = [(-50.0, -50.0, 0.0), (50.0, -50.0, 0.0), (50.0, 50.0, 0.0), (-50.0, 50.0, 0.0)]
+    scene, mast = write_scene(tmp_path, {"ground": [corners]}), np.array([0.0, 0.0, 10.0])
+    places = np.array([[20.0, 0.0, 1.5], [-30.0, 5.0, 1.5]])
+    amplitudes = runpy.run_path(str(EXAMPLE / "synthetic.py"))["amplitudes"]
+    planted = {"stone": {"conductivity": 1e9}}
+    (gains,) = amplitudes(scene, [mast], places, 3.6e9, planted, max_depth=1, samples=2000)
+    for place, found in zip(places, gains, strict=True):
+        length = np.linalg.norm([place - mast, place * [1, 1, -1] - mast], axis=1)
+        assert sorted(found) == pytest.approx(sorted(299792458 / 3.6e9 / (4 * np.pi * length)), rel=1e-3)
