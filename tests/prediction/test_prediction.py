@@ -15,6 +15,8 @@ import planted
 from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.cli.app import app
+from calibray.coordinates import Frame
+from calibray.errors import InputError
 from calibray.prediction.corrections import calibration_residuals, krige_residuals
 from calibray.prediction.suggestion import suggest
 from calibray.result.held_out import BlockErrors, ResidualField
@@ -101,6 +103,37 @@ def test_the_command_adds_columns_and_warns_of_implausible_positions(received, t
     assert predictions.remark.tolist() == ["", "receiver under the ground", "receiver beyond the scene"]
     assert "receiver under the ground: 1 of 3 links, row 3" in run.stderr
     assert "receiver beyond the scene: 1 of 3 links, row 4" in run.stderr
+
+
+def test_places_far_from_the_scene_are_refused(tmp_path):
+    """The table swaps longitude and latitude; one place among others only has a remark."""
+    frame, table = Frame.local(10.0, 50.0), planted.campaign(noise_db=0.3)
+    degrees = frame.to_geographic(table[["rx_x", "rx_y", "rx_z"]].to_numpy())
+    table = table.assign(lon=degrees[:, 0], lat=degrees[:, 1])[["lon", "lat", "path_loss_db"]]
+    links = {
+        "file": "links.csv", "tx": [10.0, 50.0, 3.0], "rx": ["lon", "lat", 1.5], "value": "path_loss_db",
+        "position": "geographic",
+    }  # fmt: skip
+    scene = {"file": "sionna:simple_street_canyon", "frequency": 3.5e9, "origin": [10.0, 50.0]}
+    method = {"name": "auto", "options": {"starts": 16}}
+    study = planted.study(tmp_path, table, scene=scene, links=links, method=method)
+    result = calibrate(study, engine=planted.engine())
+    places = table[["lon", "lat"]].iloc[::3]
+    swapped = places.rename(columns={"lon": "lat", "lat": "lon"})
+    for refused in (result.predict, result.predict_interval, result.suggest):
+        with pytest.raises(InputError, match="check the order of longitude and latitude"):
+            refused(swapped)
+    assert len(suggest(result, places, 1)) == 1
+    far = planted.links().iloc[::3].assign(rx_x=1e6)
+    with pytest.raises(InputError, match="relative to the scene's origin"):
+        result.predict(far)
+    mixed = result.predict_interval(pd.concat([places, places.head(1) + 0.1]))
+    assert mixed.remark.tolist() == [*[""] * len(places), "receiver beyond the scene"]
+    result.save(tmp_path / "out")
+    swapped.to_csv(tmp_path / "swapped.csv", index=False)
+    run = CliRunner().invoke(app, ["predict", str(tmp_path / "out"), str(tmp_path / "swapped.csv")])
+    assert run.exit_code == 2
+    assert "swapped.csv: all receivers are more than" in run.stderr
 
 
 def test_points_are_located():

@@ -13,8 +13,16 @@ import pandas as pd
 from calibray.engines.cluster.chunks import CHUNK_LINKS, for_each_chunk, select_links, stated_chunk_size
 from calibray.engines.cluster.workers import InProcess, Workers
 from calibray.measurements import Measurements, PiecedTable
-from calibray.prediction.predict import as_links, check_groups, interval, open_for_links, position_remarks
+from calibray.prediction.predict import (
+    as_links,
+    check_groups,
+    interval,
+    open_for_links,
+    position_remarks,
+    refuse_far_links,
+)
 from calibray.result.record import Record
+from calibray.scenes import read_triangles
 from calibray.study import Setup
 from calibray.support.messages import duration
 from calibray.support.progress import Progress, with_total
@@ -100,11 +108,13 @@ def predict_batches(
         InputError: See `predict` and `predict_interval`.
         EngineError: The paths do not fit into memory, or workers fail repeatedly.
     """
-    setup, done = None, 0
+    setup, triangles, done = None, None, 0
     for rows in table.pieces(BATCH):
         links = as_links(result, rows)
-        if setup is None:
+        if setup is None or triangles is None:
             setup = open_for_links(result, links, allow_changed_inputs=allow_changed_inputs)
+            triangles = read_triangles(setup.scene)
+        refuse_far_links(result, links, triangles)
         setup.parameters.check_carriers([frequency for frequency, _ in links.carriers])
         if level is None:
             check_groups(result, links)

@@ -32,6 +32,7 @@ from calibray.scenes.checks.positions import INSIDE, locate
 from calibray.scenes.obstruction import CLUSTER, OUT_OF_SIGHT
 from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Setup
+from calibray.study.link_checks import refuse_far_receivers
 from calibray.support.progress import Progress
 from calibray.validation.models import without_scene
 
@@ -52,10 +53,11 @@ def predict(
     """Predict path loss at new links; see `Result.predict`.
 
     Raises:
-        InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of the
-            scene or an antenna has changed since the calibration.
+        InputError: A column is missing, a position cannot be used, all receivers are far from the scene, a group has no
+            calibrated offset, or a file of the scene or an antenna has changed since the calibration.
     """
     setup = open_for_links(result, as_links(result, links), allow_changed_inputs=allow_changed_inputs)
+    refuse_far_links(result, setup.links, read_triangles(setup.scene))
     return interval(result, setup, None, progress)["path_loss_db"].to_numpy()
 
 
@@ -77,6 +79,7 @@ def predict_interval(
             the calibration had too few links to estimate the size of residuals.
     """
     setup = open_for_links(result, as_links(result, links), allow_changed_inputs=allow_changed_inputs)
+    refuse_far_links(result, setup.links, read_triangles(setup.scene))
     table = interval(result, setup, level, progress)
     measured_quantity = as_measured(result.study, setup.links, table)
     return table.assign(**measured_quantity, remark=position_remarks(result, setup))
@@ -104,6 +107,22 @@ def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs:
     setup = Setup.open(result.study, links=links).placed_at(result.parameters, NEIGHBOURS)
     check_inputs(result, setup, allow_changed_inputs)
     return setup
+
+
+def refuse_far_links(result: Record, links: Measurements, triangles: Triangles) -> None:
+    """Refuse links whose receivers are all far from a scene, given its triangles.
+
+    A scene whose triangles are not all known has no known size.
+
+    Raises:
+        InputError: All receivers are far.
+    """
+    if triangles.left_out or not len(triangles.face):
+        return
+    corners, section = triangles.corners, result.study.links
+    bounds = np.concatenate([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))])
+    is_geographic = section.position == "geographic" and any(name in links.frame for name in section.rx)
+    refuse_far_receivers(bounds, links.rx, links.source, is_geographic)
 
 
 def traced_materials(result: Record, materials: dict[str, Material] | None) -> dict[str, Material] | None:

@@ -26,8 +26,15 @@ from calibray.prediction.experiment_design import (
     initial_range_probability,
 )
 from calibray.prediction.observables import Worth, worth_measuring
-from calibray.prediction.predict import as_links, check_inputs, traced_materials, with_constants
+from calibray.prediction.predict import (
+    as_links,
+    check_inputs,
+    refuse_far_links,
+    traced_materials,
+    with_constants,
+)
 from calibray.result.record import Record
+from calibray.scenes import read_triangles
 from calibray.study import Setup
 from calibray.support.messages import percent
 from calibray.support.progress import Progress
@@ -97,6 +104,7 @@ def suggest(
     # Both share one loaded tracer.
     setup = calibrated.at(links)
     check_inputs(result, setup, allow_changed_inputs)
+    refuse_far_links(result, links, read_triangles(setup.scene))
     announce(result, len(links), "candidates")
     model = _ReplayedDraws(result, with_constants(result, calibrated), progress)
     setup = with_constants(result, setup)

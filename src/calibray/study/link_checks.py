@@ -95,7 +95,7 @@ def _positions(
     overhead: SceneSurfaces, links: Measurements, is_geographic: bool
 ) -> Iterator[tuple[str, str]]:
     tx, rx = np.unique(links.tx, axis=0), np.unique(links.rx, axis=0)
-    _refuse_far_links(overhead, rx, links.source, is_geographic)
+    refuse_far_receivers(overhead.bounds, rx, links.source, is_geographic)
     for name, points in (("receivers", rx), ("transmitters", tx)):
         below = overhead.underground(points) | (points[:, 2] < overhead.bounds[2])
         if below.any():
@@ -132,14 +132,26 @@ def _positions(
         yield problem, "check position and height: an antenna on a roof is above it"
 
 
-def _refuse_far_links(
-    overhead: SceneSurfaces, rx: NDArray[np.float64], source: str, is_geographic: bool
+def refuse_far_receivers(
+    bounds: NDArray[np.float64], rx: NDArray[np.float64], source: str, is_geographic: bool
 ) -> None:
-    size = max(float(np.max(overhead.bounds[3:5] - overhead.bounds[:2])), 100.0)
-    if overhead.outside(rx, FAR * size).all():
+    """Refuse receivers that are all farther from the scene than `FAR` times its size.
+
+    Args:
+        bounds: West, south, bottom, east, north and top of the scene [6], [m].
+        rx: Positions of the receivers [n, 3], [m].
+        source: The table that contains them.
+        is_geographic: Whether it contains degrees.
+
+    Raises:
+        InputError: All receivers are that far.
+    """
+    low, high = bounds[:2], bounds[3:5]
+    furthest = FAR * max(float(np.max(high - low)), 100.0)
+    if ((rx[:, :2] < low - furthest) | (rx[:, :2] > high + furthest)).any(axis=1).all():
         centre = rx.mean(axis=0)
         raise InputError(
-            f"{source}: all receivers are more than {FAR * size:.0f} m from the scene, near ({centre[0]:.0f}, "
+            f"{source}: all receivers are more than {furthest:.0f} m from the scene, near ({centre[0]:.0f}, "
             f"{centre[1]:.0f}) m; "
             + (
                 "check the order of longitude and latitude, and that the scene is at this place"
