@@ -333,3 +333,13 @@ def test_values_are_judged_without_the_codes_of_missing_ones():
     guess = column_names.find_value(table)
     assert (guess.column, guess.reason) == ("rssi", "its name, and values about -76")
     assert np.isfinite(table.frame["rssi"]).all()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["device", "Gerät", "Endgeraet", "Mobiltelefon", "Empfänger", "teléfono", "Dispositivo", "appareil", "Téléphone",
+     "ricevitore", "Cellulare"],
+)  # fmt: skip
+def test_columns_of_devices_are_found_in_five_languages(name):
+    frame = pd.DataFrame({"Zelle": ["a", "b"], name: ["S21", "Pixel"], "Straße": ["Nord", "Süd"]})
+    assert transmitter_columns.find_devices(frame) == [name]

@@ -85,6 +85,23 @@ def test_a_phones_log_becomes_a_study_that_reads(scene, tmp_path):
     assert (status, "already exists" in err, file.read_text()) == (2, True, text)
 
 
+@pytest.mark.parametrize(
+    ("column", "offsets", "reason"),
+    [
+        ("Gerät", "Zelle, Gerät", "each transmitter and each receiver has its own gain"),
+        ("Straße", "Zelle", "no column of devices was found; each transmitter has its own gain"),
+    ],
+)
+def test_the_reason_of_the_offsets_says_which_columns_were_found(scene, tmp_path, column, offsets, reason):
+    places = {"x": [5.0, 9.0, 5.0, 9.0], "y": 15.0, "RSRP [dBm]": [-90.1, -91.2, -92.3, -93.4]}
+    file = table(tmp_path, **places, Zelle=["a", "a", "b", "b"], **{column: ["S21", "Pixel", "S21", "Pixel"]})
+    cells = tmp_path / "cells.csv"
+    pd.DataFrame({"Zelle": ["a", "b"], "x": [0.0, 10.0], "y": 20.0, "z": 10.0}).to_csv(cells, index=False)
+    found = draft(scene, file, tmp_path / "study.toml", cells, 3.5e9)
+    (offset,) = (each for each in found.assumptions if each.what == "offset.per")
+    assert (offset.value, offset.reason) == (offsets, reason)
+
+
 def test_metres_and_a_distance_tell_where_the_transmitter_stands(scene, tmp_path):
     rx = np.array([(x, y, 1.6) for x in range(-40, 16, 8) for y in (-20.0, 15.0)])
     far = np.sqrt(((rx - [0, 0, 12.0]) ** 2).sum(axis=1))

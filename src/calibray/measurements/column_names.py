@@ -18,14 +18,19 @@ from calibray.measurements.selection import without_codes
 from calibray.measurements.source_table import SourceTable
 from calibray.support.messages import shortened
 
+_DEVICES: Final = (
+    "(tele)?phone|smartphone|terminale?|empf(a|ae)nger|(end|mess)?ger(a|ae)t|(mobil)?telefon|handy|receptor|"
+    "dispositivo|telefono|movil|celular|recepteur|appareil|ricevitore|apparecchio|cellulare"
+)
+"""Receiving devices in English, German, Spanish, French and Italian."""
+
 PATTERNS: Final = {
     # What a column may hold, and the regular expression that a whole word of its name matches.
     "transmitter": r"tx|transmitter|bs|bts|site|cell|cell_?(id|name)|[en]?ci|eci|ap|bssid|[ge]nb|[ge]?nodeb|base|"
-    r"basestation|anchor|beacon|gateway|gw|sender|basisstation|(funk)?zelle|celda|cellule|cella|celula|emisor|emetteur|"
-    r"estacion|station",
-    "receiver": r"rx|receiver|ue|phone|mobile|device|empf(a|ae)nger|receptor|recepteur|ricevitore|movil|mobil",
-    "receiving device": r"rx|receiver|ue|phone|device|handset|eui|imei|(phone|user|device|dev)_?id|empf(a|ae)nger|"
-    r"movil",
+    r"basestation|anchor|beacon|gateway|gw|sender|basisstation|((mobil)?funk)?zelle|celda|cellule|cella|celula|emisor|"
+    r"transmisor|emetteur|trasmettitore|estacion|station|stazione",
+    "receiver": rf"rx|receiver|ue|phone|mobile|device|mobil|{_DEVICES}",
+    "receiving device": rf"rx|receiver|ue|phone|device|handset|eui|imei|(phone|user|device|dev)_?id|{_DEVICES}",
     "name of a transmitter": r"id|name|mac|address|bssid",
     "x": r"x|east|easting|pos_?x|x_?pos|ost(wert)?|rechtswert|este",
     "y": r"y|north|northing|pos_?y|y_?pos|nord(wert)?|hochwert|norte",

@@ -95,10 +95,13 @@ def _offset_groups(draft: LinksDraft, value: ValueColumn) -> list[str]:
         draft.assume("offset", "one for all links", "the values include cables and unknown antenna gains")
         return []
     name = draft.section.get("transmitter")
-    groups = [*([name] if name else []), *transmitter_columns.find_devices(draft.table.frame)]
-    groups = list(dict.fromkeys(groups))
-    reason = "each transmitter and each receiver has its own gain"
-    draft.assume("offset.per", ", ".join(groups) or "one", reason)
+    devices = transmitter_columns.find_devices(draft.table.frame)
+    ends = [*(["each transmitter"] if name else []), *(["each receiver"] if devices else [])]
+    reasons = [] if devices else ["no column of devices was found"]
+    if ends:
+        reasons.append(f"{' and '.join(ends)} has its own gain")
+    groups = list(dict.fromkeys([*([name] if name else []), *devices]))
+    draft.assume("offset.per", ", ".join(groups) or "one", "; ".join(reasons))
     return groups
 
 
