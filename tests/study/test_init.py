@@ -22,7 +22,7 @@ from calibray.measurements import SourceTable, column_names
 from calibray.scenes.authoring import Footprints, Terrain, make_plan_scene, make_scene, read_plan
 from calibray.scenes.checks import SceneSurfaces
 from calibray.study import Study
-from calibray.study.draft import Draft, Given, schema_text
+from calibray.study.draft import Draft, Given, _share_at_lowest, schema_text
 from calibray.study.draft import draft as draft_study
 from calibray.study.link_checks import count_unknowns
 from calibray.study.toml_file import study_text
@@ -100,6 +100,34 @@ def test_the_reason_of_the_offsets_says_which_columns_were_found(scene, tmp_path
     found = draft(scene, file, tmp_path / "study.toml", cells, 3.5e9)
     (offset,) = (each for each in found.assumptions if each.what == "offset.per")
     assert (offset.value, offset.reason) == (offsets, reason)
+
+
+def test_values_that_the_receiver_clips_become_its_noise_floor(scene, tmp_path):
+    """A third of the powers of a walk are below the floor of the receiver; rounded powers without a floor have none."""
+    distance = np.geomspace(5.0, 300.0, 300)
+    power = -60 - 30 * np.log10(distance) + np.random.default_rng(5).normal(0.0, 6.0, 300)
+    floor = np.quantile(power, 0.33).round(1)
+    for rsrp, expected in ((np.maximum(power.round(1), floor), floor), (power.round(), None)):
+        file = table(tmp_path, x=distance - 150, y=-15.0, z=1.5, rsrp_dbm=rsrp)
+        found = draft(scene, file, tmp_path / "study.toml", frequency=3.5e9, tx=[-160.0, -15.0, 10.0])
+        assert found.study.links.noise_floor_dbm == expected
+        below = int((rsrp == floor).sum()) if expected else 0
+        assert found.study.measurements().prepared.get("at or below the noise floor, left out", 0) == below
+        reasons = {each.what: each.reason for each in found.assumptions}
+        stated = f"{below / 300:.0%} of the values equal the lowest one" if expected else None
+        assert reasons.get("links.noise_floor_dbm") == stated
+
+
+@pytest.mark.parametrize("step", [1.0, 2.0, 5.0])
+@pytest.mark.parametrize("count", [20, 300, 5000])
+def test_rounded_powers_are_not_taken_for_clipped_ones(step, count):
+    random = np.random.default_rng(count)
+    for powers in (
+        random.normal(-95, 8, count),
+        random.uniform(-120, -60, count),
+        -70 - random.gamma(2, 8, count),
+    ):
+        assert _share_at_lowest(pd.Series((powers / step).round() * step)) == 0.0
 
 
 def test_metres_and_a_distance_tell_where_the_transmitter_stands(scene, tmp_path):

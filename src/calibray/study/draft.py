@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import pandas as pd
 from scipy.constants import speed_of_light
 
 from calibray.errors import InputError
@@ -38,6 +39,12 @@ AVERAGING_WAVELENGTHS: Final = 40
 PLACE_SAMPLES: Final = 20
 """Median number of samples at one position above which samples are averaged by position: a stationary scan. The
 logarithm of the mean of 20 samples of Rayleigh fading is biased by 0.1 dB."""
+
+CLIPPED_SHARE: Final = 0.03
+"""Smallest share of the values that equal the lowest one if the receiver clips them."""
+
+CLIPPED_RATIO: Final = 10
+"""Smallest ratio of their number to the median number of values that equal another one."""
 
 
 def draft_links(scene: str, links: Path, target: Path, given: Given) -> LinksDraft:
@@ -100,7 +107,8 @@ def _offset_groups(draft: LinksDraft, value: ValueColumn) -> list[str]:
     reasons = [] if devices else ["no column of devices was found"]
     if ends:
         reasons.append(f"{' and '.join(ends)} has its own gain")
-    groups = list(dict.fromkeys([*([name] if name else []), *devices]))
+    groups = [*([name] if name else []), *devices]
+    groups = list(dict.fromkeys(groups))
     draft.assume("offset.per", ", ".join(groups) or "one", "; ".join(reasons))
     return groups
 
@@ -108,16 +116,32 @@ def _offset_groups(draft: LinksDraft, value: ValueColumn) -> list[str]:
 def _add_noise_floor(draft: LinksDraft, value: ValueColumn) -> None:
     raw = draft.table.frame[value.column]
     column = without_codes(raw)
-    if "wide" in draft.section or not column.isna().any():
+    if "wide" in draft.section:
         return
     missing = f"{int(column.isna().sum())} values are missing"
-    if value.quantity in ("rsrp", "received_power"):
-        floor = float(np.floor(column.min()))
-        draft.section["noise_floor_dbm"] = floor
-        draft.assume("links.noise_floor_dbm", f"{floor:g} dBm", f"{missing}, and none is lower")
-    elif raw.isna().any():
-        draft.add_filter(f"`{value.column}`.notna()")
-        draft.assume("links.where", draft.section["where"], missing)
+    if value.quantity not in ("rsrp", "received_power"):
+        if raw.isna().any():
+            draft.add_filter(f"`{value.column}`.notna()")
+            draft.assume("links.where", draft.section["where"], missing)
+        return
+    lowest, share = float(column.min()), _share_at_lowest(column)
+    if share > 0:
+        floor, reason = lowest, f"{share:.0%} of the values equal the lowest one"
+    elif column.isna().any():
+        floor, reason = float(np.floor(lowest)), f"{missing}, and none is lower"
+    else:
+        return
+    draft.section["noise_floor_dbm"] = floor
+    draft.assume("links.noise_floor_dbm", f"{floor:g} dBm", reason)
+
+
+def _share_at_lowest(values: pd.Series) -> float:
+    """Share of the values that equal the lowest one if a receiver states it for all weaker powers; otherwise 0."""
+    counts = values.value_counts().sort_index()
+    share = counts.iloc[0] / counts.sum()
+    if share >= CLIPPED_SHARE and counts.iloc[0] >= CLIPPED_RATIO * counts.iloc[1:].median():
+        return float(share)
+    return 0.0
 
 
 def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
