@@ -186,6 +186,29 @@ def test_impossible_suggestions_are_refused(result, table):
         cb.suggest(changed(result, files={name: "0" * 64 for name in result.provenance.files}), table)
 
 
+def test_candidates_below_the_noise_floor_are_left_out(folder, result, table, caplog):
+    measured = pd.read_csv(folder / "links.csv")
+    measured.assign(rsrp_dbm=-measured.path_loss_db).to_csv(folder / "powers.csv", index=False)
+    floor = -float(measured.path_loss_db.max()) - 0.5
+    content = study(folder).content()
+    content["links"] |= {
+        "file": "powers.csv",
+        "value": "rsrp_dbm",
+        "quantity": "rsrp",
+        "noise_floor_dbm": floor,
+    }
+    powers = changed(result, study=Study.from_content(content, folder / "powers.toml"))
+    every = cb.suggest(result, table, len(table))
+    weak = every.path_loss_db >= -floor
+    assert 0 < weak.sum() < len(table)
+    assert set(cb.suggest(powers, table, len(table)).row) == set(every.row[~weak])
+    assert f"{weak.sum()} of 25 candidates are left out" in caplog.text
+    with pytest.raises(
+        InputError, match=rf"all {weak.sum()} candidates .* not above links.noise_floor_dbm = "
+    ):
+        cb.suggest(powers, table[table.rx_x.isin(every.rx_x[weak])])
+
+
 def test_where_two_ranges_fit_the_first_suggestion_distinguishes_them(result, table):
     """Three of 128 draws lie in the second range; another point would narrow the first range more."""
     values = np.where(np.arange(128) % 50 == 1, 14.0, np.linspace(3.0, 9.0, 128))

@@ -16,7 +16,7 @@ from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, Term
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.measurements import Measurements
 from calibray.measurements.placement import POSITION_COLUMNS
-from calibray.prediction.batches import announce
+from calibray.prediction.batches import LOG, announce
 from calibray.prediction.experiment_design import (
     UNIFORM_INFORMATION,
     Beliefs,
@@ -25,7 +25,7 @@ from calibray.prediction.experiment_design import (
     choose_candidates,
     initial_range_probability,
 )
-from calibray.prediction.observables import Worth, worth_measuring
+from calibray.prediction.observables import Worth, as_measured, worth_measuring
 from calibray.prediction.predict import (
     as_links,
     check_inputs,
@@ -64,7 +64,8 @@ def suggest(
 
     Each candidate is traced and replayed for draws from the posterior. If the draws predict the same path loss, a
     measurement adds nothing; if they differ by more than the error of a link, it rules some of them out. Candidates are
-    chosen one after another, each as the best addition to the earlier ones.
+    chosen one after another, each as the best addition to the earlier ones. Candidates whose mean predicted power is
+    not above the study's noise floor are left out; a warning in the log counts them.
 
     Args:
         result: The calibration, on the engine "replay" or "retrace", with draws from the posterior.
@@ -84,7 +85,7 @@ def suggest(
 
     Raises:
         InputError: `Result.predict` would refuse the input, except for unknown groups; the calibration has no draws; or
-            no candidate has a path.
+            no candidate has a path and a predicted power above the study's noise floor.
     """
     if count < 1:
         raise InputError(f"count = {count}: must be at least 1")
@@ -114,6 +115,7 @@ def suggest(
         raise InputError(
             f"{links.source}: none of {len(links)} candidates has a path; choose other positions"
         )
+    reached = _received(result, links, predicted[: model.num_draws].mean(axis=0), reached)
     errors = replace(errors, common=errors.common[reached], position=errors.position[reached])
     beliefs = model.beliefs()
     outlooks = choose_candidates(beliefs, predicted[:, reached], slope[:, reached], errors, count)
@@ -131,6 +133,36 @@ def suggest(
         observable=[worth.kind for worth in best],
         observable_gain=[_gain(result, worth.narrowed) for worth in best],
     )
+
+
+def _received(
+    result: Record, links: Measurements, path_loss_db: NDArray[np.float64], reached: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """The candidates among those reached whose predicted power is above the study's noise floor.
+
+    All remain if the study has no noise floor, or the transmitted power of the candidates is unknown.
+
+    Raises:
+        InputError: None is above it.
+    """
+    floor = result.study.links.noise_floor_dbm
+    powers = as_measured(result.study, links, pd.DataFrame({"path_loss_db": path_loss_db}))
+    if floor is None or not powers:
+        return reached
+    (power,) = powers.values()
+    received = reached[power[reached] > floor]
+    below, highest = len(reached) - len(received), power[reached].max()
+    if not len(received):
+        raise InputError(
+            f"{links.source}: the predicted power of all {below} candidates with a path, at most {highest:.1f} dBm, is "
+            f"not above links.noise_floor_dbm = {floor:g}; choose positions nearer to the transmitters"
+        )
+    if below:
+        LOG.warning(
+            "%s of %s candidates are left out: their predicted power is not above links.noise_floor_dbm = %g",
+            f"{below:,}", f"{len(links):,}", floor,
+        )  # fmt: skip
+    return received
 
 
 class _ReplayedDraws:
