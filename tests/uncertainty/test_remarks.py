@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 
 import planted
 from calibray.fitting.problem import Problem
@@ -39,7 +40,7 @@ def test_values_outside_their_intervals_are_named_with_the_reason():
     (text,) = remarks(outside)
     assert f"{NAMES[1]} 4.4, interval 2 to 3, 6 to 9, most probable 7" in text
     assert NAMES[0] not in text
-    assert "neighbouring links share part of their noise" in text
+    assert "neighbouring links share part of their errors" in text
     assert f"{np.exp(3.0):.2g} times as probable" in text
     assert "blocks = 4" in text
     # With blocks held out already, that advice would be empty.
@@ -49,8 +50,10 @@ def test_values_outside_their_intervals_are_named_with_the_reason():
 
 
 def test_noise_that_the_data_favour_is_reported():
+    study = Study.from_content(planted.content("links.csv"))
+
     def kinds(**noise):
-        return [remark.kind for remark in departures(noise)]
+        return [remark.kind for remark in departures(noise, study)]
 
     # Kinds that share the weight count against Gaussian noise; those of little weight do not.
     assert kinds(gaussian=0.02, correlated=0.2, out_of_sight=0.7) == [RemarkKind.ERRORS_OUT_OF_SIGHT]
@@ -58,3 +61,18 @@ def test_noise_that_the_data_favour_is_reported():
     # Beforehand, half of the weight is that of buildings which differ.
     assert kinds(gaussian=0.9, heterogeneous=0.7) == []
     assert kinds(gaussian=0.9, heterogeneous=0.8) == [RemarkKind.HETEROGENEITY]
+
+
+@pytest.mark.parametrize(
+    ("trace", "advice"),
+    [
+        ({"max_depth": 2}, "set in [trace]: refraction = true, diffraction = true, max_depth = 3."),
+        ({"max_depth": 2, "diffraction": True}, "set in [trace]: refraction = true, max_depth = 3."),
+        ({"max_depth": 5, "refraction": True, "diffraction": True}, "set in [trace]: max_depth = 6."),
+        ({"max_depth": 100, "refraction": True, "diffraction": True}, "The intervals account for it."),
+    ],
+)
+def test_the_remark_on_errors_out_of_sight_advises_what_the_study_lacks(trace, advice):
+    study = Study.from_content(planted.content("links.csv", trace=trace))
+    (remark,) = departures({"out_of_sight": 1.0}, study)
+    assert remark_text(remark).endswith(advice)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibray.result.held_out import AVERAGES, Model
-from calibray.result.wording import judgement_text
+from calibray.result.wording import choice_text, judgement_text
 from calibray.validation.held_out_statistics import MOST_CLUSTERS, compare, spatial_blocks
 from calibray.validation.validation import Validation
 
@@ -198,9 +198,15 @@ def test_the_average_of_the_chosen_model_and_a_second_one_predicts(best, partner
     validation = synthetic_validation(size_db | dict.fromkeys(AVERAGES, 9.0) | {best: 2.0, average: 3.0})
     assert validation.chosen == average
     assert validation.nested_rmse_db == pytest.approx(3.0, rel=0.1)
-    assert f"{str(best)!r}, the best on held-out blocks. It is averaged" in validation.choice
-    assert f"with the model {str(partner)!r}" in validation.choice
+    averaged = f"The prediction is the average of {str(best)!r} and {str(partner)!r}, because"
+    assert f"{str(best)!r}, the best on held-out blocks. {averaged}" in validation.choice
     assert set(validation.table.index) == {*map(str, size_db), str(average)}
+
+
+def test_the_text_of_an_average_names_both_of_its_models():
+    """Another model is the best, and is no part of the average."""
+    text = choice_text(Model.OFFSETS, Model.CALIBRATED, Model.PRIOR)
+    assert f"The prediction is the average of {str(Model.OFFSETS)!r} and {str(Model.PRIOR)!r}" in text
 
 
 def test_a_model_with_a_prior_or_without_a_scene_is_not_averaged():

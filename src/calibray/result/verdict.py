@@ -107,7 +107,8 @@ class RemarkKind(StrEnum):
 
     CORRELATED_NOISE = "correlated noise"  # weight, gaussian_weight
     HEAVY_TAILS = "heavy tails"  # weight, gaussian_weight
-    ERRORS_OUT_OF_SIGHT = "errors out of sight"  # weight, gaussian_weight
+    # weight, gaussian_weight; lacking, settings of [trace] that would find further paths
+    ERRORS_OUT_OF_SIGHT = "errors out of sight"
     # observables, names, path_loss, further, standard_errors; slope and slope_error of measured over modelled values
     CONFLICT = "conflict"
     HETEROGENEITY = "heterogeneity"  # weight, gaussian_weight

@@ -131,6 +131,15 @@ def _noise_remark(finding: str) -> Callable[[dict[str, Any]], str]:
     )
 
 
+def _errors_out_of_sight(values: dict[str, Any]) -> str:
+    text = _noise_remark(
+        "Errors of weak links out of sight are larger than those of the others, as if the scene lacked paths to them"
+    )(values)
+    # Results of earlier versions do not say what their study lacks.
+    lacking = values.get("lacking")
+    return f"{text} To find more paths, set in [trace]: {', '.join(lacking)}." if lacking else text
+
+
 _CAUSES: Final = {
     "correlated": "neighbouring links share part of their errors, so that many links count as few",
     "out_of_sight": "weak links out of sight count less if the scene lacks paths to them",
@@ -267,10 +276,7 @@ def _missing_region(values: dict[str, Any]) -> str:
 _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.CORRELATED_NOISE: _noise_remark("Neighbouring links share part of their errors"),
     RemarkKind.HEAVY_TAILS: _noise_remark("The noise has heavy tails, as with outliers"),
-    RemarkKind.ERRORS_OUT_OF_SIGHT: _noise_remark(
-        "Errors of weak links out of sight are larger than those of the others, as if the scene lacked paths to them. "
-        "Trace with refraction and diffraction"
-    ),
+    RemarkKind.ERRORS_OUT_OF_SIGHT: _errors_out_of_sight,
     RemarkKind.HETEROGENEITY: _noise_remark(
         "Errors are larger on links that depend more on the materials, as if buildings of one material differed"
     ),
@@ -321,8 +327,8 @@ def choice_text(chosen: str, best: str, partner: str | None = None) -> str:
     added = (
         ""
         if partner is None
-        else f" It is averaged with the model {str(partner)!r}, because the best model on a few blocks is often not "
-        "the best elsewhere."
+        else f" The prediction is the average of {str(chosen)!r} and {str(partner)!r}, because the best model on a few "
+        "blocks is often not the best elsewhere."
     )
     if chosen == best:
         return f"Predictions use the model {str(chosen)!r}, the best on held-out blocks.{added}"

@@ -201,7 +201,7 @@ def _assess(
     at_both = model.at_scene_constants(np.stack([relevant[0], most_probable]))
     log_odds = float(at_both[1] - at_both[0])
     most_probable = problem.parameters.named(problem.parameters.from_search(most_probable))
-    remarks = [*offset.remarks, *departures(noise)]
+    remarks = [*offset.remarks, *departures(noise, problem.setup.study)]
     if problem in engines:
         remarks += missed(problem, posterior.means, float(optimum.value[0]))
     remarks += outside_interval(problem, best, intervals, most_probable, log_odds, noise)

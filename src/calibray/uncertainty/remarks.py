@@ -24,6 +24,8 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import BASINS, least_squares
 from calibray.result.verdict import CONFIDENCE, Interval, Remark, RemarkKind, Value
 from calibray.result.wording import MOST_ODDS
+from calibray.study.model import StudyModel
+from calibray.tracing.settings import RANGES
 from calibray.uncertainty.draws import Draws
 from calibray.uncertainty.joint_model import has_offset
 from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, HEAVY, OUT_OF_SIGHT
@@ -172,15 +174,30 @@ DEPARTURES: Final = {
 CAUSES: Final = (CORRELATED, OUT_OF_SIGHT, HEAVY, DIFFERING, GAUSSIAN)
 
 
-def departures(noise: Mapping[str, float]) -> tuple[Remark, ...]:
-    """A remark for each noise model that the data favour over independent Gaussian noise, from their weights."""
+def departures(noise: Mapping[str, float], study: StudyModel) -> tuple[Remark, ...]:
+    """A remark for each noise model that the data favour over independent Gaussian noise, from their weights.
+
+    The study shows which paths the model may lack.
+    """
     gaussian, remarks = float(noise.get(GAUSSIAN, 0.0)), []
     for kind, remark in DEPARTURES.items():
         weight = float(noise.get(kind, 0.0))
         rival = 1.0 - weight if kind == DIFFERING else gaussian
         if weight > max(NOTABLE, LIKELY * (weight + rival)):
-            remarks.append(Remark(remark, {"weight": weight, "gaussian_weight": gaussian}))
+            values: dict[str, Value] = {"weight": weight, "gaussian_weight": gaussian}
+            if remark is RemarkKind.ERRORS_OUT_OF_SIGHT:
+                values["lacking"] = _lacking(study)
+            remarks.append(Remark(remark, values))
     return tuple(remarks)
+
+
+def _lacking(study: StudyModel) -> list[str]:
+    """Settings of the tracer that would find further paths, as in a study file; none for an external program."""
+    if study.engine.external:
+        return []
+    switches = [f"{name} = true" for name in ("refraction", "diffraction") if not getattr(study.trace, name)]
+    depth = study.trace.max_depth + 1
+    return switches + [f"max_depth = {depth}"] * (depth <= RANGES["max_depth"][1])
 
 
 def missed(problem: Problem, posterior: Draws, best_value: float) -> tuple[Remark, ...]:
