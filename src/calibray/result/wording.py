@@ -269,7 +269,7 @@ def _missing_region(values: dict[str, Any]) -> str:
         f"line of {values['links']} links, would explain {percent(values['share'])} of the mean square of the "
         f"residuals (chance alone {percent(values['chance'])}). The materials may have absorbed part of these losses, "
         "and the verdicts assume that nothing is missing there. Check whether there are trees, and state them under "
-        "[regions]."
+        "[regions]; a wrong direction of an antenna can look like this, too."
     )
 
 
