@@ -136,7 +136,7 @@ def test_a_conflict_is_reported_with_both_answers(tmp_path, table, engine):
     assert remark.values["standard_errors"] > 4.0
     assert abs(remark.values["path_loss"][0] - 2.0) > 2.0
     assert remark.values["further"] == pytest.approx([2.0, 9.0], abs=1.0)
-    assert any("require different parameters" in text for text in result.remarks)
+    assert any("require parameter values that differ by" in text for text in result.remarks)
 
 
 @pytest.mark.parametrize(

@@ -225,7 +225,7 @@ def test_parquet_without_pyarrow_names_the_extra(tmp_path, monkeypatch):
     path = tmp_path / "links.parquet"
     path.write_bytes(b"")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(InputError, match=r"pip install calibray\[parquet\]"):
+    with pytest.raises(InputError, match=r"pip install 'calibray\[parquet\]'"):
         read_measurements(path, [0, 0, 10.0], ["x", "y", "z"], "loss")
 
 

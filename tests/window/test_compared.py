@@ -53,7 +53,7 @@ def test_the_result_of_less_error_in_the_blocks_predicts_better_in_either_order(
 def test_equal_errors_are_not_called_better(results):
     planted, folder = results
     planted.update(old=held_out(3.0, 1), new=held_out(3.0, 2))
-    assert "predicts not clearly better" in better("old", "new", folder)
+    assert "old does not predict significantly better than new" in better("old", "new", folder)
 
 
 def test_results_without_links_in_common_are_not_compared(results):
