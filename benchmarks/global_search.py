@@ -13,7 +13,6 @@ import argparse
 import json
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 from unittest.mock import patch
@@ -21,11 +20,10 @@ from unittest.mock import patch
 import numpy as np
 
 from calibray.errors import InputError
-from calibray.fitting.problem import Problem
 from calibray.fitting.search import least_squares, local_searches
 from calibray.optimizers.least_squares import LeastSquares
 from calibray.tables import Column, Table, numbers, render
-from ray_mapping import NOISE_DB, Foreign, Place, district, office
+from ray_mapping import Foreign, Place, district, office, planted
 
 MANY: Final = 2048
 METHODS: Final = ("auto", "without hopping")
@@ -33,17 +31,10 @@ METHODS: Final = ("auto", "without hopping")
 
 def searched(place: Place, engine: Foreign, number: int) -> dict[str, Any]:
     """Gaps and costs of the searches for one truth."""
-    random, parameters = (
-        np.random.default_rng([40, int(place.name.split("-")[-1]), number]),
-        engine.parameters,
-    )
-    truth = parameters.from_search(random.uniform(*parameters.search_bounds))
-    loss = engine.replay.path_loss(truth[None])[0]
-    measured = np.where(np.isfinite(loss), loss, 0.0) + NOISE_DB * random.standard_normal(len(loss))
-    known = Problem.of(place.setup, engine.replay)
-    problem = replace(known, objective=replace(known.objective, measured=measured))
+    seed, parameters = int(place.name.split("-")[-1]), engine.parameters
+    problem, truth = planted(place, engine, np.random.default_rng([40, seed, number]))
     starts = local_searches(engine.replay.interactions)
-    first, planted = (parameters.to_search(values)[None] for values in (parameters.start, truth))
+    first, true = (parameters.to_search(values)[None] for values in (parameters.start, truth))
     problem.squares(first, derivatives=True)  # compiles
 
     def run(*arguments: Any, **settings: Any) -> tuple[LeastSquares, float]:
@@ -53,7 +44,7 @@ def searched(place: Place, engine: Foreign, number: int) -> dict[str, Any]:
     runs = {METHODS[0]: run(starts, first)}
     with patch("calibray.optimizers.least_squares.PATIENCE", 0):
         runs[METHODS[1]] = run(starts, first)
-    more = run(MANY, np.concatenate([first, planted]), seed=1)[0]
+    more = run(MANY, np.concatenate([first, true]), seed=1)[0]
     best = min(more.best.y, *(search.best.y for search, _ in runs.values()))
     return {
         "parameters": len(parameters),
@@ -82,7 +73,7 @@ def summary(lines: list[dict[str, Any]]) -> Table:
             )
         )
     columns = ("runs", "above 0.001 dB", "above 0.01 dB", "largest gap [dB]", "evaluations", "CPU [s]")
-    return Table("Searches", (Column("search"), *numbers(*columns)), tuple(rows))
+    return Table("Searches", (Column("search"), *map(numbers, columns)), tuple(rows))
 
 
 def main() -> None:

@@ -201,15 +201,20 @@ class Foreign:
         return Export.of_table(replace(self.table, power=powers(paths)), self.setting)
 
 
-def repetition(place: Place, foreign: Foreign, name: str, seed: int) -> dict[str, Any]:
-    """One planted truth on one engine."""
-    started, random = time.process_time(), np.random.default_rng([seed, 30])
+def planted(place: Place, foreign: Foreign, random: np.random.Generator) -> tuple[Problem, np.ndarray]:
+    """The problem on an engine's replay whose links are measured with noise at a drawn truth [d], and this truth."""
     parameters = foreign.parameters
     truth = parameters.from_search(random.uniform(*parameters.search_bounds))
     loss = foreign.replay.path_loss(truth[None])[0]
     measured = np.where(np.isfinite(loss), loss, 0.0) + NOISE_DB * random.standard_normal(len(loss))
     known = Problem.of(place.setup, foreign.replay)
-    problem = replace(known, objective=replace(known.objective, measured=measured))
+    return replace(known, objective=replace(known.objective, measured=measured)), truth
+
+
+def repetition(place: Place, foreign: Foreign, name: str, seed: int) -> dict[str, Any]:
+    """One planted truth on one engine."""
+    started, parameters = time.process_time(), foreign.parameters
+    problem, truth = planted(place, foreign, np.random.default_rng([seed, 30]))
     optimum = least_squares(problem, SEARCHES, parameters.to_search(truth)[None]).best.y
     mapped = map_rays(problem, foreign.rays, seed=seed, most_calls=6)
     points = parameters.to_search(np.array([call.candidate for call in mapped.calls]))

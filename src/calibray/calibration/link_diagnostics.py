@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -218,10 +218,9 @@ def region_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
     region = missing_region(links.tx[counted], links.rx[counted], -residual_db, known)
     if region is None or not region.significant:
         return ()
-    values = asdict(region)
-    sides = dict(zip(("west", "south", "east", "north"), values.pop("box"), strict=True))
+    values = region.row()
     del values["significant"]
-    return (Remark(RemarkKind.MISSING_REGION, sides | values),)
+    return (Remark(RemarkKind.MISSING_REGION, values),)
 
 
 def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Remark, ...]:

@@ -141,7 +141,9 @@ def _chunk_size(setup: Setup) -> int:
 def _predict_chunk(task: _Task, links: Measurements, progress: Progress | None = None) -> pd.DataFrame:
     setup = task.setup.at(links)
     predictions = interval(task.result, setup, task.level, progress)
-    return predictions.assign(remark=position_remarks(task.result, setup) if task.with_remarks else "")
+    if not task.with_remarks:
+        return predictions.assign(remark="")
+    return predictions.assign(remark=position_remarks(task.result, setup, read_triangles(setup.scene)))
 
 
 LOG: Final = logging.getLogger(__name__)

@@ -79,10 +79,11 @@ def predict_interval(
             the calibration had too few links to estimate the size of residuals.
     """
     setup = open_for_links(result, as_links(result, links), allow_changed_inputs=allow_changed_inputs)
-    refuse_far_links(result, setup.links, read_triangles(setup.scene))
+    triangles = read_triangles(setup.scene)
+    refuse_far_links(result, setup.links, triangles)
     table = interval(result, setup, level, progress)
     measured_quantity = as_measured(result.study, setup.links, table)
-    return table.assign(**measured_quantity, remark=position_remarks(result, setup))
+    return table.assign(**measured_quantity, remark=position_remarks(result, setup, triangles))
 
 
 def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -> Measurements:
@@ -346,12 +347,12 @@ def check_inputs(result: Record, setup: Setup, allow_changed: bool) -> None:
         )
 
 
-def position_remarks(result: Record, setup: Setup) -> NDArray[np.str_]:
+def position_remarks(result: Record, setup: Setup, triangles: Triangles) -> NDArray[np.str_]:
     """A remark on the position of every link [links]; empty where the positions are plausible.
 
     Indoors, if most calibrated receivers are inside a building, that remark is omitted.
     """
-    triangles, links = read_triangles(setup.scene), setup.links
+    links = setup.links
     if not len(triangles.face):
         return np.full(len(links), "")
     indoors = is_indoors(result, triangles)

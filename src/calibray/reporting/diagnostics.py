@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from functools import lru_cache
 from itertools import combinations
 from typing import Final
@@ -155,11 +154,7 @@ def _missing_region(result: Record) -> pd.DataFrame:
     known = links[OUT_OF_SIGHT].to_numpy(float) if OUT_OF_SIGHT in links else np.zeros(len(links))
     excess_db = links["measured_db"].to_numpy(float) - links["predicted_db"].to_numpy(float)
     region = _searched(np.column_stack([ends, excess_db, known]).tobytes())
-    if region is None:
-        return pd.DataFrame()
-    row = asdict(region)
-    west, south, east, north = row.pop("box")
-    return pd.DataFrame([{"west": west, "south": south, "east": east, "north": north, **row}])
+    return pd.DataFrame() if region is None else pd.DataFrame([region.row()])
 
 
 @lru_cache(maxsize=4)

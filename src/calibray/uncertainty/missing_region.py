@@ -8,8 +8,8 @@ Communications in Statistics 26, 1997).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,6 @@ MOST: Final = 20_000
 
 SHUFFLES: Final = 99
 """Number of random orders of the residuals; a rectangle is reported if none of them has a better one."""
-
 
 NEGLIGIBLE: Final = 1e-6
 """Sum of squares of a rectangle's column, relative to the largest, below which rounding dominates."""
@@ -76,6 +75,11 @@ class MissingRegion:
     share: float
     chance: float
     significant: bool
+
+    def row(self) -> dict[str, Any]:
+        """Its values by name, with the four sides of the box."""
+        sides = dict(zip(("west", "south", "east", "north"), self.box, strict=True))
+        return sides | {name: value for name, value in asdict(self).items() if name != "box"}
 
 
 def missing_region(

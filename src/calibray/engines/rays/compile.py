@@ -40,7 +40,6 @@ pattern differ by tenths, while transmitted power or watts instead of decibels c
 DIRECT_GAIN_DB: Final = 60.0
 """Largest total gain of both antennas of a direct path [dB]: two dishes of 30 dBi."""
 
-
 HIGH_GAIN_DB: Final = 25.0
 """Gain of both antennas above which a warning follows [dB]: a sector antenna of 18 dBi and a receiver of 7 dBi."""
 
