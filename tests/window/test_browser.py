@@ -20,7 +20,7 @@ from axe_playwright_python.sync_playwright import Axe
 
 from calibray.scenes import read_scene, read_triangles
 from calibray.window.desk import RADIUS, StudyFolder, solid
-from window_server import CHROMIUM, SIZES, add, finished, launched, opened, press, served, step
+from window_server import CHROMIUM, SIZES, add, finished, launched, opened, press, served, start, step
 
 pytestmark = pytest.mark.skipif(not CHROMIUM, reason="needs chromium; apt-get install chromium")
 
@@ -38,8 +38,7 @@ def walked(tmp_path_factory):
         with served(folder, kill=True) as address:
             page = opened(browser, address)
             add(page, "Map or plan", [EXAMPLES / "plan.csv"])
-            step(page, "Map or plan").get_by_role("button", name="Make the scene").click()
-            page.get_by_text("running: calibray scene").wait_for()
+            start(page, "Map or plan", "Make the scene")
         # A result whose study has hostile names, with a report that tries to leave its frame.
         (folder / "result").mkdir()
         record = json.loads(GOLDEN.read_text())
@@ -197,7 +196,7 @@ def test_the_chosen_result_is_exported_and_nothing_entered_is_lost(walked):
     page.get_by_role("option", name="result", exact=True).click()
     lowest = step(page, "Parameters").get_by_label("Lowest").first
     lowest.fill("1.7")
-    predict.get_by_role("button", name="Export").click()
+    start(page, "Predict and use", "Export")
     page.get_by_text(re.compile(r"calibray export result --out exported-result")).first.wait_for()
     page.wait_for_timeout(600)
     assert predict.get_by_label("Result").input_value() == "result"

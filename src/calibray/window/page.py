@@ -13,7 +13,7 @@ from nicegui import events, run, ui
 from calibray.window.desk import RADIUS, TABLES, Desk, Solid, solid
 from calibray.window.jobs import Stage, stages
 from calibray.window.result_steps import show_prediction, show_result, show_run
-from calibray.window.study_steps import findings, show_measurements, show_parameters, show_scene
+from calibray.window.study_steps import findings, show_measurements, show_parameters, show_scene, upload
 
 STEPS: Final = (
     ("Map or plan", show_scene),
@@ -23,6 +23,12 @@ STEPS: Final = (
     ("Result", show_result),
     ("Predict and use", show_prediction),
 )
+UPLOADS: Final = {
+    "Map or plan": "Add maps, plans, scenes, height models",
+    "Measurements": "Add tables, tracks",
+}
+"""The steps that take files, and their buttons."""
+
 HEAD: Final = '<link rel="stylesheet" href="/window/window.css"><script src="/window/plan.js" defer></script>'
 
 
@@ -54,6 +60,9 @@ def build(desk: Desk) -> None:
             for number, (name, show) in enumerate(STEPS, 1):
                 with ui.element("section").classes("step").props(f'aria-label="{name}"'):
                     heading(f"{number}. {name}", 2)
+                    # Outside of what is shown again, which would end an upload.
+                    if name in UPLOADS:
+                        upload(desk, UPLOADS[name])
                     show(desk)
 
     def contents() -> dict[str, object]:

@@ -22,26 +22,27 @@ COMMANDS: Final = {".osm": "osm", ".pbf": "osm", ".csv": "plan", ".dxf": "plan"}
 def upload(desk: Desk, label: str) -> None:
     """Take files into the folder."""
 
-    async def take(event: events.UploadEventArguments) -> None:
-        with desk.messages():
-            target = desk.folder.check_upload(event.file.name)
-            target.parent.mkdir(exist_ok=True)
-            await event.file.save(target)
-            ui.notify(f"Added: {target.name}", type="positive")
-        # The list of files changes when all of them have come.
-        ui.timer(0.3, desk.refresh, once=True)
+    async def take(event: events.MultiUploadEventArguments) -> None:
+        for file in event.files:
+            with desk.messages():
+                target = desk.folder.check_upload(file.name)
+                target.parent.mkdir(exist_ok=True)
+                await file.save(target)
+                ui.notify(f"Added: {target.name}", type="positive")
+        desk.refresh()
 
     button = ui.button(label).props("outline")
     ui.label("Or drop files here:").classes("quiet")
-    files = ui.upload(on_upload=take, multiple=True, auto_upload=True, max_file_size=LARGEST).classes("wide")
+    files = ui.upload(on_multi_upload=take, multiple=True, auto_upload=True, max_file_size=LARGEST)
     # The header of Quasar's uploader, which is hidden, has buttons without names.
-    button.on("click", js_handler=f"() => getElement({files.id}).pickFiles()")
+    uploader = f"getElement({files.id}).$refs.qRef"
+    files.classes("wide").on("uploaded", js_handler=f"() => {uploader}.removeUploadedFiles()")
+    button.on("click", js_handler=f"() => {uploader}.pickFiles()")
 
 
 @ui.refreshable
 def show_scene(desk: Desk) -> None:
     """Draw the step of the scene: a map, footprints or a floor plan is converted, or a scene is chosen."""
-    upload(desk, "Add maps, plans, scenes, height models")
     sources, terrain = desk.folder.files(MAPS), desk.folder.files((".tif", ".tiff"))
     if sources:
         with ui.row():
@@ -117,7 +118,6 @@ SECTIONS = ("scene", "links", "antennas", "trace", "offset")
 @ui.refreshable
 def show_measurements(desk: Desk) -> None:
     """Draw the step of the measurements: tables of links become a drafted study, whose assumptions can be changed."""
-    upload(desk, "Add tables, tracks")
     if desk.folder.study_file.is_file():
         _assumptions(desk)
         findings(desk)
