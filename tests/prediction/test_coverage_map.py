@@ -202,6 +202,20 @@ def test_an_adaptive_number_of_rays_finds_the_study_s_paths(result, coverage):
     assert (adaptive[reached] - coverage.path_loss_db[reached]).max() < 0.05
 
 
+@pytest.mark.parametrize("per", ["half", ["half"]])
+def test_the_group_is_that_of_the_links_measured_at_the_transmitter(result, monkeypatch, per):
+    def traced(*_, **__):
+        raise InterruptedError
+
+    monkeypatch.setattr(cb.Setup, "trace", traced)
+    content = result.study.content()
+    content["offset"]["per"] = per
+    study = cb.Study.from_content(content, result.study.path)
+    links = result.links.assign(group="west", tx_x=float(TX[0]), tx_y=float(TX[1]), tx_z=float(TX[2]))
+    with pytest.raises(InterruptedError):
+        cb.coverage_map(changed(result, study=study, links=links), TX, cell=30.0, bounds=AREA)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -157,13 +157,13 @@ def _column_values(
 ) -> dict[str, object]:
     """Values of the study's columns, the same at every link from this transmitter."""
     study, values = result.study, dict(columns)
-    per = study.offset.per if study.offset is not None else None
-    if isinstance(per, str) and per not in values and {"group", "tx_x"} <= set(result.links):
+    groups = study.offset_groups
+    if len(groups) == 1 and groups[0] not in values and {"group", "tx_x"} <= set(result.links):
         distance = np.abs(result.links[list(TX_COLUMNS)].to_numpy(float) - tx).max(axis=1)
-        groups = set(result.links["group"].astype(str).to_numpy()[distance < MIN_DISTANCE])
-        if len(groups) == 1:
-            values[per] = groups.pop()
-    needed = [*([per] if isinstance(per, str) else per or ())]
+        labels = set(result.links["group"].astype(str).to_numpy()[distance < MIN_DISTANCE])
+        if len(labels) == 1:
+            values[groups[0]] = labels.pop()
+    needed = [*groups]
     for section in study.nuisance.values():
         needed += [section.per] if section.per is not None and section.cluster_m is None else []
         needed += [section.by] if section.by not in (CONSTANT, LOG_DISTANCE, *OBSTRUCTION) else []
