@@ -19,8 +19,20 @@ import trimesh
 from axe_playwright_python.sync_playwright import Axe
 
 from calibray.scenes import read_scene, read_triangles
-from calibray.window.desk import RADIUS, StudyFolder, solid
-from window_server import CHROMIUM, SIZES, add, finished, launched, opened, press, served, start, step
+from calibray.window.desk import LARGEST, RADIUS, StudyFolder, solid
+from window_server import (
+    CHROMIUM,
+    SIZES,
+    add,
+    command,
+    finished,
+    launched,
+    opened,
+    press,
+    served,
+    start,
+    step,
+)
 
 pytestmark = pytest.mark.skipif(not CHROMIUM, reason="needs chromium; apt-get install chromium")
 
@@ -182,6 +194,93 @@ def test_a_hostile_upload_is_refused(walked, tmp_path):
     step(page, "Map or plan").locator("input[type=file]").first.set_input_files(bad)
     page.get_by_text("use letters, digits").wait_for()
     assert not (folder / "<b>x.csv").exists()
+
+
+def test_a_file_beside_the_fields_for_files_does_not_replace_the_page(walked):
+    _, page, _, _ = walked
+    refused = """name => {
+        const files = new DataTransfer();
+        files.items.add(new File(["x"], "x.csv"));
+        return !document.body.dispatchEvent(
+            new DragEvent(name, { dataTransfer: files, bubbles: true, cancelable: true }));
+    }"""
+    assert page.evaluate(refused, "dragover")
+    assert page.evaluate(refused, "drop")
+
+
+def test_a_file_over_the_limit_is_refused_with_a_message(walked, tmp_path):
+    folder, page, _, _ = walked
+    with (tmp_path / "large.csv").open("wb") as sparse:
+        sparse.truncate(LARGEST + 1)
+    with page.expect_file_chooser() as chooser:
+        step(page, "Measurements").get_by_role("button", name="Add").click()
+    chooser.value.set_files(str(tmp_path / "large.csv"))
+    page.get_by_text("Larger than 1 GiB").wait_for()
+    assert not (folder / "large.csv").exists()
+
+
+def test_the_area_and_the_place_stay_on_the_map_until_they_are_cleared(walked):
+    _, _, browser, address = walked
+    page = opened(browser, address)
+    page.locator("#plan[data-links='84']").wait_for()
+    page.get_by_role("button", name="Draw an area").click()
+    box = page.locator("#plan").bounding_box()
+    page.mouse.move(box["x"] + 100, box["y"] + 100)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 250, box["y"] + 200, steps=3)
+    page.mouse.up()
+    predict = step(page, "Predict and use")
+    predict.get_by_text(re.compile(r"Area: x [\d.]+ to [\d.]+ m, y [\d.]+ to [\d.]+ m")).wait_for()
+    area = page.locator("#plan").get_attribute("data-area")
+    predict.get_by_label("x [m]").fill("2.5")
+    predict.get_by_label("y [m]").fill("3.5")
+    page.locator("#plan[data-place='2.5,3.5']").wait_for()
+    page.reload()
+    page.locator("#plan[data-place='2.5,3.5'][data-links='84']").wait_for()
+    west = float(page.locator("#plan").get_attribute("data-area").split(",")[0])
+    assert west == pytest.approx(float(area.split(",")[0]), abs=0.06)
+    page.get_by_role("button", name="Clear the area").click()
+    predict.get_by_text("Area: the whole scene").wait_for()
+    page.locator("#plan[data-area='']").wait_for()
+    page.context.close()
+
+
+def test_an_empty_field_is_named_and_starts_nothing(walked):
+    folder, _, browser, address = walked
+    page = opened(browser, address)
+    page.locator("#plan[data-links='84']").wait_for()
+    page.wait_for_timeout(600)
+    before, text = command(page), (folder / "study.toml").read_text()
+    step(page, "Predict and use").get_by_label("Width of a cell [m]").fill("")
+    step(page, "Predict and use").get_by_role("button", name="Map the area").click()
+    page.get_by_text("Width of a cell [m]: is empty; give a number").wait_for()
+    step(page, "Parameters").get_by_label("Lowest").first.fill("")
+    step(page, "Parameters").get_by_role("button", name="Save parameters").click()
+    page.get_by_text("brick_wall.relative_permittivity: Lowest: is empty; give a number").wait_for()
+    assert command(page) == before
+    assert (folder / "study.toml").read_text() == text
+    # A map needs the group of the offset of its transmitter.
+    step(page, "Predict and use").get_by_label("Width of a cell [m]").fill("2")
+    start(page, "Predict and use", "Map the area")
+    assert "calibray map result --tx 0.6 0.7 2.2 --height 1.5 --cell 2.0 --column=ap=ap1" in command(page)
+    for _ in range(200):
+        if not command(page).startswith("running"):
+            break
+        page.wait_for_timeout(100)
+    page.context.close()
+
+
+def test_stop_is_the_same_button_while_the_progress_changes(walked):
+    _, page, _, _ = walked
+    start(page, "Run", "Check the rays")
+    stop = page.get_by_role("button", name="Stop")
+    stop.focus()
+    stages = page.get_by_role("status", name="Last command").locator(".stage")
+    page.wait_for_function("""() => document.querySelector(".activity .stage").innerText.includes("· ")""")
+    assert page.evaluate("document.activeElement.innerText").strip() == "Stop"
+    assert stages.count() == 1
+    page.keyboard.press("Enter")
+    page.get_by_text("stopped: calibray trace study.toml --check").wait_for()
 
 
 def test_the_chosen_result_is_exported_and_nothing_entered_is_lost(walked):

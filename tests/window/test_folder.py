@@ -45,12 +45,23 @@ def test_hostile_names_of_uploads_are_refused(folder, name):
 
 def test_an_upload_replaces_nothing_and_follows_no_link(folder, tmp_path):
     assert folder.check_upload("Messung März (2).csv") == tmp_path / "Messung März (2).csv"
+    # As some systems write it: a letter and a mark.
+    assert folder.check_upload("Mo\u0308bel.csv") == tmp_path / "M\u00f6bel.csv"
+    assert folder.check_upload("नक्शा.osm") == tmp_path / "नक्शा.osm"
     assert folder.check_upload("wall.ply") == tmp_path / "meshes" / "wall.ply"
     (tmp_path / "there.csv").write_text("")
     (tmp_path / "link.csv").symlink_to(tmp_path / "nowhere")
     for name in ("there.csv", "link.csv"):
         with pytest.raises(InputError, match="already exists"):
             folder.check_upload(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("図" * 90 + ".csv", "too long"), ("a, ü.csv", r"'a, ü\.csv': use")]
+)
+def test_the_reason_for_which_a_name_is_refused_shows_it(folder, name, message):
+    with pytest.raises(InputError, match=message):
+        folder.check_upload(name)
 
 
 def test_reasons_are_read_from_comments_only(folder):

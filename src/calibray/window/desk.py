@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+import unicodedata
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -43,7 +44,9 @@ LARGEST: Final = 2**30
 
 Control = TypeVar("Control", bound=ValueElement)
 
-_NAME: Final = re.compile(r"[\w][\w .()+-]{0,119}")
+_NAME: Final = re.compile(r"[\w][\w .()+-]*")
+_LONGEST_NAME: Final = 200
+"""Of file names [bytes]; file systems take 255, and some files of a scene have longer names."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +95,13 @@ class StudyFolder:
         Raises:
             InputError: The name is not a plain file name, Calibray does not read this kind of file, or the file exists.
         """
-        shown = shortened(ascii(name))
-        if not _NAME.fullmatch(name) or name.endswith((" ", ".")):
+        # Some systems write an umlaut as a letter and a mark; other scripts have marks that no single letter replaces.
+        name = unicodedata.normalize("NFC", name)
+        letters = "".join(letter for letter in name if not unicodedata.category(letter).startswith("M"))
+        shown = shortened(repr(name))
+        if len(name.encode("utf-8", "replace")) > _LONGEST_NAME:
+            raise InputError(f"{shown}: the name is too long; shorten it to {_LONGEST_NAME} bytes")
+        if not _NAME.fullmatch(letters) or name.endswith((" ", ".")):
             raise InputError(
                 f"{shown}: use letters, digits, spaces, and . _ - ( ) + in names of files; rename it"
             )
@@ -195,6 +203,17 @@ def solid(folder: StudyFolder, scene: str | None) -> Solid | None:
     return Solid(meshes, *((np.unique(ends, axis=0) - centre) * scale for ends in (tx, rx)))
 
 
+def filled(control: ui.number) -> float:
+    """The number in a field.
+
+    Raises:
+        InputError: The field is empty.
+    """
+    if control.value is None:
+        raise InputError(f"{control.props['label']}: is empty; give a number")
+    return control.value
+
+
 @dataclass
 class Desk:
     """The state of the page; there is one user, so all tabs share it.
@@ -232,6 +251,11 @@ class Desk:
             job = self.jobs.start([str(word) for word in words])
             ui.notify(f"Started: {job.command}", type="info", color="primary")
             self.refresh()
+
+    def mark(self) -> None:
+        """Show the chosen place and area on the map of this tab."""
+        area = dict(zip(("west", "south", "east", "north"), self.area, strict=True)) if self.area else None
+        ui.run_javascript(f"plan.mark({json.dumps(self.point)}, {json.dumps(area)})")
 
     def keep(self, control: Control) -> Control:
         """The control, with the value that the user entered before its step was last shown, if it can have it."""

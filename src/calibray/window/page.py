@@ -11,7 +11,7 @@ import numpy as np
 from nicegui import events, run, ui
 
 from calibray.window.desk import RADIUS, TABLES, Desk, Solid, solid
-from calibray.window.jobs import Stage, stages
+from calibray.window.jobs import Job, stages
 from calibray.window.result_steps import show_prediction, show_result, show_run
 from calibray.window.study_steps import findings, show_measurements, show_parameters, show_scene, upload
 
@@ -52,6 +52,7 @@ def build(desk: Desk) -> None:
                 ui.button("Draw an area", on_click=lambda: ui.run_javascript("plan.drawArea()")).props(
                     "outline dense"
                 )
+                ui.button("Clear the area", on_click=lambda: clear_area()).props("outline dense")
                 view_button(desk)
             ui.label("Drag to move, wheel to zoom, click to choose a place.").classes("quiet")
             place = ui.label().classes("quiet").mark("place")
@@ -97,6 +98,12 @@ def build(desk: Desk) -> None:
         place.set_text(f"Chosen area: {east - west:.0f} m by {north - south:.0f} m")
         show_prediction.refresh()
 
+    def clear_area() -> None:
+        desk.area = None
+        place.set_text("")
+        desk.mark()
+        show_prediction.refresh()
+
     def loaded(event: events.GenericEventArguments) -> None:
         data: dict[str, Any] = event.args
         desk.transmitters = data["transmitters"]
@@ -107,7 +114,12 @@ def build(desk: Desk) -> None:
         findings.refresh()
 
     desk.refresh = refresh
-    ui.timer(0.1, reload_map, once=True)
+
+    def first_map() -> None:
+        reload_map()
+        desk.mark()
+
+    ui.timer(0.1, first_map, once=True)
     ui.on("picked", picked)
     ui.on("area", area_drawn)
     ui.on("plan", loaded)
@@ -116,10 +128,14 @@ def build(desk: Desk) -> None:
 
     def watch() -> None:
         job = desk.jobs.running()
-        # Only after a change: a button that is made again loses the keyboard.
-        if job != watched["job"]:
-            activity.refresh()
-        ended = watched["job"] is not None and job is None
+        before = watched["job"]
+        # Only what has changed: a button that is made again loses the keyboard, and a click.
+        if job is None or before is None or job.number != before.number:
+            if job != before:
+                activity.refresh()
+        elif job != before:
+            progress.refresh(job)
+        ended = before is not None and job is None
         watched["job"] = job
         if ended:
             refresh()
@@ -143,15 +159,17 @@ def activity(desk: Desk) -> None:
     with ui.element("div").classes("activity").props('role=status aria-label="Last command"'):
         ui.label(f"{job.state}: {job.command}").classes("command").mark("activity")
         if job.state == "running":
-            progress(stages(job.log))
+            progress(job)
             ui.button("Stop", on_click=lambda: desk.jobs.stop(job)).props("outline dense color=negative")
         else:
             lines = [line for line in job.log.splitlines() if line.strip()]
             ui.label("\n".join(lines[-6:])).classes("log")
 
 
-def progress(shown: list[Stage]) -> None:
+@ui.refreshable
+def progress(job: Job) -> None:
     """The stages of a running command: the earlier ones, the progress of the last one, and the best value so far."""
+    shown = stages(job.log)
     for stage in shown[:-1]:
         ui.label(" · ".join(filter(None, (stage.name, f"{stage.seconds} s", stage.best)))).classes("quiet")
     last = shown[-1] if shown else None

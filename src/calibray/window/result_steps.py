@@ -21,8 +21,9 @@ from calibray.result.files import read
 from calibray.result.held_out import HeldOutErrors
 from calibray.support.output_tables import write_table
 from calibray.validation.held_out_statistics import compare
-from calibray.window.desk import STUDY, Desk
+from calibray.window.desk import STUDY, Desk, filled
 from calibray.window.jobs import Job
+from calibray.window.study_steps import safe
 
 RUNS_SHOWN = 20
 
@@ -282,6 +283,7 @@ def show_prediction(desk: Desk) -> None:
     def placed() -> None:
         if east.value is not None and north.value is not None:
             desk.point = east.value, north.value
+            desk.mark()
 
     for coordinate in (east, north):
         coordinate.on_value_change(placed)
@@ -295,33 +297,22 @@ def show_prediction(desk: Desk) -> None:
         with desk.messages():
             if east.value is None or north.value is None:
                 raise InputError("choose a place: click on the map, or give x and y")
-            places = np.array([[east.value, north.value, height.value]])
+            places = np.array([[east.value, north.value, filled(height)]])
             write_table(desk.folder.path / PLACE, _links(desk, site(), places))
             desk.start(["predict", chosen.value, PLACE, "--level", 0.9, "--out", PREDICTED])
 
     def cover() -> None:
         with desk.messages():
-            bounds = ["--bounds", *desk.area] if desk.area else []
-            desk.start(
-                [
-                    "map",
-                    chosen.value,
-                    "--tx",
-                    *site(),
-                    "--height",
-                    height.value,
-                    "--cell",
-                    cell.value,
-                    *bounds,
-                ]
-            )
+            words: list[object] = ["map", chosen.value, "--tx", *site()]
+            words += ["--height", filled(height), "--cell", filled(cell)]
+            words += ["--bounds", *desk.area] if desk.area else []
+            words += [f"--column={name}={value}" for name, value in _shared(desk, site()).items()]
+            desk.start(words)
 
     def suggest() -> None:
         with desk.messages():
-            write_table(
-                desk.folder.path / CANDIDATES,
-                _links(desk, site(), _grid(desk, cell.value or 5.0, height.value or 1.5)),
-            )
+            places = _grid(desk, filled(cell), filled(height))
+            write_table(desk.folder.path / CANDIDATES, _links(desk, site(), places))
             desk.start(["suggest", chosen.value, CANDIDATES, "--count", 5, "--out", SUGGESTED])
 
     def export() -> None:
@@ -332,33 +323,40 @@ def show_prediction(desk: Desk) -> None:
         ui.button("Map the area", on_click=cover)
         ui.button("Suggest places", on_click=suggest)
         ui.button("Export", on_click=export).props("outline")
-    ui.label(f"Area: {desk.area or 'the whole scene'}").classes("quiet")
+    ui.label(f"Area: {_bounds(desk.area) if desk.area else 'the whole scene'}").classes("quiet")
     _predicted(desk)
     _suggested(desk)
     for name in names:
         if (desk.folder.path / name / "map.png").is_file():
             age = (desk.folder.path / name / "map.png").stat().st_mtime_ns
-            ui.element("img").props(f'src="/result/{name}/map.png?{age}" alt="Map of {name}"').classes(
-                "coverage"
-            )
+            ui.element("img").props(
+                f'src="/result/{quote(name)}/map.png?{age}" alt="Map of {safe(name)}"'
+            ).classes("coverage")
+
+
+def _bounds(area: tuple[float, float, float, float]) -> str:
+    west, south, east, north = area
+    return f"x {west:.1f} to {east:.1f} m, y {south:.1f} to {north:.1f} m"
 
 
 def _links(desk: Desk, tx: list[float], rx: Any) -> pd.DataFrame:
     """Links from a transmitter to places, with the groups and the carrier of its measured links."""
+    table = pd.DataFrame({f"rx_{axis}": rx[:, k] for k, axis in enumerate("xyz")})
+    for k, axis in enumerate("xyz"):
+        table[f"tx_{axis}"] = tx[k]
+    return table.assign(**_shared(desk, tx))
+
+
+def _shared(desk: Desk, tx: list[float]) -> dict[str, Any]:
+    """The groups and the carrier of the links that were measured at a transmitter, by their columns."""
     from calibray.study import Study
 
     study = Study.load(desk.folder.study_file)
     links = study.measurements()
-    table = pd.DataFrame({f"rx_{axis}": rx[:, k] for k, axis in enumerate("xyz")})
-    for k, axis in enumerate("xyz"):
-        table[f"tx_{axis}"] = tx[k]
     same = np.flatnonzero(np.abs(links.tx - tx).max(axis=1) < 0.01)
     row = links.table.frame.iloc[int(same[0]) if len(same) else 0]
     columns = [*study.offset_groups, study.links.transmitter, study.links.frequency]
-    for column in columns:
-        if isinstance(column, str) and column in row.index and column not in table:
-            table[column] = row[column]
-    return table
+    return {name: row[name] for name in columns if isinstance(name, str) and name in row.index}
 
 
 def _grid(desk: Desk, cell: float, height: float) -> Any:

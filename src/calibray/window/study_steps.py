@@ -12,7 +12,7 @@ from nicegui import events, ui
 
 from calibray.errors import InputError
 from calibray.materials import DEFAULT_REVISION, ITU_MATERIALS
-from calibray.window.desk import LARGEST, MAPS, STUDY, TABLES, Desk
+from calibray.window.desk import LARGEST, MAPS, STUDY, TABLES, Desk, filled
 
 ITU: Final = [name for name in ITU_MATERIALS[DEFAULT_REVISION] if name != "vacuum"]
 COMMANDS: Final = {".osm": "osm", ".pbf": "osm", ".csv": "plan", ".dxf": "plan"}
@@ -31,9 +31,14 @@ def upload(desk: Desk, label: str) -> None:
                 ui.notify(f"Added: {target.name}", type="positive")
         desk.refresh()
 
+    def refuse() -> None:
+        ui.notify(f"Larger than {LARGEST // 2**30} GiB: put the file into the folder.", type="negative")
+
     button = ui.button(label).props("outline")
     ui.label("Or drop files here:").classes("quiet")
-    files = ui.upload(on_multi_upload=take, multiple=True, auto_upload=True, max_file_size=LARGEST)
+    files = ui.upload(
+        on_multi_upload=take, on_rejected=refuse, multiple=True, auto_upload=True, max_file_size=LARGEST
+    )
     # The header of Quasar's uploader, which is hidden, has buttons without names.
     uploader = f"getElement({files.id}).$refs.qRef"
     files.classes("wide").on("uploaded", js_handler=f"() => {uploader}.removeUploadedFiles()")
@@ -67,18 +72,24 @@ def show_scene(desk: Desk) -> None:
             apart = desk.keep(ui.switch("One mesh per building"))
 
         def make() -> None:
-            words: list[object] = ["scene", kind.value, source.value, "--out", "scene"]
-            if kind.value == "plan":
-                words += ["--unit", unit.value]
-                words += [f"--height={height.value}"] if _is_number(height.value) else []
-            else:
-                words += ["--wall", f"{wall.value}:{thickness.value}", "--ground", f"{ground.value}:1.0"]
-                words += ["--terrain", relief.value] if relief.value else []
-                words += ["--per-building"] if apart.value else []
-            if kind.value == "footprints":
-                words += [f"--height={height.value}"]
-            desk.scene = "scene/scene.xml"
-            desk.start(words)
+            with desk.messages():
+                words: list[object] = ["scene", kind.value, source.value, "--out", "scene"]
+                if kind.value == "plan":
+                    words += ["--unit", filled(unit)]
+                    words += [f"--height={height.value}"] if _is_number(height.value) else []
+                else:
+                    words += [
+                        "--wall",
+                        f"{wall.value}:{filled(thickness)}",
+                        "--ground",
+                        f"{ground.value}:1.0",
+                    ]
+                    words += ["--terrain", relief.value] if relief.value else []
+                    words += ["--per-building"] if apart.value else []
+                if kind.value == "footprints":
+                    words += [f"--height={height.value}"]
+                desk.scene = "scene/scene.xml"
+                desk.start(words)
 
         ui.button("Make the scene", on_click=make)
     scenes = desk.folder.scenes()
@@ -292,14 +303,20 @@ def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | No
             with ui.row():
                 for bound, which in ((lower, "lowest"), (upper, "highest")):
                     slider = ui.slider(min=0, max=max(2 * high, 20.0), step=0.1).bind_value(bound)
-                    slider.classes("bound").props(f'label aria-label="{_safe(name)} {which}, slider"')
+                    slider.classes("bound").props(f'label aria-label="{safe(name)} {which}, slider"')
+
+    def number(control: ui.number) -> float:
+        try:
+            return filled(control)
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from None
 
     def read() -> dict[str, Any] | None:
         if not chosen.value:
             return None
-        changed = {**entry, "bounds": [lower.value, upper.value]}
+        changed = {**entry, "bounds": [number(lower), number(upper)]}
         if itu.value:
-            changed["prior"] = {"itu": itu.value, "spread": spread.value}
+            changed["prior"] = {"itu": itu.value, "spread": number(spread)}
         elif "itu" in prior:
             del changed["prior"]
         return changed
@@ -311,6 +328,6 @@ def _known(name: object) -> str:
     return name if isinstance(name, str) and name in ITU else ""
 
 
-def _safe(name: str) -> str:
+def safe(name: str) -> str:
     """A name for a property, whose syntax has quotes."""
     return "".join(letter for letter in name if letter.isalnum() or letter in " ._-")

@@ -61,6 +61,8 @@ const plan = (() => {
       const [u, v] = toScreen(area.west, area.north), [s, t] = toScreen(area.east, area.south);
       context.strokeRect(u, v, s - u, t - v);
     }
+    canvas.dataset.area = area ? [area.west, area.south, area.east, area.north] : "";
+    canvas.dataset.place = point ? point.map((length) => length.toFixed(1)) : "";
     canvas.dataset.links = data.links.length;
     canvas.dataset.drawn = Number(canvas.dataset.drawn || 0) + 1;
   }
@@ -152,6 +154,14 @@ const plan = (() => {
       context = canvas.getContext("2d");
       listen();
       new ResizeObserver(size).observe(canvas);
+      // A file that is dropped beside the fields for files would replace the page.
+      for (const name of ["dragover", "drop"]) {
+        window.addEventListener(name, (event) => {
+          if (!event.dataTransfer.types.includes("Files")) return;
+          event.preventDefault();
+          event.dataTransfer.dropEffect = "none";
+        });
+      }
       matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => setTimeout(renew, 50));
     }
     const answer = await (early || ask(scene));
@@ -168,6 +178,7 @@ const plan = (() => {
   return {
     load, fit,
     drawArea() { drawing = true; canvas.classList.add("drawing"); },
+    mark(place, bounds) { point = place; area = bounds; redraw(); },
     suggest(points) { suggested = points; redraw(); },
   };
 })();
