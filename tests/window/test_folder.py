@@ -83,6 +83,15 @@ def test_a_changed_study_keeps_its_reasons_and_a_wrong_one_is_not_written(folder
     assert folder.reasons()["links.value"] == "the only column of its kind"
 
 
+@pytest.mark.parametrize(
+    "wrong", ['bounds = "x"', "bounds = [1, 2, 3]", "bounds = 1979-05-27", "bounds = [1.5"]
+)
+def test_of_a_file_that_is_not_a_study_the_page_shows_no_values(folder, wrong):
+    assert folder.valid_content() == folder.content()
+    folder.study_file.write_text(STUDY.replace("bounds = [1.5, 12.0]", wrong))
+    assert folder.valid_content() == {}
+
+
 def test_results_are_named_by_folders_with_a_record(folder, tmp_path):
     (tmp_path / "result").mkdir()
     (tmp_path / "result" / "result.json").write_text('{"fit": {}}')

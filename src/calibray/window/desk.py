@@ -122,6 +122,15 @@ class StudyFolder:
         except (OSError, ValueError, RecursionError):
             return {}
 
+    def valid_content(self) -> dict[str, Any]:
+        """The sections of the study file, whose values have the types of a study; empty if it is not one."""
+        content = self.content()
+        try:
+            Study.from_content(content, self.study_file)
+        except InputError:
+            return {}
+        return content
+
     def text(self) -> str:
         """The study file; empty without one."""
         try:

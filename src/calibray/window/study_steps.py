@@ -175,7 +175,7 @@ def findings(desk: Desk) -> None:
 
 
 def _assumptions(desk: Desk) -> None:
-    content, reasons = desk.folder.content(), desk.folder.reasons()
+    content, reasons = desk.folder.valid_content(), desk.folder.reasons()
     columns = _columns(desk, content)
     edits: list[tuple[str, str, Callable[[], Any]]] = []
     for section in SECTIONS:
@@ -270,7 +270,7 @@ def _is_sites(name: str) -> bool:
 @ui.refreshable
 def show_parameters(desk: Desk) -> None:
     """Draw the step of the parameters: what is calibrated, within which bounds, and with which prior."""
-    parameters = desk.folder.content().get("parameters")
+    parameters = desk.folder.valid_content().get("parameters")
     if not isinstance(parameters, dict):
         ui.label("Draft the study first.").classes("quiet")
         return
