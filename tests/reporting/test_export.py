@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 import calibray as cb
 import planted
+import shown
 from calibray.calibration.result import Result
 from calibray.cli.app import app
 from calibray.errors import InputError
@@ -128,6 +129,14 @@ def test_coefficients_over_frequency_are_exported(folder, tmp_path):
     content = json.loads((tmp_path / "materials.json").read_text())
     assert {name: content["wood"][name] for name in law} == law
     assert "itu_a" not in content["marble"]
+
+
+def test_exported_coefficients_are_those_of_the_prediction_model():
+    result = changed(shown.result(), laws={"wood": {"itu_a": 5.1, "itu_b": 0.1}})
+    model = replace(result.prediction.model, parameters={"wood.itu_a": 4.2})
+    chosen = replace(result, prediction=replace(result.prediction, model=model))
+    assert chosen.scene_laws == {"wood": {"itu_a": 4.2, "itu_b": 0.1}}
+    assert changed(chosen, parameters=None).scene_laws == result.fit.laws
 
 
 @pytest.mark.skipif(shutil.which("octave-cli") is None, reason="needs octave-cli")

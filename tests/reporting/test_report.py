@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +12,9 @@ import shown
 from calibray.comparison import comparison
 from calibray.reporting import result_tables
 from calibray.reporting import scene_tables as trace
+from calibray.reporting.page import _laws
+from calibray.reporting.summary import summary
+from calibray.reporting.wording import carriers_text
 from calibray.tables import render
 from calibray.tracing.protocol import EnclosedAntennas
 from changed import changed
@@ -35,6 +39,18 @@ def test_a_result_is_printed_as_stored():
     ):
         text = render(result_tables.heading(found), *result_tables.tables(changed(found, enclosed=enclosed)))
         assert text == golden(name)
+
+
+def test_a_law_of_one_constant_and_several_carriers_are_reported():
+    result = changed(shown.result(), laws={"walls": {"itu_a": 5.1, "itu_b": 0.1}})
+    (law,) = _laws(result).rows
+    assert law == ("walls", "5.1", "0.1", "-", "-")
+    carriers = np.where(np.arange(len(result.links)) % 2, 28e9, 3.5e9)
+    several = replace(result, links=result.links.assign(frequency=carriers))
+    assert carriers_text(result) == "3.5 GHz"
+    assert carriers_text(several) == "3.5 GHz, 28 GHz"
+    scope = summary(several)[1].text
+    assert "at 3.5 GHz, 28 GHz, on" in scope
 
 
 def test_a_trace_and_its_check_are_printed_as_stored():

@@ -156,8 +156,8 @@ def _rows(result: Record) -> Iterator[dict[str, Any]]:
                 row[f"{constant}_verdict"] = "unknown" if interval is None else interval.label
             if interval is not None:
                 row |= {f"{constant}_lower": interval.lower, f"{constant}_upper": interval.upper}
-        if result.fit.laws:
-            law = result.fit.laws.get(name, {})
+        if result.scene_laws:
+            law = result.scene_laws.get(name, {})
             row |= {key: law.get(key, math.nan) for key in ("itu_a", "itu_b", "itu_c", "itu_d")}
         yield row
 

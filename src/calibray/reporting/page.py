@@ -31,7 +31,7 @@ from calibray.reporting.link_map import Plan, marks, plan, ramp, ramp_limit
 from calibray.reporting.link_survey import Survey, in_measured_quantity, measured_quantity, residual, survey
 from calibray.reporting.summary import summary
 from calibray.reporting.viewer import TRIANGLES, Rays, packed, rays
-from calibray.reporting.wording import diagnostics_table, held_out_text
+from calibray.reporting.wording import carriers_text, diagnostics_table, held_out_text
 from calibray.result.held_out import Model
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict
@@ -39,7 +39,7 @@ from calibray.scenes import Scene, Triangles, read_scene, read_triangles
 from calibray.support import figure_style as style
 from calibray.support.output_files import check_file, check_outputs, write_text
 from calibray.support.progress import Progress
-from calibray.tables import Column, Table, decibels, hertz, numbers
+from calibray.tables import Column, Table, decibels, numbers
 from calibray.validation.validation import Validation, observables_table
 
 FILE: Final = "report.html"
@@ -248,7 +248,7 @@ def _tiles(result: Record) -> list[tuple[str, str, str]]:
             ),
         ),
         ("Links", f"{len(result.links):,}", held_out_text(result)),
-        ("RT calls", f"{result.rt_calls:,}", f"at {hertz(result.study.scene.frequency)}"),
+        ("RT calls", f"{result.rt_calls:,}", f"at {carriers_text(result)}"),
     ]
     if result.intervals:
         tiles.append(("Identified parameters", f"{identified} of {len(result.parameters)}", "see Values"))
@@ -266,7 +266,8 @@ def _laws(result: Record) -> Table:
     """The coefficients of the power laws of ITU-R P.2040, if they were calibrated."""
     names = ("itu_a", "itu_b", "itu_c", "itu_d")
     rows = tuple(
-        (material, *(f"{law[name]:.4g}" for name in names)) for material, law in result.fit.laws.items()
+        (material, *(f"{law[name]:.4g}" if name in law else "-" for name in names))
+        for material, law in result.fit.laws.items()
     )
     columns = (Column("Material"), numbers("a"), numbers("b"), numbers("c"), numbers("d"))
     return Table("Over frequency: eps_r = a f^b, sigma = c f^d [S/m], f in GHz (ITU-R P.2040)", columns, rows)

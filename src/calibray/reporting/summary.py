@@ -8,11 +8,11 @@ from typing import Final, Literal
 
 from calibray.optimizers.methods import label
 from calibray.parameters.parameter import PARAMETER_BOUNDS
-from calibray.reporting.wording import block_sentence, prediction_text, scene_alone_text
+from calibray.reporting.wording import block_sentence, carriers_text, prediction_text, scene_alone_text
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict
 from calibray.result.wording import NOT_JUDGED, judgement_text
-from calibray.tables import hertz, named, rows_text
+from calibray.tables import named, rows_text
 from calibray.validation.validation import Validation
 
 Kind = Literal["plain", "good", "caution"]
@@ -68,7 +68,7 @@ def _scope(result: Record) -> Sentence:
     constants = "1 constant" if count == 1 else f"{count} constants"
     return Sentence(
         "What was calibrated?",
-        f"{constants} of {_list(materials)} at {hertz(study.scene.frequency)}, on "
+        f"{constants} of {_list(materials)} at {carriers_text(result)}, on "
         f"{result.counts['calibrated_on']:,} links, by {label(study.method.name)} with the engine "
         f"{study.engine.name}: {result.rt_calls:,} RT calls in {_seconds(result.cost.seconds)}, after "
         f"{_seconds(result.cost.trace_seconds)} of tracing and loading.",

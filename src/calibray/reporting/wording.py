@@ -12,7 +12,7 @@ from calibray.reporting.diagnostics import calibration_links, diagnostics, link_
 from calibray.result.held_out import HeldOutErrors, Model
 from calibray.result.record import Record
 from calibray.support.messages import percent
-from calibray.tables import Column, Table, rows_text
+from calibray.tables import Column, Table, hertz, named, rows_text
 from calibray.uncertainty.verdicts import TRADE_OFF
 
 SCENE_ALONE_DB: Final = 0.05
@@ -47,6 +47,13 @@ _AVERAGED: Final = {
     Model.AVERAGE_CALIBRATED: "those of a fit with a prior",
     Model.AVERAGE_OFFSETS: "those of a fit with a prior and offsets",
 }
+
+
+def carriers_text(record: Record) -> str:
+    """The carriers of the links: that of the scene, unless links have their own."""
+    if "frequency" not in record.links:
+        return hertz(record.study.scene.frequency)
+    return named(map(hertz, np.unique(record.links["frequency"].to_numpy(float)).tolist()))
 
 
 def scene_alone_text(record: Record) -> str:

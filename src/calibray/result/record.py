@@ -280,6 +280,15 @@ class Record:
         return self.materials if self.prediction.materials is None else self.prediction.materials
 
     @property
+    def scene_laws(self) -> dict[str, dict[str, float]]:
+        """Coefficients of ITU-R P.2040 by material, as in `Fit.laws`, that give the constants of `scene_materials`."""
+        values = self.prediction.model.parameters or {}
+        return {
+            material: {name: values.get(f"{material}.{name}", value) for name, value in law.items()}
+            for material, law in self.fit.laws.items()
+        }
+
+    @property
     def rmse_db(self) -> float:
         """RMSE over the calibration links (paper eq. 1) [dB]."""
         return self.fit.rmse_db

@@ -165,6 +165,7 @@ def summary(study: StudyModel) -> tuple[Table, Table]:
     rows = [
         ("scene", study.scene.file),
         ("frequency", hertz(study.scene.frequency)),
+        *([("of each link", study.links.frequency)] if study.links.frequency else []),
         ("links", f"{study.links.file}: {study.links.value}, {study.links.quantity}"),
         ("combining", study.objective.combining),
     ]
