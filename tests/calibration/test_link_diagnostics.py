@@ -1,9 +1,8 @@
-"""Leverage against closed forms, and a planted region of extra loss."""
+"""Leverage against closed forms, a planted region of extra loss, and planted differences between devices."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -11,7 +10,8 @@ import pytest
 import shapely
 
 import two_ray
-from calibray.calibration.link_diagnostics import leverage, region_remark
+from calibray.calibration.differing_groups import differing_groups
+from calibray.calibration.link_diagnostics import groups_remark, leverage, region_remark
 from calibray.engines import Replay
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
@@ -44,21 +44,31 @@ def test_dependent_columns_count_once():
     assert leverage(np.hstack([column, 2 * column]), np.zeros((6, 0))).sum() == pytest.approx(1.0)
 
 
-def test_a_loss_where_the_scene_has_nothing_is_a_remark_only_if_planted(tmp_path: Path) -> None:
-    study = two_ray.study(tmp_path, links=200, objective={"combining": "power"})
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
+    """Links all around, with two columns that name the phone."""
+    folder = tmp_path_factory.mktemp("study")
+    study = two_ray.study(folder, links=200, objective={"combining": "power"})
     random = np.random.default_rng(0)
-    table = pd.read_csv(tmp_path / "links.csv")
+    table = pd.read_csv(folder / "links.csv")
     table[["rx_x", "rx_y"]] = random.uniform(-120, 120, (200, 2))
-    table.to_csv(tmp_path / "links.csv", index=False)
+    table["phone"] = random.choice(["a", "b", "c"], 200)
+    table["serial"] = table["phone"].map({"a": 4, "b": 7, "c": 9})
+    table.to_csv(folder / "links.csv", index=False)
     setup = Setup.open(study, tracer=two_ray.TwoRay)
-    engine, truth = Replay(setup.trace(), setup.parameters), np.array([two_ray.TRUTH])
+    return Problem.of(setup, Replay(setup.trace(), setup.parameters))
+
+
+def test_a_loss_where_the_scene_has_nothing_is_a_remark_only_if_planted(problem: Problem) -> None:
+    truth, random = np.array([two_ray.TRUTH]), np.random.default_rng(1)
+    modelled = problem.modelled(problem.parameters.to_search(truth[None]))
     belt = Region(np.array([shapely.box(20, -90, 40, -10)]), np.zeros(1), np.full(1, 10.0))
-    length = belt.length_inside(setup.links.tx, setup.links.rx)
-    problem = Problem.of(setup, engine)
+    links = problem.setup.links
+    length = belt.length_inside(links.tx, links.rx)
 
     def remarks(loss_db_per_m: float) -> tuple:
-        loss = engine.path_loss(truth[None])[0] + random.normal(0, 3, 200) + loss_db_per_m * length
-        trail = Trail(best=truth, best_modelled=engine.path_loss(truth[None])[0])
+        loss = modelled[0] + random.normal(0, 3, 200) + loss_db_per_m * length
+        trail = Trail(best=truth, best_modelled=modelled[0])
         return region_remark(replace(problem, objective=replace(problem.objective, measured=loss)), trail)
 
     assert remarks(0.0) == ()
@@ -69,3 +79,64 @@ def test_a_loss_where_the_scene_has_nothing_is_a_remark_only_if_planted(tmp_path
     text = remark_text(remark)
     assert text.startswith(f"Losses of {remark.values['attenuation']:.2g} dB/m within x = ")
     assert "state them under [regions]" in text
+
+
+def test_a_column_that_explains_residuals_is_named_only_if_planted(problem: Problem) -> None:
+    truth, random = np.array([two_ray.TRUTH]), np.random.default_rng(2)
+    modelled = problem.modelled(problem.parameters.to_search(truth[None]))[0]
+
+    def remarks(step_db: float) -> tuple:
+        slow = (problem.setup.links.frame["phone"] == "b").to_numpy()
+        loss = modelled + random.normal(0, 3, 200) + step_db * slow
+        trail = Trail(best=truth, best_modelled=modelled)
+        return groups_remark(replace(problem, objective=replace(problem.objective, measured=loss)), trail)
+
+    assert remarks(0.0) == ()
+    (remark,) = remarks(5.0)
+    assert remark.kind == RemarkKind.DIFFERING_GROUPS
+    assert remark.values["others"] == ["serial"]
+    text = remark_text(remark)
+    assert "column 'phone'" in text
+    assert "'b' +" in text
+    assert text.endswith('[offset] per = "phone".')
+
+
+def field_and_noise(position: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Errors with a part that neighbours within 40 m share, and a slope [dB]."""
+    distance = np.linalg.norm(position[:, None] - position, axis=2)
+    root = np.linalg.cholesky(np.exp(-distance / 40) + 1e-9 * np.eye(len(position)))
+    count = len(position)
+    return 4 * root @ random.normal(size=count) + random.normal(0, 3, count) + 0.05 * position[:, 0]
+
+
+def test_groups_of_devices_are_found_and_those_of_places_are_not():
+    found, mistaken = [], 0
+    for seed in range(40):
+        random = np.random.default_rng(seed)
+        position = random.uniform(0, 200, (160, 2))
+        ends = np.hstack([np.tile([0.0, 0.0, 20.0], (160, 1)), position, np.full((160, 1), 1.5)])
+        errors, device = field_and_noise(position, random), random.choice(list("abcd"), 160)
+        street = np.char.add(
+            (position[:, 0] // 50).astype(int).astype(str), (position[:, 1] > 100).astype(str)
+        )
+        side = np.where(position[:, 0] > 100, "east", "west")
+        places = {"street": street, "side": side}
+        mistaken += bool(
+            differing_groups(errors + 5.0 * (side == "east"), ends, {**places, "device": device})
+        )
+        differing = differing_groups(errors + 5.0 * (device == "c"), ends, {**places, "device": device})
+        found += [each for each in differing if each.label == "c"]
+    assert mistaken <= 2
+    assert len(found) > 30
+    standard = [(each.difference_db - 5.0) / each.error_db for each in found]
+    assert abs(np.mean(standard)) < 0.7
+    assert np.std(standard) < 1.6
+
+
+def test_transmitters_are_places_too():
+    random = np.random.default_rng(3)
+    mast = np.arange(200) % 2
+    rx = np.column_stack([random.uniform(0, 100, (200, 2)), np.full(200, 1.5)])
+    ends = np.hstack([np.where(mast[:, None] == 1, [[10.0, 0.0, 20.0]], [[0.0, 0.0, 20.0]]), rx])
+    site = np.where(mast == 1, "north", "south")
+    assert differing_groups(random.normal(size=200) + 5.0 * mast, ends, {"site": site}) == []

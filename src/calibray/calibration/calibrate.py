@@ -8,7 +8,12 @@ from pathlib import Path
 from typing import Final
 
 from calibray import engines
-from calibray.calibration.link_diagnostics import directions_remark, region_remark, unreached_remark
+from calibray.calibration.link_diagnostics import (
+    directions_remark,
+    groups_remark,
+    region_remark,
+    unreached_remark,
+)
 from calibray.calibration.make_result import Run, Timing, make_result
 from calibray.calibration.result import Result
 from calibray.engines.cluster.workers import Workers
@@ -130,6 +135,7 @@ def calibrate(
     on_links = unreached_remark(problem, progress) if can_trace and exporting is None else ()
     # A wrong direction looks like a loss on one side of a transmitter.
     on_links += directions_remark(problem, trail.best) or region_remark(problem, trail)
+    on_links += groups_remark(problem, trail)
     run = Run(problem, trail, gap_db, cheap, enclosed, (*of_rays, *on_links), timing)
     result = make_result(run, assessment, validation)
     if out is not None:

@@ -7,18 +7,21 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import fdtrc
 
+from calibray.calibration.differing_groups import differing_groups
 from calibray.engines.kinds.replay import replay
 from calibray.engines.replay import Replay
 from calibray.fields import path_gains
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.fitting.search import Trail
 from calibray.materials import Material
-from calibray.measurements import Measurements
+from calibray.measurements import POSITION_COLUMNS, Measurements
 from calibray.paths import Kind, Paths
 from calibray.result.verdict import Remark, RemarkKind, Value
+from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study import Setup, Study
 from calibray.study.link_checks import LINKS_PER_UNKNOWN
@@ -181,6 +184,9 @@ def _reached(setup: Setup, sample: NDArray[np.int64], change: dict[str, Any]) ->
     return len(np.unique(paths.link))
 
 
+MOST_NUMBERS: Final = 12
+"""Largest number of distinct numbers that are labels of groups, such as days or floors."""
+
 FEWEST_OF_TRANSMITTER: Final = 2 * LINKS_PER_UNKNOWN
 """Number of links per transmitter needed to test its direction, which has two angles."""
 
@@ -221,6 +227,42 @@ def region_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
     values = region.row()
     del values["significant"]
     return (Remark(RemarkKind.MISSING_REGION, values),)
+
+
+def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
+    """Name the column that no nuisance uses and whose groups, such as devices, explain the residuals of a calibration.
+
+    Labels are texts, or a few whole numbers: levels of a signal would follow the measured value.
+    """
+    setup, links, count = problem.setup, problem.setup.links, problem.objective.num_counted
+    if not isinstance(links, Measurements):
+        return ()
+    section, counted = setup.study.links, np.flatnonzero(problem.objective.weight > 0)
+    used = {*OBSTRUCTION, *POSITION_COLUMNS, *section.tx, *section.rx, section.value}
+    for term in setup.study.nuisance_terms.values():
+        used |= {term.by, *term.per}
+    columns = {}
+    for name in links.frame.columns.difference(list(used)):
+        cells = links.frame[name].iloc[counted]
+        few = not pd.api.types.is_numeric_dtype(cells) or cells.nunique() <= MOST_NUMBERS
+        if few and cells.notna().all():
+            columns[str(name)] = cells.astype(str).to_numpy(dtype=np.str_)
+    residual_db = problem.residuals(trail.best[None], trail.best_modelled[None])[0, :count]
+    found = differing_groups(-residual_db, np.hstack([links.tx, links.rx])[counted], columns)
+    if not found:
+        return ()
+    column = found[0].column
+    groups = [each for each in found if each.column == column]
+    values: dict[str, Value] = {
+        "column": column,
+        "labels": [each.label for each in groups],
+        "differences_db": [each.difference_db for each in groups],
+        "errors_db": [each.error_db for each in groups],
+        "others": sorted({each.column for each in found} - {column}),
+        "per": [*setup.study.offset_groups, column],
+        "chance": found[0].chance,
+    }
+    return (Remark(RemarkKind.DIFFERING_GROUPS, values),)
 
 
 def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Remark, ...]:

@@ -79,7 +79,7 @@ class Run:
         retrace_gap_db: Change of every link's path loss when traced again [links], [dB]; None if not traced again.
         cheap: The cheap model, if the method had one.
         enclosed: Antennas inside closed bodies; None if this was not checked.
-        on_links: Remarks on ray mapping, on links without a path and on directions of antennas.
+        on_links: Remarks on ray mapping, links without a path, directions of antennas, and groups of links.
         timing: Time of its parts.
     """
 

@@ -128,6 +128,8 @@ class RemarkKind(StrEnum):
     # transmitters; azimuth_deg and downtilt_deg, what to add to their stated angles, and azimuth_error_deg,
     # downtilt_error_deg
     ANTENNA_DIRECTIONS = "antenna directions"
+    # column, labels, differences_db, errors_db, others (columns that also explain residuals), per, chance
+    DIFFERING_GROUPS = "differing groups"
     UNREACHED_LINKS = (
         "unreached links"  # links, of (all), sample, switches, reached (links of the sample by switch)
     )

@@ -16,6 +16,9 @@ MOST_ODDS: Final = 1000.0
 SHOWN_PIECES: Final = 3
 """Largest number of pieces of an interval that are listed one by one."""
 
+SHOWN_GROUPS: Final = 4
+"""Largest number of groups that a remark lists."""
+
 NOT_JUDGED: Final = (
     "No links were held out, so nothing shows which model predicts new links best. Set [holdout] blocks = 4, or run "
     "calibray validate."
@@ -273,6 +276,23 @@ def _missing_region(values: dict[str, Any]) -> str:
     )
 
 
+def _differing_groups(values: dict[str, Any]) -> str:
+    rows = list(zip(values["labels"], values["differences_db"], values["errors_db"], strict=True))
+    groups = "; ".join(
+        f"{label!r} {difference:+.1f} dB (standard error {error:.1f} dB)"
+        for label, difference, error in rows[:SHOWN_GROUPS]
+    )
+    more = f"; and {len(rows) - SHOWN_GROUPS} more" if len(rows) > SHOWN_GROUPS else ""
+    others = f" The same holds for the columns {', '.join(values['others'])}." if values["others"] else ""
+    per = ", ".join(f'"{name}"' for name in values["per"])
+    return (
+        f"Residuals of links in the same place depend on the column {values['column']!r}, more than by chance. "
+        f"Measured minus modelled path loss, compared with neighbouring links: {groups}{more}.{others} If the column "
+        f"names devices, antennas or days, give each an offset: [offset] per = "
+        f"{f'[{per}]' if len(values['per']) > 1 else per}."
+    )
+
+
 _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.CORRELATED_NOISE: _noise_remark("Neighbouring links share part of their errors"),
     RemarkKind.HEAVY_TAILS: _noise_remark("The noise has heavy tails, as with outliers"),
@@ -301,6 +321,7 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.NOT_JUDGED: lambda values: NOT_JUDGED,
     RemarkKind.MISSING_REGION: _missing_region,
     RemarkKind.UNREACHED_LINKS: _unreached_links,
+    RemarkKind.DIFFERING_GROUPS: _differing_groups,
     RemarkKind.ANTENNA_DIRECTIONS: _antenna_directions,
     RemarkKind.CONFLICT: _conflict,
 }
