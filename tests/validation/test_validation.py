@@ -7,9 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calibray.measurements import Measurements
 from calibray.result.held_out import AVERAGES, Model
 from calibray.result.wording import choice_text, judgement_text
-from calibray.validation.held_out_statistics import MOST_CLUSTERS, compare, spatial_blocks
+from calibray.validation.held_out_statistics import (
+    MOST_CLUSTERS,
+    compare,
+    moving_end,
+    place_blocks,
+    spatial_blocks,
+)
 from calibray.validation.validation import Validation
 
 
@@ -25,6 +32,25 @@ def test_blocks_are_even_and_compact():
     spread = np.mean([np.linalg.norm(position[block == k] - middle[k], axis=1).mean() for k in range(8)])
     assert spread < 0.7 * np.linalg.norm(position - position.mean(axis=0), axis=1).mean()
     assert np.unique(spatial_blocks(np.zeros((5, 3)), 9)).tolist() == [0, 1, 2, 3, 4]
+
+
+def test_blocks_follow_the_end_that_moved():
+    moved, fixed = positions(60), np.tile([0.0, 0.0, 9.0], (60, 1))
+    downlink = Measurements(tx=fixed, rx=moved, path_loss_db=np.full(60, 90.0))
+    uplink = Measurements(tx=moved, rx=fixed, path_loss_db=np.full(60, 90.0))
+    assert moving_end(downlink) is downlink.rx
+    assert moving_end(uplink) is uplink.tx
+    assert (place_blocks(moving_end(uplink), 4) == place_blocks(moving_end(downlink), 4)).all()
+
+
+def test_links_of_one_place_are_in_one_block():
+    place = np.random.default_rng(5).integers(0, 14, 100)
+    position = positions(14)[place] + np.random.default_rng(6).choice([0.0, 3.0], (100, 1)) * [0, 0, 1]
+    block = place_blocks(position, 4)
+    assert len(set(zip(place.tolist(), block.tolist(), strict=True))) == len(set(place.tolist()))
+    assert len(set(block.tolist())) == 4
+    distinct = positions(103)
+    assert (place_blocks(distinct, 8) == spatial_blocks(distinct[:, :2], 8)).all()
 
 
 @pytest.mark.parametrize(

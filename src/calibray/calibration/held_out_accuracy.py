@@ -25,10 +25,11 @@ from calibray.validation.choice import HeldOutResiduals, fit_variant, fitted_ter
 from calibray.validation.held_out_statistics import (
     compare,
     held_out_gaps,
+    moving_end,
     observable_errors,
     out_of_sight_ratio,
+    place_blocks,
     predicting,
-    spatial_blocks,
     two_levels,
 )
 from calibray.validation.models import (
@@ -85,7 +86,7 @@ def on_held_out_links(
             "a log-distance model": models.log_distance,
         }
         others = {name: (model - objective.measured)[judged] for name, model in baselines.items()}
-        judgement = compare(errors, others, links.rx[judged])
+        judgement = compare(errors, others, moving_end(links)[judged])
         # No link has a residual in all models.
         judgement = judgement if judgement.links else None
     name, residuals = _choice(problem, trail, models, judged)
@@ -125,11 +126,11 @@ def _choice(
     finite = np.isfinite(np.stack(list(errors.values()))).all(axis=0)
     errors, count = {name: values[finite] for name, values in errors.items()}, int(finite.sum())
     if count >= FEW:
-        name = predicting(errors, setup.links.rx[judged][finite])
+        name = predicting(errors, moving_end(setup.links)[judged][finite])
         rms_db, basis = float(np.sqrt(np.mean(errors[name] ** 2))), f"errors of {count} links held out"
         basis = basis if name == Model.CALIBRATED else f"{name}, {basis}"
         position = np.hstack([setup.links.tx, setup.links.rx])[judged][finite]
-        block = spatial_blocks(position[:, 3:5], DEFAULT_BLOCKS)
+        block = place_blocks(moving_end(setup.links)[judged][finite], DEFAULT_BLOCKS)
         levels = two_levels(errors[name], block, position)
         if levels is not None:
             kept = np.flatnonzero(judged)[finite]

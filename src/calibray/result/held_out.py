@@ -81,7 +81,7 @@ class HeldOutErrors:
         labels: Names of the blocks.
         block: Block of every link [links]; -1 if it is not judged.
         errors: Modelled minus measured path loss by name of the model [links], [dB]; NaN if it is not judged.
-        position: Positions of the receivers [links, 3], [m].
+        position: Positions of the end that moved [links, 3], [m], from `moving_end`.
         measured_db: Measured path loss [links], [dB].
         level: Nominal coverage of the intervals.
         observables: Errors of the further observables by name; empty in a loaded result, whose accuracy contains them.

@@ -81,6 +81,27 @@ def spatial_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int6
     return block
 
 
+def moving_end(links: Measurements) -> NDArray[np.float64]:
+    """Positions of the receivers, or of the transmitters if these are at more places [links, 3], [m]."""
+    tx_places, rx_places = (len(np.unique(end, axis=0)) for end in (links.tx, links.rx))
+    return links.tx if tx_places > rx_places else links.rx
+
+
+def place_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """Divide links with positions [n, 3], [m], like `spatial_blocks` in plan, each place within one block [n].
+
+    Example:
+        >>> place_blocks(np.array([[0.0, 0, 1], [0.0, 0, 4], [0.0, 0, 7], [9.0, 0, 1]]), 2).tolist()
+        [0, 0, 0, 1]
+    """
+    _, first, place = np.unique(position[:, :2], axis=0, return_index=True, return_inverse=True)
+    # In the order of the links, which decides between equal coordinates.
+    order = np.argsort(first)
+    block = np.empty(len(first), dtype=np.int64)
+    block[order] = spatial_blocks(position[first[order], :2], count)
+    return block[place.reshape(-1)]
+
+
 def compare(
     errors: NDArray[np.float64],
     baselines: Errors,

@@ -25,7 +25,13 @@ from calibray.study.model import StudyModel
 from calibray.support.progress import Progress
 from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.protocol import TracerFactory
-from calibray.validation.held_out_statistics import MODELS, held_out_gaps, observable_errors, spatial_blocks
+from calibray.validation.held_out_statistics import (
+    MODELS,
+    held_out_gaps,
+    moving_end,
+    observable_errors,
+    place_blocks,
+)
 from calibray.validation.models import (
     NO_MINIMA,
     averages,
@@ -139,7 +145,7 @@ def validate_problem(
     judged = (block >= 0) & np.isfinite(errors[Model.INITIAL]) & np.isfinite(errors[Model.CALIBRATED])
     complete = {name: residual for name, residual in errors.items() if np.isfinite(residual[judged]).all()}
     return Validation(
-        labels, np.where(judged, block, -1), complete, links.rx, objective.measured,
+        labels, np.where(judged, block, -1), complete, moving_end(links), objective.measured,
         observables=observable_errors(gaps, problem.setup.study),
     )  # fmt: skip
 
@@ -153,8 +159,8 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
     block = np.full(len(links), -1, dtype=np.int64)
     if by is None:
         count = DEFAULT_BLOCKS if count is None else count
-        block[counted] = spatial_blocks(links.rx[counted, :2], count)
-        labels = tuple(str(number + 1) for number in range(count))
+        block[counted] = place_blocks(moving_end(links)[counted], count)
+        labels = tuple(str(number + 1) for number in range(block.max() + 1))
     else:
         if by == TX and by not in links.frame:
             link_labels = np.unique(links.tx, axis=0, return_inverse=True)[1].reshape(-1).astype(str)
