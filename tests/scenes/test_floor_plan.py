@@ -314,6 +314,30 @@ def test_walls_of_impossible_size_are_refused(tmp_path, row):
         read_plan(tmp_path / "plan.csv")
 
 
+def test_storeys_above_each_other_need_their_own_floors(tmp_path):
+    def storey(bottom):
+        ends = [(0, 0, 10, 0), (10, 0, 10, 6), (10, 6, 0, 6), (0, 6, 0, 0)]
+        return [line(*each, bottom=bottom, top=bottom + 2.6) for each in ends]
+
+    with pytest.raises(InputError, match=r"a storey begins at 2\.8 m, .* make a scene of each storey"):
+        make_plan_scene([*storey(0.0), *storey(2.8)], tmp_path)
+    make_plan_scene([*storey(0.0), *storey(2.8)], tmp_path, lids=())
+    parapet = [line(2, 2, 8, 2, top=1.0), line(2, 2, 8, 2, kind="glass", bottom=1.0)]
+    make_plan_scene([*OUTER, *parapet], tmp_path)
+
+
+@pytest.mark.parametrize(("thickness", "stated"), [(24, "24"), (0.0001, "0.0001")])
+def test_a_thickness_in_another_unit_is_refused(tmp_path, thickness, stated):
+    plan = tmp_path / "plan.csv"
+    plan.write_text(f"x0,y0,x1,y1,type,thickness\n0,0,5,0,brick,{thickness}\n")
+    with pytest.raises(
+        InputError, match=rf"row 2: thickness = {stated} m, must be 0\.0005 to 3 m; state its unit"
+    ):
+        read_plan(plan)
+    plan.write_text("x0,y0,x1,y1,type,thickness_cm\n0,0,5,0,brick,24\n")
+    assert read_plan(plan)[0].thickness == pytest.approx(0.24)
+
+
 @pytest.mark.parametrize("ending", ["csv.gz", "csv.zip", "csv.xz", "csv.zst", "csv.bz2", "tar"])
 @pytest.mark.parametrize(
     "content", [gzip.compress(b"x0,y0,x1,y1,type\n" + b"\0" * 10**7), b"text", b"\0\xff"]

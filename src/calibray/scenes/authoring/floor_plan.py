@@ -26,6 +26,9 @@ from calibray.support.output_files import exists
 OPENINGS: Final = frozenset({"door", "window"})
 """Types that replace the wall on which they are drawn."""
 
+THICKNESS: Final = (0.0005, 3.0)
+"""Smallest and largest thickness of a wall [m]; beyond it, the column has another unit than the coordinates."""
+
 VECTOR_SUFFIXES: Final = (".dxf", ".geojson", ".json", ".gpkg", ".shp", ".fgb", ".gdb")
 """Extensions of vector files; any other file is read as CSV."""
 
@@ -128,6 +131,11 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[
             raise InputError(
                 f"{row}: {size:g} m from the origin, {extent:g} m high and {thickness:g} m thick; coordinates may be "
                 f"{WIDEST:g} m, heights and thicknesses {HIGHEST:g} m at most; correct it or its unit"
+            )
+        if not (np.isnan(thickness) or THICKNESS[0] <= thickness <= THICKNESS[1]):
+            raise InputError(
+                f"{row}: thickness = {thickness:g} m, must be {THICKNESS[0]:g} to {THICKNESS[1]:g} m; state its unit "
+                "in the name of the column, such as thickness_cm, or the plan's unit (--unit 0.01 for cm)"
             )
         stated = None if np.isnan(thickness) else thickness
         segments += [Segment(a, b, kind.strip().lower(), bottom, bottom + extent, stated) for a, b in sides]

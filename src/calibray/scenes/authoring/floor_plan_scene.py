@@ -55,6 +55,9 @@ WALL_THICKNESS: Final = 0.12
 NAMED: Final = 10
 """Largest number of types without a material that a message names."""
 
+STOREY: Final = 1.8
+"""Smallest height of a storey [m]; lower parts of walls, such as parapets, are no storeys."""
+
 ROUNDING: Final = 2.0
 """Distance of a corner from its line that rounding explains [mm]: walls of a plan are cut where they cross."""
 
@@ -90,8 +93,8 @@ def make_plan_scene(
         overwrite: Replace files that Calibray did not write.
 
     Raises:
-        InputError: A type has no material, there is no segment, the folder cannot be written, or a file there must not
-            be replaced.
+        InputError: A type has no material, there is no segment, storeys above each other would have no floor between
+            them, the folder cannot be written, or a file there must not be replaced.
     """
     folder = check_outputs(folder, SCENE_FILES, overwrite=overwrite)
     types = {**TYPES, **(types or {})}
@@ -99,6 +102,11 @@ def make_plan_scene(
         raise InputError("the floor plan contains no segment; give at least one wall")
     merged = merge_faces(segments) if merge else MergedPlan(segments)
     sheets = merged.sheets
+    if lids and (level := _separation(sheets)) is not None:
+        raise InputError(
+            f"floor plan: a storey begins at {level:g} m, where the scene would have no floor; make a scene of each "
+            "storey, or omit floor and ceiling (--no-floor --no-ceiling) and add the floors to the scene yourself"
+        )
     materials = _materials(sheets, types)
     pieces = _pieces(_extend_to_walls(sheets), [material.name for material in materials])
     objects = _wall_objects(pieces)
@@ -149,6 +157,16 @@ def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) 
         else material
         for material in materials
     ]
+
+
+def _separation(sheets: Sequence[Segment]) -> float | None:
+    """Height at which one storey ends and all sheets above begin [m]; None if there is one storey."""
+    lowest, highest = min(sheet.bottom for sheet in sheets), max(sheet.top for sheet in sheets)
+    for level in sorted({sheet.bottom for sheet in sheets}):
+        passed = any(sheet.bottom < level - MILLIMETRE and sheet.top > level + MILLIMETRE for sheet in sheets)
+        if not passed and level - lowest >= STOREY and highest - level >= STOREY:
+            return level
+    return None
 
 
 def _extend_to_walls(sheets: Sequence[Segment]) -> list[Segment]:
