@@ -96,6 +96,19 @@ def test_the_knife_edge_is_that_of_p_526():
     assert grazing.knife_edge_db(0.1) == pytest.approx([6.03], abs=0.02)
 
 
+def test_a_floor_over_the_whole_scene_blocks_links_between_storeys():
+    """The ends of two links are above each other; floors and the ceiling are no obstacles within a storey."""
+    corners = np.concatenate([box((0, 0), (12, 9), z, z)[-2:] for z in (0.0, 3.0, 6.0)])
+    face = np.arange(3 * len(corners)).reshape(-1, 3)
+    storeys = Triangles(corners.reshape(-1, 3), face, np.zeros(len(face), int), np.ones(len(face), bool))
+    tx, beyond = (2.0, 2.0, 2.5), (20.0, 2.0, 1.5)
+    start = np.array([tx, tx, tx, (2.0, 2.0, 5.5), tx])
+    end = np.array([(9.0, 5.0, 1.5), (9.0, 5.0, 4.5), (2.0, 2.0, 4.5), (9.0, 5.0, 4.5), beyond])
+    found = obstruction(storeys, start, end)
+    assert found.out_of_sight.tolist() == [False, True, True, False, False]
+    assert obstruction(storeys, end, start).out_of_sight.tolist() == found.out_of_sight.tolist()
+
+
 def test_a_scene_without_obstacles_blocks_nothing():
     found = obstruction(scene(), np.array([[0, 0, 10.0]]), np.array([[200, 0, 10.0]]))
     assert (found.length_m[0], found.walls[0], found.knife_edge_db(0.1)[0]) == (0.0, 0, 0.0)

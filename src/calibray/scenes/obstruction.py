@@ -19,7 +19,7 @@ from calibray.errors import InputError
 from calibray.measurements import Measurements
 from calibray.scenes.regions import Region, united
 from calibray.scenes.scene import Scene
-from calibray.scenes.triangles import LEVEL, Triangles, read_triangles
+from calibray.scenes.triangles import BATCH, LEVEL, Triangles, read_triangles, vertical_crossings
 
 OUT_OF_SIGHT: Final = "out_of_sight"
 WALLS: Final = "walls_crossed"
@@ -30,9 +30,6 @@ crosses, its length inside buildings [m], and the knife-edge loss of the highest
 
 SAME_CROSSING: Final = 1e-3
 """Crossings closer than this count as one, on an edge that two triangles share [m]."""
-
-BATCH: Final = 2_000_000
-"""Largest number of pairs of a line and a triangle in memory at once; each needs about 100 bytes."""
 
 CLEAR: Final = -0.78
 """Fresnel parameter below which an edge causes no loss (ITU-R P.526-15, section 4.1)."""
@@ -46,11 +43,13 @@ class Obstruction:
         length_m: Length inside buildings [n], [m].
         walls: Number of walls crossed [n].
         clearance: Largest Fresnel parameter of a roof's edge for a wavelength of 1 m [n]; -inf over no building.
+        other_floor: Whether a floor over the whole scene lies between the ends [n].
     """
 
     length_m: NDArray[np.float64]
     walls: NDArray[np.int64]
     clearance: NDArray[np.float64]
+    other_floor: NDArray[np.bool_]
 
     def columns(self, wavelength: NDArray[np.float64] | float) -> dict[str, NDArray[np.float64]]:
         """The values of `OBSTACLES` [n] by name, for a wavelength [m] of all links or of each [n]."""
@@ -59,8 +58,8 @@ class Obstruction:
 
     @property
     def out_of_sight(self) -> NDArray[np.bool_]:
-        """Whether a wall or a roof is between the ends [n]."""
-        return (self.length_m > 0) | (self.walls > 0)
+        """Whether a wall, a roof or a floor is between the ends [n]."""
+        return (self.length_m > 0) | (self.walls > 0) | self.other_floor
 
     def knife_edge_db(self, wavelength: NDArray[np.float64] | float) -> NDArray[np.float64]:
         """Diffraction loss of the highest roof edge as a knife edge [n], [dB], by ITU-R P.526-15 equation 31.
@@ -74,7 +73,7 @@ class Obstruction:
 
 
 def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[np.float64]) -> Obstruction:
-    """Obstruction of links with ends [n, 3], [m]; triangles of the ground are not obstacles.
+    """Obstruction of links with ends [n, 3], [m]; triangles of the ground are obstacles only as floors between them.
 
     Example:
         A roof 10 m high over the square from (0, 0) to (10, 10) m, and one wall at x = 0:
@@ -115,7 +114,25 @@ def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[n
     separate = np.ones(len(crossed), dtype=bool)
     separate[1:] = (np.diff(crossed[:, 0]) > 0) | (np.diff(crossed[:, 1]) > SAME_CROSSING)
     np.add.at(walls, crossed[separate, 0].astype(np.int64), 1)
-    return Obstruction(length, walls, clearance)
+    return Obstruction(length, walls, clearance, _on_other_floor(triangles, start, end))
+
+
+def _on_other_floor(
+    triangles: Triangles, start: NDArray[np.float64], end: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Whether one end [n, 3], [m], has fewer sheets of the ground below it and more above it than the other [n].
+
+    Where the ground ends, or a floor has a hole, the numbers do not tell.
+    """
+    points, index = np.unique(np.concatenate([start, end]), axis=0, return_inverse=True)
+    below, above = np.zeros(len(points), dtype=np.int64), np.zeros(len(points), dtype=np.int64)
+    for _, point, height in vertical_crossings(triangles.corners[triangles.ground], points):
+        is_above = height > points[point, 2]
+        np.add.at(above, point, is_above)
+        np.add.at(below, point, ~is_above)
+    first, last = np.split(index.reshape(-1), 2)
+    higher, fewer = below[last] - below[first], above[last] - above[first]
+    return higher * fewer < 0
 
 
 def _pairs(

@@ -25,6 +25,9 @@ STEEP: Final = 0.1
 WITHOUT_GAPS: Final = 0.9
 """Share of its extent that a sheet over the whole scene covers, such as a floor or a ceiling [1]."""
 
+BATCH: Final = 2_000_000
+"""Largest number of pairs of a line and a triangle in memory at once; each needs about 100 bytes."""
+
 _EDGE: Final = 1e-9
 """Points up to this distance outside a triangle count as over it, as a share of its size [1]."""
 
@@ -189,6 +192,39 @@ def ground_heights(
     z = origin[triangle, 2] + u * along[triangle, 2] + v * across[triangle, 2]
     np.minimum.at(heights, (row[over], column[over]), z[over])
     return np.where(np.isfinite(heights), heights, triangles.vertex[:, 2].min())
+
+
+def vertical_crossings(
+    corners: NDArray[np.float64], points: NDArray[np.float64]
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]:
+    """Triangles that vertical lines through points cross, in batches: triangle, point and height [m] of each crossing.
+
+    The points [n, 3] are sorted by x.
+    """
+    # The lines are moved by a fraction of a micrometre: through an edge shared by two triangles they would cross both.
+    x, y = points[:, 0] + 3.1e-7, points[:, 1] + 1.7e-7
+    low, high = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
+    first = np.searchsorted(x, low[:, 0], "left")
+    count = np.searchsorted(x, high[:, 0], "right") - first
+    batch = np.cumsum(count) // BATCH
+    for members in np.split(np.arange(len(corners)), np.flatnonzero(np.diff(batch)) + 1):
+        triangle = np.repeat(members, count[members])
+        start = np.cumsum(count[members]) - count[members]
+        point = np.arange(len(triangle)) + np.repeat(first[members] - start, count[members])
+        near = (low[triangle, 1] <= y[point]) & (y[point] <= high[triangle, 1])
+        triangle, point = triangle[near], point[near]
+        origin = corners[triangle, 0]
+        side_u, side_v = corners[triangle, 1] - origin, corners[triangle, 2] - origin
+        area = side_u[:, 0] * side_v[:, 1] - side_u[:, 1] * side_v[:, 0]
+        vertical = np.abs(area) <= 1e-12
+        area = np.where(vertical, 1.0, area)
+        east, north = x[point] - origin[:, 0], y[point] - origin[:, 1]
+        # Barycentric coordinates of the line in the plane z = 0.
+        u = (east * side_v[:, 1] - north * side_v[:, 0]) / area
+        v = (north * side_u[:, 0] - east * side_u[:, 1]) / area
+        crossed = (u >= 0) & (v >= 0) & (u + v < 1) & ~vertical
+        height = origin[:, 2] + u * side_u[:, 2] + v * side_v[:, 2]
+        yield triangle[crossed], point[crossed], height[crossed]
 
 
 def _grid_index(

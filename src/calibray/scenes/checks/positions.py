@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.scenes.obstruction import BATCH, SAME_CROSSING, crossing
-from calibray.scenes.triangles import STEEP, Triangles, is_ground, read_meshes
+from calibray.scenes.obstruction import SAME_CROSSING, crossing
+from calibray.scenes.triangles import BATCH, STEEP, Triangles, is_ground, read_meshes, vertical_crossings
 from calibray.support.lazy_imports import library
 
 KERB: Final = 2.0
@@ -237,7 +236,7 @@ def locate(triangles: Triangles, points: NDArray[np.float64]) -> NDArray[np.str_
     corners = triangles.corners
     scene_low, scene_high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     over_building, ground, ground_below = (np.zeros(len(unique), dtype=int) for _ in range(3))
-    for batch, point, height in _crossed_triangles(corners, unique):
+    for batch, point, height in vertical_crossings(corners, unique):
         above = height > unique[point, 2] + CLEARANCE
         is_ground = triangles.ground[batch]
         np.add.at(over_building, point, above & ~is_ground)
@@ -247,36 +246,3 @@ def locate(triangles: Triangles, points: NDArray[np.float64]) -> NDArray[np.str_
     under = ((ground > 0) & (ground_below == 0)) | (unique[:, 2] < scene_low[2] - CLEARANCE)
     location = np.select([beyond, under, over_building % 2 == 1], [BEYOND, UNDER, INSIDE], "")
     return location[inverse.reshape(-1)]
-
-
-def _crossed_triangles(
-    corners: NDArray[np.float64], points: NDArray[np.float64]
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]:
-    """Triangles that vertical lines through points cross, in batches: triangle, point and height [m] of each crossing.
-
-    The points [n, 3] are sorted by x.
-    """
-    # The lines are moved by a fraction of a micrometre: through an edge shared by two triangles they would cross both.
-    x, y = points[:, 0] + 3.1e-7, points[:, 1] + 1.7e-7
-    low, high = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
-    first = np.searchsorted(x, low[:, 0], "left")
-    count = np.searchsorted(x, high[:, 0], "right") - first
-    batch = np.cumsum(count) // BATCH
-    for members in np.split(np.arange(len(corners)), np.flatnonzero(np.diff(batch)) + 1):
-        triangle = np.repeat(members, count[members])
-        start = np.cumsum(count[members]) - count[members]
-        point = np.arange(len(triangle)) + np.repeat(first[members] - start, count[members])
-        near = (low[triangle, 1] <= y[point]) & (y[point] <= high[triangle, 1])
-        triangle, point = triangle[near], point[near]
-        origin = corners[triangle, 0]
-        side_u, side_v = corners[triangle, 1] - origin, corners[triangle, 2] - origin
-        area = side_u[:, 0] * side_v[:, 1] - side_u[:, 1] * side_v[:, 0]
-        vertical = np.abs(area) <= 1e-12
-        area = np.where(vertical, 1.0, area)
-        east, north = x[point] - origin[:, 0], y[point] - origin[:, 1]
-        # Barycentric coordinates of the line in the plane z = 0.
-        u = (east * side_v[:, 1] - north * side_v[:, 0]) / area
-        v = (north * side_u[:, 0] - east * side_u[:, 1]) / area
-        crossed = (u >= 0) & (v >= 0) & (u + v < 1) & ~vertical
-        height = origin[:, 2] + u * side_u[:, 2] + v * side_v[:, 2]
-        yield triangle[crossed], point[crossed], height[crossed]
