@@ -307,6 +307,13 @@ def test_an_unknown_method_is_refused_before_any_work(tmp_path, exact, method, m
     assert planted.engine().calls == calls
 
 
+def test_the_name_of_a_file_is_no_study():
+    with pytest.raises(
+        InputError, match=r"study: is a str, must be a Study; .* calibrate\(Study\.load\(file\)\)"
+    ):
+        calibrate("study.toml")
+
+
 def test_an_unknown_option_of_a_method_is_refused(tmp_path, exact):
     with pytest.raises(InputError, match=r"method\.options\.wolfes: the method 'gwo' has no such setting"):
         run(tmp_path, exact, None, method={"name": "gwo", "options": {"wolfes": 3}})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -165,6 +166,12 @@ def test_the_position_of_the_transmitter_has_no_path_loss(result, coverage, monk
     assert np.isnan(one_cell.path_loss_db).all()
 
 
+def test_a_map_is_shown_in_one_line(coverage):
+    assert re.fullmatch(
+        r"<map of 12 cells of 30 m, transmitter at \(.*\) m, path_loss_db [\d.]+ to [\d.]+>", repr(coverage)
+    )
+
+
 def test_received_power_is_transmitted_power_minus_path_loss(coverage):
     power = replace(coverage, power_dbm=43.0).layers
     assert list(power) == ["received_power_dbm", "lower_dbm", "upper_dbm"]
@@ -225,6 +232,10 @@ def test_the_group_is_that_of_the_links_measured_at_the_transmitter(result, monk
         ({"cell": 0.01}, "must be at most 1000000"),
         ({"bounds": [10, 0, -10, 5]}, "west less than east"),
         ({"height": np.nan}, "height = nan"),
+        ({"height": None}, "height = None: must be a finite number"),
+        ({"cell": "5"}, "cell = '5': must be a finite number greater than 0"),
+        ({"tx": "mast"}, "tx = 'mast': must be x, y and z"),
+        ({"bounds": "scene"}, "bounds = 'scene': must be west, south, east and north"),
         ({"level": 1.5}, r"level = 1\.5"),
         ({"samples": 0}, "trace.samples"),
         ({"columns": {}}, "--column half=VALUE"),

@@ -76,6 +76,14 @@ def test_a_table_with_the_columns_of_the_measurements_is_predicted(tmp_path):
     predicted = result.predict(standard)
     assert np.isfinite(predicted).all()
     assert result.predict(own_columns) == pytest.approx(predicted)
+    assert result.predict(own_columns.astype(object)) == pytest.approx(predicted)
+    for wrong, message in (
+        ("new.csv", "links: is a str, must be a pandas DataFrame; read a file first"),
+        (own_columns.to_numpy(), "links: is a ndarray, must be a pandas DataFrame"),
+        (pd.concat([own_columns, own_columns], axis=1), "links: has several columns 'east'; keep one"),
+    ):
+        with pytest.raises(InputError, match=message):
+            result.predict(wrong)
     assert result.predict_interval(own_columns).upper_db.to_numpy() == pytest.approx(
         result.predict_interval(standard).upper_db.to_numpy()
     )

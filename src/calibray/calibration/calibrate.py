@@ -20,6 +20,7 @@ from calibray.engines.cluster.workers import Workers
 from calibray.engines.ledger.ledger import LEDGER_FILE
 from calibray.engines.protocol import Answering, Engine
 from calibray.engines.rays.export import Exporting
+from calibray.errors import InputError
 from calibray.fitting.cheap_replay import CheapReplay, make_cheap_replay
 from calibray.fitting.fidelity_loop import retrace
 from calibray.fitting.preliminary_fits import estimate_noise, estimate_spreads, leave_out_near_floor
@@ -86,6 +87,10 @@ def calibrate(
         >>> result.rmse_db < result.initial_rmse_db  # doctest: +SKIP
         True
     """
+    if not isinstance(study, Study | Setup):
+        raise InputError(
+            f"study: is a {type(study).__name__}, must be a Study; read a file first: calibrate(Study.load(file))"
+        )
     replaced = study.replace(method=method, seed=seed)
     plan, setup = (replaced.study, replaced) if isinstance(replaced, Setup) else (replaced, None)
     check_method(plan.method.name)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from numbers import Real
 from typing import Final, Literal
 
 import numpy as np
@@ -130,9 +131,9 @@ def coverage_map(
 def _transmitter(result: Record, tx: Sequence[float] | None) -> NDArray[np.float64]:
     """The given position of the transmitter, or that of the calibration's only one [3], [m]."""
     if tx is not None:
-        position = np.array(tx, dtype=float).reshape(-1)
+        position = _numbers(tx)
         if position.shape != (3,) or not np.isfinite(position).all():
-            raise InputError(f"tx = {list(tx)}: must be x, y and z, three finite numbers [m]")
+            raise InputError(f"tx = {tx!r}: must be x, y and z, three finite numbers [m]")
         return position
     names = list(TX_COLUMNS)
     positions = (
@@ -206,11 +207,11 @@ def _grid(
             raise InputError("the scene has no readable mesh, so its area is unknown; give --bounds")
         ends = np.concatenate([triangles.vertex.min(axis=0)[:2], triangles.vertex.max(axis=0)[:2]])
     else:
-        ends = np.array(bounds, dtype=float).reshape(-1)
+        ends = _numbers(bounds)
     if ends.shape != (4,) or not np.isfinite(ends).all() or not (ends[:2] < ends[2:]).all():
         raise InputError(
-            f"bounds = {ends.tolist()}: must be west, south, east and north [m], west less than east and south less "
-            "than north"
+            f"bounds = {ends.tolist() if bounds is None else bounds!r}: must be west, south, east and north [m], west "
+            "less than east and south less than north"
         )
     # The tolerance keeps rounding errors from adding a cell.
     count = np.maximum(np.ceil((ends[2:] - ends[:2]) / cell - 1e-6), 1.0)
@@ -225,7 +226,16 @@ def _grid(
     return eastings, northings
 
 
+def _numbers(values: Sequence[float]) -> NDArray[np.float64]:
+    """The values as numbers [n]; NaN if they are none."""
+    try:
+        return np.array(values, dtype=float).reshape(-1)
+    except (TypeError, ValueError):
+        return np.full(1, np.nan)
+
+
 def _check_number(name: str, value: float, lower: float) -> None:
-    if not (np.isfinite(value) and value > lower):
+    if not isinstance(value, Real) or not (np.isfinite(value) and value > lower):
         bound = "" if np.isinf(lower) else f" greater than {lower:g}"
-        raise InputError(f"{name} = {value:g}: must be a finite number{bound}")
+        shown = f"{value:g}" if isinstance(value, float) else repr(value)
+        raise InputError(f"{name} = {shown}: must be a finite number{bound}")

@@ -40,7 +40,7 @@ QUANTILES: Final = (0.02, 0.98)
 
 
 @final
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class CoverageMap:
     """Path loss, or received power, over a grid of square cells.
 
@@ -78,6 +78,13 @@ class CoverageMap:
     frame: Frame | None
     triangles: Triangles
     observables: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        (name, best), *_ = self.layers.items()
+        known = best[np.isfinite(best)]
+        values = f"{name} {known.min():.1f} to {known.max():.1f}" if known.size else f"{name} unknown"
+        tx = ", ".join(f"{coordinate:g}" for coordinate in self.tx)
+        return f"<map of {best.size:,} cells of {self.cell:g} m, transmitter at ({tx}) m, {values}>"
 
     @property
     def layers(self) -> dict[str, NDArray[np.float64]]:

@@ -90,12 +90,20 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
     """New links, with the groups and carriers of the study's columns, from a table or from rows of a file.
 
     Raises:
-        InputError: A column is missing, or a position is not finite.
+        InputError: The links are no table, a column is missing, or a position is not finite.
     """
     if isinstance(links, Measurements):
         return links
+    if isinstance(links, pd.DataFrame):
+        if links.columns.has_duplicates:
+            name = links.columns[links.columns.duplicated()][0]
+            raise InputError(f"links: has several columns {name!r}; keep one")
+        links = SourceTable(links.reset_index(drop=True).infer_objects(), source="links")
     if not isinstance(links, SourceTable):
-        links = SourceTable(links.reset_index(drop=True), source="links")
+        raise InputError(
+            f"links: is a {type(links).__name__}, must be a pandas DataFrame; read a file first, for instance by "
+            "pandas.read_csv(file)"
+        )
     return result.study.places(links)
 
 
