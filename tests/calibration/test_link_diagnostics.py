@@ -101,6 +101,25 @@ def test_a_column_that_explains_residuals_is_named_only_if_planted(problem: Prob
     assert text.endswith('[offset] per = "phone".')
 
 
+def test_levels_of_the_signal_are_no_groups(problem: Problem) -> None:
+    truth, links = np.array([two_ray.TRUTH]), problem.setup.links
+    modelled = problem.modelled(problem.parameters.to_search(truth[None]))[0]
+    loss = modelled + np.random.default_rng(4).normal(0, 3, 200)
+    bars = np.digitize(loss, np.quantile(loss, [0.2, 0.4, 0.6, 0.8]))
+    measured = replace(problem.objective, measured=loss)
+    frame = links.frame.drop(columns=["phone", "serial"]).assign(bars=bars)
+
+    def remarks(frame: pd.DataFrame) -> tuple:
+        own = replace(links, table=replace(links.table, frame=frame), path_loss_db=loss)
+        changed = replace(problem, setup=replace(problem.setup, links=own), objective=measured)
+        return groups_remark(changed, Trail(best=truth, best_modelled=modelled))
+
+    assert remarks(frame) == ()
+    # As texts they would be named.
+    (remark,) = remarks(frame.assign(bars=frame["bars"].astype(str)))
+    assert remark.values["column"] == "bars"
+
+
 def field_and_noise(position: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Errors with a part that neighbours within 40 m share, and a slope [dB]."""
     distance = np.linalg.norm(position[:, None] - position, axis=2)

@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pandas.api.types import is_numeric_dtype
 from scipy.special import fdtrc
 
 from calibray.calibration.differing_groups import differing_groups
@@ -187,6 +188,9 @@ def _reached(setup: Setup, sample: NDArray[np.int64], change: dict[str, Any]) ->
 MOST_NUMBERS: Final = 12
 """Largest number of distinct numbers that are labels of groups, such as days or floors."""
 
+SIGNAL_CORRELATION: Final = 0.5
+"""Rank correlation with path loss above which whole numbers are levels of a signal, such as a channel quality."""
+
 FEWEST_OF_TRANSMITTER: Final = 2 * LINKS_PER_UNKNOWN
 """Number of links per transmitter needed to test its direction, which has two angles."""
 
@@ -232,7 +236,7 @@ def region_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
 def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
     """Name the column that no nuisance uses and whose groups, such as devices, explain the residuals of a calibration.
 
-    Labels are texts, or a few whole numbers: levels of a signal would follow the measured value.
+    Labels are texts, or a few whole numbers that do not follow the measured value, as the levels of a signal do.
     """
     setup, links, count = problem.setup, problem.setup.links, problem.objective.num_counted
     if not isinstance(links, Measurements):
@@ -244,8 +248,9 @@ def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
     columns = {}
     for name in links.frame.columns.difference(list(used)):
         cells = links.frame[name].iloc[counted]
-        few = not pd.api.types.is_numeric_dtype(cells) or cells.nunique() <= MOST_NUMBERS
-        if few and cells.notna().all():
+        if cells.notna().all() and (
+            not is_numeric_dtype(cells) or _are_labels(cells, links.path_loss_db[counted])
+        ):
             columns[str(name)] = cells.astype(str).to_numpy(dtype=np.str_)
     residual_db = problem.residuals(trail.best[None], trail.best_modelled[None])[0, :count]
     found = differing_groups(-residual_db, np.hstack([links.tx, links.rx])[counted], columns)
@@ -263,6 +268,14 @@ def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
         "chance": found[0].chance,
     }
     return (Remark(RemarkKind.DIFFERING_GROUPS, values),)
+
+
+def _are_labels(cells: pd.Series, path_loss_db: NDArray[np.float64]) -> bool:
+    """Whether numbers may be labels of groups, and not the levels of a signal."""
+    if cells.nunique() > MOST_NUMBERS or (cells % 1 != 0).any():
+        return False
+    correlation = cells.corr(pd.Series(path_loss_db, cells.index), method="spearman")
+    return not abs(correlation) > SIGNAL_CORRELATION
 
 
 def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Remark, ...]:
