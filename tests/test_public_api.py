@@ -30,6 +30,8 @@ SIGNATURES = {
 }
 NAMES = {
     *SIGNATURES,
+    "EngineError",
+    "InputError",
     "Measurements",
     "Paths",
     "Result",

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from calibray import optimizers as optimizers
     from calibray.calibration.calibrate import calibrate as calibrate
     from calibray.calibration.result import Result as Result
+    from calibray.errors import EngineError as EngineError
+    from calibray.errors import InputError as InputError
     from calibray.fields import path_gains as path_gains
     from calibray.fields import path_loss as path_loss
     from calibray.fields.channel import channel_statistics as channel_statistics
@@ -47,6 +49,7 @@ __all__, __getattr__, __dir__ = lazy_attributes(
         "optimizers": "",
         "calibration.calibrate": "calibrate",
         "calibration.result": "Result",
+        "errors": "EngineError InputError",
         "fields": "path_gains path_loss",
         "fields.channel": "channel_statistics power_delay_profile",
         "materials": "Material itu_material",

@@ -209,6 +209,17 @@ def test_an_adaptive_number_of_rays_finds_the_study_s_paths(result, coverage):
     assert (adaptive[reached] - coverage.path_loss_db[reached]).max() < 0.05
 
 
+def test_a_group_without_measurements_is_announced(result, caplog):
+    arguments = {"tx": TX, "cell": 30.0, "bounds": AREA}
+    with caplog.at_level("WARNING"):
+        cb.coverage_map(result, columns=WEST, **arguments)
+        assert not caplog.messages
+        cb.coverage_map(result, columns={"half": "wset"}, **arguments)
+    assert caplog.messages == [
+        "half = wset: no link of this group was measured, so the map has the mean offset"
+    ]
+
+
 @pytest.mark.parametrize("per", ["half", ["half"]])
 def test_the_group_is_that_of_the_links_measured_at_the_transmitter(result, monkeypatch, per):
     def traced(*_, **__):

@@ -7,6 +7,7 @@ and by more than 0.7 dB in 10 % (`python benchmarks/coverage_map.py --solver`).
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from numbers import Real
@@ -25,7 +26,7 @@ from calibray.prediction.batches import announce, batch_size, predict_links
 from calibray.prediction.map_files import CoverageMap
 from calibray.prediction.observables import observable_columns
 from calibray.prediction.predict import as_links, is_indoors, open_for_links
-from calibray.result.held_out import NO_PATH
+from calibray.result.held_out import NEW_GROUP, NO_PATH
 from calibray.result.record import Record
 from calibray.scenes import Triangles, ground_heights, read_triangles
 from calibray.scenes.checks.positions import INSIDE, locate
@@ -34,6 +35,8 @@ from calibray.study import Study
 from calibray.study.mounting import mounting_columns
 from calibray.study.row_steps import known_frame
 from calibray.support.progress import Progress, with_total
+
+_LOG: Final = logging.getLogger(__name__)
 
 MOST_CELLS: Final = 1_000_000
 
@@ -115,6 +118,9 @@ def coverage_map(
         for name in observables.keys() & set(predictions):
             observables[name][batch] = predictions[name]
         no_path[batch] = predictions["basis"].str.startswith(NO_PATH)
+        if not start and predictions["basis"].str.contains(NEW_GROUP).any():
+            stated = ", ".join(f"{name} = {value}" for name, value in constants.items())
+            _LOG.warning("%s: no link of this group was measured, so the map has the mean offset", stated)
     # Outdoors, the log-distance model does not apply inside buildings.
     without_scene = no_path | (result.prediction.model.parameters is None)
     if without_scene.any() and not is_indoors(result, triangles):

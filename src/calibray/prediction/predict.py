@@ -25,7 +25,7 @@ from calibray.prediction.corrections import (
     nuisance_shift,
 )
 from calibray.prediction.observables import Replayed, as_measured, further_observables
-from calibray.result.held_out import Model, PredictionModel
+from calibray.result.held_out import NEW_GROUP, Model, PredictionModel
 from calibray.result.record import Record
 from calibray.scenes import Triangles, read_triangles
 from calibray.scenes.checks.positions import INSIDE, locate
@@ -212,7 +212,7 @@ def interval(
     far_db = _residual_db(result, links, between)
     near_db = far_db if field is None else np.minimum(field.own_db, far_db)
     total_db = np.sqrt((1.0 - known_share) * far_db**2 + known_share * near_db**2 + variance)
-    link_basis = np.where(shift.spread_db > 0, f"{basis}, group without measurements", basis)
+    link_basis = np.where(shift.spread_db > 0, f"{basis}, {NEW_GROUP}", basis)
     link_basis = np.where(
         known_share > NEAR_SHARE, np.char.add(link_basis, ", near measured links"), link_basis
     )

@@ -132,6 +132,9 @@ class Judgement:
 NO_PATH: Final = "no path"
 """Beginning of the column `basis` of predictions for links without a path."""
 
+NEW_GROUP: Final = "group without measurements"
+"""Part of the column `basis` of predictions for links whose offset is the mean of the measured groups."""
+
 
 @dataclass(frozen=True)
 class FittedTerm:
