@@ -206,6 +206,18 @@ def test_a_run_with_blocks_is_validated_by_them(tmp_path, noisy):
     assert found.prediction.model.name.startswith("calibrated")
 
 
+def test_groups_that_are_held_out_as_a_whole_are_announced(tmp_path, noisy, caplog):
+    problem = Problem.of(Setup.open(planted.study(tmp_path, noisy, offset={"per": "half"})), planted.engine())
+    with caplog.at_level("WARNING"):
+        validate_problem(problem, by="half")
+    (message,) = caplog.messages
+    assert message.startswith("offset: 12 of 12 links are held out together with all links of their group")
+    caplog.clear()
+    with caplog.at_level("WARNING"):
+        validate_problem(problem, 4)
+    assert not caplog.messages
+
+
 def test_a_run_without_validation_says_how_to_validate(result, tmp_path, noisy):
     assert NOT_JUDGED in result.remarks
     assert NOT_JUDGED not in run(tmp_path, noisy, holdout={"where": "half == 'east'"}).remarks

@@ -272,7 +272,7 @@ def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
 
 def _are_labels(cells: pd.Series, path_loss_db: NDArray[np.float64]) -> bool:
     """Whether numbers may be labels of groups, and not the levels of a signal."""
-    if cells.nunique() > MOST_NUMBERS or (cells % 1 != 0).any():
+    if not 2 <= cells.nunique() <= MOST_NUMBERS or (cells % 1 != 0).any():
         return False
     correlation = cells.corr(pd.Series(path_loss_db, cells.index), method="spearman")
     return not abs(correlation) > SIGNAL_CORRELATION

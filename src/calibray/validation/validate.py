@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final, cast
@@ -14,11 +15,13 @@ from calibray.engines.cluster.workers import Workers
 from calibray.engines.protocol import Answering
 from calibray.engines.rays.export import Exporting
 from calibray.errors import EngineError, InputError
+from calibray.fitting.nuisance import CONSTANT
 from calibray.fitting.preliminary_fits import estimate_noise, leave_out_near_floor
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_mapping import maps_rays, search_rays
 from calibray.fitting.search import AUTO
 from calibray.result.held_out import Model
+from calibray.scenes.obstruction import CLUSTER
 from calibray.study import Setup, Study
 from calibray.study.calibration_sections import DEFAULT_BLOCKS, MOST_BLOCKS
 from calibray.study.model import StudyModel
@@ -43,6 +46,8 @@ from calibray.validation.models import (
     without_scene,
 )
 from calibray.validation.validation import Validation
+
+_LOG: Final = logging.getLogger(__name__)
 
 TX: Final = "tx"
 """Name of the transmitter's position as a label, if the table has no such column."""
@@ -126,6 +131,7 @@ def validate_problem(
     problem = replace(problem, setup=problem.setup.with_obstruction())
     links, objective = problem.setup.links, problem.objective
     block, labels = _divide(problem, blocks, by)
+    _announce_new_groups(problem, block)
     all_link_minima = {name: minima for name, (_, minima) in fit_variants(problem, known_minima).items()}
     errors: dict[str, NDArray[np.float64]] = {}
     gaps = {observable.name: np.full((len(MODELS), len(links)), np.nan) for observable in problem.observed}
@@ -148,6 +154,24 @@ def validate_problem(
         labels, np.where(judged, block, -1), complete, moving_end(links), objective.measured,
         observables=observable_errors(gaps, problem.setup.study),
     )  # fmt: skip
+
+
+def _announce_new_groups(problem: Problem, block: NDArray[np.int64]) -> None:
+    """Say which offsets are unknown for held-out links, because all links of their group are in the same block [n]."""
+    counted = np.flatnonzero(block >= 0)
+    stated = problem.setup.study.nuisance_terms
+    for term in problem.objective.nuisance.terms:
+        if term.by != CONSTANT or len(term.labels) == 1 or CLUSTER in stated[term.around or term.name].per:
+            continue
+        pairs = np.unique(np.stack([term.group[counted], block[counted]]), axis=1)
+        groups, number = np.unique(pairs[0], return_counts=True)
+        alone = np.isin(term.group[counted], groups[number == 1]).sum()
+        if alone:
+            _LOG.warning(
+                "%s: %s of %s links are held out together with all links of their group; their offset is then the mean "
+                "of the other groups, so held-out errors contain the spread between groups",
+                term.around or term.name, f"{alone:,}", f"{len(counted):,}",
+            )  # fmt: skip
 
 
 def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:
