@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from calibray.errors import InputError
@@ -90,6 +92,14 @@ def test_of_a_file_that_is_not_a_study_the_page_shows_no_values(folder, wrong):
     assert folder.valid_content() == folder.content()
     folder.study_file.write_text(STUDY.replace("bounds = [1.5, 12.0]", wrong))
     assert folder.valid_content() == {}
+
+
+def test_the_latest_result_is_the_last(folder, tmp_path):
+    for second, name in enumerate(("result-2", "result-10", "result-9")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "result.json").write_text("{}")
+        os.utime(tmp_path / name / "result.json", (0, second))
+    assert folder.results() == ["result-2", "result-10", "result-9"]
 
 
 def test_results_are_named_by_folders_with_a_record(folder, tmp_path):

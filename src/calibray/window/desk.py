@@ -72,8 +72,13 @@ class StudyFolder:
         return sorted(name for name in names if not name.startswith("."))
 
     def results(self) -> list[str]:
-        """The folders with results."""
-        return sorted(file.parent.name for file in self.path.glob("*/result.json") if file.is_file())
+        """The folders with results, the latest last."""
+        written = {
+            file.parent.name: file.stat().st_mtime_ns
+            for file in self.path.glob("*/result.json")
+            if file.is_file()
+        }
+        return sorted(written, key=lambda name: (written[name], name))
 
     def result(self, name: str) -> dict[str, Any]:
         """The record of a result.
