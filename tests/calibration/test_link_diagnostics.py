@@ -152,6 +152,16 @@ def test_groups_of_devices_are_found_and_those_of_places_are_not():
     assert np.std(standard) < 1.6
 
 
+def test_groups_without_a_difference_are_seldom_reported():
+    reported = 0
+    for seed in range(200):
+        random = np.random.default_rng(seed)
+        ends = np.hstack([np.zeros((60, 3)), random.uniform(0, 200, (60, 2)), np.full((60, 1), 1.5)])
+        device = random.choice(list("ab"), 60)
+        reported += bool(differing_groups(random.normal(0, 3, 60), ends, {"device": device}))
+    assert reported <= 6
+
+
 def test_transmitters_are_places_too():
     random = np.random.default_rng(3)
     mast = np.arange(200) % 2
