@@ -223,6 +223,19 @@ def test_types_become_materials(tmp_path):
         make_plan_scene([line(0, 0, 1, 0, "brik")], tmp_path)
 
 
+def test_a_plan_of_unusual_size_asks_for_its_unit(tmp_path, caplog):
+    path = tmp_path / "plan.csv"
+    path.write_text("x0,y0,x1,y1,type\n0,0,1000,0,brick\n1000,0,1000,700,brick\n")
+    read_plan(path, unit=0.01)
+    assert not caplog.messages
+    read_plan(path)
+    read_plan(path, unit=0.001)
+    assert [message.partition("is ")[2].partition(";")[0] for message in caplog.messages] == [
+        "1000 m wide",
+        "1 m wide",
+    ]
+
+
 def test_a_plan_is_read_in_its_unit(tmp_path):
     path = tmp_path / "plan.csv"
     path.write_text(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -23,11 +24,16 @@ from calibray.support.lazy_imports import library
 from calibray.support.messages import did_you_mean, first_line, shortened
 from calibray.support.output_files import exists
 
+_LOG: Final = logging.getLogger(__name__)
+
 OPENINGS: Final = frozenset({"door", "window"})
 """Types that replace the wall on which they are drawn."""
 
 THICKNESS: Final = (0.0005, 3.0)
 """Smallest and largest thickness of a wall [m]; beyond it, the column has another unit than the coordinates."""
+
+USUAL_EXTENT: Final = (2.0, 300.0)
+"""Extent of a plan [m] beyond which a warning asks for its unit; large halls are 300 m long."""
 
 VECTOR_SUFFIXES: Final = (".dxf", ".geojson", ".json", ".gpkg", ".shp", ".fgb", ".gdb")
 """Extensions of vector files; any other file is read as CSV."""
@@ -141,6 +147,14 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[
         segments += [Segment(a, b, kind.strip().lower(), bottom, bottom + extent, stated) for a, b in sides]
     if not segments:
         raise InputError(f"floor plan {path}: contains no segment; give at least one wall")
+    widest = float(
+        np.ptp([end for segment in segments for end in (segment.start, segment.end)], axis=0).max()
+    )
+    if not USUAL_EXTENT[0] <= widest <= USUAL_EXTENT[1]:
+        _LOG.warning(
+            "floor plan %s: is %g m wide; if that is wrong, state the unit of its coordinates, such as --unit 0.01 for "
+            "centimetres", path, widest,
+        )  # fmt: skip
     return segments
 
 
