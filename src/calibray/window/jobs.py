@@ -218,12 +218,16 @@ def stages(log: str) -> list[Stage]:
 
 
 def main() -> None:
-    """Run the command given after the file for the exit status."""
+    """Run the command given after the file for the exit status, unless it is stopped before."""
+    stopped: list[int] = []
     # A handler, unlike SIG_IGN, is not inherited by the command.
-    signal.signal(signal.SIGINT, lambda *_: None)
+    signal.signal(signal.SIGINT, lambda number, _: stopped.append(number))
     _, status_file, *words = sys.argv
-    ended = subprocess.run([sys.executable, "-m", "calibray", *words], stdin=subprocess.DEVNULL, check=False)
-    write_text(Path(status_file), f"{ended.returncode}\n")
+    status = -signal.SIGINT
+    if not stopped:
+        command = [sys.executable, "-m", "calibray", *words]
+        status = subprocess.run(command, stdin=subprocess.DEVNULL, check=False).returncode
+    write_text(Path(status_file), f"{status}\n")
 
 
 if __name__ == "__main__":

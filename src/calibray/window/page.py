@@ -71,7 +71,7 @@ def build(desk: Desk) -> None:
         text = desk.folder.text()
         return {"Measurements": (text, desk.folder.files((*TABLES, ".gpx"))), "Parameters": text}
 
-    shown = contents()
+    shown, watched = contents(), {"job": desk.jobs.running()}
 
     def refresh() -> None:
         now = contents()
@@ -79,6 +79,8 @@ def build(desk: Desk) -> None:
             if name not in now or now[name] != shown[name]:
                 show.refresh()
         shown.update(now)
+        # Otherwise `watch` would show the command again, and a click on its Stop would be lost.
+        watched["job"] = desk.jobs.running()
         activity.refresh()
         reload_map()
 
@@ -124,7 +126,6 @@ def build(desk: Desk) -> None:
     ui.on("area", area_drawn)
     ui.on("plan", loaded)
     ui.on("findings", examined)
-    watched = {"job": desk.jobs.running()}
 
     def watch() -> None:
         job = desk.jobs.running()
