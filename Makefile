@@ -46,7 +46,7 @@ lint: $(VENV)/.checks
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
-	$(BIN)/pyright --threads 2
+	$(BIN)/pyright
 
 bench: setup
 	$(BIN)/python benchmarks/replay.py
