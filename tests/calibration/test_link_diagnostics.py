@@ -115,6 +115,9 @@ def test_levels_of_the_signal_are_no_groups(problem: Problem) -> None:
         return groups_remark(changed, Trail(best=truth, best_modelled=modelled))
 
     assert remarks(frame) == ()
+    # Columns whose names stand twice, and complex numbers, are left out.
+    assert remarks(pd.concat([frame, frame[["bars"]].astype(str)], axis=1)) == ()
+    assert remarks(frame.assign(bars=frame["bars"] * 1j)) == ()
     # As texts they would be named.
     (remark,) = remarks(frame.assign(bars=frame["bars"].astype(str)))
     assert remark.values["column"] == "bars"

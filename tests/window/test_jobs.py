@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from calibray.errors import InputError
-from calibray.window.jobs import FOLDER, Jobs
+from calibray.window.jobs import FOLDER, Jobs, main
 
 
 def test_a_command_ends_with_its_status_and_output(tmp_path):
@@ -71,3 +71,12 @@ def test_records_of_others_are_passed_over_and_their_processes_are_not_touched(t
         json.dumps({"words": ["run"], "pid": os.getpid(), "created": time.time() - 1e6})
     )
     assert [(job.number, job.state) for job in Jobs(tmp_path).list()] == [(3, "died")]
+
+
+def test_a_command_that_is_stopped_before_it_starts_does_not_run(tmp_path, monkeypatch):
+    ended = tmp_path / "0001.exit"
+    monkeypatch.setattr(sys, "argv", ["", str(ended), "demo"])
+    monkeypatch.setattr(subprocess, "run", None)
+    monkeypatch.setattr(signal, "signal", lambda number, handler: handler(number, None))
+    main()
+    assert ended.read_text() == "-2\n"

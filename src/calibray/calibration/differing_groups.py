@@ -85,8 +85,11 @@ def differing_groups(
             score = np.bincount(cluster, inside * residual) - square * difference
             error = float(np.sqrt(np.sum(score**2) * mixed / (mixed - 1)) / square.sum())
             improved = np.sqrt(mean_square) - np.sqrt(max(mean_square - variance * difference**2, 0.0))
-            chance = 2 * float(stdtr(mixed - 1, -abs(difference) / max(error, 1e-12)))
-            chance = chance if improved >= SMALLEST_DB else 1.0
+            chance = 1.0
+            if improved >= SMALLEST_DB:
+                chance = 2 * float(stdtr(mixed - 1, -abs(difference) / max(error, 1e-12)))
             tested.append(Difference(column, str(name), difference, error, chance))
-    found = [replace(each, chance=each.chance * len(tested)) for each in tested]
-    return sorted((each for each in found if each.chance < SIGNIFICANCE), key=lambda each: each.chance)
+    # Bonferroni's correction for the number of groups.
+    corrected = [replace(group, chance=group.chance * len(tested)) for group in tested]
+    significant = [group for group in corrected if group.chance < SIGNIFICANCE]
+    return sorted(significant, key=lambda group: group.chance)

@@ -246,33 +246,34 @@ def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
     for term in setup.study.nuisance_terms.values():
         used |= {term.by, *term.per}
     columns = {}
-    for name in links.frame.columns.difference(list(used)):
-        cells = links.frame[name].iloc[counted]
+    frame = links.frame.loc[:, ~links.frame.columns.duplicated(keep=False)].iloc[counted]
+    for name in frame.columns.difference(list(used)):
+        cells = frame[name]
         if cells.notna().all() and (
             not is_numeric_dtype(cells) or _are_labels(cells, links.path_loss_db[counted])
         ):
             columns[str(name)] = cells.astype(str).to_numpy(dtype=np.str_)
     residual_db = problem.residuals(trail.best[None], trail.best_modelled[None])[0, :count]
-    found = differing_groups(-residual_db, np.hstack([links.tx, links.rx])[counted], columns)
-    if not found:
+    differing = differing_groups(-residual_db, np.hstack([links.tx, links.rx])[counted], columns)
+    if not differing:
         return ()
-    column = found[0].column
-    groups = [each for each in found if each.column == column]
+    column = differing[0].column
+    groups = [group for group in differing if group.column == column]
     values: dict[str, Value] = {
         "column": column,
-        "labels": [each.label for each in groups],
-        "differences_db": [each.difference_db for each in groups],
-        "errors_db": [each.error_db for each in groups],
-        "others": sorted({each.column for each in found} - {column}),
+        "labels": [group.label for group in groups],
+        "differences_db": [group.difference_db for group in groups],
+        "errors_db": [group.error_db for group in groups],
+        "others": sorted({group.column for group in differing} - {column}),
         "per": [*setup.study.offset_groups, column],
-        "chance": found[0].chance,
+        "chance": differing[0].chance,
     }
     return (Remark(RemarkKind.DIFFERING_GROUPS, values),)
 
 
 def _are_labels(cells: pd.Series, path_loss_db: NDArray[np.float64]) -> bool:
     """Whether numbers may be labels of groups, and not the levels of a signal."""
-    if not 2 <= cells.nunique() <= MOST_NUMBERS or (cells % 1 != 0).any():
+    if cells.dtype.kind == "c" or not 2 <= cells.nunique() <= MOST_NUMBERS or (cells % 1 != 0).any():
         return False
     correlation = cells.corr(pd.Series(path_loss_db, cells.index), method="spearman")
     return not abs(correlation) > SIGNAL_CORRELATION
