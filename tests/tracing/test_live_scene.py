@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,6 +16,7 @@ from calibray import engines
 from calibray.errors import InputError
 from calibray.measurements.observables import KINDS, SECTORS, Statistic
 from calibray.tracing.sionna.live_scene import apply_materials
+from small_scenes import write_scene
 
 PLANTED = {"marble": 9.2, "concrete": 3.1}
 
@@ -74,6 +76,17 @@ def test_sionna_and_the_study_agree_and_materials_are_set(study: cb.Study, measu
         assert np.array(scene.radio_materials[name].relative_permittivity).item() == pytest.approx(value)
     with pytest.raises(InputError, match="no material 'walls'"):
         apply_materials(scene, {"walls": planted["marble"]})
+
+
+def test_materials_of_another_carrier_cause_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    scene = street()
+    marble = {"marble": cb.itu_material("marble", 28e9, thickness=0.1)}
+    apply_materials(scene, marble, 3.5e9)
+    assert not caplog.messages
+    apply_materials(scene, marble, 28e9)
+    assert caplog.messages == [
+        "scene.frequency is 3.5 GHz, but the calibrated constants hold at 28 GHz; set scene.frequency = 28000000000.0"
+    ]
 
 
 def test_observables_equal_those_of_sionnas_impulse_responses(study: cb.Study) -> None:
@@ -186,7 +199,7 @@ def test_scattering_patterns_are_those_of_the_scene(
 
 
 def test_what_is_not_a_matrix_of_path_loss_is_refused(measured: np.ndarray, tmp_path: Path) -> None:
-    def refused(values: object, message: str, **sections: dict) -> None:
+    def refused(values: object, message: str, **sections: Any) -> None:
         with pytest.raises(InputError, match=message):
             cb.Study.from_sionna(street(), values, tmp_path, **sections)
 
@@ -200,7 +213,58 @@ def test_what_is_not_a_matrix_of_path_loss_is_refused(measured: np.ndarray, tmp_
     refused([[1.0, 2.0], [3.0]], "not a matrix of numbers")
     refused(frame.iloc[[0, 0]], "row 'tx0' is repeated; give one row for each transmitter")
     refused(frame.iloc[:, [2, 2]], "column 'rx2' is repeated")
+    refused(measured > 80, "tx0, rx0: (True|False), must be a finite real number")
     refused(measured, "set scene.frequency there", scene={"frequency": 28e9})
+    refused(measured, r"links: is \[1\], must be a dictionary", links=[1])
+    refused(measured, "offset: is None, must be a dictionary", offset=None)
+
+
+class OtherFrame(np.ndarray):
+    """A table of another package, whose rows have no names."""
+
+    columns = tuple(f"rx{number}" for number in range(7, -1, -1))
+
+
+def test_columns_of_other_packages_are_not_taken_in_the_order_of_the_scene(measured: np.ndarray) -> None:
+    with pytest.raises(InputError, match=r"measured: is a .*OtherFrame, whose rows have no names"):
+        cb.Study.from_sionna(street(), measured[:, ::-1].view(OtherFrame))
+
+
+@pytest.mark.parametrize("name", ["links.csv", "study.toml", "scene.xml"])
+def test_files_of_the_user_are_not_replaced(measured: np.ndarray, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("measured for a week")
+    with pytest.raises(InputError, match=f"{name}: was not written by Calibray"):
+        cb.Study.from_sionna(street(), measured, tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == [name]
+    cb.Study.from_sionna(street(), measured, tmp_path, overwrite=True)
+    assert (
+        cb.Study.from_sionna(street(), measured, tmp_path).measurements().path_loss_db.size == measured.size
+    )
+
+
+def moved_street(folder: Path, distance: float) -> rt.Scene:
+    """A wall in the bundled street's place, and its devices, moved along x and y [m]."""
+    corners = [
+        (x + distance, 9 + distance, z) for x, z in ((-30.0, 0.0), (30.0, 0.0), (30.0, 9.0), (-30.0, 9.0))
+    ]
+    scene = rt.load_scene(str(write_scene(folder, {"wall": [corners]})))
+    scene.frequency, original = 3.5e9, street()
+    scene.tx_array, scene.rx_array = original.tx_array, original.rx_array
+    for device in [*original.transmitters.values(), *original.receivers.values()]:
+        position = np.array(device.position).ravel() + np.array([distance, distance, 0])
+        scene.add(type(device)(device.name, position=position.tolist(), orientation=[0.3, 0.1, 0]))
+    return scene
+
+
+def test_a_scene_far_from_its_origin_has_lost_its_precision(
+    measured: np.ndarray, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    cb.Study.from_sionna(moved_street(tmp_path, 5_000.0), measured)
+    assert not caplog.messages
+    cb.Study.from_sionna(moved_street(tmp_path, 30_000.0), measured)
+    assert "the scene reaches 30030 m from its origin" in caplog.text
+    with pytest.raises(InputError, match=r"in steps of 0.03125 m; move the origin into the scene"):
+        cb.Study.from_sionna(moved_street(tmp_path, 300_000.0), measured)
 
 
 def test_what_a_study_cannot_state_is_refused(measured: np.ndarray, tmp_path: Path) -> None:

@@ -187,14 +187,15 @@ class Result(Record):
     def apply(self, scene: object) -> None:
         """Set the calibrated materials in a `sionna.rt.Scene` in memory, at the study's carrier.
 
-        Their constants then stay when `scene.frequency` is set, although ITU materials otherwise change with it.
+        A warning names the carriers if the scene has another one. The constants stay when `scene.frequency` is set,
+        although ITU materials otherwise change with it.
 
         Raises:
             InputError: The object is not a scene of Sionna RT, or the scene lacks a material.
         """
         from calibray.tracing.sionna.live_scene import apply_materials
 
-        apply_materials(scene, self.materials)
+        apply_materials(scene, self.materials, self.study.scene.frequency)
 
     def export(self, folder: str | Path, *, copy: bool = False, overwrite: bool = False) -> tuple[str, ...]:
         """Write the calibrated scene for Sionna RT, and its materials as tables; see `calibray.reporting.export`."""

@@ -33,8 +33,8 @@ from calibray.study.model import StudyModel
 from calibray.study.row_steps import position_steps, row_track, study_links
 from calibray.study.setup import Setup
 from calibray.study.toml_file import study_text
-from calibray.support.messages import first_line, shortened
-from calibray.support.output_files import check_folder, write_text
+from calibray.support.messages import first_line, shortened, type_name
+from calibray.support.output_files import check_outputs, write_text
 from calibray.support.output_tables import write_table
 from calibray.tables import Column, Table, hertz, numbers, short_html, short_text
 
@@ -67,17 +67,25 @@ class Study(StudyModel):
 
     @classmethod
     def from_sionna(
-        cls, scene: object, /, measured: Any, folder: str | Path | None = None, **sections: Mapping[str, Any]
+        cls,
+        scene: object,
+        /,
+        measured: Any,
+        folder: str | Path | None = None,
+        *,
+        overwrite: bool = False,
+        **sections: Mapping[str, Any],
     ) -> Study:
         """A study of a Sionna RT scene in memory, with its carrier, transmitters, receivers, arrays and materials.
 
         Args:
             scene: The `sionna.rt.Scene`.
             measured: Path loss [tx, rx], [dB], in the order of the scene's transmitters and receivers, with NaN where
-                nothing was measured; or a DataFrame with names of transmitters as rows and of receivers as columns.
-                Masked values and pd.NA count as NaN.
+                nothing was measured; or a pandas DataFrame with names of transmitters as rows and of receivers as
+                columns. Masked values and pd.NA count as NaN.
             folder: Folder to write the scene, the links and `study.toml` into, for `Study.load`; a temporary folder if
                 None.
+            overwrite: Replace files in the folder that Calibray did not write.
             **sections: Sections of the study file in place of the defaults, such as ``trace={"max_depth": 5}`` or
                 ``links={"quantity": "received_power"}``. Without `parameters`, the permittivity of every material is
                 calibrated.
@@ -88,8 +96,15 @@ class Study(StudyModel):
         Raises:
             InputError: The scene or a value cannot be used, or the folder cannot be written.
         """
-        target = Path(mkdtemp(prefix="calibray-study-") if folder is None else folder)
-        content = _write_live_study(scene, measured, target, sections)
+        for name, section in sections.items():
+            if not isinstance(section, Mapping):
+                raise InputError(
+                    f"{name}: is {shortened(repr(section))}, must be a dictionary with keys of this section of the "
+                    "study file; leave it out for the defaults"
+                )
+        target = mkdtemp(prefix="calibray-study-") if folder is None else folder
+        target = check_outputs(target, ("links.csv", "study.toml"), overwrite=overwrite)
+        content = _write_live_study(scene, measured, target, sections, overwrite)
         study = cls.from_content(content, target / "study.toml")
         write_text(target / "study.toml", study_text(content, {}))
         return study
@@ -193,7 +208,7 @@ LARGEST_PERMITTIVITY: Final = 15.0
 
 
 def _write_live_study(
-    scene: object, measured: Any, folder: Path, sections: Mapping[str, Any]
+    scene: object, measured: Any, folder: Path, sections: Mapping[str, Any], overwrite: bool
 ) -> dict[str, Any]:
     """Write the files of a scene in memory and its measured values; returns the content of the study.
 
@@ -207,8 +222,8 @@ def _write_live_study(
     live = LiveScene.of(scene)
     links = dict(sections.get("links", {}))
     table = _links(live, measured)
-    check_folder(folder)
-    write_scene(folder, live.objects, {name: _numbers(item) for name, item in live.materials.items()})
+    constants = {name: _numbers(item) for name, item in live.materials.items()}
+    write_scene(folder, live.objects, constants, overwrite=overwrite)
     write_table(folder / "links.csv", table)
     power = {"tx_power_dbm": "tx_power_dbm"} if links.get("quantity") == "received_power" else {}
     antennas = zip(("tx", "rx"), live.antennas, strict=True)
@@ -217,7 +232,7 @@ def _write_live_study(
         "version": 1,
         "scene": {"file": "scene.xml", "frequency": live.frequency},
         "materials": {
-            name: _numbers(item) | {"scattering_pattern": item.scattering_pattern}
+            name: constants[name] | {"scattering_pattern": item.scattering_pattern}
             for name, item in live.materials.items()
         },
         "antennas": {
@@ -279,6 +294,11 @@ def _matrix(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> NDArray[np.f
             f"measured: is the text {shortened(str(measured))!r}, must be values; read a file first, for instance by "
             "pandas.read_csv(file, index_col=0)"
         )
+    elif hasattr(measured, "columns"):
+        raise InputError(
+            f"measured: is a {type_name(measured)}, whose rows have no names; give a pandas DataFrame with names of "
+            "transmitters as rows (.to_pandas().set_index(...)), or an array in the order of the scene (.to_numpy())"
+        )
     try:
         given = np.ma.asanyarray(measured)
     except (TypeError, ValueError) as error:
@@ -291,7 +311,7 @@ def _matrix(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> NDArray[np.f
     values, stated = np.full(shape, np.nan), np.ma.getdata(given).astype(object)
     for tx, rx in np.argwhere(present).tolist():
         value = stated[tx, rx]
-        if not (isinstance(value, Real) and np.isfinite(float(value))):
+        if isinstance(value, bool) or not (isinstance(value, Real) and np.isfinite(float(value))):
             raise InputError(
                 f"measured: {list(live.tx)[tx]}, {list(live.rx)[rx]}: {shortened(repr(value))}, must be a finite real "
                 "number in decibels, or NaN where nothing was measured"

@@ -76,6 +76,17 @@ def first_line(error: Exception) -> str:
     return shortened((str(error).strip() or type(error).__name__).splitlines()[0], 300)
 
 
+def type_name(value: object) -> str:
+    """The name of a value's type, with its package unless that is Python itself.
+
+    Example:
+        >>> type_name(None), type_name(ValueError()), type_name(get_close_matches)
+        ('NoneType', 'ValueError', 'function')
+    """
+    package = type(value).__module__.partition(".")[0]
+    return type(value).__name__ if package == "builtins" else f"{package}.{type(value).__name__}"
+
+
 def percent(share: float) -> str:
     """Write a share as a whole number of per cent.
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -26,11 +26,15 @@ from calibray.errors import InputError
 from calibray.materials import SCALAR_CONSTANTS, Material
 from calibray.scenes import Mesh, MeshObject, read_scene
 from calibray.scenes.export import exported_names
+from calibray.scenes.shapes import COARSE, TOO_COARSE
 from calibray.support.messages import did_you_mean, first_line, shortened
+from calibray.tables import hertz
 from calibray.tracing.protocol import Links
 from calibray.tracing.settings import PATTERNS, POLARIZATIONS, Antenna
 from calibray.tracing.sionna.scene import scattering_pattern, surfaces_agree, surfaces_by_material
 from calibray.tracing.sionna.tracer import Tracer
+
+_LOG: Final = logging.getLogger(__name__)
 
 DIRECTIONS: Final = 64
 """Number of directions in which a pattern is compared with the known ones."""
@@ -71,9 +75,11 @@ class LiveScene:
                 "the scene has no transmitter, receiver or antenna array; add them, and set scene.tx_array and "
                 "scene.rx_array"
             )
+        objects = tuple(part for item in live.objects.values() for part in _objects(item))
+        _check_precision(objects)
         return cls(
             _number(live.frequency),
-            tuple(part for item in live.objects.values() for part in _objects(item)),
+            objects,
             {item.radio_material.name: _material(item.radio_material) for item in live.objects.values()},
             (_antenna("tx", live.tx_array, live.transmitters), _antenna("rx", live.rx_array, live.receivers)),
             {name: _vector(device.position) for name, device in live.transmitters.items()},
@@ -82,11 +88,11 @@ class LiveScene:
         )
 
 
-def apply_materials(scene: object, materials: Mapping[str, Material]) -> None:
+def apply_materials(scene: object, materials: Mapping[str, Material], frequency: float | None = None) -> None:
     """Set the constants of a scene's materials by name.
 
-    They hold at one carrier. ITU materials no longer compute theirs when `scene.frequency` is set, which would replace
-    the calibrated ones.
+    They hold at one carrier, `frequency` [Hz]; a scene at another one causes a warning. ITU materials no longer compute
+    theirs when `scene.frequency` is set, which would replace the calibrated ones.
 
     Raises:
         InputError: The object is not a scene of Sionna RT, or the scene lacks a material; nothing is set then.
@@ -104,6 +110,11 @@ def apply_materials(scene: object, materials: Mapping[str, Material]) -> None:
         for constant in SCALAR_CONSTANTS:
             setattr(target, constant, getattr(material, constant))
         target.scattering_pattern = scattering_pattern(material)
+    if frequency is not None and not np.isclose(carrier := _number(live.frequency), frequency, rtol=1e-6):
+        _LOG.warning(
+            "scene.frequency is %s, but the calibrated constants hold at %s; set scene.frequency = %r",
+            hertz(carrier), hertz(frequency), frequency,
+        )  # fmt: skip
 
 
 def _checked(scene: object) -> Any:
@@ -132,6 +143,20 @@ def _objects(item: Any) -> Iterator[MeshObject]:
         yield MeshObject(
             f"object-{name}{suffix}", item.radio_material.name, Mesh(position[used], faces.reshape(-1, 3))
         )
+
+
+def _check_precision(objects: Iterable[MeshObject]) -> None:
+    """Refuse a scene so far from its origin that single precision, which Sionna RT uses, rounds it."""
+    furthest = max((float(np.abs(item.mesh.vertices).max()) for item in objects), default=0.0)
+    step = float(np.spacing(np.float32(furthest)))
+    where = f"the scene reaches {furthest:.0f} m from its origin"
+    fault = f"{where}, where Sionna RT stores coordinates in steps of {step:g} m"
+    if step > TOO_COARSE:
+        raise InputError(
+            f"{fault}; move the origin into the scene and load it again, or write a study file for its scene file"
+        )
+    if step > COARSE:
+        _LOG.warning("%s: path loss may change by hundredths of a dB; move the origin into the scene", fault)
 
 
 def _material(material: Any) -> Material:
@@ -201,8 +226,6 @@ LARGEST_DIFFERENCE_DB: Final = 0.01
 
 SAMPLES: Final = 20_000
 """Number of rays of the comparison; both scenes use the same rays."""
-
-_LOG: Final = logging.getLogger(__name__)
 
 
 def verify_export(tracer: Tracer, materials: Mapping[str, Material], target: Path, links: Links) -> None:
