@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf, isfinite
+from numbers import Real
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
@@ -319,5 +320,5 @@ def itu_law(name: str, frequency: float, revision: str = DEFAULT_REVISION) -> It
 
 
 def _check_frequency(frequency: float) -> None:
-    if not (isfinite(frequency) and frequency > 0):
+    if not (isinstance(frequency, Real) and isfinite(frequency) and frequency > 0):
         raise InputError(f"frequency = {frequency!r}: must be a finite number greater than 0 Hz")

@@ -91,6 +91,14 @@ def calibrate(
         raise InputError(
             f"study: is a {type(study).__name__}, must be a Study; read a file first: calibrate(Study.load(file))"
         )
+    if not isinstance(engine, Engine | None):
+        raise InputError(
+            f"engine: is {engine!r}, must be an engine over all links; a name is set by study.replace(engine=NAME)"
+        )
+    if not isinstance(workers, Workers | None):
+        raise InputError(f"workers: is {workers!r}, must be the workers of engines.open_workers(NUMBER)")
+    if not isinstance(cheap_model, Study | Setup | None):
+        raise InputError(f"cheap_model: is {cheap_model!r}, must be a Study, such as Study.load(file)")
     replaced = study.replace(method=method, seed=seed)
     plan, setup = (replaced.study, replaced) if isinstance(replaced, Setup) else (replaced, None)
     check_method(plan.method.name)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from calibray.errors import InputError
 from calibray.materials import FREQUENCIES
 from calibray.measurements.source_table import SourceTable
-from calibray.support.messages import shortened
+from calibray.support.messages import first_line, shortened
 from calibray.tables import Column, Table, hertz, named, short_html, short_text
 
 MIN_DISTANCE: Final = 1e-3
@@ -82,7 +82,7 @@ class Measurements:
             ("censored", (count,), np.bool_),
         ):
             if getattr(self, name) is not None:
-                array = np.array(getattr(self, name), dtype=dtype)
+                array = _as_array(name, getattr(self, name), dtype)
                 if array.shape != shape:
                     raise InputError(f"{name}: shape {array.shape}, must be {shape}")
                 array.flags.writeable = False
@@ -202,6 +202,18 @@ class Measurements:
                     f"{self.source}: where = {shortened(holdout)!r} leaves no link for {part}; change the filter"
                 )
         return held_out
+
+
+def _as_array(name: str, values: ArrayLike, dtype: type) -> NDArray[np.generic]:
+    """A copy of the values as an array; masked numbers become NaN."""
+    try:
+        if isinstance(values, np.ma.MaskedArray) and dtype is np.float64:
+            return np.where(np.ma.getmaskarray(values), np.nan, np.ma.getdata(values).astype(dtype))
+        return np.array(values, dtype=dtype)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"{name}: cannot be used ({first_line(error)}); give an array of real numbers"
+        ) from None
 
 
 def _check_links(links: Measurements) -> None:

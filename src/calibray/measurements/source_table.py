@@ -108,10 +108,9 @@ class SourceTable:
             raise InputError(
                 f"{self.source}: column {source!r} contains {column.dtype}, must contain numbers"
             )
-        if pd.api.types.is_bool_dtype(column):
-            raise InputError(
-                f"{self.source}: column {source!r} contains true and false, must contain numbers"
-            )
+        if pd.api.types.is_bool_dtype(column) or pd.api.types.is_complex_dtype(column):
+            fault = "true and false" if pd.api.types.is_bool_dtype(column) else "complex numbers"
+            raise InputError(f"{self.source}: column {source!r} contains {fault}, must contain numbers")
         parsed = pd.to_numeric(column, errors="coerce")
         if (text := parsed.isna().to_numpy() & ~missing).any():
             first = int(np.flatnonzero(text)[0])

@@ -27,7 +27,7 @@ from calibray.measurements.source_table import SourceTable
 from calibray.support.lazy_imports import library
 from calibray.support.memory import available_memory, run_limited
 from calibray.support.messages import first_line, shortened
-from calibray.support.output_files import exists
+from calibray.support.output_files import as_path, exists
 
 MAX_UNPACKED: Final = 2**28
 """Largest unpacked size of a workbook [bytes]."""
@@ -214,7 +214,7 @@ def read_table(path: str | Path) -> SourceTable:
         InputError: The file does not exist, has another extension, is empty or malformed, or the library that reads it
             (pyarrow, openpyxl) is not installed.
     """
-    path = Path(path)
+    path = as_path(path, "table")
     if not exists(path):
         raise InputError(f"{shortened(str(path), 300)}: no such file")
     match path.suffix.lower():

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from html import escape
+from numbers import Real
 from pathlib import Path
 from textwrap import shorten
 from typing import Any, Final
@@ -30,7 +31,7 @@ from calibray.paths.interactions import Diffraction, Diffuse, Kind
 from calibray.support.cache_folder import Store, cache_folder
 from calibray.support.memory import run_limited
 from calibray.support.messages import first_line
-from calibray.support.output_files import check_file, exists, replacing
+from calibray.support.output_files import as_path, check_file, exists, replacing
 
 _WIDTH: Final = 80
 """Largest length of a line of the summary [characters]."""
@@ -137,7 +138,7 @@ class Paths:
         Raises:
             InputError: The frequency is not a positive number, or a material is not among the paths'.
         """
-        if not (np.isfinite(frequency) and frequency > 0):
+        if not (isinstance(frequency, Real) and np.isfinite(frequency) and frequency > 0):
             raise InputError(f"frequency = {frequency!r}: must be a finite number of Hz greater than 0")
         return replace(self, frequency=float(frequency), materials=self._with_materials(materials))
 
@@ -164,6 +165,12 @@ class Paths:
             raise InputError(
                 f"no material {unknown[0]!r} in the traced scene; it has {', '.join(self.materials)}"
             )
+        for name, material in (materials or {}).items():
+            if not isinstance(material, Material):
+                raise InputError(
+                    f"material {name!r}: is {material!r}, must be a Material with all its constants; for instance "
+                    f"dataclasses.replace(paths.materials[{name!r}], relative_permittivity=5.0)"
+                )
         return {**self.materials, **(materials or {})}
 
     def save(self, path: str | Path, overwrite: bool = False) -> None:
@@ -201,7 +208,7 @@ class Paths:
         Raises:
             InputError: The file does not exist, is not a path file, has another version, or is damaged.
         """
-        source = Path(path)
+        source = as_path(path, "path file")
         if not exists(source):
             raise InputError(f"{source}: does not exist; write one with `calibray trace STUDY -o {source}`")
         try:

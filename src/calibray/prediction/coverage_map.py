@@ -163,6 +163,8 @@ def _column_values(
     result: Record, tx: NDArray[np.float64], columns: Mapping[str, object]
 ) -> dict[str, object]:
     """Values of the study's columns, the same at every link from this transmitter."""
+    if not isinstance(columns, Mapping):
+        raise InputError(f"columns = {columns!r}: must be a dictionary of a value for each column")
     study, values = result.study, dict(columns)
     groups = study.offset_groups
     if len(groups) == 1 and groups[0] not in values and {"group", "tx_x"} <= set(result.links):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from numbers import Real
 from pathlib import Path
 from typing import Final
 
@@ -33,6 +34,7 @@ from calibray.scenes.obstruction import CLUSTER, OUT_OF_SIGHT
 from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Setup
 from calibray.study.link_checks import refuse_far_receivers
+from calibray.support.messages import type_name
 from calibray.support.progress import Progress
 from calibray.validation.models import without_scene
 
@@ -101,8 +103,8 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
         links = SourceTable(links.reset_index(drop=True).infer_objects(), source="links")
     if not isinstance(links, SourceTable):
         raise InputError(
-            f"links: is a {type(links).__name__}, must be a pandas DataFrame; read a file first, for instance by "
-            "pandas.read_csv(file)"
+            f"links: is a {type_name(links)}, must be a pandas DataFrame, such as pandas.read_csv(file) for a file, or "
+            "table.to_pandas() for a table of another package"
         )
     return result.study.places(links)
 
@@ -186,8 +188,8 @@ def interval(
         table = pd.DataFrame({"path_loss_db": path_loss_db, "basis": basis})
         table = table.assign(**further_observables(result, replayed))
         return fill_missing(result.prediction, result.study, setup.links, table)
-    if not 0 < level < 1:
-        raise InputError(f"level = {level:g}: must be between 0 and 1, such as 0.9")
+    if not (isinstance(level, Real) and 0 < level < 1):
+        raise InputError(f"level = {level!r}: must be between 0 and 1, such as 0.9")
     setup = _with_columns(result, setup)
     links, field, model = setup.links, result.prediction.residual_field, result.prediction.model
     if model.residual_db is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from numbers import Integral
 from typing import Final
 
 import numpy as np
@@ -87,8 +88,8 @@ def suggest(
         InputError: `Result.predict` would refuse the input, except for unknown groups; the calibration has no draws; or
             no candidate has a path and a predicted power above the study's noise floor.
     """
-    if count < 1:
-        raise InputError(f"count = {count}: must be at least 1")
+    if isinstance(count, bool) or not (isinstance(count, Integral) and count >= 1):
+        raise InputError(f"count = {count!r}: must be a whole number of at least 1")
     study = result.study
     if study.engine.external:
         raise InputError(

@@ -31,6 +31,7 @@ from calibray.scenes import export_scene, read_scene
 from calibray.study import Study
 from calibray.support.messages import shortened
 from calibray.support.output_files import (
+    as_path,
     check_outputs,
     check_unchanged,
     exists,
@@ -167,7 +168,7 @@ def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str,
         InputError: The folder contains no result, one of another version, one that was damaged or edited, or files of
             several runs.
     """
-    source = Path(folder) / RESULT_FILE
+    source = as_path(folder, "result") / RESULT_FILE
     stored, study = _read_stored(source)
     links, history = (read_rows(source.parent, name, columns) for name, columns in COLUMNS.items())
     if not allow_changed_inputs:

@@ -26,8 +26,8 @@ from calibray.study.calibration_sections import NuisanceTerm
 from calibray.study.content import BUNDLED, OFFSET, StudyContent
 from calibray.study.regions import PREFIX
 from calibray.study.toml_file import expand, read_content, refuse_unquoted_names, split_engine_keys
-from calibray.support.messages import shortened
-from calibray.support.output_files import exists
+from calibray.support.messages import shortened, type_name
+from calibray.support.output_files import as_path, exists
 from calibray.support.strict_models import explain
 from calibray.tracing.settings import Antenna
 
@@ -43,7 +43,7 @@ class StudyModel(StudyContent, ABC):
             InputError: The file does not exist, is not TOML, has an unknown key or an impossible value, or names a
                 file that does not exist; one line for each error.
         """
-        path = Path(path)
+        path = as_path(path, "study")
         study = cls.from_content(read_content(path), path)
         study.check_files()
         return study
@@ -57,6 +57,10 @@ class StudyModel(StudyContent, ABC):
         Raises:
             InputError: A key is unknown or a value impossible; one line for each error.
         """
+        if not isinstance(content, Mapping):
+            raise InputError(
+                f"{path}: is a {type_name(content)}, must be a dictionary of the sections of a study"
+            )
         refuse_unquoted_names(content.get("parameters"), path)
         engine, other_engines = split_engine_keys(content.get("engine", {}), str(path))
         content = {**content, "engine": engine}

@@ -48,6 +48,7 @@ from calibray.study.mounting import link_mountings, pose_effects, with_populatio
 from calibray.study.regions import region_effects
 from calibray.study.row_steps import scene_place, study_links, study_regions
 from calibray.study.sections import AntennasSection
+from calibray.support.messages import type_name
 from calibray.support.progress import Progress
 from calibray.tracing import cache
 from calibray.tracing.antennas import POSE, Mounting, mount
@@ -101,6 +102,10 @@ class Setup:
         Raises:
             InputError: The links, the scene, the parameters or the hold-out cannot be used.
         """
+        if not isinstance(study, StudyModel):
+            raise InputError(
+                f"study: is a {type_name(study)}, must be a Study; read a file by Study.load(file)"
+            )
         held_out = None
         if links is None:
             links = study_links(study)

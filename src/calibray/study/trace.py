@@ -21,6 +21,7 @@ from calibray.paths import Paths
 from calibray.scenes import Scene, read_scene
 from calibray.study.setup import Setup
 from calibray.study.study import Study
+from calibray.support.messages import type_name
 from calibray.support.progress import Progress
 from calibray.tracing import default_tracer
 from calibray.tracing.protocol import Links
@@ -106,7 +107,8 @@ def trace(
 def _trace_study(study: Study, links: Links | None, materials: Constants, progress: Progress | None) -> Paths:
     if not isinstance(links, Measurements | None):
         raise InputError(
-            "trace: the links of a study must be Measurements; use read_measurements, which takes a table"
+            f"trace: the links of a study must be Measurements, not a {type_name(links)}; read_measurements reads a "
+            "file, Measurements(tx, rx, path_loss_db) takes arrays"
         )
     complete: dict[str, Material] = {}
     for name, constants in materials.items():

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import BinaryIO, Final, NoReturn
 
 from calibray.errors import InputError
-from calibray.support.messages import shortened
+from calibray.support.messages import shortened, type_name
 
 PARTIAL: Final = ".part"  # end of the name of an unfinished file
 SIGNATURES: Final = ".calibray"  # a line per file written, its SHA-256 and its name; only appended to
@@ -33,6 +33,19 @@ _UNFINISHED: Final = re.compile(r"\.([0-9]{1,10})-[0-9a-f]{32}" + re.escape(PART
 _SIGNATURE_LINE: Final = re.compile(rb"[0-9a-f]{64}  ")  # start of each line of a signature file
 # Windows has neither flag: its links need special rights, and it has no FIFO in a folder.
 NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
+
+
+def as_path(name: object, role: str) -> Path:
+    """The path of a file or folder that a caller names; `role` starts the message.
+
+    Raises:
+        InputError: The name is neither text nor a path.
+    """
+    if not isinstance(name, str | os.PathLike) or isinstance(os.fspath(name), bytes):
+        raise InputError(
+            f"{role}: is a {type_name(name)}, must be the name of a file or folder, as text or Path"
+        )
+    return Path(name)
 
 
 def exists(file: str | Path) -> bool:
@@ -147,7 +160,7 @@ def is_unchanged_output(file: Path) -> bool:
 
 def _valid_name(path: str | Path, role: str) -> Path:
     """The path of an output; refused if a file cannot have this name."""
-    target = Path(path)
+    target = as_path(path, role)
     _status(target, role)
     return target
 

@@ -21,6 +21,7 @@ from calibray.paths import Paths, concatenate
 from calibray.paths.chains import Chains, compile_chains, zenith_azimuth
 from calibray.scenes import Scene
 from calibray.scenes.meshes import LARGEST_COORDINATE
+from calibray.support.messages import type_name
 from calibray.support.progress import Progress
 from calibray.tracing.antennas import AntennaPattern, rotate_jones
 from calibray.tracing.settings import Antenna, TraceSettings
@@ -198,6 +199,10 @@ def link_positions(links: Links) -> tuple[NDArray[np.float64], NDArray[np.float6
     Raises:
         InputError: There is no link, a position is not finite or too far away, or the ends of a link coincide.
     """
+    if not (hasattr(links, "tx") and hasattr(links, "rx")):
+        raise InputError(
+            f"links: is a {type_name(links)}, must have positions tx and rx, as Measurements(tx, rx, path_loss_db)"
+        )
     tx, rx = np.asarray(links.tx, dtype=float), np.asarray(links.rx, dtype=float)
     if tx.shape != rx.shape or tx.ndim != 2 or tx.shape[1:] != (3,) or not len(tx):
         raise InputError(

@@ -24,7 +24,7 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from threading import Lock
-from typing import Any, Final, Protocol, cast, final
+from typing import Any, Final, Protocol, cast, final, runtime_checkable
 from weakref import WeakSet
 
 from calibray.engines.cluster.dask_workers import POLL, Answered, DaskWorkers, count_death, scheduler_client
@@ -46,6 +46,7 @@ ObjectKey = tuple[int, int]
 """The number of a handle and of a chunk."""
 
 
+@runtime_checkable
 class Workers(Protocol):
     """Runs the work of an engine: this process, processes on this machine, or a Dask cluster."""
 
