@@ -56,6 +56,10 @@ def test_rows_keep_their_lines_and_the_lines_above_the_header_are_counted(tmp_pa
     table = read(tmp_path, "Logger\nv 2\n" + PLAIN)
     assert table.row.tolist() == [4, 5, 6]
     assert table.changes == {"lines above the header, skipped": 2}
+    # A spreadsheet gives all lines the same number of cells.
+    padded = read(tmp_path, "Logger,,,\nv 2,,,\n" + PLAIN, "padded.csv")
+    pd.testing.assert_frame_equal(padded.frame, table.frame)
+    assert (padded.row.tolist(), padded.changes) == (table.row.tolist(), table.changes)
 
 
 def test_placeholders_are_missing_values_of_columns_of_numbers_only(tmp_path):

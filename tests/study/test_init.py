@@ -452,6 +452,28 @@ def test_a_carrier_that_no_law_of_itu_covers_gets_the_constants_of_the_nearest(s
     assert stated["walls"].relative_permittivity == at_1_ghz.relative_permittivity
 
 
+def test_carriers_of_the_table_of_transmitters_are_read(scene, tmp_path):
+    sites = pd.DataFrame({"cell": ["a", "b", "other"], "x": [-30.0, -60.0, 0.0], "y": 0.0, "height": 9.0})
+    rows = {"x": np.arange(10.0), "y": 20.0, "cell": ["a", "b"] * 5, "rsrp_dbm": np.arange(-90, -80)}
+    links, target = table(tmp_path, **rows), tmp_path / "study.toml"
+
+    def drafted(frequency=None, **carriers):
+        sites.assign(**carriers).to_csv(tmp_path / "cells.csv", index=False)
+        return draft(str(scene), links, target, tmp_path / "cells.csv", frequency)
+
+    # Only the transmitters of the links count.
+    assert drafted(**{"freq [MHz]": [800.0, 800.0, 2100.0]}).study.scene.frequency == 800e6
+    for frequency in (None, 2e9):
+        several = drafted(frequency, **{"freq [MHz]": [3500.0, 800.0, 2100.0]})
+        assert several.study.scene.frequency == (frequency or 800e6)
+        assert several.study.links.frequency == "freq [MHz]"
+        assert [carrier for carrier, _ in several.study.measurements().carriers] == [800e6, 3500e6]
+    said = {assumption.what: assumption.reason for assumption in several.assumptions}
+    assert said["scene.frequency"] == "given; the lowest carrier of column freq [MHz] is 8e+08 Hz"
+    with pytest.raises(InputError, match=r"cells\.csv: column 'freq' has 2 carriers.*frequency_mhz"):
+        drafted(freq=[3500.0, 800.0, 2100.0])
+
+
 @pytest.mark.parametrize(("places", "held_out"), [(24, True), (18, False), (24, False)])
 def test_blocks_are_held_out_if_links_suffice(scene, tmp_path, places, held_out):
     columns = {

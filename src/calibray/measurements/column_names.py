@@ -309,6 +309,16 @@ def find_length_unit(names: Iterable[str]) -> float:
     return LENGTH_UNITS.get(next(iter(units), "m"), 1.0)
 
 
+def find_frequency_unit(name: str, default: str = "hz") -> float:
+    """The unit of carriers that a column's name states [Hz]; that of `default` if it states none.
+
+    Example:
+        >>> find_frequency_unit("Downlink [MHz]"), find_frequency_unit("carrier")
+        (1000000.0, 1.0)
+    """
+    return FREQUENCY_UNITS[next((unit for unit in FREQUENCY_UNITS if unit in words(name)), default)]
+
+
 def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
     """Find the column of carriers, and the carrier of every row [Hz], if there is one.
 
@@ -320,8 +330,7 @@ def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
         values = frame[name].to_numpy(dtype=float)
         median = float(np.nanmedian(values))
         likely_unit = "ghz" if median < 300 else "mhz" if median < 3e5 else "hz"
-        unit = next((unit for unit in FREQUENCY_UNITS if unit in words(name)), likely_unit)
-        carriers = values * FREQUENCY_UNITS[unit]
+        carriers = values * find_frequency_unit(name, likely_unit)
         if FREQUENCIES[0] <= np.nanmin(carriers) and np.nanmax(carriers) <= FREQUENCIES[1]:
             return name, carriers
     return None

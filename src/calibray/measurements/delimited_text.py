@@ -80,8 +80,9 @@ def read_text(path: Path) -> str:
 def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTable:
     r"""Rows of a table in a text, without blank lines.
 
-    Lines above the header with another number of cells are skipped; units in a row below it are appended to the names.
-    Columns of numbers may contain placeholders (`PLACEHOLDERS`) and one unit of decibels in every cell.
+    Lines above the header with another number of cells, or with mostly empty cells, are skipped; units in a row below
+    it are appended to the names. Columns of numbers may contain placeholders (`PLACEHOLDERS`) and one unit of decibels
+    in every cell.
 
     Args:
         path: Name of the table for messages.
@@ -149,6 +150,9 @@ def _layout(text: str, separator: str | None) -> _Layout:
             widths = {len(cells) for cells, _, _ in records[1:]}
             width = len(records[0][0]) if records else 0
             if width < 2 or not widths <= {width, width + 1} or len(widths) > 1:
+                continue
+            # Spreadsheets pad lines above the header with empty cells.
+            if 2 * sum(map(bool, map(str.strip, records[0][0]))) < width:
                 continue
             # A row of values is no header. What stands above a header is no row of its table.
             if above and (len(records) < 2 or any(map(_is_number, records[0][0]))):

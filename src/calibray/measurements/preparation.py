@@ -41,7 +41,7 @@ class LinkColumns:
         weight: Column of relative weights [1], greater than 0.
         std: Standard deviation [dB] of the values, a number or a column; the weights become 1 / std^2.
         tx_power_dbm: Transmitted power [dBm], a number or a column; only for "received_power".
-        frequency: Column of carrier frequencies [Hz].
+        frequency: Column of carrier frequencies, in Hz or the unit in its name.
 
     Raises:
         InputError: The quantity is unknown or does not match `tx_power_dbm`, or both `weight` and `std` are given.

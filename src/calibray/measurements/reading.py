@@ -61,7 +61,7 @@ def read_measurements(
         std: Standard deviation [dB] of the values, a number or a column; the weights become 1 / std^2.
         tx_power_dbm: Transmitted power [dBm], a number or a column, only for "received_power": the path loss is this
             power minus the received power, including antenna gains and cable losses.
-        frequency: Column of carrier frequencies [Hz], for links measured at several carriers.
+        frequency: Column of carrier frequencies, in Hz or the unit in its name, for links measured at several carriers.
 
     Returns:
         The links that pass, in the order of the file.
@@ -119,7 +119,7 @@ def links_from_table(
         rx=table.positions("rx", rx),
         path_loss_db=np.full(len(table), np.nan),
         group=None if group is None else table.labels(group),
-        frequency=table.numbers(frequency) if frequency is not None and frequency in table.frame else None,
+        frequency=_carriers(table, frequency) if frequency in table.frame else None,
         table=table,
     )
 
@@ -148,11 +148,18 @@ def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> 
         path_loss_db=_path_loss_db(table, columns),
         weight=_weights(table, columns),
         group=None if columns.group is None else table.labels(columns.group),
-        frequency=None if columns.frequency is None else table.numbers(columns.frequency),
+        frequency=_carriers(table, columns.frequency),
         limit_db=limit_db,
         censored=censored,
         table=table,
     )
+
+
+def _carriers(table: SourceTable, column: str | None) -> NDArray[np.float64] | None:
+    """Carrier of every row [rows], [Hz], from a column in the unit of its name; None without a column."""
+    if column is None:
+        return None
+    return table.numbers(column) * column_names.find_frequency_unit(column)
 
 
 def _path_loss_db(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +25,7 @@ from calibray.measurements import (
     transmitter_columns,
 )
 from calibray.measurements.column_names import PositionColumns
+from calibray.measurements.links import MAX_CARRIERS
 from calibray.measurements.selection import comparison, find_codes
 from calibray.scenes import read_frame
 from calibray.scenes.checks import SceneSurfaces
@@ -40,6 +41,9 @@ TRANSMITTER_HEIGHT: Final = 10.0
 
 LEVEL_GROUND: Final = 0.5
 """Largest height of the ground that counts as z = 0 [m]."""
+
+SAME_CARRIER: Final = 0.01
+"""Largest relative difference of carriers that count as one: free-space loss changes by 0.09 dB."""
 
 DISTANCE_TOLERANCE: Final = 0.05
 """Largest median difference between a table's distances and its positions [m]."""
@@ -92,7 +96,7 @@ class LinksDraft:
         assumptions: The assumptions.
         frequency: The study's carrier [Hz].
         table: The links.
-        sites: The transmitters; None without their table.
+        sites: The transmitters of the links; None without their table.
         rx: Columns of the receivers' positions.
         tx: Columns of the transmitters' positions; None without columns.
         groups: The columns that group the offset.
@@ -188,6 +192,7 @@ class LinksDraft:
             self.section["transmitter"] = self._transmitter_key = name
             self.assume("links.transmitter", name, reason)
             self._leave_out_unknown_transmitters(name, self.sites.frame[of_table])
+            self._keep_used_transmitters(of_table, self.table.frame[name])
             return
         name = transmitter_columns.find_transmitter_names(self.sites.frame)
         columns = transmitter_columns.find_wide_columns(self.table.frame, self.sites.labels(name).tolist())
@@ -198,6 +203,7 @@ class LinksDraft:
             )
         self.section |= {"wide": columns, "transmitter": name}
         self._transmitter_key = name
+        self._keep_used_transmitters(name, columns.values())
         reason = f"named as in {self.given.transmitters.name}"
         if unknown := transmitter_columns.find_unknown_wide_columns(self.table.frame, columns):
             reason += f", which lacks the transmitters of {', '.join(unknown)}: left out"
@@ -206,6 +212,12 @@ class LinksDraft:
         self.assume_codes(codes, ", ".join(columns))
         steps = Preparation(wide=columns, transmitter=name)
         self.table = select_rows(self.table, steps, transmitter_columns.name_melted_values(columns))
+
+    def _keep_used_transmitters(self, key: str, names: Iterable[object]) -> None:
+        """Keep the transmitters of the links: a network's table has others, with other carriers and antennas."""
+        if self.sites is not None:
+            compared = comparison(self.sites.frame[key])
+            self.sites = self.sites.select(np.isin(compared(self.sites.frame[key]), compared(names)))
 
     def _leave_out_unknown_transmitters(self, key: str, names_of_sites: pd.Series) -> None:
         """Draft a filter for rows whose transmitter the table of transmitters lacks."""
@@ -237,27 +249,45 @@ class LinksDraft:
             self.assume("links.missing", listed, f"far from all other values of {columns}: not measured")
 
     def _frequency(self) -> float:
-        if self.given.frequency is not None:
-            self.assume("scene.frequency", f"{self.given.frequency:g} Hz", "given")
-            return float(self.given.frequency)
-        column = column_names.find_frequency(self.table.frame)
-        if column is None:
+        """The study's carrier: the given one, or that of a column of the links or of the transmitters."""
+        given, stated = self.given.frequency, self._stated_frequency()
+        if given is not None:
+            differs = stated is not None and abs(stated[0] - given) >= SAME_CARRIER * given
+            reason = f"given; the {stated[1]} is {stated[0]:g} Hz" if stated and differs else "given"
+            self.assume("scene.frequency", f"{given:g} Hz", reason)
+            return float(given)
+        if stated is None:
             raise InputError(
                 f"{self.links}: no column of carrier frequencies; give --frequency, for instance --frequency 3.5e9"
             )
-        name, carriers = column
-        median = float(np.median(carriers))
-        if np.ptp(carriers) < 0.01 * median:
-            self.assume("scene.frequency", f"{median:g} Hz", f"median of column {name}")
-            return median
-        if np.array_equal(carriers, self.table.frame[name]):
+        self.assume("scene.frequency", f"{stated[0]:g} Hz", stated[1])
+        return stated[0]
+
+    def _stated_frequency(self) -> tuple[float, str] | None:
+        """A carrier that a table states [Hz] and what it is; several carriers become ``links.frequency``."""
+        rows, file = self.table.frame, self.links
+        if column_names.find_frequency(rows) is None and self.given.transmitters is not None:
+            rows, file = self.transmitter_rows, self.given.transmitters
+        column = column_names.find_frequency(rows)
+        if column is None:
+            return None
+        name, values = column
+        carriers = np.unique(values[np.isfinite(values)])
+        if carriers[-1] - carriers[0] < SAME_CARRIER * carriers[0]:
+            return float(np.nanmedian(values)), f"median of column {name}"
+        read = rows[name].to_numpy(dtype=float) * column_names.find_frequency_unit(name)
+        if np.array_equal(read, values, equal_nan=True) and len(carriers) <= MAX_CARRIERS:
             self.section["frequency"] = name
-            self.assume("links.frequency", name, f"{len(np.unique(carriers))} carriers in Hz")
-            return median
-        raise InputError(
-            f"{self.links}: column {name!r} has several carriers, not in Hz; give it in Hz, or --frequency and a table "
-            "of one carrier"
-        )
+            self.assume("links.frequency", name, f"{len(carriers)} carriers in {file.name}")
+            # The tracer samples paths through walls at this carrier, for which walls are most transparent.
+            return float(carriers[0]), f"lowest carrier of column {name}"
+        if self.given.frequency is None:
+            raise InputError(
+                f"{file}: column {name!r} has {len(carriers)} carriers; at most {MAX_CARRIERS} are calibrated "
+                "together, in Hz or a unit that the column's name states, such as frequency_mhz; or give --frequency "
+                "and a table of one carrier"
+            )
+        return float(np.nanmedian(values)), f"median of column {name}"
 
     def _position_columns(self) -> tuple[PositionColumns, PositionColumns | None]:
         """Columns of the receivers' and the transmitters' positions; None if the transmitter has no columns."""

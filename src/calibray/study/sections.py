@@ -218,7 +218,8 @@ class LinksSection(Section):
         rx_antenna: Antennas of the receivers, if they differ.
         device: Column of the names of receiving devices, which parameters such as "rx:PHONE.dx" displace.
         position_error_m: Standard deviation of the receivers' positions along x and y [m], a number or a column.
-        frequency: Column of carrier frequencies [Hz]; if absent, all links have the scene's carrier.
+        frequency: Column of carrier frequencies, in Hz or the unit in its name; if absent, all links have the scene's
+            carrier.
         wide: Name of the transmitter by column, for a table with one column per transmitter.
         track: GPX track that gives each row the columns `track_longitude` and `track_latitude` [deg].
         heights: "ground" for heights above the scene's ground; above z = 0 of the scene if absent.
