@@ -186,6 +186,11 @@ def test_footprints_become_a_scene(tmp_path):
     status, out, _ = scene_command("footprints", town, "-o", tmp_path / "out", "--height", 8)
     assert status == 0
     assert "0.0 m to 8.0 m high" in out
+    storeys = ("footprints", town, "-o", tmp_path / "storeys", "--levels", "levels")
+    write_town(town, {"levels": 4})
+    assert "0.0 m to 12.0 m high" in scene_command(*storeys)[1]
+    status, _, err = scene_command(*storeys[:4])
+    assert (status, "there are: levels" in err) == (2, True)
 
 
 @pytest.mark.parametrize(

@@ -108,7 +108,12 @@ class MapOptions:
 class ColumnOptions:
     """Options that name the columns of a vector file."""
 
-    height: Annotated[str, option("COLUMN", "Column with the heights above the ground, or a number [m].")]
+    height: Annotated[
+        str | None,
+        option(
+            "COLUMN", "Column with the heights above the ground, or a number [m]; not needed with --levels."
+        ),
+    ] = None
     bottom: Annotated[
         str, option("COLUMN", "Column with the heights of the lower ends, or a number [m].")
     ] = "0"

@@ -61,7 +61,7 @@ def show_scene(desk: Desk) -> None:
             )
             source.on_value_change(lambda event: kind.set_value(_kind(event.value)))
         with ui.expansion("Settings of the scene").classes("wide"), ui.row():
-            height = desk.keep(ui.input("Height: a column, or metres", value="3"))
+            height = desk.keep(ui.input("Height: a column, or metres", value=""))
             wall = desk.keep(ui.select(ITU, label="Walls (ITU-R P.2040)", value="concrete"))
             thickness = desk.keep(
                 ui.number("Thickness of walls [m]", value=0.3, min=0.001, max=10, step=0.01),
@@ -87,7 +87,7 @@ def show_scene(desk: Desk) -> None:
                     words += ["--terrain", relief.value] if relief.value else []
                     words += ["--per-building"] if apart.value else []
                 if kind.value == "footprints":
-                    words += [f"--height={height.value}"]
+                    words += [f"--height={height.value}"] if height.value else []
                 desk.scene = "scene/scene.xml"
                 desk.start(words)
 

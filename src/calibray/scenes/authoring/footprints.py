@@ -295,7 +295,7 @@ class FootprintColumns:
 
 def read_footprints(
     path: str | Path,
-    height: str | float,
+    height: str | float | None,
     columns: FootprintColumns | None = None,
     layer: str | None = None,
     frame: Frame | None = None,
@@ -307,7 +307,7 @@ def read_footprints(
         path: A GeoJSON file, Shapefile, GeoPackage, FlatGeobuf file or Esri geodatabase that states its reference
             system.
         height: Column with the heights of the buildings above the ground [m], or one height for all; a text that is
-            both a number and the name of a column means the column.
+            both a number and the name of a column means the column. None if `columns` has the numbers of storeys.
         columns: Further columns.
         layer: Layer of the file, if it has several.
         frame: The scene's frame; by default a local frame centred on the footprints.
@@ -315,13 +315,20 @@ def read_footprints(
 
     Raises:
         InputError: The file does not exist, cannot be read, states no reference system, lacks a column or contains no
-            polygon; or a height is negative or not a number.
+            polygon; or a height is not given, negative or not a number.
     """
     path, rule, named = Path(path), rule or HeightRule(), columns or FootprintColumns()
     outlines, table, crs = _read(path, layer)
     frame = frame or _local_frame(outlines, crs)
     count = len(outlines)
-    tops, bottoms = (_numbers(path, table, source, count) for source in (height, named.bottom))
+    if height is None and named.levels is None:
+        raise InputError(
+            f"footprints {path}: the heights of the buildings are not given; name their column in --height, or that of "
+            f"the numbers of storeys in --levels (there are: {', '.join(map(str, table)) or 'none'}), or give one "
+            "height for all in --height"
+        )
+    bottoms = _numbers(path, table, named.bottom, count)
+    tops = np.full(count, np.nan) if height is None else _numbers(path, table, height, count)
     bottoms = np.where(np.isfinite(bottoms), bottoms, 0.0)
     storeys = np.full(count, np.nan) if named.levels is None else _numbers(path, table, named.levels, count)
     has_height = np.isfinite(tops) & (tops > bottoms)
