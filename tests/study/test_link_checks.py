@@ -78,12 +78,13 @@ def test_sound_links_raise_no_suspicion(town):
         (lambda t: t.assign(x=t.y, y=t.x), "if x and y are swapped"),
         (lambda t: t.assign(x=-t.y, y=t.x), "if they are turned by 90 degrees"),
         (lambda t: t.assign(x=t.x + 200), "are beyond the scene; their centre is"),
+        (lambda t: t.assign(x=t.x + 900 * (t.index == 7)), "1 of 60 receivers are beyond the scene"),
         (lambda t: t.assign(z=t.z - 4), "60 of 60 receivers are below the ground"),
         (lambda t: t.assign(y=np.where(t.index < 5, 20.0, t.y), x=np.where(t.index < 5, 10.0 + t.index, t.x)),
          "5 of 60 receivers are inside buildings"),
         (lambda t: t.assign(loss=t.loss - 30), "path losses are below free space, by"),
     ],
-    ids=["swapped", "turned", "origin", "underground", "indoors", "watts"],
+    ids=["swapped", "turned", "origin", "jump", "underground", "indoors", "watts"],
 )  # fmt: skip
 def test_a_planted_mistake_of_links_is_named(town, mistake, named):
     assert named in suspicions(town, mistake(links()))

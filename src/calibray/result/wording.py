@@ -356,7 +356,7 @@ def choice_text(chosen: str, best: str, partner: str | None = None) -> str:
     near = ", which stays near the initial materials" if chosen == Model.PRIOR else ""
     return (
         f"Predictions use the model {str(chosen)!r}{near}. The model {str(best)!r} is better on held-out blocks, but "
-        f"not clearly enough.{added}"
+        f"by too little to be preferred.{added}"
     )
 
 

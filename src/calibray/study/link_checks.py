@@ -122,6 +122,13 @@ def _positions(
             f"and {shift[1]:.0f} m north of the scene's centre",
             "check the origin of the positions",
         )
+    elif beyond.any():
+        row = links.row[int(np.argmax(overhead.outside(links.rx)))]
+        yield (
+            f"{int(beyond.sum())} of {len(rx)} receivers are beyond the scene, where it has no ground and no buildings, "
+            f"the first in row {row}",
+            "leave out wrong positions with links.where, or make a larger scene",
+        )
     inside = roofed & ~overhead.underground(rx)
     if inside.any():
         problem = f"{int(inside.sum())} of {len(rx)} receivers are inside buildings"
