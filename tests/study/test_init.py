@@ -118,6 +118,19 @@ def test_values_that_the_receiver_clips_become_its_noise_floor(scene, tmp_path):
         assert reasons.get("links.noise_floor_dbm") == stated
 
 
+def test_values_at_the_ends_of_what_a_receiver_states_are_no_measurements(tmp_path, scene):
+    """Each access point of a wide table has a third of its values at either end."""
+    power = np.random.default_rng(7).normal(-75.0, 15.0, (200, 2)).round(1).clip(-82.0, -68.0)
+    file = table(tmp_path, x=np.arange(200.0), y=-15.0, rss_a=power[:, 0], rss_b=power[:, 1])
+    (tmp_path / "masts.csv").write_text("name,x,y,z\na,-20,0,9\nb,-60,0,9\n")
+    drafted = draft(scene, file, tmp_path / "study.toml", tmp_path / "masts.csv", 3.5e9)
+    losses = drafted.study.measurements().path_loss_db
+    assert sorted(losses) == sorted(-power[(power > -82.0) & (power < -68.0)])
+    reasons = {assumption.what: assumption.reason for assumption in drafted.assumptions}
+    share = f"{(power == -68.0).mean():.0%}"
+    assert reasons["links.where"] == f"{share} of the values equal the highest one: the receiver is saturated"
+
+
 @pytest.mark.parametrize("step", [1.0, 2.0, 5.0])
 @pytest.mark.parametrize("count", [20, 300, 5000])
 def test_rounded_powers_are_not_taken_for_clipped_ones(step, count):
@@ -288,6 +301,7 @@ def test_what_cannot_be_told_is_asked_for(scene, tmp_path, columns, message):
             {"Lat": "50.01N", "Lon": 9.99, "RSRP": -80.0},
             "'Lat' contains text such as '50.01N': write numbers",
         ),
+        ({"lat": 5000.6, "lon": 959.4, "RSRP": -80.0}, "'lat' has values about 5001, not degrees"),
         ({"x": 0.0, "y": 30.0, "RSRP": ["<-110"] + ["-80"] * 9}, "'RSRP' contains text such as '<-110'"),
         (
             {"x": 0.0, "y": 30.0, "Signal": 84.0},

@@ -234,7 +234,9 @@ def test_the_text_of_an_average_names_both_of_its_models():
     text = choice_text(Model.OFFSETS, Model.CALIBRATED, Model.PRIOR)
     assert f"The prediction is the average of {str(Model.OFFSETS)!r} and {str(Model.PRIOR)!r}" in text
     # The difference can be significant, and the judgement then says that calibration helped.
-    assert f"{str(Model.CALIBRATED)!r} is better on held-out blocks, but by too little to be preferred." in text
+    assert (
+        f"{str(Model.CALIBRATED)!r} is better on held-out blocks, but by too little to be preferred." in text
+    )
 
 
 def test_a_model_with_a_prior_or_without_a_scene_is_not_averaged():

@@ -199,6 +199,23 @@ def text_instead(frame: pd.DataFrame, *rows: str) -> str:
     return ""
 
 
+def no_degrees(frame: pd.DataFrame) -> str:
+    """Text of a column that is named like longitudes or latitudes but has other numbers; empty without such a column.
+
+    Example:
+        >>> no_degrees(pd.DataFrame({"lat": [4734.12], "lon": [1041.84]}))
+        "; column 'lat' has values about 4734, not degrees: write 47.5687 for 4734.12 (NMEA), and name metres x, y"
+    """
+    for name in numeric_columns(frame):
+        largest = 90 if matches(name, "latitude") else 180
+        if matches(name, "latitude", "longitude") and (median := abs(frame[name].median())) > largest:
+            return (
+                f"; column {shortened(name)!r} has values about {median:.0f}, not degrees: write 47.5687 for "
+                "4734.12 (NMEA), and name metres x, y"
+            )
+    return ""
+
+
 def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) -> PositionColumns | None:
     """Find the columns of one end's position; metres are preferred to degrees.
 

@@ -116,23 +116,32 @@ def _offset_groups(draft: LinksDraft, value: ValueColumn) -> list[str]:
 def _add_noise_floor(draft: LinksDraft, value: ValueColumn) -> None:
     raw = draft.table.frame[value.column]
     column = without_codes(raw)
-    if "wide" in draft.section:
-        return
     missing = f"{int(column.isna().sum())} values are missing"
     if value.quantity not in ("rsrp", "received_power"):
         if raw.isna().any():
             draft.add_filter(f"`{value.column}`.notna()")
             draft.assume("links.where", draft.section["where"], missing)
         return
+    _leave_out_saturated(draft, value, column)
     lowest, share = float(column.min()), _share_at_lowest(column)
     if share > 0:
         floor, reason = lowest, f"{share:.0%} of the values equal the lowest one"
-    elif column.isna().any():
+    elif column.isna().any() and "wide" not in draft.section:
         floor, reason = float(np.floor(lowest)), f"{missing}, and none is lower"
     else:
         return
     draft.section["noise_floor_dbm"] = floor
     draft.assume("links.noise_floor_dbm", f"{floor:g} dBm", reason)
+
+
+def _leave_out_saturated(draft: LinksDraft, value: ValueColumn, column: pd.Series) -> None:
+    """Leave out rows with the largest power that a receiver can state, if it states it for all stronger powers."""
+    share = _share_at_lowest(-column)
+    if share > 0:
+        name, highest = value.column, float(column.max())
+        draft.add_filter(f"(`{name}` < {highest:g} or `{name}`.isna())")
+        reason = f"{share:.0%} of the values equal the highest one: the receiver is saturated"
+        draft.assume("links.where", draft.section["where"], reason)
 
 
 def _share_at_lowest(values: pd.Series) -> float:

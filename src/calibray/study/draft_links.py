@@ -300,6 +300,7 @@ class LinksDraft:
                 f"{self.links}: no columns of receiver positions ({self._columns()}); name them rx_x, rx_y, rx_z [m], "
                 "or longitude and latitude"
                 f"{column_names.text_instead(self.table.frame, 'x', 'y', 'longitude', 'latitude')}"
+                f"{column_names.no_degrees(self.table.frame)}"
             )
         if self.given.tx is not None:
             return rx, None

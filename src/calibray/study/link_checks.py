@@ -125,8 +125,8 @@ def _positions(
     elif beyond.any():
         row = links.row[int(np.argmax(overhead.outside(links.rx)))]
         yield (
-            f"{int(beyond.sum())} of {len(rx)} receivers are beyond the scene, where it has no ground and no buildings, "
-            f"the first in row {row}",
+            f"{int(beyond.sum())} of {len(rx)} receivers are beyond the scene, where it has no ground and no "
+            f"buildings, the first in row {row}",
             "leave out wrong positions with links.where, or make a larger scene",
         )
     inside = roofed & ~overhead.underground(rx)
