@@ -9,10 +9,13 @@ import pytest
 
 import planted
 from calibray import fields
+from calibray.engines import ReplayCarriers
+from calibray.engines.replay import CarrierPaths
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares
 from calibray.parameters import Parameter
+from calibray.paths.selection import take_links
 from calibray.result.verdict import Cause
 from calibray.scenes import Triangles, building_numbers
 from calibray.study import Setup, Study
@@ -138,8 +141,29 @@ def test_a_thickness_that_is_not_known_exactly_widens_the_interval(problem):
     assert all(Cause.CONSTANTS not in interval.without for interval in exact.intervals.values())
 
 
-def test_logarithms_of_factors_act_on_the_gaps(problem):
+def at_carriers(problem: Problem) -> Problem:
+    """The problem with every second link at another carrier, where marble has another conductivity."""
+    paths, links = problem.engine.paths, np.arange(planted.LINKS)
+    marble = {"marble": replace(paths.materials["marble"], conductivity=0.3)}
+    there = CarrierPaths(take_links(paths, links[1::2]).at(10e9, marble), links[1::2])
+    here = CarrierPaths(take_links(paths, links[::2]), links[::2])
+    return replace(problem, engine=ReplayCarriers([here, there], problem.parameters, paths.materials))
+
+
+def test_constants_that_are_equal_at_all_carriers_vary(problem):
+    best = problem.parameters.to_search(np.array(list(planted.TRUTH.values())))
+    objective = replace(problem.objective, measured=problem.modelled(best[None])[0])
+    problem = replace(problem, objective=objective)
+    several = at_carriers(problem)
+    one, both = (joint_model(each, best, 0.3**2, problem.freedom) for each in (problem, several))
+    assert "marble.thickness" in both.effects_db
+    assert {*one.effects_db} - {*both.effects_db} == {"marble.conductivity"}
+
+
+@pytest.mark.parametrize("carriers", [1, 2])
+def test_logarithms_of_factors_act_on_the_gaps(problem, carriers):
     """A factor on all buildings of a material is a factor on its mean; without factors the gaps are the study's."""
+    problem = problem if carriers == 1 else at_carriers(problem)
     best = problem.parameters.to_search(np.array(list(planted.TRUTH.values())))
     measured = problem.modelled(best[None])[0]
     known = replace(problem, objective=replace(problem.objective, measured=measured))
@@ -176,7 +200,7 @@ def test_weak_paths_are_left_out_of_large_programs(problem, monkeypatch):
     monkeypatch.setattr(buildings, "MANY", 0)
     monkeypatch.setattr(buildings, "WEAK", 0.8)
     replay = split_replay(problem, problem.parameters, by_building=True)
-    assert 0 < replay.engine.interactions < problem.engine.interactions
+    assert 0 < replay.interactions < problem.engine.interactions
     fewer = replay.path_loss(values, np.ones((20, len(replay.parameter_of))))
     # At one of 16 candidates the paths left out carry a twentieth on average.
     assert 0.0 < np.mean(fewer - whole) < 0.3

@@ -107,6 +107,11 @@ class Replay:
         return self.paths.num_interactions
 
     @property
+    def parts(self) -> tuple[tuple[Replay, NDArray[np.intp]], ...]:
+        """The replay of every carrier with the indices of its links: this one with all links."""
+        return ((self, np.arange(self.paths.num_links)),)
+
+    @property
     def large(self) -> bool:
         """Whether there are so many interactions that a candidate takes milliseconds."""
         return self.interactions > LARGE
@@ -324,6 +329,11 @@ class ReplayCarriers:
     def interactions(self) -> int:
         """Number of interactions that are evaluated for a candidate, over all carriers."""
         return sum(replay.interactions for replay, _, _ in self._carriers)
+
+    @property
+    def parts(self) -> tuple[tuple[Replay, NDArray[np.intp]], ...]:
+        """The replay of every carrier with the indices of its links."""
+        return tuple((replay, links) for replay, _, links in self._carriers)
 
     @property
     def large(self) -> bool:

@@ -349,7 +349,7 @@ def _with_constants(
         building_of=np.unique(replay.building_of[of_building], return_inverse=True)[1],
         only_buildings=np.flatnonzero((constants == of_buildings) & (constants > 0)),
         effects_db={item.name: effects[item.name] for item in varied},
-        interactions=max(replay.engine.interactions, 1),
+        interactions=max(replay.interactions, 1),
     )
 
 
@@ -371,7 +371,8 @@ def has_offset(problem: Problem) -> bool:
 
 
 def _fixed_constants(problem: Problem) -> list[Parameter]:
-    """Constants that the scene fixes, of the materials that have a parameter."""
+    """Constants that the scene fixes, equal at all carriers, of the materials that have a parameter."""
+    replays = [replay for replay, _ in problem.engine.parts]  # type: ignore[attr-defined]
     materials, spread = problem.engine.materials, problem.setup.study.noise.constants_spread
     names = [
         f"{material}.{field_name}"
@@ -383,8 +384,10 @@ def _fixed_constants(problem: Problem) -> list[Parameter]:
     items = []
     for name in names:
         material, field_name = split_name(name)
-        constant = fixed_constant(name, float(getattr(materials[material], field_name)), spread)
-        if name not in problem.parameters.names and constant is not None:
+        value = getattr(materials[material], field_name)
+        constant = fixed_constant(name, float(value), spread)
+        varies = any(getattr(replay.materials[material], field_name) != value for replay in replays)
+        if name not in problem.parameters.names and constant is not None and not varies:
             items.append(constant)
     return items
 
