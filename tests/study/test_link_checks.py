@@ -10,9 +10,11 @@ import pytest
 import shapely
 from typer.testing import CliRunner
 
+from calibray.calibration.calibrate import calibrate
 from calibray.cli.app import app
 from calibray.errors import InputError
 from calibray.scenes.authoring import Footprints, make_scene
+from calibray.scenes.checks import SceneSurfaces, building_outlines
 from calibray.study import Study
 from calibray.study.link_checks import examine
 
@@ -83,8 +85,9 @@ def test_sound_links_raise_no_suspicion(town):
         (lambda t: t.assign(y=np.where(t.index < 5, 20.0, t.y), x=np.where(t.index < 5, 10.0 + t.index, t.x)),
          "5 of 60 receivers are inside buildings"),
         (lambda t: t.assign(loss=t.loss - 30), "path losses are below free space, by"),
+        (lambda t: t.assign(z=np.where(t.index < 5, 0.0, t.z)), "5 of 60 receivers touch the ground"),
     ],
-    ids=["swapped", "turned", "origin", "jump", "underground", "indoors", "watts"],
+    ids=["swapped", "turned", "origin", "jump", "underground", "indoors", "watts", "height"],
 )  # fmt: skip
 def test_a_planted_mistake_of_links_is_named(town, mistake, named):
     assert named in suspicions(town, mistake(links()))
@@ -125,7 +128,10 @@ def test_links_of_another_town_are_refused(town):
         suspicions(town, links().assign(x=links().x + 690_000))
 
 
-def test_run_warns_before_it_traces(town):
+SUNK = "60 of 60 receivers are below the ground; check heights and their datum"
+
+
+def test_run_warns_before_it_traces(town, caplog):
     links().assign(z=-4.0).to_csv(town / "sunk.csv", index=False)
     (town / "sunk.toml").write_text(
         'version = 1\n[scene]\nfile = "scene.xml"\nfrequency = 3.5e9\n[links]\nfile = "sunk.csv"\n'
@@ -134,8 +140,46 @@ def test_run_warns_before_it_traces(town):
     )
     result = CliRunner().invoke(app, ["run", str(town / "sunk.toml"), "--out", str(town / "out")])
     assert "Warning: " in result.stderr
-    assert "60 of 60 receivers are below the ground; check heights and their datum" in result.stderr
+    assert result.stderr.count(SUNK) == 1
     assert result.exit_code == 2  # and no path leads there
+    assert not caplog.messages
+    with pytest.raises(InputError, match="no path reaches any"):
+        calibrate(Study.load(town / "sunk.toml"))
+    assert SUNK in caplog.text
+
+
+def test_transforms_of_shapes_are_applied(tmp_path, town):
+    """A rectangle is a ground of 400 m, and a cube is a house of 12 m; neither has a file."""
+    reference = '<ref id="mat-walls" name="bsdf"/></shape>'
+    shapes = (
+        '<shape type="rectangle" id="mesh-plane"><transform name="to_world"><scale value="200"/></transform>'
+        f"{reference}"
+        '<shape type="cube" id="mesh-block"><transform name="to_world"><scale x="40" y="9" z="6"/>'
+        f'<translate x="-20" y="20" z="6"/></transform>{reference}'
+    )
+    material = '<bsdf type="itu-radio-material" id="mat-walls"><string name="type" value="concrete"/></bsdf>'
+    scene = tmp_path / "scene.xml"
+    scene.write_text(f'<scene version="2.1.0">{material}{shapes}</scene>')
+    surfaces = SceneSurfaces.read(scene)
+    assert surfaces.bounds.tolist() == [-200, -200, 0, 200, 200, 12]
+    assert surfaces.under_roof([[-20, 20, 1.5], [30, 20, 1.5]]).tolist() == [True, False]
+    assert surfaces.underground([[30, 20, -1.0], [30, 20, 1.5]]).tolist() == [True, False]
+    assert surfaces.touching([[30, 20, 0.009], [30, 20, 0.011], [-20, 20, 12.0]]).tolist() == [
+        True,
+        False,
+        True,
+    ]
+    assert building_outlines(scene).bounds == pytest.approx((-60, 11, 20, 29))
+
+
+def test_a_scene_in_millimetres_is_named(tmp_path, town):
+    scene = tmp_path / "scene.xml"
+    text = (town / "scene.xml").read_text().replace('value="meshes/', f'value="{town}/meshes/')
+    scale = '<transform name="to_world"><scale value="1000"/></transform>'
+    scene.write_text(text.replace('<boolean name="face_normals"', f'{scale}<boolean name="face_normals"'))
+    assert "large, as if in millimetres" in suspicions(
+        town, links(), scene={"file": str(scene), "frequency": 3.5e9}
+    )
 
 
 def test_averages_that_span_much_of_the_scene_are_named(town):

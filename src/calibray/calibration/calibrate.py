@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +31,7 @@ from calibray.fitting.search import check_fit, check_method, choose, search
 from calibray.result.files import FILES
 from calibray.result.held_out import Model
 from calibray.study import Setup, Study
+from calibray.study.link_checks import suspicions
 from calibray.support.interruption import ensure_interruption, unwrap_interruption
 from calibray.support.output_files import check_outputs
 from calibray.support.progress import Progress
@@ -38,6 +40,8 @@ from calibray.tracing.protocol import TracerFactory
 from calibray.uncertainty.assessment import certainty
 from calibray.validation.models import NO_MINIMA
 from calibray.validation.validate import check_engine, validate_problem
+
+_LOG: Final = logging.getLogger(__name__)
 
 MINIMA_WITHOUT_MULTISTART: Final = 2
 """If a method has no multi-start, it returns at most this many minima, which are too few starting points for a
@@ -61,6 +65,8 @@ def calibrate(
     cheap_model: Study | Setup | None = None,
 ) -> Result:
     """Calibrate a scene's materials against measurements.
+
+    Suspicious positions and values of a study's links are logged as warnings. An opened study is not checked.
 
     Args:
         study: The study, opened or not.
@@ -109,7 +115,10 @@ def calibrate(
         check_engine(plan)
     started = time.perf_counter()
     can_trace = setup is not None
-    setup = setup or Setup.open(plan, tracer)
+    if setup is None:
+        setup = Setup.open(plan, tracer)
+        for finding in suspicions(plan, setup.links):
+            _LOG.warning("%s: %s; %s", finding.subject, finding.problem, finding.remedy)
     if engine is None:
         check_fit(setup)
         ledger = None if out is None else Path(out) / LEDGER_FILE

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
 
 import typer
 
-from calibray.errors import InputError
 from calibray.support import interruption
 from calibray.support.progress import Progress
 
@@ -137,26 +136,10 @@ def warn(study: Study, links: Measurements) -> None:
     Raises:
         InputError: The links are far from the scene, or the scene cannot be read.
     """
-    from importlib.util import find_spec
-
     from calibray.reporting.scene_tables import warning_lines
-    from calibray.study.link_checks import examine
+    from calibray.study.link_checks import suspicions
 
-    if missing := [name for name in ("shapely", "trimesh") if find_spec(name) is None]:
-        echo(
-            f"Positions were not checked against the scene: {missing[0]} is not installed; "
-            "run pip install 'calibray[scenes]'",
-            err=True,
-        )
-        return
-    try:
-        findings = examine(study, links)
-    except InputError:
-        # An external program may read scene files that Calibray cannot.
-        if study.engine.external:
-            return
-        raise
-    if findings:
+    if findings := suspicions(study, links):
         echo(warning_lines(findings), err=True)
 
 

@@ -6,6 +6,7 @@ Each finding is a suspicion with its evidence, not a proof. Only links that are 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from typing import Final
 
 import numpy as np
@@ -15,7 +16,7 @@ from scipy.constants import speed_of_light
 from calibray.errors import InputError
 from calibray.measurements import FEW, Measurements
 from calibray.measurements.column_names import words
-from calibray.scenes.checks import Finding, SceneSurfaces
+from calibray.scenes.checks import Finding, SceneSurfaces, scale_findings
 from calibray.study.model import StudyModel
 from calibray.study.mounting import link_antennas
 from calibray.tracing.gain_table import read_gain_table
@@ -47,6 +48,24 @@ _TURNS: Final[dict[str, _Turn]] = {
 }
 
 
+def suspicions(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
+    """As `examine`, but a scene that only an external program reads is not checked, nor positions without shapely.
+
+    Raises:
+        InputError: The links are far from the scene, or the scene cannot be read.
+    """
+    if find_spec("shapely") is None:
+        problem = "positions were not checked against the scene: shapely is not installed"
+        return (Finding("warning", links.source, problem, "run pip install 'calibray[scenes]'"),)
+    try:
+        return examine(study, links)
+    except InputError:
+        # An external program may read scene files that Calibray cannot.
+        if study.engine.external:
+            return ()
+        raise
+
+
 def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
     """Check links for common mistakes; returns the suspicions and their remedies.
 
@@ -54,7 +73,9 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
         InputError: All links are far from the scene, the scene cannot be read, or shapely or trimesh is not installed.
     """
     overhead = SceneSurfaces.read(study.scene_source)
+    scale = scale_findings(overhead.bounds[:3], overhead.bounds[3:])
     checks = (
+        *((finding.problem, finding.remedy) for finding in scale if finding.severity == "error"),
         *_positions(overhead, links, study.links.position == "geographic"),
         *_levels(study, links),
         *_angles(study, links),
@@ -101,6 +122,13 @@ def _positions(
         if below.any():
             problem = f"{int(below.sum())} of {len(points)} {name} are below the ground"
             yield problem, "check heights and their datum"
+        touching = overhead.touching(points)
+        if touching.any():
+            yield (
+                f"{int(touching.sum())} of {len(points)} {name} touch the ground, a floor or a roof, whose reflections "
+                f"are missed there",
+                "give the height of the antenna, at least 1 cm above the surface",
+            )
     roofed = overhead.under_roof(rx)
     if roofed.mean() > 0.8 and overhead.under_roof(tx).any():
         return  # an indoor scene

@@ -7,3 +7,4 @@ from calibray.scenes.checks.positions import move_outside as move_outside
 from calibray.scenes.checks.scene_check import Finding as Finding
 from calibray.scenes.checks.scene_check import SceneCheck as SceneCheck
 from calibray.scenes.checks.scene_check import check_scene as check_scene
+from calibray.scenes.checks.scene_check import scale_findings as scale_findings

@@ -116,7 +116,7 @@ def check_scene(source: str | Path, progress: Progress | None = None) -> SceneCh
         high = np.maximum(high, item.mesh.vertices.max(axis=0))
         if progress is not None:
             progress("examining", len(checked), len(root.findall("shape")))
-    findings = [*_material_findings(root, checked), *_scale_findings(low, high), *coarse]
+    findings = [*_material_findings(root, checked), *scale_findings(low, high), *coarse]
     for item in checked:
         findings += _mesh_findings(item)
     order = ("error", "warning", "note")
@@ -150,7 +150,7 @@ def _mesh_findings(item: MeshFaults) -> list[Finding]:
         (
             item.repeated_faces,
             "warning",
-            f"{share} that coincide with another one: waves pass through the wall twice",
+            f"{share} that coincide with another one: paths through them may be lost, and reflections counted twice",
             "remove the copies",
         ),
     )
@@ -182,7 +182,7 @@ def _material_findings(root: ElementTree.Element, objects: Sequence[MeshFaults])
             yield Finding("error", item.name, problem, "rename the object")
 
 
-def _scale_findings(low: NDArray[np.float64], high: NDArray[np.float64]) -> Iterator[Finding]:
+def scale_findings(low: NDArray[np.float64], high: NDArray[np.float64]) -> Iterator[Finding]:
     """Faults of unit and origin, from the corners of the scene's bounds [3]."""
     extent = high - low
     width = float(extent[:2].max())
