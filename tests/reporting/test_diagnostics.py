@@ -12,6 +12,7 @@ from calibray.calibration.link_diagnostics import _depth_and_power
 from calibray.calibration.result import Result
 from calibray.fields import path_gains
 from calibray.reporting.wording import diagnostics_table
+from calibray.result.verdict import Remark, RemarkKind
 from calibray.scenes.regions import Region
 from changed import changed
 from made_up_report import made_up
@@ -115,6 +116,12 @@ def test_the_page_points_at_a_region_of_extra_loss_only_if_planted():
     assert text.startswith("losses of ")
     assert shaded.diagnostics["missing_region"].share.item() > 0.3
     assert "than chance" in finding(planted(result, noise), "missing region")
+    # The remark has searched the residuals of the calibrated model; the page names no second region.
+    values = shaded.diagnostics["missing_region"].drop(columns="significant").iloc[0].to_dict()
+    remark = Remark(RemarkKind.MISSING_REGION, {**values, "attenuation": 0.25})
+    assert finding(changed(shaded, remarks=(remark,)), "missing region").startswith(
+        "losses of 0.25 dB/m within"
+    )
 
 
 def test_residuals_by_obstruction_and_by_street(result):

@@ -50,6 +50,8 @@ def test_an_upload_replaces_nothing_and_follows_no_link(folder, tmp_path):
     # As some systems write it: a letter and a mark.
     assert folder.check_upload("Mo\u0308bel.csv") == tmp_path / "M\u00f6bel.csv"
     assert folder.check_upload("नक्शा.osm") == tmp_path / "नक्शा.osm"
+    for name in ("drive.txt", "scanner.tsv", "levels.dat", "houses.fgb", "sector.pln"):
+        assert folder.check_upload(name) == tmp_path / name
     assert folder.check_upload("wall.ply") == tmp_path / "meshes" / "wall.ply"
     (tmp_path / "there.csv").write_text("")
     (tmp_path / "link.csv").symlink_to(tmp_path / "nowhere")

@@ -14,6 +14,7 @@ from calibray.measurements import FEW
 from calibray.measurements.placement import ends_of
 from calibray.reporting.link_survey import measured_quantity, residual
 from calibray.result.record import Record
+from calibray.result.verdict import RemarkKind
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.uncertainty.missing_region import MissingRegion, missing_region
 from calibray.uncertainty.residual_correlation import variogram
@@ -147,6 +148,10 @@ def _by_street(result: Record) -> pd.DataFrame:
 
 
 def _missing_region(result: Record) -> pd.DataFrame:
+    """The rectangle of the remark on the calibrated model; without a remark, that of the prediction model."""
+    for remark in result.uncertainty.remarks:
+        if remark.kind == RemarkKind.MISSING_REGION:
+            return pd.DataFrame([{**remark.values, "significant": True}])
     links, _ = calibration_links(result)
     ends = ends_of(links)
     if ends is None:

@@ -243,9 +243,9 @@ def _content(links: LinksDraft) -> dict[str, Any]:
     indoors = _indoors(links)
     if section.get("position") == "geographic" and not indoors:
         section["inside"] = "move"
-        reason = (
-            "satellite positions have errors of metres, some are inside walls; position_error_m models them"
-        )
+        reason = "satellite positions have errors of metres, some are inside walls"
+        # Displaced receivers are averaged at one carrier.
+        reason += "" if "frequency" in section else "; position_error_m models them"
         links.assume("links.inside", "move", reason)
     antenna_section = add_antennas(links)
     trace = {"max_depth": _depth(links) if indoors else 3, "samples": 200_000}

@@ -24,6 +24,7 @@ from nicegui.elements.mixins.value_element import ValueElement
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
+from calibray.measurements.delimited_text import SUFFIXES
 from calibray.reporting.link_map import lay_out
 from calibray.scenes import read_scene, read_triangles
 from calibray.scenes.checks import SceneSurfaces
@@ -32,13 +33,14 @@ from calibray.study.link_checks import count_unknowns, examine
 from calibray.support.lazy_imports import library
 from calibray.support.messages import shortened
 from calibray.support.output_files import write_text
+from calibray.tracing.gain_table import TWO_CUT_SUFFIXES
 from calibray.window.jobs import Jobs
 
 STUDY: Final = "study.toml"
-MAPS: Final = (".osm", ".pbf", ".geojson", ".gpkg", ".shp", ".dxf", ".csv")
-TABLES: Final = (".csv", ".xlsx", ".parquet")
+MAPS: Final = (".osm", ".pbf", ".geojson", ".gpkg", ".shp", ".fgb", ".dxf", ".csv")
+TABLES: Final = (*SUFFIXES, ".xlsx", ".parquet")
 MESHES: Final = (".ply", ".obj")
-PARTS: Final = (".shx", ".dbf", ".prj", ".cpg", ".tif", ".tiff", ".gpx", ".xml", ".json", ".msi")
+PARTS: Final = (".shx", ".dbf", ".prj", ".cpg", ".tif", ".tiff", ".gpx", ".xml", ".json")
 LARGEST: Final = 2**30
 """Largest size of an uploaded file [bytes]; put larger files into the folder."""
 
@@ -111,7 +113,7 @@ class StudyFolder:
                 f"{shown}: use letters, digits, spaces, and . _ - ( ) + in names of files; rename it"
             )
         ending = Path(name).suffix.lower()
-        if ending not in (*MAPS, *TABLES, *PARTS, *MESHES):
+        if ending not in (*MAPS, *TABLES, *PARTS, *TWO_CUT_SUFFIXES, *MESHES):
             raise InputError(
                 f"{shown}: files of this kind are not read; give a map, a plan, a table or a scene"
             )

@@ -68,6 +68,9 @@ def show_scene(desk: Desk) -> None:
             )
             ground = desk.keep(ui.select(ITU, label="Ground", value="concrete"))
             unit = desk.keep(ui.number("Unit of a plan [m]", value=1.0, min=1e-6))
+            materials = desk.keep(
+                ui.input("Materials of a plan", placeholder="outer=brick:0.3, inner=plasterboard", value="")
+            )
             relief = desk.keep(ui.select(["", *terrain], label="Height model of the ground", value=""))
             apart = desk.keep(ui.switch("One mesh per building"))
 
@@ -77,6 +80,8 @@ def show_scene(desk: Desk) -> None:
                 if kind.value == "plan":
                     words += ["--unit", filled(unit)]
                     words += [f"--height={height.value}"] if _is_number(height.value) else []
+                    stated = filter(None, map(str.strip, (materials.value or "").split(",")))
+                    words += [f"--material={material}" for material in stated]
                 else:
                     words += [
                         "--wall",
@@ -137,7 +142,7 @@ def show_measurements(desk: Desk) -> None:
         return
     tables, tracks = desk.folder.files(TABLES), desk.folder.files((".gpx",))
     if not tables:
-        ui.label("Add a table of measured links: CSV, Excel or Parquet.").classes("quiet")
+        ui.label("Add a table of measured links: text such as CSV, Excel or Parquet.").classes("quiet")
         return
     with ui.row():
         links = desk.keep(
