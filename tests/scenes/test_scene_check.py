@@ -11,7 +11,7 @@ from calibray.errors import InputError
 from calibray.scenes import Mesh, MeshObject, join_meshes, write_scene
 from calibray.scenes.authoring import Windows, make_scene
 from calibray.scenes.checks import SceneCheck, check_scene
-from calibray.scenes.checks.scene_check import count_faults
+from calibray.scenes.checks.scene_check import count_faults, find_covers
 from planted_maps import L_SHAPE, footprints
 
 STONE = {"stone": {"type": "concrete", "thickness": 0.2}}
@@ -131,3 +131,41 @@ def test_meshes_that_cannot_be_read_are_named(tmp_path):
     file.write_text('<scene version="2.1.0"></scene>')
     with pytest.raises(InputError, match="no mesh"):
         check_scene(file)
+
+
+def sheet(x: float, low: float, high: float) -> Mesh:
+    """A wall across the x axis, from y and z = low to high."""
+    corners = [[x, low, low], [x, high, low], [x, high, high], [x, low, high]]
+    return Mesh(np.array(corners, dtype=float), np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+@pytest.mark.parametrize("turn", [[0, 1, 2], [1, 2, 0], [2, 0, 1]])
+@pytest.mark.parametrize(("gap", "count"), [(0.0, 2), (0.001, 2), (0.009, 2), (0.011, 0)])
+def test_faces_closer_than_a_centimetre_are_found(turn, gap, count):
+    """The small sheet lies at the large one, whose centroids it does not cover."""
+    corners = np.concatenate(
+        [mesh.vertices[mesh.faces] for mesh in (sheet(5.0, -9.0, 9.0), sheet(5.0 + gap, 1.0, 2.0))]
+    )
+    cover = find_covers(corners[:, :, turn])
+    assert (cover[:2] < 0).all()
+    assert (cover >= 0).sum() == count
+
+
+def test_touching_buildings_and_floors_on_the_ground_are_no_overlap():
+    neighbour = cube()
+    neighbour.vertices[:, 0] += 10.0
+    ground = Mesh(np.array([[-90.0, -90, 0], [90, -90, 0], [0, 90, 0]]), np.array([[0, 1, 2]]))
+    corners = [mesh.vertices[mesh.faces] for mesh in (cube(), neighbour, ground)]
+    assert (find_covers(np.concatenate(corners)) < 0).all()
+    # The copy of a building shows its walls and its roof twice.
+    assert (find_covers(np.concatenate([*corners, corners[1]])) >= 0).sum() > 10
+
+
+def test_a_road_in_the_plane_of_the_ground_is_named(tmp_path):
+    materials = STONE | {"tar": {"type": "concrete", "thickness": 0.1}}
+    plane = [MeshObject(name, material, Mesh(sheet(0.0, -size, size).vertices[:, [1, 2, 0]], sheet(0, 0, 1).faces))
+             for name, material, size in (("ground", "stone", 90.0), ("road", "tar", 20.0))]  # fmt: skip
+    finding = next(item for item in check_scene(write_scene(tmp_path, plane, materials)).findings if not item.subject
+                   and "parallel" in item.problem)  # fmt: skip
+    assert finding.severity == "warning"
+    assert "(such as 'mesh-road' at 'mesh-ground'), 2 of them of another material" in finding.problem

@@ -21,6 +21,7 @@ from calibray.scenes.authoring import (
     make_plan_scene,
     make_scene,
 )
+from calibray.scenes.checks.scene_check import CLOSE
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
 from planted_maps import L_SHAPE, footprints
@@ -128,3 +129,23 @@ def test_a_plan_with_both_faces_drawn_is_traced_like_one_with_centre_lines(tmp_p
     assert traced[0] == traced[1]
     direct = [next(kinds for link, _, kinds in paths if link == 0) for paths in (traced[1], traced[2])]
     assert direct == [(Kind.REFRACTION,), (Kind.REFRACTION, Kind.REFRACTION)]
+
+
+@pytest.mark.parametrize(("gap", "reflections"), [(CLOSE / 10, 2), (CLOSE, 1)])
+def test_sheets_that_are_too_close_reflect_twice(tmp_path, gap, reflections):
+    """`check_scene` warns below `CLOSE`."""
+    ground, patch = (
+        [[(-size, -size, z), (size, -size, z), (size, size, z), (-size, size, z)]]
+        for size, z in ((90, 0), (60, gap))
+    )
+    scene = write_scene(tmp_path, {"ground": ground, "patch": patch}, BSDF)
+    paths = trace(scene, [[0, 0, 10]] * 3, [[-40, 8, 1.5], [20, 5, 1.5], [3, 30, 1.5]], diffraction=False)
+    assert np.bincount(paths.link).tolist() == [1 + reflections] * 3
+
+
+@pytest.mark.parametrize(("gap", "reached"), [(CLOSE / 10, False), (CLOSE, True)])
+def test_no_path_passes_walls_that_are_too_close(tmp_path, gap, reached):
+    walls = {str(x): [[(x, -9, 0), (x, 9, 0), (x, 9, 9), (x, -9, 9)]] for x in (10, 10 + gap)}
+    scene = write_scene(tmp_path, walls)
+    paths = trace(scene, [[0, 0, 5]], [[20, 3, 2]], diffraction=False, refraction=True, max_depth=3)
+    assert bool(paths.num_paths) == reached
