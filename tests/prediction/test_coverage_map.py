@@ -7,6 +7,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -15,10 +16,12 @@ import rasterio
 from typer.testing import CliRunner
 
 import calibray as cb
+import planted
 from calibray.cli.app import app
 from calibray.coordinates import transformer
 from calibray.errors import InputError
 from calibray.prediction import batches
+from calibray.prediction.coverage_map import _column_values
 from calibray.prediction.map_files import CoverageMap, geotiff
 from calibray.reporting.link_map import footprints
 from calibray.result import FittedTerm, PredictionModel
@@ -282,3 +285,18 @@ def test_a_building_on_the_border_keeps_its_outline():
     (outline,) = footprints(roof, 5.0, -50.0, 105.0, 50.0)
     assert sorted(map(tuple, outline)) == [(-10, -10), (-10, 10), (10, -10), (10, 10)]
     assert footprints(roof, 11.0, -50.0, 111.0, 50.0) == []
+
+
+def test_a_map_has_the_carrier_of_the_links_measured_at_its_transmitter(tmp_path):
+    """Two sectors at one position have two carriers; the stated sector chooses."""
+    table = planted.links().assign(path_loss_db=90.0, sector=["a", "b"] * 6, carrier=[8e8, 3.5e9] * 6)
+    columns = {"tx": list(planted.COLUMNS[:3]), "rx": list(planted.COLUMNS[3:]), "value": "path_loss_db"}
+    links = {"file": "links.csv", **columns, "frequency": "carrier"}
+    result = SimpleNamespace(study=planted.study(tmp_path, table, links=links), links=pd.DataFrame())
+    tx = table[list(planted.COLUMNS[:3])].to_numpy()[0]
+    for sector, carrier in (("a", 8e8), ("b", 3.5e9)):
+        assert _column_values(result, tx, {"sector": sector})["carrier"] == carrier
+    assert _column_values(result, tx + 5.0, {"carrier": 2e9}) == {"carrier": 2e9}
+    for place, stated in ((tx, {}), (tx + 5.0, {"sector": "a"})):
+        with pytest.raises(InputError, match="needs the links' column 'carrier'"):
+            _column_values(result, place, stated)

@@ -176,8 +176,9 @@ def _column_values(
     for section in study.nuisance.values():
         needed += [section.per] if section.per is not None and section.cluster_m is None else []
         needed += [section.by] if section.by not in (CONSTANT, LOG_DISTANCE, *OBSTRUCTION) else []
-    values |= _mounting_values(study, tx, values)
-    needed += mounting_columns(study)
+    of_links = [*mounting_columns(study), *([study.links.frequency] if study.links.frequency else [])]
+    values |= _measured_values(study, tx, of_links, values)
+    needed += of_links
     for name in needed:
         if name not in values:
             raise InputError(
@@ -187,11 +188,10 @@ def _column_values(
     return values
 
 
-def _mounting_values(
-    study: Study, tx: NDArray[np.float64], stated: Mapping[str, object]
+def _measured_values(
+    study: Study, tx: NDArray[np.float64], columns: Sequence[str], stated: Mapping[str, object]
 ) -> dict[str, object]:
-    """Values of the columns of antennas and their directions that all links measured at this transmitter share."""
-    columns = mounting_columns(study)
+    """Values of columns, such as those of antennas and carriers, that all links measured at this transmitter share."""
     if not set(columns) - set(stated):
         return {}
     links = study.measurements()
