@@ -78,8 +78,8 @@ def test_a_table_with_the_columns_of_the_measurements_is_predicted(tmp_path):
     assert result.predict(own_columns) == pytest.approx(predicted)
     assert result.predict(own_columns.astype(object)) == pytest.approx(predicted)
     for wrong, message in (
-        ("new.csv", "links: is a str, must be a pandas DataFrame; read a file first"),
-        (own_columns.to_numpy(), "links: is a ndarray, must be a pandas DataFrame"),
+        ("new.csv", "links: is a str, must be a pandas DataFrame, such as pandas.read_csv"),
+        (own_columns.to_numpy(), r"links: is a numpy\.ndarray, must be a pandas DataFrame"),
         (pd.concat([own_columns, own_columns], axis=1), "links: has several columns 'east'; keep one"),
     ):
         with pytest.raises(InputError, match=message):
