@@ -2,6 +2,7 @@
 
     python benchmarks/ray_mapping.py --first 3000 --districts 20 --offices 10 --seeds 3 --out rays.jsonl
     python benchmarks/ray_mapping.py --first 3000 --districts 20 --offices 10 --seeds 3 --in-turn 1   # of eight engines
+    python benchmarks/ray_mapping.py --first 3000 --districts 20 --in-turn 1 --engines "$OUTSIDE"   # see below
 
 The engine is the replay of a district or an office with its own antennas, constants and physics, which the study does
 not state; it answers with the power of every path. Truths are drawn evenly within the bounds, errors have 3 dB. The
@@ -24,6 +25,7 @@ from typing import Any, Final
 import jax
 import numpy as np
 import pandas as pd
+import scipy.optimize
 
 import districts
 from calibray.engines import Replay
@@ -77,6 +79,36 @@ ENGINES: Final[dict[str, tuple[Any, Any]]] = {
     ),
 }
 """Antennas, and materials from the study's at a carrier [Hz]; calibrated constants are those of the candidate."""
+
+
+def _tied(materials: dict[str, Material], start: dict[str, Material]) -> dict[str, Material]:
+    """The loss tangent is that of the start values, so that conductivity changes with permittivity."""
+    return {
+        key: changed(item, conductivity=item.relative_permittivity / start[key].relative_permittivity)
+        for key, item in materials.items()
+    }
+
+
+def _compressed(materials: dict[str, Material], _: dict[str, Material]) -> dict[str, Material]:
+    """Susceptibilities are 0.7 times those that the engine is asked for."""
+    return {
+        key: replace(item, relative_permittivity=1 + 0.7 * (item.relative_permittivity - 1))
+        for key, item in materials.items()
+    }
+
+
+MATERIALS: Final = {"loss tangent": _tied, "permittivity law": _compressed}
+"""Materials of a call, from those of the candidate and of the start values."""
+
+OUTSIDE: Final = (*MATERIALS, "wall loss", "strongest paths", "rounded powers")
+"""Engines whose powers the model of rays cannot represent, with other antennas.
+
+With "wall loss", permittivity does not change paths through walls. "Strongest paths" answers with the five strongest of
+each link. "Rounded powers" answers with multiples of 0.1 dB.
+"""
+
+STRONGEST: Final = 5
+LOCAL_SEARCHES: Final = 16  # for the optimum of an engine without derivatives
 
 
 @dataclass(frozen=True)
@@ -180,7 +212,8 @@ class Foreign:
     """An engine that answers with rays."""
 
     def __init__(self, place: Place, name: str) -> None:
-        antennas, materials = ENGINES[name]
+        antennas, materials = ENGINES.get(name, (OTHER, lambda m, _: m))
+        self.name = name
         setup, bare = place.setup, place.paths
         self.table = rays_of(place.paths)
         self.setting = RaySetting.of(setup)
@@ -197,33 +230,95 @@ class Foreign:
 
     def rays(self, candidate: np.ndarray) -> Export:
         """The answer to one candidate."""
-        paths = replace(self.paths, materials=self.parameters.materials(candidate, self.paths.materials))
-        return Export.of_table(replace(self.table, power=powers(paths)), self.setting)
+        power = self.powers(candidate)
+        answered = np.flatnonzero(power > 0)
+        return Export.of_table(replace(self.table, power=power).take(answered), self.setting)
+
+    def powers(self, candidate: np.ndarray) -> np.ndarray:
+        """Power of every path for a candidate, 0 if the engine leaves it out."""
+        start = self.parameters.materials(self.parameters.start, self.paths.materials)
+        materials = self.parameters.materials(candidate, self.paths.materials)
+        if self.name in MATERIALS:
+            materials = MATERIALS[self.name](materials, start)
+        power = powers(replace(self.paths, materials=materials))
+        if self.name == "wall loss":
+            path = np.repeat(np.arange(self.paths.num_paths), np.diff(self.paths.first))
+            through = np.unique(path[self.paths.kind == Kind.TRANSMISSION])
+            power[through] = powers(replace(self.paths, materials=start))[through]
+        if self.name == "strongest paths":
+            order = np.lexsort((-power, self.paths.link))
+            rank = np.arange(len(order)) - np.searchsorted(self.paths.link[order], self.paths.link[order])
+            power[order[rank >= STRONGEST]] = 0.0
+        if self.name == "rounded powers":
+            power = 10 ** ((10 * np.log10(power)).round(1) / 10)
+        return power
+
+    def path_loss(self, candidates: np.ndarray) -> np.ndarray:
+        """Path loss of the links [n, L] for candidates [n, d]."""
+        with np.errstate(divide="ignore"):
+            return np.stack(
+                [
+                    -10 * np.log10(np.bincount(self.paths.link, self.powers(each), self.paths.num_links))
+                    for each in candidates
+                ]
+            )
 
 
 def planted(place: Place, foreign: Foreign, random: np.random.Generator) -> tuple[Problem, np.ndarray]:
     """The problem on an engine's replay whose links are measured with noise at a drawn truth [d], and this truth."""
     parameters = foreign.parameters
     truth = parameters.from_search(random.uniform(*parameters.search_bounds))
-    loss = foreign.replay.path_loss(truth[None])[0]
+    loss = foreign.path_loss(truth[None])[0]
     measured = np.where(np.isfinite(loss), loss, 0.0) + NOISE_DB * random.standard_normal(len(loss))
     known = Problem.of(place.setup, foreign.replay)
     return replace(known, objective=replace(known.objective, measured=measured)), truth
 
 
+def lowest(problem: Problem, foreign: Foreign, points: np.ndarray, random: np.random.Generator) -> float:
+    """The lowest RMSE of an engine [dB], searched from points [n, d] and at random."""
+    if foreign.name in ENGINES:
+        return least_squares(problem, SEARCHES, points).best.y
+    parameters, bounds = foreign.parameters, foreign.parameters.search_bounds
+    span = bounds[1] - bounds[0]
+
+    def residuals(unit: np.ndarray) -> np.ndarray:
+        candidate = parameters.from_search(bounds[0] + unit * span)
+        return problem.objective.residuals(foreign.path_loss(candidate[None]))[0]
+
+    starts = [*(points - bounds[0]) / span, *random.uniform(size=(LOCAL_SEARCHES, len(span)))]
+    # Rounded powers are constant over small steps.
+    found = [
+        scipy.optimize.least_squares(
+            residuals, start, bounds=(-1e-9, 1 + 1e-9), diff_step=3e-2, max_nfev=30
+        ).x
+        for start in np.clip(starts, 0, 1)
+    ]
+    found += [
+        scipy.optimize.minimize(
+            lambda unit: float(np.mean(residuals(np.clip(unit, 0, 1)) ** 2)), best, method="Nelder-Mead",
+            options={"maxfev": 300, "xatol": 1e-4, "fatol": 1e-6},
+        ).x
+        for best in sorted(found, key=lambda unit: float(np.sum(residuals(unit) ** 2)))[:2]
+    ]  # fmt: skip
+    candidates = parameters.from_search(bounds[0] + np.clip([*starts, *found], 0, 1) * span)
+    return float(problem.objective.rmse(foreign.path_loss(candidates)).min())
+
+
 def repetition(place: Place, foreign: Foreign, name: str, seed: int) -> dict[str, Any]:
     """One planted truth on one engine."""
     started, parameters = time.process_time(), foreign.parameters
-    problem, truth = planted(place, foreign, np.random.default_rng([seed, 30]))
-    optimum = least_squares(problem, SEARCHES, parameters.to_search(truth)[None]).best.y
+    random = np.random.default_rng([seed, 30])
+    problem, truth = planted(place, foreign, random)
     mapped = map_rays(problem, foreign.rays, seed=seed, most_calls=6)
-    points = parameters.to_search(np.array([call.candidate for call in mapped.calls]))
-    excess = problem.squares(points).value - optimum
+    seconds = time.process_time() - started
+    candidates = np.array([call.candidate for call in mapped.calls])
+    optimum = lowest(problem, foreign, parameters.to_search(np.vstack([truth, candidates])), random)
+    excess = problem.objective.rmse(foreign.path_loss(candidates)) - optimum
     return {
         "place": place.name, "engine": name, "seed": seed, "paths": foreign.paths.num_paths,
         "calls": next((k + 1 for k, value in enumerate(excess.tolist()) if value <= REACHED_DB), FAILED),
         "made": len(excess), "excess_db": excess.round(6).tolist(), "misfit_db": mapped.understanding.misfit_db,
-        "gap_db": mapped.gap_db, "understood": mapped.understood, "seconds": time.process_time() - started,
+        "gap_db": mapped.gap_db, "changed_db": mapped.changed_db, "understood": mapped.understood, "seconds": seconds,
     }  # fmt: skip
 
 
