@@ -33,7 +33,7 @@ from calibray.engines.rays.compile import RaySetting, compile_rays, powers, rays
 from calibray.engines.rays.export import Export
 from calibray.errors import InputError
 from calibray.fitting.problem import Problem
-from calibray.fitting.ray_mapping import map_rays
+from calibray.fitting.ray_mapping import map_rays, with_engine
 from calibray.fitting.ray_model import HALF_SPACE
 from calibray.fitting.search import least_squares
 from calibray.materials import Material, itu_material
@@ -100,10 +100,10 @@ def _compressed(materials: dict[str, Material], _: dict[str, Material]) -> dict[
 MATERIALS: Final = {"loss tangent": _tied, "permittivity law": _compressed}
 """Materials of a call, from those of the candidate and of the start values."""
 
-OUTSIDE: Final = (*MATERIALS, "wall loss", "strongest paths", "rounded powers")
+OUTSIDE: Final = (*MATERIALS, "first order", "strongest paths", "rounded powers")
 """Engines whose powers the model of rays cannot represent, with other antennas.
 
-With "wall loss", permittivity does not change paths through walls. "Strongest paths" answers with the five strongest of
+With "first order", permittivity changes paths of one interaction only. "Strongest paths" answers with the five strongest of
 each link. "Rounded powers" answers with multiples of 0.1 dB.
 """
 
@@ -241,10 +241,9 @@ class Foreign:
         if self.name in MATERIALS:
             materials = MATERIALS[self.name](materials, start)
         power = powers(replace(self.paths, materials=materials))
-        if self.name == "wall loss":
-            path = np.repeat(np.arange(self.paths.num_paths), np.diff(self.paths.first))
-            through = np.unique(path[self.paths.kind == Kind.TRANSMISSION])
-            power[through] = powers(replace(self.paths, materials=start))[through]
+        if self.name == "first order":
+            longer = np.diff(self.paths.first) > 1
+            power[longer] = powers(replace(self.paths, materials=start))[longer]
         if self.name == "strongest paths":
             order = np.lexsort((-power, self.paths.link))
             rank = np.arange(len(order)) - np.searchsorted(self.paths.link[order], self.paths.link[order])
@@ -311,14 +310,18 @@ def repetition(place: Place, foreign: Foreign, name: str, seed: int) -> dict[str
     problem, truth = planted(place, foreign, random)
     mapped = map_rays(problem, foreign.rays, seed=seed, most_calls=6)
     seconds = time.process_time() - started
+    best = parameters.to_search(mapped.best.candidate)[None]
+    promised = least_squares(with_engine(problem, mapped.engine), SEARCHES, best).best.y
     candidates = np.array([call.candidate for call in mapped.calls])
     optimum = lowest(problem, foreign, parameters.to_search(np.vstack([truth, candidates])), random)
-    excess = problem.objective.rmse(foreign.path_loss(candidates)) - optimum
+    rmse = problem.objective.rmse(foreign.path_loss(candidates))
+    excess = rmse - optimum
     return {
         "place": place.name, "engine": name, "seed": seed, "paths": foreign.paths.num_paths,
         "calls": next((k + 1 for k, value in enumerate(excess.tolist()) if value <= REACHED_DB), FAILED),
         "made": len(excess), "excess_db": excess.round(6).tolist(), "misfit_db": mapped.understanding.misfit_db,
-        "gap_db": mapped.gap_db, "changed_db": mapped.changed_db, "understood": mapped.understood, "seconds": seconds,
+        "gap_db": mapped.gap_db, "changed_db": mapped.changed_db, "promised_db": float(rmse.min() - promised),
+        "understood": mapped.understood, "seconds": seconds,
     }  # fmt: skip
 
 
