@@ -103,8 +103,8 @@ MATERIALS: Final = {"loss tangent": _tied, "permittivity law": _compressed}
 OUTSIDE: Final = (*MATERIALS, "first order", "strongest paths", "rounded powers")
 """Engines whose powers the model of rays cannot represent, with other antennas.
 
-With "first order", permittivity changes paths of one interaction only. "Strongest paths" answers with the five strongest of
-each link. "Rounded powers" answers with multiples of 0.1 dB.
+With "first order", permittivity changes paths of one interaction only. "Strongest paths" answers with the five
+strongest of each link. "Rounded powers" answers with multiples of 0.1 dB.
 """
 
 STRONGEST: Final = 5
