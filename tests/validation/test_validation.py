@@ -158,8 +158,8 @@ def test_a_calibrated_model_is_chosen_only_if_it_is_clearly_better():
     assert near.chosen == Model.INITIAL
     assert near.best == Model.KRIGING
     assert near.choice == (
-        "Predictions use the model 'initial materials'. The model 'calibrated' is better on held-out blocks, but not "
-        "clearly enough."
+        "Predictions use the model 'initial materials'. The model 'calibrated' is better on held-out blocks, but "
+        "by too little to be preferred."
     )
     assert near.choice in near.summary()[2]
     assert near.content()["chosen"] == Model.INITIAL
@@ -196,8 +196,8 @@ def test_the_log_distance_model_is_chosen_where_it_is_clearly_better():
     assert near.table.loc[Model.LOG_DISTANCE, "rmse_db"] < near.table.loc[Model.CALIBRATED, "rmse_db"]
     assert near.chosen == Model.CALIBRATED
     assert near.choice == (
-        "Predictions use the model 'calibrated'. The model 'log-distance' is better on held-out blocks, but not "
-        "clearly enough."
+        "Predictions use the model 'calibrated'. The model 'log-distance' is better on held-out blocks, but "
+        "by too little to be preferred."
     )
 
 
