@@ -220,6 +220,11 @@ def test_path_loss_out_of_range_is_refused_with_a_hint_at_the_sign(tmp_path, val
     assert read_answer(tmp_path / "response.json", "json", 3)[0].tolist() == [20, 300, np.inf]
 
 
+def test_a_byte_order_mark_and_line_ends_of_windows_are_read(tmp_path):
+    (tmp_path / "response.json").write_bytes(b'\xef\xbb\xbf{"path_loss_db":\r\n[20, 300]}\r\n')
+    assert read_answer(tmp_path / "response.json", "json", 2)[0].tolist() == [20, 300]
+
+
 def test_hdf5_responses_that_lie_elsewhere_or_unfold_to_any_size(tmp_path):
     path = tmp_path / "response.h5"
     with h5py.File(tmp_path / "other.h5", "w") as other:

@@ -210,7 +210,7 @@ def _read_bytes(path: Path, limit: int) -> bytes:
 
 def _read_json(response: bytes, name: str, _: int) -> NDArray[np.float64]:
     try:
-        content = json.loads(response.decode("utf-8"))
+        content = json.loads(response.decode("utf-8-sig"))  # some programs begin with a byte order mark
     except ValueError as error:
         raise Unusable(f"its response is not JSON ({error})") from None
     except RecursionError:

@@ -357,8 +357,8 @@ def parse_rays(content: bytes, source: str) -> SourceTable:
     """
     if content.startswith(HDF5):
         return _parsed(BytesIO(content), source)
-    text = content.decode("utf-8", "replace")
-    header = text.lstrip("\ufeff \r\n\t").partition("\n")[0].strip()
+    text = content.decode("utf-8-sig", "replace")
+    header = text.lstrip().partition("\n")[0].strip()
     if re.match(r"[^\[{]*[,;\t]", header):
         raise InputError(f"{source}: begins with {shortened(header)!r}; must be JSON or HDF5, not CSV")
     return _parsed(text, source)
