@@ -370,14 +370,18 @@ def test_result_keeps_the_law_and_writes_the_constants_at_the_scenes_carrier(
 
 
 def test_prediction_takes_the_carrier_of_each_link_or_else_the_scenes(
-    folder: Path, result: Result, truth: np.ndarray
+    folder: Path, result: Result, truth: np.ndarray, caplog: pytest.LogCaptureFixture
 ) -> None:
     frame = table()
     np.testing.assert_allclose(Result.load(folder / "out").predict(frame), truth, atol=1e-3)
+    assert not caplog.messages
     ten = frame["carrier"] == 10e9
     without = result.predict(frame.drop(columns="carrier"))
     np.testing.assert_allclose(without[ten], truth[ten], atol=1e-3)
     assert np.abs(without[~ten] - truth[~ten]).max() > 1
+    (warning,) = caplog.messages
+    assert "lacks the column of carriers 'carrier'" in warning
+    assert "scene.frequency = 10 GHz" in warning
 
 
 # Bad input

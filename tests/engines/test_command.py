@@ -223,6 +223,23 @@ def test_a_run_completes_in_spite_of_failures(tmp_path):
     assert result.rmse_db < result.initial_rmse_db
 
 
+def test_predictions_at_new_links_are_answers_of_the_program(tmp_path):
+    """The program has other physics than the ray tracer, whose replay misses it by more than 10 dB."""
+    content = programs.content(tmp_path) | {"method": {"name": "random", "options": {"budget": 6}}}
+    result = calibrate(Study.from_content(content, tmp_path / "study.toml"), out=tmp_path / "out")
+    new = planted.links().iloc[:4]
+    new = new.assign(rx_x=new.rx_x + 0.25)
+    before = len(programs.calls(tmp_path))
+    told = programs.expected(np.array(list(result.parameters.values())), new)[0]
+    np.testing.assert_allclose(result.predict(new), told, atol=1e-6)
+    assert len(programs.calls(tmp_path)) == before + 1
+    np.testing.assert_allclose(result.predict_interval(new).path_loss_db, told, atol=1e-6)
+    assert len(programs.calls(tmp_path)) == before + 2
+    programs.content(tmp_path, "sys.exit('no licence')")
+    with pytest.raises(EngineError, match=r"no licence.*A prediction needs this call"):
+        result.predict(new)
+
+
 def test_a_program_that_breaks_down_ends_the_run_and_loses_nothing(tmp_path):
     """It answers 8 calls and then never again; mended, it goes on from there."""
     content = programs.content(tmp_path, "if earlier > 8: sys.exit('the licence ran out')", give_up_after=4)

@@ -14,7 +14,8 @@ from calibray.reporting import result_tables
 from calibray.reporting import scene_tables as trace
 from calibray.reporting.page import _laws
 from calibray.reporting.summary import summary
-from calibray.reporting.wording import carriers_text
+from calibray.reporting.wording import carriers_text, method_text, scene_alone_text
+from calibray.study import Study
 from calibray.tables import render
 from calibray.tracing.protocol import EnclosedAntennas
 from changed import changed
@@ -51,6 +52,21 @@ def test_a_law_of_one_constant_and_several_carriers_are_reported():
     assert carriers_text(several) == "3.5 GHz, 28 GHz"
     scope = summary(several)[1].text
     assert "at 3.5 GHz, 28 GHz, on" in scope
+
+
+def test_the_result_of_an_external_program_names_its_method_its_failures_and_its_predictions():
+    content = shown.result().study.content()
+    content |= {"engine": {"name": "command", "command": ["model"]}, "method": {"name": "auto"}}
+    result = changed(shown.result(), study=Study.from_content(content, "external.toml"), cheap_replays=10)
+    history = result.history.assign(rmse_db=result.history.rmse_db.where(result.history.index > 1, np.inf))
+    assert "by auto (space mapping) with the engine command" in summary(result)[1].text
+    assert method_text(changed(result, cheap_replays=0), "auto") == "auto (vector surrogate)"
+    assert method_text(shown.result(), "auto") == "auto (least squares)"
+    assert ("failed, or a link lost its path", "2") in result_tables.costs(
+        replace(result, history=history)
+    ).rows
+    assert "Predictions at new links and maps call the program" in scene_alone_text(result)
+    assert "differs from the predictions" in scene_alone_text(shown.result())
 
 
 def test_a_trace_and_its_check_are_printed_as_stored():

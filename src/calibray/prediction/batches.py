@@ -155,6 +155,13 @@ def announce(result: Record, links: int, what: str = "links") -> None:
     if result.prediction.model.parameters is None:
         LOG.info("%s %s, predicted without a trace: the log-distance model uses no scene", f"{links:,}", what)
         return
+    if (engine := result.study.engine).external:
+        calls = 1 if engine.exports_rays or result.prediction.model.averaged is None else 2
+        LOG.info(
+            "%s %s: %d %s of the program per batch of %s or fewer, not counted as RT calls of the calibration",
+            f"{links:,}", what, calls, "call" if calls == 1 else "calls", what,
+        )  # fmt: skip
+        return
     calibrated, seconds = len(result.links), _seconds(result, links)
     time = f"up to about {duration(seconds)}" if seconds >= 2 else "less than 2 seconds"
     LOG.info(

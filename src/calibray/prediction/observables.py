@@ -33,12 +33,14 @@ deviation from them is 9 %."""
 class Replayed(NamedTuple):
     """An engine over new links, the values of the prediction model, then of every draw [1 + draws, d].
 
-    If path loss is averaged over two sets of values, both precede the draws, and `averaged` is 2.
+    If path loss is averaged over two sets of values, both precede the draws, and `averaged` is 2. `answers` are the
+    path loss that an external program answers for the values before the draws [averaged, links], [dB].
     """
 
     engine: Engine
     values: NDArray[np.float64]
     averaged: int = 1
+    answers: NDArray[np.float64] | None = None
 
 
 def observable_columns(study: Study, level: float | None) -> tuple[str, ...]:

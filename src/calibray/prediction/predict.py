@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from numbers import Real
 from pathlib import Path
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 import pandas as pd
@@ -14,7 +15,8 @@ from scipy.spatial import KDTree
 from scipy.special import stdtrit
 
 from calibray.engines.kinds.replay import replay
-from calibray.errors import InputError
+from calibray.engines.protocol import Answering, Engine
+from calibray.errors import EngineError, InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements, SourceTable
 from calibray.parameters import fixed_constant, split_name
@@ -36,7 +38,10 @@ from calibray.study import Setup
 from calibray.study.link_checks import refuse_far_receivers
 from calibray.support.messages import type_name
 from calibray.support.progress import Progress
+from calibray.tables import hertz
 from calibray.validation.models import without_scene
+
+_LOG: Final = logging.getLogger(__name__)
 
 NEIGHBOURS: Final = (0.125, 0.5)
 """Distances of the displaced antennas that are traced, as shares of the largest displacement: 1 and 4 m of 8 m."""
@@ -112,9 +117,17 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
 def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs: bool = False) -> Setup:
     """Open the study of a calibration for new links.
 
+    A warning names the assumed carrier if the study has a column of carriers and the links have none.
+
     Raises:
         InputError: The scene or the parameters cannot be used, or one of these files has changed.
     """
+    column = result.study.links.frequency
+    if column is not None and links.frequency is None:
+        _LOG.warning(
+            "%s: lacks the column of carriers %r, so all links are predicted at scene.frequency = %s; add the column "
+            "for other carriers", links.source, column, hertz(result.study.scene.frequency),
+        )  # fmt: skip
     setup = Setup.open(result.study, links=links).placed_at(result.parameters, NEIGHBOURS)
     check_inputs(result, setup, allow_changed_inputs)
     return setup
@@ -295,7 +308,11 @@ def _draws(result: Record) -> dict[str, list[float]]:
 def _replay(
     result: Record, setup: Setup, draws: dict[str, list[float]], progress: Progress | None
 ) -> Replayed | None:
-    """The paths of opened links, with the values of the prediction model and of every draw; None without a scene."""
+    """The paths of opened links, with the values of the prediction model and of every draw; None without a scene.
+
+    A program that answers with path loss is called for the values of the prediction model, which the replay of another
+    ray tracer would miss by its antennas and its physics. The replay gives the change of path loss from draw to draw.
+    """
     prediction, names = result.prediction, setup.parameters.names
     if prediction.model.parameters is None:
         return None
@@ -308,23 +325,50 @@ def _replay(
         scene_values = setup.parameters.start[None, values.shape[1] :]
         drawn = np.stack([draws[name] for name in names], axis=1)
         values = np.vstack([np.hstack([values, scene_values]), drawn])
-    return Replayed(
-        replay(setup, setup.trace(traced_materials(result, prediction.materials), progress)),
-        values,
-        averaged,
-    )
+    answers = None
+    if result.study.engine.external and not result.study.engine.exports_rays:
+        program = setup.study.engine.open(setup, None, None, None)
+        answers = _answers(program, values[:averaged, : len(prediction.model.parameters)])
+        if not draws and not result.study.observables:
+            return Replayed(program, values, averaged, answers)
+    traced = setup.trace(traced_materials(result, prediction.materials), progress)
+    return Replayed(replay(setup, traced), values, averaged, answers)
+
+
+def _answers(program: Engine, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Path loss that a program answers to values of its parameters [n, d], [n, links], [dB].
+
+    Raises:
+        EngineError: A call failed.
+    """
+    answers = list(cast(Answering, program).answers(values))
+    if failure := next((answer.failure for answer in answers if answer.failure), ""):
+        raise EngineError(f"{failure}. A prediction needs this call: correct the program, and predict again")
+    return np.stack([each.path_loss_db for each in sorted(answers, key=lambda each: each.index)])
 
 
 def _modelled(result: Record, links: Measurements, replayed: Replayed | None) -> NDArray[np.float64]:
     """Path loss of the prediction model without nuisances, then of every draw [1 + draws, links], [dB]."""
     if replayed is None:
         return without_scene(result.study, links)[None]
-    path_loss_db = replayed.engine.path_loss(replayed.values)
+    path_loss_db = _path_loss(replayed)
     # Predictions of a model that validation chose end at the ceiling, as the model does in the validation.
     ceiling_db = None if result.held_out is None else result.study.objective.ceiling_db
     path_loss_db = path_loss_db if ceiling_db is None else np.minimum(path_loss_db, ceiling_db)
     mean_db = path_loss_db[: replayed.averaged].mean(axis=0, keepdims=True)
     return np.vstack([mean_db, path_loss_db[replayed.averaged :]])
+
+
+def _path_loss(replayed: Replayed) -> NDArray[np.float64]:
+    """Path loss for all values [n, links], [dB]; for a program, its answers and the changes of the replay."""
+    if (answers := replayed.answers) is None:
+        return replayed.engine.path_loss(replayed.values)
+    if not len(replayed.values) > len(answers):
+        return answers
+    path_loss_db = replayed.engine.path_loss(np.delete(replayed.values, np.s_[1 : len(answers)], axis=0))
+    present = np.isfinite(path_loss_db).all(axis=0)
+    change_db = np.where(present, path_loss_db[1:] - np.where(present, path_loss_db[0], 0.0), 0.0)
+    return np.vstack([answers, answers[0] + change_db])
 
 
 def _residual_field(result: Record, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from calibray.optimizers import label
 from calibray.reporting.link_survey import Survey, in_measured_quantity, measured_quantity
 from calibray.reporting.trust_figures import PANELS, residuals_by_direction, trust_figures
+from calibray.reporting.wording import method_text
 from calibray.result.record import Record
 from calibray.support.figure_style import (
     BLUE,
@@ -64,7 +64,12 @@ def cumulative_cost(results: Mapping[str, Record]) -> Figure:
             value = result.history.groupby("iteration")[column].max()
             end = f"{value.iloc[-1]:.4g}"
             axes.plot(
-                value.index, value, "o-", ms=4, color=COLORS.get(method), label=f"{label(method)}: {end}"
+                value.index,
+                value,
+                "o-",
+                ms=4,
+                color=COLORS.get(method),
+                label=f"{method_text(result, method)}: {end}",
             )
             if method == "sgwo-im":
                 calls = result.history.groupby("iteration")["call"].max().diff()
@@ -91,7 +96,7 @@ def convergence(results: Mapping[str, Record], optimum_db: float | None = None) 
         history = result.history
         axes.step(
             history["call"], history["best_db"], where="post", color=COLORS.get(method),
-            label=f"{label(method)}: {result.rmse_db:.3f} dB",
+            label=f"{method_text(result, method)}: {result.rmse_db:.3f} dB",
         )  # fmt: skip
     if _unequal(results) or max(result.history["call"].max() for result in results.values()) > LONG:
         logarithmic(axes, "x")
@@ -155,7 +160,7 @@ def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
             "-",
             ".",
             color=color,
-            label=label(method),
+            label=method_text(result, method),
             ms=size,
             lw=width,
         )

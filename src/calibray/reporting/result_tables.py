@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from math import log
+from math import inf, log
 from typing import Final
 
 from calibray.fitting.nuisance import OFFSET
@@ -180,6 +180,8 @@ def costs(result: Record) -> Table:
     rows = [("RT calls", f"{cost.rt_calls:,}")]
     if cost.ledger_hits:
         rows.append(("answered by the ledger", f"{cost.ledger_hits:,}"))
+    if result.study.engine.expensive and (failed := int((result.history.rmse_db == inf).sum())):
+        rows.append(("failed, or a link lost its path", f"{failed:,}"))
     if cost.cheap_replays:
         rows.append(("replays of the cheap model", f"{cost.cheap_replays:,} in {cost.cheap_seconds:.1f} s"))
     if result.fit.retrace_gap_db is not None:

@@ -6,9 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from calibray.optimizers.methods import label
 from calibray.parameters.parameter import PARAMETER_BOUNDS
-from calibray.reporting.wording import block_sentence, carriers_text, prediction_text, scene_alone_text
+from calibray.reporting.wording import (
+    block_sentence,
+    carriers_text,
+    method_text,
+    prediction_text,
+    scene_alone_text,
+)
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict
 from calibray.result.wording import NOT_JUDGED, judgement_text
@@ -69,7 +74,7 @@ def _scope(result: Record) -> Sentence:
     return Sentence(
         "What was calibrated?",
         f"{constants} of {_list(materials)} at {carriers_text(result)}, on "
-        f"{result.counts['calibrated_on']:,} links, by {label(study.method.name)} with the engine "
+        f"{result.counts['calibrated_on']:,} links, by {method_text(result, study.method.name)} with the engine "
         f"{study.engine.name}: {result.rt_calls:,} RT calls in {_seconds(result.cost.seconds)}, after "
         f"{_seconds(result.cost.trace_seconds)} of tracing and loading.",
     )

@@ -7,7 +7,9 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
+from calibray.fitting.search import AUTO
 from calibray.measurements import FEW
+from calibray.optimizers.methods import label
 from calibray.reporting.diagnostics import calibration_links, diagnostics, link_distance
 from calibray.result.held_out import HeldOutErrors, Model
 from calibray.result.record import Record
@@ -73,6 +75,11 @@ def scene_alone_text(record: Record) -> str:
         else f" Within about {field.range_m:.3g} m of measured links, predictions also add the "
         f"correlated part of their residuals ({field.shared_db:.2f} dB RMS), which no scene contains."
     )
+    if record.study.engine.external and model.parameters is not None:
+        return (
+            "Predictions at new links and maps call the program. The exported scene has the calibrated materials; "
+            f"another ray tracer gives other path loss with it, as far as antennas and physics differ.{near}"
+        )
     if rms_db < SCENE_ALONE_DB:
         return near.lstrip()
     rough = [
@@ -101,6 +108,15 @@ def scene_alone_text(record: Record) -> str:
         f"The exported scene alone differs from the predictions by {rms_db:.2f} dB (RMS over {len(difference)} links; "
         f"{spread_db:.2f} dB without the mean of each group): a scene cannot contain {cause}.{near}"
     )
+
+
+def method_text(record: Record, name: str) -> str:
+    """The name of a method of a calibration, and what `auto` did."""
+    if name != AUTO or not record.study.engine.expensive:
+        return label(name)
+    if record.study.engine.exports_rays:
+        return f"{name} (ray mapping)"
+    return f"{name} ({'space mapping' if record.cost.cheap_replays else 'vector surrogate'})"
 
 
 def sampling_text(record: Record) -> str:
