@@ -218,8 +218,8 @@ def _changes(calls: list[Call]) -> tuple[int, float, int]:
 
 def _remark(mapped: RayMap) -> Remark:
     understanding = mapped.understanding
-    constants = dict(understanding.model.described(understanding.values))
-    slabs = any(field == "thickness" for _, field in understanding.model.assumed)
+    model, at_best = understanding.model, (mapped.best.candidate, understanding.values)
+    constants, half_spaces = dict(model.described(*at_best)), model.half_spaces(*at_best)
     return Remark(
         RemarkKind.RAY_MAPPING,
         {
@@ -230,7 +230,8 @@ def _remark(mapped: RayMap) -> Remark:
             "changed": mapped.changed,
             "changed_db": mapped.changed_db,
             "lost": mapped.lost,
-            "half_space": slabs and not any(name.endswith(".thickness") for name in constants),
+            "half_space": bool(half_spaces) and not any(name.endswith(".thickness") for name in constants),
+            "half_spaces": half_spaces,
             "names": list(constants),
             "values": list(constants.values()),
         },

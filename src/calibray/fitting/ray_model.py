@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
+from scipy.constants import epsilon_0, speed_of_light
 
 from calibray.engines.rays.export import Export
 from calibray.fields import (
@@ -39,6 +40,9 @@ from calibray.paths.chains import spherical_basis
 
 HALF_SPACE: Final = 1e4
 """Thickness that no wave crosses [m]: it decays within it unless the conductivity is below 1e-6 S/m."""
+
+DECAYED: Final = 4.0
+"""Attenuation within a slab [Np] beyond which it acts as a half-space: the returning wave has e^-8 of its amplitude."""
 
 RANGES: Final = {"thickness": (5e-4, HALF_SPACE), "conductivity": (1e-7, 1e3)}
 """Ranges of the assumed constants, in the fields' units."""
@@ -188,11 +192,32 @@ class RayModel:
         materials = self.materials(candidate, values)
         return replace(self.paths, materials=materials, tx_field=fields[0], rx_field=fields[1])
 
-    def described(self, values: NDArray[np.float64]) -> Iterable[tuple[str, float]]:
-        """Names and values of the assumed constants; a half-space has no thickness."""
+    def described(
+        self, candidate: NDArray[np.float64], values: NDArray[np.float64]
+    ) -> Iterable[tuple[str, float]]:
+        """Names and values [k] of the assumed constants at a candidate [d]; a half-space has no thickness."""
+        half_spaces = self.half_spaces(candidate, values)
         for (name, field), value in zip(self.assumed, np.exp(values).tolist(), strict=False):
-            if not (field == "thickness" and value > HALF_SPACE / 2):
+            if not (field == "thickness" and name in half_spaces):
                 yield f"{name}.{field}", value
+
+    def half_spaces(self, candidate: NDArray[np.float64], values: NDArray[np.float64]) -> list[str]:
+        """Materials of assumed thickness from whose far face no wave returns, at a candidate [d] with values [k]."""
+        materials, wavenumber = (
+            self.materials(candidate, values),
+            2 * np.pi * self.paths.frequency / speed_of_light,
+        )
+
+        def attenuation(item: Material) -> float:
+            loss = item.conductivity / (wavenumber * speed_of_light * epsilon_0)
+            return -wavenumber * item.thickness * float(np.sqrt(item.relative_permittivity - 1j * loss).imag)
+
+        return [
+            name
+            for name, field in self.assumed
+            if field == "thickness"
+            and (materials[name].thickness > HALF_SPACE / 2 or attenuation(materials[name]) > DECAYED)
+        ]
 
     @cached_property
     def bases(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

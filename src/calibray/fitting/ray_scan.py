@@ -26,7 +26,7 @@ from scipy.optimize import least_squares
 from calibray.fields import jax_settings
 from calibray.fields.arithmetic import materialize
 from calibray.fields.slab import coefficients, loss_term
-from calibray.fitting.ray_model import ANGLES, HALF_SPACE, TILT, ports, tilted_theta
+from calibray.fitting.ray_model import ANGLES, DECAYED, HALF_SPACE, TILT, ports, tilted_theta
 from calibray.materials import Material
 from calibray.paths import Kind, Paths
 
@@ -38,9 +38,6 @@ THINNEST: Final = 1e-3
 
 THICKEST: Final = 0.6
 """Largest thickness of a scan [m], unless the study's is more than half of it."""
-
-DECAYED: Final = 4.0
-"""Attenuation within a slab [Np] beyond which it acts as a half-space: the returning wave has e^-8 of its amplitude."""
 
 RESOLUTION: Final = 20.0
 """Number of points of a scan per wavelength in the slab, which has two resonances."""

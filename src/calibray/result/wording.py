@@ -244,6 +244,9 @@ def _ray_mapping(values: dict[str, Any]) -> str:
     assumed = zip(values["names"], values["values"], strict=True)
     constants = ", ".join(f"{name} {value:.3g}" for name, value in assumed)
     surfaces = "half-spaces" if values["half_space"] else "slabs"
+    # Results of earlier versions do not name the half-spaces among slabs.
+    if not values["half_space"] and (names := values.get("half_spaces")):
+        surfaces = f"slabs, except half-spaces of {' and '.join(names)},"
     text = (
         f"The model explains the ratios of the ray powers in {values['calls']} calls with a misfit of "
         f"{values['misfit_db']:.3f} dB, and predicted path loss at the last call within {values['gap_db']:.3f} dB"
@@ -314,6 +317,10 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.FEW_DRAWS: lambda values: (
         "Independent populations of draws disagree. The intervals are rough, and a range that fits may be missing, so "
         "no parameter is more than weakly identified. Calibrate fewer parameters, or give them priors."
+    ),
+    RemarkKind.EXACT_CONSTANTS: lambda values: (
+        "Coefficients of laws are parameters, so the intervals count all other constants as exact and all buildings of "
+        "a material as equal. They are too narrow if that is wrong."
     ),
     RemarkKind.APPROXIMATE_INTERVALS: _approximate_intervals,
     RemarkKind.RAY_MAPPING: _ray_mapping,

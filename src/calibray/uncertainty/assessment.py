@@ -32,7 +32,14 @@ from calibray.uncertainty.draws import systematic_resampling
 from calibray.uncertainty.emulator import emulate
 from calibray.uncertainty.joint_model import JointModel, has_offset, joint_model
 from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, HEAVY, OUT_OF_SIGHT
-from calibray.uncertainty.remarks import conflict, departures, fit_undeclared_offset, missed, outside_interval
+from calibray.uncertainty.remarks import (
+    conflict,
+    departures,
+    exact_constants,
+    fit_undeclared_offset,
+    missed,
+    outside_interval,
+)
 from calibray.uncertainty.repeats import average_repeats
 from calibray.uncertainty.sequential_monte_carlo import Posterior, draw_posterior, joined
 from calibray.uncertainty.verdicts import Axes, consistent, local_intervals, verdicts, with_reason
@@ -210,6 +217,7 @@ def _assess(
         remarks += conflict(problem, relevant)
     if not posterior.means.agree:
         remarks.append(Remark(RemarkKind.FEW_DRAWS))
+    remarks += exact_constants(problem.parameters, problem.setup.study)
     return replace(
         assessment,
         intervals=intervals,
