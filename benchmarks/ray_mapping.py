@@ -33,7 +33,7 @@ from calibray.engines.rays.compile import RaySetting, compile_rays, powers, rays
 from calibray.engines.rays.export import Export
 from calibray.errors import InputError
 from calibray.fitting.problem import Problem
-from calibray.fitting.ray_mapping import map_rays, with_engine
+from calibray.fitting.ray_mapping import map_rays
 from calibray.fitting.ray_model import HALF_SPACE
 from calibray.fitting.search import least_squares
 from calibray.materials import Material, itu_material
@@ -310,18 +310,15 @@ def repetition(place: Place, foreign: Foreign, name: str, seed: int) -> dict[str
     problem, truth = planted(place, foreign, random)
     mapped = map_rays(problem, foreign.rays, seed=seed, most_calls=6)
     seconds = time.process_time() - started
-    best = parameters.to_search(mapped.best.candidate)[None]
-    promised = least_squares(with_engine(problem, mapped.engine), SEARCHES, best).best.y
     candidates = np.array([call.candidate for call in mapped.calls])
     optimum = lowest(problem, foreign, parameters.to_search(np.vstack([truth, candidates])), random)
-    rmse = problem.objective.rmse(foreign.path_loss(candidates))
-    excess = rmse - optimum
+    excess = problem.objective.rmse(foreign.path_loss(candidates)) - optimum
     return {
         "place": place.name, "engine": name, "seed": seed, "paths": foreign.paths.num_paths,
         "calls": next((k + 1 for k, value in enumerate(excess.tolist()) if value <= REACHED_DB), FAILED),
         "made": len(excess), "excess_db": excess.round(6).tolist(), "misfit_db": mapped.understanding.misfit_db,
-        "gap_db": mapped.gap_db, "changed_db": mapped.changed_db, "promised_db": float(rmse.min() - promised),
-        "understood": mapped.understood, "seconds": seconds,
+        "gap_db": mapped.gap_db, "changed_db": mapped.changed_db, "remaining_db": mapped.remaining_db,
+        "reached": mapped.reached, "understood": mapped.understood, "seconds": seconds,
     }  # fmt: skip
 
 
@@ -337,7 +334,8 @@ def _attempt(place: Place, name: str, seed: int) -> dict[str, Any] | None:
     except Exception as error:
         return {
             "place": place.name, "engine": name, "seed": seed, "calls": FAILED, "made": 0, "excess_db": [],
-            "understood": False, "seconds": time.process_time() - started, "error": f"{type(error).__name__}: {error}",
+            "reached": False, "understood": False, "seconds": time.process_time() - started,
+            "error": f"{type(error).__name__}: {error}",
         }  # fmt: skip
 
 
@@ -429,16 +427,15 @@ class Places:
 
 def _summary(rows: list[dict[str, Any]]) -> str:
     calls = np.array([row["calls"] for row in rows])
-    understood = np.array([row["understood"] for row in rows])
-    excess = np.array(
-        [min(row["excess_db"], default=np.inf) for row in rows]
-    )  # of the best call, which is the result
-    right = (excess > 0.02)[~understood]
+    understood, reached = (np.array([row[key] for row in rows]) for key in ("understood", "reached"))
+    # The result is the best call.
+    excess = np.array([min(row["excess_db"], default=np.inf) for row in rows])
+    right = (excess > 0.02)[~reached]
     return (
         f"{len(rows)} runs: calls median {np.median(calls):g}, 90th percentile {np.quantile(calls, 0.9):g}; "
-        f"{understood.sum()} understood, {(excess[understood] > 0.05).sum()} of them above 0.05 dB "
-        f"(largest {excess[understood].max(initial=0.0):.4f} dB); {len(right)} not understood, {right.sum()} of them "
-        f"above 0.02 dB; {np.mean([row['seconds'] for row in rows]):.1f} s of CPU each; "
+        f"{understood.sum()} understood, {reached.sum()} reached, {(excess[reached] > 0.05).sum()} of them above "
+        f"0.05 dB (largest {excess[reached].max(initial=0.0):.4f} dB); {len(right)} perhaps missed, {right.sum()} of "
+        f"them above 0.02 dB; {np.mean([row['seconds'] for row in rows]):.1f} s of CPU each; "
         f"{sum('error' in row for row in rows)} ended with an error"
     )
 

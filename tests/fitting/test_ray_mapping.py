@@ -275,6 +275,7 @@ def test_an_engine_of_other_physics_is_not_understood(
 ) -> None:
     monkeypatch.setattr(ray_fit, "TRIALS", 5)
     strange = map_rays(foreign.problem, replace(foreign, ripple=0.1), most_calls=3)
+    assert not strange.reached
     assert not strange.understood
     assert strange.understanding.misfit_db > 0.2
     # It agrees with the engine at the best call nevertheless.
@@ -282,6 +283,25 @@ def test_an_engine_of_other_physics_is_not_understood(
     np.testing.assert_allclose(
         strange.engine.path_loss(last.candidate[None])[0], last.export.path_loss_db, atol=1e-6
     )
+    # What is left to gain is the difference to the replay's minimum.
+    bounds = foreign.problem.parameters.search_bounds
+    grid = np.append(foreign.problem.parameters.from_search(np.linspace(*bounds, 20_001)), last.candidate)[
+        :, None
+    ]
+    value = foreign.problem.objective.value(strange.engine.path_loss(grid))
+    assert strange.remaining_db == pytest.approx(value[-1] - value.min(), rel=0.02)
+    assert strange.remaining_db > 1e-3
+
+
+def test_the_optimum_is_reached_without_understanding(mapped: RayMap) -> None:
+    """The misfit matters for the replay elsewhere, the gap and the remaining gain for the optimum."""
+    assert mapped.reached
+    misfit = replace(mapped, understanding=replace(mapped.understanding, misfit_db=0.5))
+    assert misfit.reached
+    assert not misfit.understood
+    for missed in (replace(mapped, gap_db=0.06), replace(mapped, remaining_db=0.06)):
+        assert not missed.reached
+        assert not missed.understood
 
 
 def test_an_engine_whose_strong_paths_come_and_go_is_not_understood(foreign: Foreign) -> None:
@@ -299,4 +319,5 @@ def test_an_engine_whose_strong_paths_come_and_go_is_not_understood(foreign: For
     assert mapped.understanding.misfit_db < 0.2
     assert mapped.gap_db < 0.05
     assert (mapped.changed, mapped.lost) == (2, 1)
+    assert not mapped.reached
     assert not mapped.understood

@@ -47,7 +47,8 @@ SIGMA_DB: Final = 0.1
 """Error of a ratio in the information [dB]."""
 
 UNDERSTOOD_DB: Final = 0.05
-"""Largest gap at the last call of an engine that counts as understood [dB]."""
+"""Largest gap at the last call of an engine that counts as understood, and largest gain that is left if its optimum
+counts as reached [dB]."""
 
 MISFIT_DB: Final = 0.2
 """Largest misfit of the ratios of such an engine [dB]. Wrong minima had 0.8 dB and more. With 0.07 to 0.19 dB, the
@@ -74,6 +75,8 @@ class RayMap:
         changed: Largest number of paths that the best call or another one has alone.
         changed_db: Largest change of a link's path loss without them, of links that keep a path [dB].
         lost: Number of links that keep none.
+        minima: Minima of the replay that replaces the engine, the lowest first, as points of the search space [k, d].
+        remaining_db: RMSE at the best call minus that at the lowest of these minima [dB].
     """
 
     engine: Replay
@@ -84,12 +87,22 @@ class RayMap:
     changed: int
     changed_db: float
     lost: int
+    minima: NDArray[np.float64]
+    remaining_db: float
+
+    @property
+    def reached(self) -> bool:
+        """Whether the last call was predicted, nothing is left to gain, and the calls have the same strong paths.
+
+        The optimum is then reached, even if the engine's assumptions are not identified.
+        """
+        predicted = max(self.gap_db, self.remaining_db) <= UNDERSTOOD_DB
+        return predicted and self.changed_db <= CHANGED_DB and not self.lost
 
     @property
     def understood(self) -> bool:
-        """Whether the model explains all calls and predicted the last one, and the calls have the same strong paths."""
-        explained = self.understanding.misfit_db <= MISFIT_DB and self.gap_db <= UNDERSTOOD_DB
-        return explained and self.changed_db <= CHANGED_DB and not self.lost
+        """Whether the model explains all calls as well, so that its replay stands for the engine elsewhere."""
+        return self.reached and self.understanding.misfit_db <= MISFIT_DB
 
 
 def maps_rays(setup: Setup) -> bool:
@@ -120,11 +133,9 @@ def search_rays(
         return export
 
     mapped = map_rays(problem, ask, seed=problem.setup.study.method.seed)
-    problem = with_engine(problem, mapped.engine)
-    best = problem.parameters.to_search(trail.best)[None]
-    trail.minima = least_squares(problem, local_searches(mapped.engine.interactions), best).minima
+    trail.minima = mapped.minima
     trail.rt_calls, trail.ledger_hits = len(mapped.calls), engine.hits
-    return problem, trail, _remark(mapped)
+    return with_engine(problem, mapped.engine), trail, _remark(mapped)
 
 
 def map_rays(
@@ -155,7 +166,11 @@ def map_rays(
     best = min(calls, key=lambda each: _objective(problem, each))
     ordered = [*(each for each in calls if each is not best), best]
     final = understand(parameters, ordered, known, understanding)
-    return RayMap(final.replay(parameters, best), tuple(calls), best, final, gap, *_changes(ordered))
+    replay = final.replay(parameters, best)
+    replayed, point = with_engine(problem, replay), parameters.to_search(best.candidate)[None]
+    found = least_squares(replayed, local_searches(replay.interactions), point)
+    remaining = float(replayed.squares(point).value[0]) - found.best.y
+    return RayMap(replay, tuple(calls), best, final, gap, *_changes(ordered), found.minima, remaining)
 
 
 def with_engine(problem: Problem, replay: Replay) -> Problem:
@@ -226,6 +241,8 @@ def _remark(mapped: RayMap) -> Remark:
             "understood": mapped.understood,
             "misfit_db": understanding.misfit_db,
             "gap_db": mapped.gap_db,
+            "reached": mapped.reached,
+            "remaining_db": mapped.remaining_db,
             "calls": len(mapped.calls),
             "changed": mapped.changed,
             "changed_db": mapped.changed_db,
