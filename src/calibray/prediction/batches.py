@@ -156,10 +156,10 @@ def announce(result: Record, links: int, what: str = "links") -> None:
         LOG.info("%s %s, predicted without a trace: the log-distance model uses no scene", f"{links:,}", what)
         return
     if (engine := result.study.engine).external:
-        calls = 1 if engine.exports_rays or result.prediction.model.averaged is None else 2
+        once = engine.exports_rays or result.prediction.model.averaged is None
         LOG.info(
-            "%s %s: %d %s of the program per batch of %s or fewer, not counted as RT calls of the calibration",
-            f"{links:,}", what, calls, "call" if calls == 1 else "calls", what,
+            "%s %s: the program is called %s for each batch of them; the result's RT calls do not include these calls",
+            f"{links:,}", what, "once" if once else "twice",
         )  # fmt: skip
         return
     calibrated, seconds = len(result.links), _seconds(result, links)

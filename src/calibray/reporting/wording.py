@@ -77,8 +77,8 @@ def scene_alone_text(record: Record) -> str:
     )
     if record.study.engine.external and model.parameters is not None:
         return (
-            "Predictions at new links and maps call the program. The exported scene has the calibrated materials; "
-            f"another ray tracer gives other path loss with it, as far as antennas and physics differ.{near}"
+            "Predictions at new links and maps call the program. The exported scene contains materials alone: another "
+            f"ray tracer gives other path loss with it, as far as antennas and physics differ.{near}"
         )
     if rms_db < SCENE_ALONE_DB:
         return near.lstrip()

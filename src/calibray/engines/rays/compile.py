@@ -22,7 +22,8 @@ from calibray.errors import InputError
 from calibray.fields import path_gains
 from calibray.paths import Kind, Paths, take_links
 from calibray.paths.chains import Chains
-from calibray.scenes import Scene, check_material_name
+from calibray.scenes import Scene
+from calibray.support.messages import did_you_mean
 from calibray.tracing.antennas import AntennaPattern
 from calibray.tracing.protocol import LinkPositions, Links, compile_paths
 from calibray.tracing.settings import Antenna
@@ -197,7 +198,12 @@ def _stated_materials(table: RayTable, scene: Scene) -> NDArray[np.int64]:
             )
         index[table.object == name] = by_object[name]
     for name in np.unique(table.material[table.material != ""]).tolist():
-        check_material_name(name, names, f"{table.source}: material")
+        if name not in names:
+            raise InputError(
+                f"{table.source}: material: the scene has no material {name!r}; {did_you_mean(name, names)}. Name "
+                "materials as in the scene, or remove the column material: interactions then get the material of the "
+                "nearest face"
+            )
         stated = table.material == name
         if (stated & (index >= 0) & (index != names[name])).any():
             raise InputError(
@@ -267,7 +273,10 @@ def _assign_links(
             f"{table.path[worst]}: the nearest link is {off[worst]:.3g} m away"
         )
         if lost.all():
-            raise InputError(f"{fault}; export the rays of the study's links, or correct the argument axes")
+            raise InputError(
+                f"{fault}; check units [m], export the rays of the study's links, or correct the "
+                "argument axes"
+            )
         _LOG.warning("%s; they are left out", fault)
     return LinkPositions(ends[:, :3], ends[:, 3:]), np.where(lost, -1, link), chosen.reshape(-1)
 
