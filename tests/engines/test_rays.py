@@ -119,7 +119,10 @@ WRONG = {
     "points of the path missing": (lambda t: t.drop(t.index[t.point == 3][0] - 1), "count up by 1"),
     "a receiver missing": (lambda t: t[t.type != "receiver"], "the last its receiver"),
     "an unknown type": (lambda t: t.replace({"type": {"reflection": "R"}}), "'R'"),
-    "an unknown material": (lambda t: t.assign(material="wood"), "no material 'wood'.* or remove the column material"),
+    "an unknown material": (
+        lambda t: t.assign(material="wood"),
+        "no material 'wood'.* or remove the column material",
+    ),
     "two powers of a path": (
         lambda t: t.assign(power_db=t.power_db - t.point),
         "must state the same power_db",
