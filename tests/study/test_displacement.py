@@ -14,6 +14,7 @@ from calibray import engines
 from calibray.errors import InputError
 from calibray.fields import DisplacementLoss, path_loss
 from calibray.measurements import Measurements
+from calibray.reporting.wording import scene_alone_text
 from calibray.study import Setup, Study
 from calibray.study.displacement import cubics, reached
 from two_ray import COLUMNS, TwoRay
@@ -185,6 +186,20 @@ def test_predictions_have_the_calibrated_height_at_exact_receivers(folder: Path,
 def test_impossible_displacements_are_refused(folder: Path, change: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         Setup.open(study(folder, "stated.csv", **change), tracer=TwoRay)
+
+
+def test_heights_are_calibrated_in_one_process(folder: Path) -> None:
+    setup = Setup.open(study(folder, "stated.csv"), tracer=TwoRay)
+    with pytest.raises(InputError, match=r"'tx:A.height': .* without --workers"):
+        engines.make(setup, workers=engines.InProcess())
+
+
+def test_the_scene_alone_has_the_stated_positions(folder: Path, result: cb.Result) -> None:
+    stated = Setup.open(study(folder, "stated.csv", {}), tracer=TwoRay)
+    materials = stated.parameters.materials([result.parameters[GROUND]], stated.scene.materials)
+    expected = path_loss(stated.trace(), materials)
+    np.testing.assert_allclose(result.links["scene_db"], expected, atol=1e-6)
+    assert "a scene cannot contain the errors of antennas" in scene_alone_text(result)
 
 
 def test_devices_need_their_column(folder: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 import calibray as cb
 import two_ray
+from calibray import engines
 from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.measurements import Measurements
@@ -46,6 +47,24 @@ def test_power_is_the_mean_over_displaced_receivers(exact: Study) -> None:
     np.testing.assert_allclose(1 / weight, 2.0**2 + np.std(losses, axis=0) ** 2, rtol=1e-9)
     # Near the transmitter, four metres matter.
     assert weight[0] < weight[-1] / 1.5
+
+
+def test_a_region_attenuates_the_paths_to_the_displaced_receivers(exact: Study) -> None:
+    """Trees between the mast and receivers at their edge: some displaced receivers are in them, others are not."""
+    trees = {"boxes": [[4.0, -3.0, 12.0, 3.0]], "top": 9.0, "specific_attenuation": 1.0, "maximum_db": 40.0}
+    content = exact.content() | {"regions": {"trees": trees}}
+    plain = Study.from_content(content, exact.path)
+    setup = Setup.open(with_error(plain), tracer=TwoRay)
+    links, start, losses = setup.links, setup.parameters.start[None], []
+    for angle in np.radians([0.0, 90.0, 180.0, 270.0]):
+        rx = links.rx + np.sqrt(2) * ERROR_M * np.array([np.cos(angle), np.sin(angle), 0.0])
+        moved = Measurements(tx=links.tx, rx=rx, path_loss_db=np.zeros(len(links)))
+        losses.append(engines.make(Setup.open(plain, tracer=TwoRay, links=moved)).path_loss(start)[0])
+    expected = -10 * np.log10(np.mean(10 ** (-np.array(losses) / 10), axis=0))
+    np.testing.assert_allclose(engines.make(setup).path_loss(start)[0], expected, atol=1e-3)
+    weight = setup.with_position_noise().links.weight
+    np.testing.assert_allclose(1 / weight, 2.0**2 + np.std(losses, axis=0) ** 2, rtol=1e-3)
+    assert np.std(losses, axis=0).max() > 3.0
 
 
 def test_a_column_of_errors_and_exact_predictions(exact: Study) -> None:

@@ -1,6 +1,7 @@
 """A study with a region of extra loss, from its file to predictions."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -213,3 +214,20 @@ def test_a_study_without_regions_has_no_effects():
         Study.from_content(planted.content("links.csv")), links=links_from_frame(planted.links())
     )
     assert plain.effects(planted.engine().paths) == ()
+
+
+@pytest.mark.parametrize("other", ["chunks", "carriers"])
+def test_the_scene_alone_has_no_trees_at_several_carriers_and_in_chunks(engine, opened, other):
+    study, links = opened.study, opened.links
+    if other == "chunks":
+        study = Study.from_content(
+            study.content() | {"engine": {"name": "replay", "chunk_links": 5}}, study.path
+        )
+    else:
+        links = replace(links, frequency=np.where(np.arange(planted.LINKS) % 2, 3.5e9, 2e9))
+    divided = engines.make(Setup.open(study, links=links))
+    with_trees, alone = divided.path_loss(TRUTH[None])[0], divided.scene_path_loss(TRUTH[None], {})[0]
+    expected = engine.scene_path_loss(TRUTH[None], {})[0]
+    same = slice(1, None, 2) if other == "carriers" else slice(None)
+    assert alone[same] == pytest.approx(expected[same], abs=1e-6)
+    assert (with_trees - alone).max() > 5.0

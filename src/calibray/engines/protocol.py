@@ -155,6 +155,21 @@ class Chunked(Differentiable, Protocol):
         ...
 
 
+@runtime_checkable
+class ReplaysScene(Protocol):
+    """An engine on stored paths, which can leave out what an exported scene does not contain."""
+
+    def scene_path_loss(
+        self, candidates: NDArray[np.float64], walls: Mapping[str, str]
+    ) -> NDArray[np.float64]:
+        """Path loss [n, L], [dB], of the scene alone for candidates [n, d], in the fields' units.
+
+        It is without effects on paths, such as the loss in regions. `walls` are the materials of the scene by the name
+        of the facades that are parts of them.
+        """
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Answer:
     """An engine's answer to one candidate.

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Final, final
 
 import numpy as np
@@ -116,9 +116,16 @@ class Replay:
         """Whether there are so many interactions that a candidate takes milliseconds."""
         return self.interactions > LARGE
 
-    def without_effects(self) -> Replay:
-        """The same without the effects, for the path loss of the scene alone."""
-        return Replay(self.paths, self.parameters, *self._options)
+    def scene_path_loss(
+        self, candidates: NDArray[np.float64], walls: Mapping[str, str]
+    ) -> NDArray[np.float64]:
+        """Path loss of the scene alone for candidates; see `ReplaysScene.scene_path_loss`."""
+        if not self.effects and not walls:
+            return self.path_loss(candidates)
+        names = list(self.paths.materials)
+        whole = np.array([names.index(walls.get(name, name)) for name in names], self.paths.material.dtype)
+        paths = replace(self.paths, material=whole[self.paths.material])
+        return Replay(paths, self.parameters, *self._options).path_loss(candidates)
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of every link for candidates; see `Engine.path_loss`."""
@@ -342,11 +349,24 @@ class ReplayCarriers:
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of every link for candidates; see `Engine.path_loss`."""
+        return self._by_carrier(candidates, Replay.path_loss)
+
+    def scene_path_loss(
+        self, candidates: NDArray[np.float64], walls: Mapping[str, str]
+    ) -> NDArray[np.float64]:
+        """Path loss of the scene alone for candidates; see `ReplaysScene.scene_path_loss`."""
+        return self._by_carrier(candidates, partial(Replay.scene_path_loss, walls=walls))
+
+    def _by_carrier(
+        self,
+        candidates: NDArray[np.float64],
+        path_loss: Callable[[Replay, NDArray[np.float64]], NDArray[np.float64]],
+    ) -> NDArray[np.float64]:
         candidates = check_candidates(candidates, len(self.parameters))
         loss = np.empty((len(candidates), self.num_links))
         for replay, frequency, links in self._carriers:
             values, _ = self.parameters.constants_and_slopes(candidates, frequency)
-            loss[:, links] = replay.path_loss(values[:, self._first])
+            loss[:, links] = path_loss(replay, values[:, self._first])
         self.calls += len(candidates)
         return loss
 

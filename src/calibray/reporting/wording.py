@@ -13,8 +13,10 @@ from calibray.optimizers.methods import label
 from calibray.reporting.diagnostics import calibration_links, diagnostics, link_distance
 from calibray.result.held_out import HeldOutErrors, Model
 from calibray.result.record import Record
+from calibray.study.displacement import RECEIVER
 from calibray.support.messages import percent
 from calibray.tables import Column, Table, hertz, named, rows_text
+from calibray.tracing.antennas import POSE
 from calibray.uncertainty.verdicts import TRADE_OFF
 
 SCENE_ALONE_DB: Final = 0.05
@@ -82,14 +84,12 @@ def scene_alone_text(record: Record) -> str:
         )
     if rms_db < SCENE_ALONE_DB:
         return near.lstrip()
-    rough = [
-        name.removesuffix(".roughness_mm")
-        for name in model.parameters or {}
-        if name.endswith(".roughness_mm")
-    ]
+    values = model.parameters or {}
+    rough = [name.removesuffix(".roughness_mm") for name in values if name.endswith(".roughness_mm")]
     missing = [
         *(f"the region {name}" for name in record.study.regions),
         *(f"the facade {name}" for name in record.study.facades),
+        *(["the errors of antennas"] if any(name.startswith((POSE, RECEIVER)) for name in values) else []),
         *(f"the roughness of {name}" for name in dict.fromkeys((*record.study.roughness_mm, *rough))),
         *(term.name for term in model.terms),
         *([] if model.averaged is None else ["the average with other materials"]),

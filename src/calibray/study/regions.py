@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
+from scipy.constants import speed_of_light
 
 from calibray.coordinates import WGS84
 from calibray.errors import InputError
@@ -19,6 +20,7 @@ from calibray.scenes.regions import Region
 from calibray.support.lazy_imports import library
 from calibray.support.messages import did_you_mean, shortened
 from calibray.support.strict_models import Section, Text
+from calibray.tracing.antennas import wave_basis
 
 if TYPE_CHECKING:
     from calibray.coordinates import Frame
@@ -210,12 +212,17 @@ def region_effects(
     parameters: Parameters,
     paths: Paths,
     frequency: float,
+    *,
+    displaced: bool = False,
 ) -> Effects:
-    """The extra loss of paths through regions; `frequency` [Hz] is the carrier of specific attenuations."""
+    """The extra loss of paths through regions; `frequency` [Hz] is the carrier of specific attenuations.
+
+    If `displaced`, paths end at displaced receivers instead of those of their links.
+    """
     # JAX is slow to import, and every study file that is read imports this module.
     from calibray.fields import ExtraLoss
 
-    path, start, end = _segments(paths)
+    path, start, end = _segments(paths, displaced)
     names = [parameters.names[index] for index in parameters.of_effects]
     effects = []
     for name, section in sections.items():
@@ -233,7 +240,9 @@ def region_effects(
     return tuple(effects)
 
 
-def _segments(paths: Paths) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+def _segments(
+    paths: Paths, displaced: bool
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """The straight pieces of all paths: number of the path [k], and both ends [k, 3], [m]."""
     number = np.arange(paths.num_paths)
     path = np.repeat(number, np.diff(paths.first) + 1)
@@ -246,4 +255,9 @@ def _segments(paths: Paths) -> tuple[NDArray[np.int64], NDArray[np.float64], NDA
     start[inner] = paths.vertex
     inner[begins], inner[ends] = True, False
     end[inner] = paths.vertex
+    if displaced:
+        # The last piece follows from its direction and from the length that the others leave.
+        before = np.bincount(path[inner], np.linalg.norm(end - start, axis=1)[inner], paths.num_paths)
+        last = paths.delay * speed_of_light - before
+        end[ends] = start[ends] - last[:, None] * wave_basis(paths.arrival)[0].T
     return path, start, end

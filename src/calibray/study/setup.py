@@ -165,9 +165,14 @@ class Setup:
     def _pose_and_region_effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
         chosen = np.arange(len(self.links)) if links is None else links
         poses = pose_effects(self.study, self.mountings, self.links.table, self.parameters, (paths, chosen))
-        study, parameters = self.study, self.parameters
-        extra = region_effects(study.regions, self.regions, parameters, paths, study.scene.frequency)
-        return poses + extra + roughness_effects(study.roughness_mm, parameters, paths)
+        return poses + self._path_effects(paths)
+
+    def _path_effects(self, paths: Paths) -> Effects:
+        """The effects that depend on the path alone: the loss in regions and on rough surfaces."""
+        study, parameters, frequency = self.study, self.parameters, self.study.scene.frequency
+        displaced = self._position_error_m is not None
+        extra = region_effects(study.regions, self.regions, parameters, paths, frequency, displaced=displaced)
+        return extra + roughness_effects(study.roughness_mm, parameters, paths)
 
     @cached_property
     def regions(self) -> dict[str, Region]:
@@ -369,10 +374,15 @@ class Setup:
         errors, links, study = self._position_error_m, self.links, self.study
         if errors is None:
             return self
-        paths = self._trace(displaced(links, errors), self.scene, None)
-        from calibray.fields import path_loss
+        from calibray.engines.replay import Computation, Replay
 
-        loss = path_loss(mount(paths, mounted_at_displaced(self.mountings, len(links))))
+        paths = mount(
+            self._trace(displaced(links, errors), self.scene, None),
+            mounted_at_displaced(self.mountings, len(links)),
+        )
+        effects = self._path_effects(paths)
+        replay = Replay(paths, self.parameters, effects=effects, computation=Computation(batch=1))
+        loss = replay.path_loss(self.parameters.start[None])[0]
         variance = 1 / links.weight if study.links.std is not None else (study.noise.std_db or 0.0) ** 2
         weight = 1 / (variance + spread_db(loss) ** 2)
         return self._with_tracer(replace(self, links=replace(links, weight=weight)))

@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.engines.replay import Replay
-from calibray.fields import path_loss
+from calibray.engines.kinds.replay import replay
+from calibray.engines.protocol import ReplaysScene
 from calibray.fitting.fidelity_loop import traced_again
 from calibray.fitting.nuisance import OFFSET
 from calibray.fitting.objective import Objective
@@ -28,6 +28,7 @@ from calibray.result.held_out import (
     PredictionModel,
 )
 from calibray.scenes.obstruction import OUT_OF_SIGHT
+from calibray.study.displacement import displaces
 from calibray.study.model import StudyModel
 from calibray.validation.models import (
     OUT_OF_SIGHT_DB,
@@ -130,16 +131,19 @@ def fit_prediction_model(
         parameters.named(others[0].candidate) if others else None,
     )
     materials = parameters.materials(candidate, problem.setup.scene.materials) if uses_scene else None
-    if isinstance(problem.engine, Replay) and problem.engine.effects:
-        scene_db = problem.engine.without_effects().path_loss(candidate[None])[0]
-    facades = setup.study.facades
-    if isinstance(problem.engine, Replay) and facades:
-        # An exported scene has one material per mesh: that of the walls that the facades are parts of.
-        whole = parameters.materials(candidate, setup.scene.materials)
-        whole |= {name: whole[section.of] for name, section in facades.items()}
-        scene_db = path_loss(problem.engine.paths, whole, setup.radio.combining, setup.radio.bandwidth)
+    # An exported scene has one material per mesh, that of the walls that facades are parts of, and links at the stated
+    # positions.
+    walls = {name: section.of for name, section in setup.study.facades.items()}
+    displaced = [name for name in parameters.names if displaces(name)]
+    if displaced:
+        stated = setup.placed_at(dict.fromkeys(displaced, 0.0))
+        sampled = setup.study.trace.refraction or setup.study.trace.diffuse_reflection
+        engine = replay(stated, stated.trace(materials if sampled else None))
+        scene_db = engine.scene_path_loss(candidate[None], walls)[0]
+    elif isinstance(problem.engine, ReplaysScene):
+        scene_db = problem.engine.scene_path_loss(candidate[None], walls)[0]
     if retrace_gap_db is not None and (candidate == trail.best).all():
-        scene_db = traced_again(scene_db, retrace_gap_db)
+        scene_db = scene_db if displaced else traced_again(scene_db, retrace_gap_db)
         path_loss_db = traced_again(path_loss_db, retrace_gap_db) if uses_scene else path_loss_db
     return FittedModel(model, materials, path_loss_db, scene_db)
 

@@ -27,6 +27,7 @@ from calibray.engines.protocol import (
     Observing,
     Reduced,
     Reduction,
+    ReplaysScene,
     Responses,
     check_candidates,
     of_links,
@@ -299,6 +300,16 @@ class ChunkedReplay:
             loss[:, chunk] = chunk_loss
         return loss
 
+    def scene_path_loss(
+        self, candidates: NDArray[np.float64], walls: Mapping[str, str]
+    ) -> NDArray[np.float64]:
+        """Path loss of the scene alone for candidates; see `ReplaysScene.scene_path_loss`."""
+        values = check_candidates(candidates, len(self.parameters))
+        loss = np.empty((len(values), len(self._study.links)))
+        for chunk, chunk_loss in self._answers(partial(_scene_path_loss, walls=dict(walls)), values):
+            loss[:, chunk] = chunk_loss
+        return loss
+
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -352,6 +363,12 @@ def _size(chunk: Chunk) -> tuple[int, bool]:
 
 def _path_loss(chunk: Chunk, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
     return chunk.engine.path_loss(candidates)
+
+
+def _scene_path_loss(
+    chunk: Chunk, candidates: NDArray[np.float64], walls: Mapping[str, str]
+) -> NDArray[np.float64]:
+    return cast(ReplaysScene, chunk.engine).scene_path_loss(candidates, walls)
 
 
 def _path_loss_and_jacobian(

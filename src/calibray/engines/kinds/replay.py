@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 _LOG: Final = logging.getLogger(__name__)
 
+DISPLACED: Final = ("height", "dx", "dy")
+"""Fields of the parameters that displace antennas."""
+
 
 @final
 class ReplaySection(EngineSection):
@@ -74,6 +77,12 @@ class ReplaySection(EngineSection):
         from calibray.engines.cluster.workers import InProcess
         from calibray.tracing.trace_plan import LONG_TRACE_SECONDS
 
+        displaced = [item.name for item in study.parameters if item.is_effect and item.field in DISPLACED]
+        if displaced:
+            raise InputError(
+                f"{study.source}: parameters: {displaced[0]!r}: path loss between traced positions is checked in one "
+                "process; calibrate without --workers and --scheduler (workers=None)"
+            )
         chunks = cut(study.links, chunk_size(self.chunk_links, len(study.links)))
         if workers is None and (seconds := seconds_to_trace(study, chunks)) > LONG_TRACE_SECONDS:
             _LOG.warning(
