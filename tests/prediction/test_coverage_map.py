@@ -300,3 +300,9 @@ def test_a_map_has_the_carrier_of_the_links_measured_at_its_transmitter(tmp_path
     for place, stated in ((tx, {}), (tx + 5.0, {"sector": "a"})):
         with pytest.raises(InputError, match="needs the links' column 'carrier'"):
             _column_values(result, place, stated)
+    # A stated number is that of the table, however it is written; here the bearing follows from the carrier.
+    table["bearing"] = [10.0, 20.0] * 6
+    mounted = links | {"tx_antenna": {"azimuth_deg": "bearing"}}
+    result.study = planted.study(tmp_path, table, links=mounted)
+    for stated in (8e8, "8e8", "800000000"):
+        assert _column_values(result, tx, {"carrier": stated})["bearing"] == 10.0

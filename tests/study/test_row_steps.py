@@ -230,3 +230,28 @@ def test_average_by_place_takes_no_size_and_other_averages_need_one(folder):
     ):
         with pytest.raises(InputError, match=message):
             study(folder, average=average)
+
+
+def test_rows_of_groups_stay_apart_and_repeats_average_observables(tmp_path):
+    """One place, two phones, two rows each, with gaps in the delay spread."""
+    table = pd.DataFrame(
+        {"phone": ["a", "a", "b", "b"], "ns": [10.0, 20.0, 30.0, np.nan], "loss": [80.0] * 4}
+    )
+    table.to_csv(tmp_path / "log.csv", index=False)
+    content = STUDY | {
+        "links": {"file": "log.csv", "tx": [0.0, 0.0, 9.0], "rx": [50.0, 0.0, 1.5], "value": "loss"},
+        "offset": None,
+    }
+    spread = {"kind": "rms_delay_spread", "column": "ns", "unit": "ns"}
+    cases = {
+        "nuisance": {
+            "nuisance": {"phones": {"by": "constant", "per": "phone"}},
+            "observables": {"s": spread},
+        },
+        "bias": {"observables": {"s": spread | {"bias": "phone"}}},
+    }
+    for sections in cases.values():
+        stated = {name: value for name, value in (content | sections).items() if value is not None}
+        links = Study.from_content(stated, tmp_path / "study.toml").measurements()
+        assert links.frame["phone"].tolist() == ["a", "b"]
+        assert links.frame["ns"].tolist() == [15.0, 30.0]

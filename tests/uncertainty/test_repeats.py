@@ -10,8 +10,10 @@ import pytest
 import planted
 from calibray import engines
 from calibray.fitting.nuisance import Nuisance, make_term
+from calibray.fitting.observed import Observed
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
+from calibray.measurements.observables import Statistic
 from calibray.optimizers import LeastSquares
 from calibray.paths import take_links
 from calibray.study import Setup, Study
@@ -108,6 +110,24 @@ def test_rows_that_only_the_initial_values_make_equal_stay():
     assert set((np.flatnonzero(averaged(rows).objective.weight) % ROWS).tolist()) == {0}
     best = np.array(list(planted.TRUTH.values()))
     assert set((np.flatnonzero(average_repeats(rows, best).objective.weight) % ROWS).tolist()) == {0, 2}
+
+
+def test_further_observables_of_repeated_rows_are_averaged_and_biases_keep_them_apart():
+    rows = problem(ROWS, objective={"no_path": "censor", "ceiling_db": 200.0})
+    count, random = len(rows.objective.weight), np.random.default_rng(2)
+    spread = np.where(np.arange(count) == 1, np.nan, random.uniform(10, 20, count))
+    observable = Observed(
+        "spread", Statistic("rms_delay_spread"), spread, 1e-9, np.full(count, -1), (), 1.0, True
+    )
+    merged = averaged(replace(rows, observed=(observable,)))
+    used = merged.observed[0].used(merged.objective.weight)
+    assert used.tolist() == list(range(0, count, ROWS))
+    expected = np.nanmean(spread.reshape(-1, ROWS), axis=1)
+    assert merged.observed[0].measured[used] == pytest.approx(expected, abs=1e-12)
+    device = (np.arange(count) % ROWS == 2).astype(np.int64)
+    biased = replace(observable, group=device, labels=("a", "b"))
+    counted = np.flatnonzero(averaged(replace(rows, observed=(biased,))).objective.weight)
+    assert sorted(set((counted % ROWS).tolist())) == [0, 2]
 
 
 def test_rows_that_a_candidate_leaves_without_a_path_are_averaged_with_each_other():

@@ -128,6 +128,7 @@ class Preparation:
         ground: Height of the ground, if heights are measured from it.
         averaging: How samples are averaged.
         keep: Columns whose groups averages keep apart, in addition to the transmitter's.
+        observables: Columns of further measured values, which are averaged over rows that repeat a link.
         computed: Further columns by name, computed from the rows with the columns of their transmitters. A function
             returns None if a column that it needs is missing and optional.
         inside: What to do with receivers inside buildings; nothing if None.
@@ -148,6 +149,7 @@ class Preparation:
     ground: Ground | None = None
     averaging: Averaging | None = None
     keep: Sequence[str] = ()
+    observables: Sequence[str] = ()
     computed: Mapping[str, Compute] = field(default_factory=dict)
     inside: Literal["drop", "move"] | None = None
     outside: MoveOutside | None = None

@@ -330,12 +330,13 @@ millimetre at best, and conversions of coordinates differ by micrometres."""
 
 
 def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
-    """Merge the rows of one link: its first row, with the mean of linear power, and of weights or standard deviations.
+    """Merge the rows of one link: its first row, with means of linear power, of weights and of further observables.
 
     Rows belong to one link if their positions agree within `SAME_POSITION`, and transmitter, groups, carrier,
     transmitted power and times are equal. Rows at different times stay separate links. A link below the noise floor is
     not merged with one above it. Receivers inside buildings are moved later: two positions may be moved to the same
-    corner. The steps `keep`, `transmitter`, `noise_floor_dbm` and `averaging` are used; averages merge repeats already.
+    corner. The steps `keep`, `observables`, `transmitter`, `noise_floor_dbm` and `averaging` are used; averages merge
+    repeats already.
 
     Raises:
         InputError: A column is missing or not numeric.
@@ -369,6 +370,8 @@ def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) 
     for name in (columns.weight, columns.std):
         if isinstance(name, str):
             merged[name] = pd.Series(table.numbers(name)).groupby(link).mean().to_numpy()
+    for name in steps.observables:
+        merged[name] = pd.Series(table.numbers(name, gaps=True)).groupby(link).mean().to_numpy()
     return table.note("rows that repeat a link, merged", int((~first).sum())).select(first).assign(**merged)
 
 

@@ -197,7 +197,11 @@ def _measured_values(
     links = study.measurements()
     here = np.linalg.norm(links.tx - tx, axis=1) < MIN_DISTANCE
     for name in set(stated) & set(links.frame):
-        here &= (links.frame[name].astype(str) == str(stated[name])).to_numpy()
+        cells, value = links.frame[name], pd.Series([stated[name]])
+        number = pd.to_numeric(value.astype(str), errors="coerce")[0]
+        here &= (
+            (cells.astype(str) == str(stated[name])) | (pd.to_numeric(cells, errors="coerce") == number)
+        ).to_numpy()
     measured = links.frame[here]
     return {
         name: measured[name].iloc[0]

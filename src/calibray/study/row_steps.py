@@ -17,6 +17,8 @@ from calibray.measurements import (
     measured_links,
     read_table,
 )
+from calibray.scenes.obstruction import CLUSTER
+from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study.model import StudyModel
 from calibray.study.mounting import PORT_POWER, mounting_columns, port_power, states_port_power
 from calibray.study.regions import Place
@@ -59,6 +61,8 @@ def row_steps(study: StudyModel) -> Preparation:
     """
     links = study.links
     inside = None if links.inside == "keep" else links.inside
+    groups = [label for term in study.nuisance_terms.values() for label in term.per]
+    groups += [item.bias for item in study.observables.values() if item.bias not in (None, "all")]
     return replace(
         position_steps(study),
         track=row_track(study),
@@ -71,13 +75,14 @@ def row_steps(study: StudyModel) -> Preparation:
         keep=list(
             dict.fromkeys(
                 [
-                    *study.offset_groups,
+                    *(label for label in groups if label not in (*OBSTRUCTION, CLUSTER)),
                     *([links.frequency] if links.frequency else []),
                     *mounting_columns(study),
                     *([links.device] if links.device else []),
                 ]
             )
         ),
+        observables=[item.column for item in study.observables.values() if item.column is not None],
         computed={PORT_POWER: partial(port_power, study)} if states_port_power(study) else {},
         inside=inside,
         outside=None if inside is None else _move_outside(study),

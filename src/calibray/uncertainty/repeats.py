@@ -29,9 +29,9 @@ REPEAT_UNIT: Final = 1e-3
 def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     """The problem whose rows of one link are replaced by their mean; the problem itself if no row repeats a link.
 
-    Rows repeat a link if their ends are at the same positions, they have the same nuisances, and the model gives them
-    the same path loss, with the initial values and with the best ones. The first row gets the mean path loss and the
-    mean weight, the others the weight 0. Studies with further observables or with a ceiling stay as they are.
+    Rows repeat a link if their ends are at the same positions, they have the same nuisances and biases, and the model
+    gives them the same path loss, with the initial values and with the best ones. The first row gets the mean path
+    loss, the mean weight and the means of further observables, the others the weight 0.
 
     Args:
         problem: The problem.
@@ -40,7 +40,7 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     objective, links = problem.objective, problem.setup.links
     counted = np.flatnonzero(objective.weight > 0)
     position = np.hstack([links.tx, links.rx])[counted]
-    if len(counted) < 2 or problem.observed or objective.ceiling_db is not None:
+    if len(counted) < 2:
         return problem
     tree = KDTree(position)
     if tree.query(position, k=2)[0][:, 1].min() > REPEAT_M:
@@ -52,6 +52,7 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
         *np.nan_to_num(problem.modelled(candidates)[:, counted] / REPEAT_DB),  # inf without a path
         *(term.value[counted] / REPEAT_UNIT for term in terms),
         *(term.group[counted] * 2.0 for term in terms),
+        *(observable.group[counted] * 2.0 for observable in problem.observed),
     ])  # fmt: skip
     first = np.full(len(counted), -1)
     for row in range(len(counted)):
@@ -65,4 +66,23 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     measured, weight = objective.measured.copy(), np.zeros(len(links))
     measured[counted[kept]] = total[kept] / weights[kept]
     weight[counted[kept]] = weights[kept] / rows[kept]
-    return replace(problem, objective=replace(objective, measured=measured, weight=weight))
+    observed = tuple(
+        replace(observable, measured=_means(observable.measured, counted, first))
+        for observable in problem.observed
+    )
+    return replace(problem, objective=replace(objective, measured=measured, weight=weight), observed=observed)
+
+
+def _means(
+    values: NDArray[np.float64], counted: NDArray[np.int64], first: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Values [L] with the mean of the known ones of each link in its first row; NaN if none is known.
+
+    `first` is the number of the first row of each counted link's repeats [m].
+    """
+    known = np.isfinite(values[counted])
+    number = np.bincount(first[known], minlength=len(counted))
+    total = np.bincount(first[known], values[counted][known], len(counted))
+    means = values.copy()
+    means[counted] = np.where(number > 0, total / np.maximum(number, 1), np.nan)
+    return means
