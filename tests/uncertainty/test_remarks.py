@@ -88,5 +88,7 @@ def test_laws_as_parameters_have_a_remark_on_what_counts_as_exact():
         remark
     )
     assert exact_constants(constant, study) == ()
+    (remark,) = exact_constants(constant, study, chunks=True)
+    assert "Links are in chunks, so the intervals count constants" in remark_text(remark)
     # The study itself states that they are exact and equal.
     assert exact_constants(law, Study.from_content(planted.content("links.csv"))) == ()

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.engines.protocol import PATH_LOSS
+from calibray.engines.protocol import PATH_LOSS, Chunked
 from calibray.fitting.cheap_replay import ReplayedModel
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, find_minima, relevant_minima
@@ -217,7 +217,8 @@ def _assess(
         remarks += conflict(problem, relevant)
     if not posterior.means.agree:
         remarks.append(Remark(RemarkKind.FEW_DRAWS))
-    remarks += exact_constants(problem.parameters, problem.setup.study)
+    chunks = isinstance(problem.engine, Chunked)
+    remarks += exact_constants(problem.parameters, problem.setup.study, chunks=chunks)
     return replace(
         assessment,
         intervals=intervals,

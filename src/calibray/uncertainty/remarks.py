@@ -201,10 +201,14 @@ def _lacking(study: StudyModel) -> list[str]:
     return switches + [f"max_depth = {depth}"] * (depth <= RANGES["max_depth"][1])
 
 
-def exact_constants(parameters: Parameters, study: StudyModel) -> tuple[Remark, ...]:
-    """A remark if coefficients of laws are parameters; then neither constants nor buildings vary in the draws."""
+def exact_constants(parameters: Parameters, study: StudyModel, *, chunks: bool = False) -> tuple[Remark, ...]:
+    """A remark if coefficients of laws are parameters, or links are in chunks.
+
+    Then neither constants nor buildings vary in the draws.
+    """
     stated = study.noise.constants_spread or study.noise.heterogeneity
-    return (Remark(RemarkKind.EXACT_CONSTANTS),) if parameters.has_laws and stated else ()
+    remark = Remark(RemarkKind.EXACT_CONSTANTS, {"chunks": chunks})
+    return (remark,) if (parameters.has_laws or chunks) and stated else ()
 
 
 def missed(problem: Problem, posterior: Draws, best_value: float) -> tuple[Remark, ...]:
