@@ -135,12 +135,13 @@ def fit_prediction_model(
     # positions.
     walls = {name: section.of for name, section in setup.study.facades.items()}
     displaced = [name for name in parameters.names if displaces(name)]
+    extra = len(parameters.of_effects) or setup.study.regions or setup.study.roughness_mm
     if displaced:
         stated = setup.placed_at(dict.fromkeys(displaced, 0.0))
         sampled = setup.study.trace.refraction or setup.study.trace.diffuse_reflection
         engine = replay(stated, stated.trace(materials if sampled else None))
         scene_db = engine.scene_path_loss(candidate[None], walls)[0]
-    elif isinstance(problem.engine, ReplaysScene):
+    elif (walls or extra) and isinstance(problem.engine, ReplaysScene):
         scene_db = problem.engine.scene_path_loss(candidate[None], walls)[0]
     if retrace_gap_db is not None and (candidate == trail.best).all():
         scene_db = scene_db if displaced else traced_again(scene_db, retrace_gap_db)
