@@ -224,7 +224,7 @@ def _unreached_links(values: dict[str, Any]) -> str:
 
 
 def _exact_constants(values: dict[str, Any]) -> str:
-    if values["chunks"]:
+    if values.get("chunks"):
         return (
             "Links are in chunks, so the intervals count constants that the scene fixes as exact and all buildings of "
             "a material as equal. They are much too narrow if that is wrong: calibrate without engine.chunk_links, "
