@@ -203,21 +203,9 @@ class RayModel:
 
     def half_spaces(self, candidate: NDArray[np.float64], values: NDArray[np.float64]) -> list[str]:
         """Materials of assumed thickness from whose far face no wave returns, at a candidate [d] with values [k]."""
-        materials, wavenumber = (
-            self.materials(candidate, values),
-            2 * np.pi * self.paths.frequency / speed_of_light,
-        )
-
-        def attenuation(item: Material) -> float:
-            loss = item.conductivity / (wavenumber * speed_of_light * epsilon_0)
-            return -wavenumber * item.thickness * float(np.sqrt(item.relative_permittivity - 1j * loss).imag)
-
-        return [
-            name
-            for name, field in self.assumed
-            if field == "thickness"
-            and (materials[name].thickness > HALF_SPACE / 2 or attenuation(materials[name]) > DECAYED)
-        ]
+        materials = self.materials(candidate, values)
+        assumed = [name for name, field in self.assumed if field == "thickness"]
+        return [name for name in assumed if _is_half_space(materials[name], self.paths.frequency)]
 
     @cached_property
     def bases(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -281,6 +269,15 @@ class Polarized:
             fields.append((tx, rx))
             first += group.size
         return with_antenna_fields(program, fields)
+
+
+def _is_half_space(material: Material, frequency: float) -> bool:
+    """Whether no wave returns from the far face of a slab at a frequency [Hz]."""
+    # ITU-R P.2040-3 eq. 9: eta'' = sigma / (2 pi f eps_0).
+    loss = material.conductivity / (2 * np.pi * frequency * epsilon_0)
+    root = np.sqrt(material.relative_permittivity - 1j * loss)
+    attenuation = -2 * np.pi * frequency / speed_of_light * root.imag * material.thickness
+    return material.thickness > HALF_SPACE / 2 or bool(attenuation > DECAYED)
 
 
 def _basis(zenith_azimuth: NDArray[np.float64]) -> NDArray[np.float64]:

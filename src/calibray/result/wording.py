@@ -224,7 +224,7 @@ def _unreached_links(values: dict[str, Any]) -> str:
 
 
 def _exact_constants(values: dict[str, Any]) -> str:
-    if values.get("chunks"):
+    if values["chunks"]:
         return (
             "Links are in chunks, so the intervals count constants that the scene fixes as exact and all buildings of "
             "a material as equal. They are much too narrow if that is wrong: calibrate without engine.chunk_links, "
@@ -257,9 +257,8 @@ def _ray_mapping(values: dict[str, Any]) -> str:
     assumed = zip(values["names"], values["values"], strict=True)
     constants = ", ".join(f"{name} {value:.3g}" for name, value in assumed)
     surfaces = "half-spaces" if values["half_space"] else "slabs"
-    # Results of earlier versions do not name the half-spaces among slabs.
-    if not values["half_space"] and (names := values.get("half_spaces")):
-        surfaces = f"slabs, except half-spaces of {' and '.join(names)},"
+    if values["half_spaces"] and not values["half_space"]:
+        surfaces = f"slabs, except half-spaces of {' and '.join(values['half_spaces'])},"
     text = (
         f"The model explains the ratios of the ray powers in {values['calls']} calls with a misfit of "
         f"{values['misfit_db']:.3f} dB, and predicted path loss at the last call within {values['gap_db']:.3f} dB"
