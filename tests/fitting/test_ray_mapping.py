@@ -294,12 +294,13 @@ def test_an_engine_of_other_physics_is_not_understood(
 
 
 def test_the_optimum_is_reached_without_understanding(mapped: RayMap) -> None:
-    """The misfit matters for the replay elsewhere, the gap and the remaining gain for the optimum."""
+    """Misfit and changed paths matter for the replay elsewhere, the gap and the remaining gain for the optimum."""
     assert mapped.reached
     misfit = replace(mapped, understanding=replace(mapped.understanding, misfit_db=0.5))
-    assert misfit.reached
-    assert not misfit.understood
-    for missed in (replace(mapped, gap_db=0.06), replace(mapped, remaining_db=0.06)):
+    for foreign in (misfit, replace(mapped, changed_db=0.6)):
+        assert foreign.reached
+        assert not foreign.understood
+    for missed in (replace(mapped, gap_db=0.06), replace(mapped, remaining_db=0.06), replace(mapped, lost=1)):
         assert not missed.reached
         assert not missed.understood
 

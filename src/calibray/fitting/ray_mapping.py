@@ -92,17 +92,20 @@ class RayMap:
 
     @property
     def reached(self) -> bool:
-        """Whether the last call was predicted, nothing is left to gain, and the calls have the same strong paths.
+        """Whether the last call was predicted, and nothing is left to gain.
 
         The optimum is then reached, even if the engine's assumptions are not identified.
         """
-        predicted = max(self.gap_db, self.remaining_db) <= UNDERSTOOD_DB
-        return predicted and self.changed_db <= CHANGED_DB and not self.lost
+        return max(self.gap_db, self.remaining_db) <= UNDERSTOOD_DB and not self.lost
 
     @property
     def understood(self) -> bool:
-        """Whether the model explains all calls as well, so that its replay stands for the engine elsewhere."""
-        return self.reached and self.understanding.misfit_db <= MISFIT_DB
+        """Whether the model also explains all calls, which have the same strong paths.
+
+        Its replay then stands for the engine elsewhere, too.
+        """
+        explained = self.understanding.misfit_db <= MISFIT_DB
+        return self.reached and explained and self.changed_db <= CHANGED_DB
 
 
 def maps_rays(setup: Setup) -> bool:
