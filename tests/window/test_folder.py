@@ -8,6 +8,7 @@ import pytest
 
 from calibray.errors import InputError
 from calibray.window.desk import StudyFolder
+from calibray.window.study_steps import likely_tables
 
 STUDY = """version = 1
 
@@ -112,3 +113,29 @@ def test_results_are_named_by_folders_with_a_record(folder, tmp_path):
     assert folder.result("result") == {"fit": {}}
     with pytest.raises(InputError, match="no such result"):
         folder.result("../result")
+
+
+RSSI = "Time\tLatitude\tLongitude\tCell name\tRSRP (dBm)\n" + "".join(
+    f"10:0{k}\t50.0{k}\t14.4{k}\t{'AB'[k % 2]}\t-{80 + k}\n" for k in range(6)
+)
+TRANSMITTERS = "Cell name\tLat\tLon\tEIRP (dBm)\nA\t50.0\t14.4\t46\nB\t50.1\t14.5\t46\n"
+
+
+def test_tables_of_links_and_transmitters_are_told_apart_by_their_columns(tmp_path):
+    names = {
+        "aps.tsv": TRANSMITTERS, "masts.txt": RSSI, "places.csv": "Latitude,Longitude\n50.0,14.4\n",
+        "place.csv": RSSI, "drive-predicted.csv": RSSI,
+    }  # fmt: skip
+    for name, text in names.items():
+        (tmp_path / name).write_text(text)
+    folder = StudyFolder(tmp_path)
+    assert folder.tables() == ["aps.tsv", "masts.txt", "places.csv"]
+    assert likely_tables(folder, folder.tables()) == ("masts.txt", "aps.tsv")
+    assert likely_tables(folder, ["places.csv"]) == ("places.csv", "")
+
+
+def test_tables_whose_columns_show_nothing_are_told_apart_by_their_names(tmp_path):
+    for name in ("cells.csv", "plan.csv", "rounds.csv"):
+        (tmp_path / name).write_text("a,b\n1,2\n")
+    folder = StudyFolder(tmp_path)
+    assert likely_tables(folder, folder.tables()) == ("rounds.csv", "cells.csv")

@@ -53,6 +53,13 @@ def test_a_command_that_was_killed_has_died(tmp_path):
     assert jobs.wait(job, 20).state == "died"
 
 
+def test_a_command_that_is_stopped_while_python_starts_is_stopped(tmp_path):
+    jobs = Jobs(tmp_path)
+    job = jobs.start(["doctor"])
+    jobs.stop(job)
+    assert jobs.wait(job, 60).state == "stopped"
+
+
 def test_a_log_without_a_record_blocks_no_command(tmp_path):
     """A server that was killed while it started a command leaves one."""
     (tmp_path / FOLDER).mkdir()

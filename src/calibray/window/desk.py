@@ -41,6 +41,12 @@ MAPS: Final = (".osm", ".pbf", ".geojson", ".gpkg", ".shp", ".fgb", ".dxf", ".cs
 TABLES: Final = (*SUFFIXES, ".xlsx", ".parquet")
 MESHES: Final = (".ply", ".obj")
 PARTS: Final = (".shx", ".dbf", ".prj", ".cpg", ".tif", ".tiff", ".gpx", ".xml", ".json")
+PLACE, CANDIDATES, SUGGESTED = "place.csv", "candidates.csv", "suggested.csv"
+"""Tables that the window writes: a place to predict at, candidates for the next measurement, and the suggested ones."""
+
+PREDICTED: Final = "-predicted.csv"
+"""End of the names of predicted tables."""
+
 LARGEST: Final = 2**30
 """Largest size of an uploaded file [bytes]; put larger files into the folder."""
 
@@ -66,6 +72,11 @@ class StudyFolder:
         """Names of the folder's files with one of the extensions."""
         candidates = (file for file in self.path.iterdir() if file.name.lower().endswith(endings))
         return sorted(file.name for file in candidates if file.is_file() and not file.name.startswith("."))
+
+    def tables(self) -> list[str]:
+        """Names of the folder's tables, except those that the window writes."""
+        written = (PLACE, CANDIDATES, SUGGESTED)
+        return [name for name in self.files(TABLES) if name not in written and not name.endswith(PREDICTED)]
 
     def scenes(self) -> list[str]:
         """The scenes of the folder and of its subfolders, except those of results."""

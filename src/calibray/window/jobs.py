@@ -18,8 +18,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
@@ -91,7 +91,8 @@ class Jobs:
             stem = self._folder / f"{number:04d}"
             arguments = [sys.executable, "-m", "calibray.window.jobs", f"{stem}.exit", *words]
             # The command writes while it runs; an exclusive file follows no link and replaces nothing.
-            with os.fdopen(os.open(f"{stem}.log", os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as log:
+            output = os.fdopen(os.open(f"{stem}.log", os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb")
+            with output as log, _held_back(signal.SIGINT):
                 child = subprocess.Popen(
                     arguments, cwd=self._study_folder, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
                     start_new_session=True,
@@ -144,6 +145,16 @@ class Jobs:
                 return now
             time.sleep(0.05)
         return job
+
+
+@contextmanager
+def _held_back(number: signal.Signals) -> Iterator[None]:
+    """Hold back a signal of this thread, and of processes that it starts, which inherit this."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {number})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _read(file: Path) -> Job | None:
@@ -222,6 +233,8 @@ def main() -> None:
     stopped: list[int] = []
     # A handler, unlike SIG_IGN, is not inherited by the command.
     signal.signal(signal.SIGINT, lambda number, _: stopped.append(number))
+    # `Jobs.start` held it back while Python started.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     _, status_file, *words = sys.argv
     status = -signal.SIGINT
     if not stopped:

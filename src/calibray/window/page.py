@@ -10,9 +10,9 @@ from typing import Any, Final
 import numpy as np
 from nicegui import events, run, ui
 
-from calibray.window.desk import RADIUS, TABLES, Desk, Solid, solid
+from calibray.window.desk import MAPS, RADIUS, Desk, Solid, solid
 from calibray.window.jobs import Job, stages
-from calibray.window.result_steps import show_prediction, show_result, show_run
+from calibray.window.result_steps import show_commands, show_prediction, show_result, show_run
 from calibray.window.study_steps import findings, show_measurements, show_parameters, show_scene, upload
 
 STEPS: Final = (
@@ -54,7 +54,7 @@ def build(desk: Desk) -> None:
                 )
                 ui.button("Clear the area", on_click=lambda: clear_area()).props("outline dense")
                 view_button(desk)
-            ui.label("Drag to move, wheel to zoom, click to choose a place.").classes("quiet")
+            ui.label("Drag to move, wheel or two fingers to zoom, click to choose a place.").classes("quiet")
             place = ui.label().classes("quiet").mark("place")
             activity(desk)
         with ui.element("div").classes("steps"):
@@ -67,9 +67,14 @@ def build(desk: Desk) -> None:
                     show(desk)
 
     def contents() -> dict[str, object]:
-        """What the steps with unsaved changes show; they are shown again only if it changes."""
-        text = desk.folder.text()
-        return {"Measurements": (text, desk.folder.files((*TABLES, ".gpx"))), "Parameters": text}
+        """What the steps with fields for texts show; they are shown again only if it changes."""
+        text, files = desk.folder.text(), desk.folder.files((*MAPS, ".tif", ".tiff"))
+        return {
+            "Map or plan": (text, files, desk.folder.scenes(), desk.scene),
+            "Measurements": (text, desk.folder.tables(), desk.folder.files((".gpx",))),
+            "Parameters": text,
+            "Run": desk.folder.study_file.is_file(),
+        }
 
     shown, watched = contents(), {"job": desk.jobs.running()}
 
@@ -78,6 +83,7 @@ def build(desk: Desk) -> None:
         for name, show in STEPS:
             if name not in now or now[name] != shown[name]:
                 show.refresh()
+        show_commands.refresh()
         shown.update(now)
         # Otherwise `watch` would show the command again, and a click on its Stop would be lost.
         watched["job"] = desk.jobs.running()

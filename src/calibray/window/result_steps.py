@@ -21,7 +21,7 @@ from calibray.result.files import read
 from calibray.result.held_out import HeldOutErrors
 from calibray.support.output_tables import write_table
 from calibray.validation.held_out_statistics import compare
-from calibray.window.desk import STUDY, Desk, filled
+from calibray.window.desk import CANDIDATES, PLACE, PREDICTED, STUDY, SUGGESTED, Desk, filled
 from calibray.window.jobs import Job
 from calibray.window.study_steps import safe
 
@@ -51,6 +51,12 @@ def show_run(desk: Desk) -> None:
             ui.button("Calibrate", on_click=lambda: start(["run", STUDY, "--out", out.value]))
             ui.button("Validate", on_click=validate).props("outline")
             ui.button("Check the rays", on_click=lambda: start(["trace", STUDY, "--check"])).props("outline")
+    show_commands(desk)
+
+
+@ui.refreshable
+def show_commands(desk: Desk) -> None:
+    """Draw what has run or is running in the folder."""
     jobs = [*desk.jobs.elsewhere(), *desk.jobs.list()][:RUNS_SHOWN]
     if not jobs:
         ui.label("Nothing has run here yet.").classes("quiet")
@@ -256,8 +262,6 @@ def better(first: str, second: str, folder: Path) -> str:
     )
 
 
-PLACE, PREDICTED = "place.csv", "place-predicted.csv"
-CANDIDATES, SUGGESTED = "candidates.csv", "suggested.csv"
 MOST_CANDIDATES: Final = 2000
 """Largest number of candidate places; each is traced."""
 
@@ -299,7 +303,10 @@ def show_prediction(desk: Desk) -> None:
                 raise InputError("choose a place: click on the map, or give x and y")
             places = np.array([[east.value, north.value, filled(height)]])
             write_table(desk.folder.path / PLACE, _links(desk, site(), places))
-            desk.start(["predict", chosen.value, PLACE, "--level", 0.9, "--out", PREDICTED])
+            predict_table(PLACE)
+
+    def predict_table(name: str) -> None:
+        desk.start(["predict", chosen.value, name, "--level", 0.9, "--out", f"{Path(name).stem}{PREDICTED}"])
 
     def cover() -> None:
         with desk.messages():
@@ -323,6 +330,10 @@ def show_prediction(desk: Desk) -> None:
         ui.button("Map the area", on_click=cover)
         ui.button("Suggest places", on_click=suggest)
         ui.button("Export", on_click=export).props("outline")
+    if tables := desk.folder.tables():
+        with ui.row():
+            table = desk.keep(ui.select(tables, label="Table of new links", value=tables[-1]))
+            ui.button("Predict the table", on_click=lambda: predict_table(table.value)).props("outline")
     ui.label(f"Area: {_bounds(desk.area) if desk.area else 'the whole scene'}").classes("quiet")
     _predicted(desk)
     _suggested(desk)
@@ -380,7 +391,7 @@ def _read(desk: Desk, name: str) -> pd.DataFrame | None:
 
 
 def _predicted(desk: Desk) -> None:
-    table = _read(desk, PREDICTED)
+    table = _read(desk, f"{Path(PLACE).stem}{PREDICTED}")
     if table is None or not len(table) or "upper_db" not in table:
         return
     row = table.iloc[0]

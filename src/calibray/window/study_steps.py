@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,7 +14,10 @@ from nicegui import events, ui
 
 from calibray.errors import InputError
 from calibray.materials import DEFAULT_REVISION, ITU_MATERIALS
-from calibray.window.desk import LARGEST, MAPS, STUDY, TABLES, Desk, filled
+from calibray.measurements import read_table
+from calibray.measurements.column_names import find_position, find_value
+from calibray.measurements.transmitter_columns import find_transmitter_names
+from calibray.window.desk import LARGEST, MAPS, STUDY, Desk, StudyFolder, filled
 
 ITU: Final = [name for name in ITU_MATERIALS[DEFAULT_REVISION] if name != "vacuum"]
 COMMANDS: Final = {".osm": "osm", ".pbf": "osm", ".csv": "plan", ".dxf": "plan"}
@@ -97,7 +102,11 @@ def show_scene(desk: Desk) -> None:
                 desk.start(words)
 
         ui.button("Make the scene", on_click=make)
-    scenes = desk.folder.scenes()
+    scenes, of_study = desk.folder.scenes(), _scene_of_study(desk)
+    if of_study:
+        ui.label(f"Scene of the study: {of_study}")
+        ui.label("The step Measurements changes it: its section scene, or Draft again.").classes("quiet")
+        return
     if desk.scene not in scenes:
         desk.scene = scenes[0] if scenes else None
     if scenes:
@@ -107,6 +116,12 @@ def show_scene(desk: Desk) -> None:
             desk.refresh()
 
         ui.select(scenes, label="Scene", value=desk.scene, on_change=choose).classes("wide")
+
+
+def _scene_of_study(desk: Desk) -> str:
+    """The scene that the study names, which the map shows; empty without a study."""
+    scene = desk.folder.valid_content().get("scene", {})
+    return str(scene.get("file", ""))
 
 
 def _likely_map(sources: list[str]) -> str:
@@ -140,16 +155,17 @@ def show_measurements(desk: Desk) -> None:
         with ui.expansion("The study file").classes("wide"):
             ui.label(desk.folder.text()).classes("log")
         return
-    tables, tracks = desk.folder.files(TABLES), desk.folder.files((".gpx",))
+    tables, tracks = desk.folder.tables(), desk.folder.files((".gpx",))
     if not tables:
         ui.label("Add a table of measured links: text such as CSV, Excel or Parquet.").classes("quiet")
         return
+    likely_links, likely_sites = likely_tables(desk.folder, tables)
     with ui.row():
         links = desk.keep(
-            ui.select(tables, label="Table of links", value=_likely_links(tables)).classes("wide"),
+            ui.select(tables, label="Table of links", value=likely_links).classes("wide"),
         )
         sites = desk.keep(
-            ui.select(["", *tables], label="Table of transmitters", value=_sites(tables)).classes("wide"),
+            ui.select(["", *tables], label="Table of transmitters", value=likely_sites).classes("wide"),
         )
         track = desk.keep(
             ui.select(["", *tracks], label="Track", value=tracks[0] if tracks else "").classes("wide"),
@@ -250,26 +266,52 @@ def _toml(value: Any) -> str:
 
 def _columns(desk: Desk, content: dict[str, Any]) -> list[str]:
     """The columns of the table of links."""
-    from calibray.measurements import read_table
-
     try:
         return [str(name) for name in read_table(desk.folder.path / str(content["links"]["file"])).frame]
     except (InputError, KeyError, TypeError, OSError):
         return []
 
 
-def _likely_links(tables: list[str]) -> str:
-    """The table that most likely contains the links."""
-    return min(tables, key=lambda name: (_is_sites(name), "plan" in name.lower(), Path(name).suffix))
+def likely_tables(folder: StudyFolder, tables: Sequence[str]) -> tuple[str, str]:
+    """The tables that most likely contain the links and their transmitters, by columns first, then by names.
+
+    The second is empty if no table looks like one of transmitters.
+    """
+    content = {name: _content(folder.path / name, (folder.path / name).stat().st_mtime_ns) for name in tables}
+    named = {name for name in tables if any(word in name.lower() for word in SITES)}
+    sites = [name for name in tables if content[name] == "transmitters"]
+    sites += [name for name in tables if not content[name] and name in named]
+    links = min(
+        tables,
+        key=lambda name: (
+            content[name] != "links", name in sites, name in named, "plan" in name.lower(), Path(name).suffix
+        ),
+    )  # fmt: skip
+    return links, next((name for name in sites if name != links), "")
 
 
-def _sites(tables: list[str]) -> str:
-    return next((name for name in tables if _is_sites(name)), "")
+SITES: Final = ("cell", "site", "mast", "access", "transmitter", "station")
+"""Words in names of tables of transmitters."""
 
 
-def _is_sites(name: str) -> bool:
-    words = ("cell", "site", "mast", "access", "transmitter", "station")
-    return any(word in name.lower() for word in words)
+@lru_cache(maxsize=100)
+def _content(file: Path, changed: int) -> str:
+    """What the columns of a table contain: "links", "transmitters", or empty if they show neither.
+
+    A file that is written again, and so has another time of change, is read again.
+    """
+    del changed
+    try:
+        table = read_table(file)
+    except (InputError, OSError):
+        return ""
+    with suppress(InputError):
+        find_value(table)
+        return "links"
+    with suppress(InputError):
+        find_transmitter_names(table.frame)
+        return "transmitters" if find_position(table.frame, "tx", unnamed=True) else ""
+    return ""
 
 
 @ui.refreshable

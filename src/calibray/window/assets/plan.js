@@ -4,6 +4,7 @@ const plan = (() => {
   let canvas, context, data = { links: [], transmitters: [] }, buildings, walls;
   let centre = [0, 0], zoom = 1, point = null, area = null, suggested = [], drawing = false, grip = null, moved = false, whole = true;
   let width = 1, height = 1, queued = false;
+  const pointers = new Map(); // where each finger or the mouse is, while it is down
   let layer = null; // what does not change while the map is dragged: an image of twice the size, its centre and zoom
 
   const color = (name) => getComputedStyle(document.body).getPropertyValue(name).trim();
@@ -63,6 +64,7 @@ const plan = (() => {
     }
     canvas.dataset.area = area ? [area.west, area.south, area.east, area.north] : "";
     canvas.dataset.place = point ? point.map((length) => length.toFixed(1)) : "";
+    canvas.dataset.zoom = zoom.toPrecision(4);
     canvas.dataset.links = data.links.length;
     canvas.dataset.drawn = Number(canvas.dataset.drawn || 0) + 1;
   }
@@ -93,6 +95,13 @@ const plan = (() => {
     centre = [x - (u - width / 2) / zoom, y + (v - height / 2) / zoom];
     redraw();
   }
+  function pinch(event) {
+    const [fixed] = [...pointers].filter(([id]) => id !== event.pointerId).map(([, position]) => position);
+    const apart = ([u, v]) => Math.max(Math.hypot(u - fixed[0], v - fixed[1]), 1);
+    const factor = apart(place(event)) / apart(pointers.get(event.pointerId));
+    pointers.set(event.pointerId, place(event));
+    zoomAt(factor, ...fixed);
+  }
   function choose(u, v) {
     point = toScene(u, v);
     emitEvent("picked", { x: point[0], y: point[1] });
@@ -105,9 +114,12 @@ const plan = (() => {
   function listen() {
     canvas.addEventListener("pointerdown", (event) => {
       canvas.setPointerCapture(event.pointerId);
-      grip = place(event); moved = false;
+      pointers.set(event.pointerId, place(event));
+      grip = pointers.size === 1 ? place(event) : null;
+      moved = false;
     });
     canvas.addEventListener("pointermove", (event) => {
+      if (pointers.size === 2 && pointers.has(event.pointerId)) pinch(event);
       if (!grip) return;
       const [u, v] = place(event);
       if (Math.hypot(u - grip[0], v - grip[1]) > 3) moved = true;
@@ -124,9 +136,11 @@ const plan = (() => {
     });
     canvas.addEventListener("pointerup", (event) => {
       if (grip && !moved) choose(...place(event));
-      else if (drawing && area) { drawing = false; canvas.classList.remove("drawing"); emitEvent("area", area); }
+      else if (grip && drawing && area) { drawing = false; canvas.classList.remove("drawing"); emitEvent("area", area); }
+      pointers.delete(event.pointerId);
       grip = null;
     });
+    canvas.addEventListener("pointercancel", (event) => { pointers.delete(event.pointerId); grip = null; });
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
       zoomAt(Math.exp(-event.deltaY / 400), ...place(event));
