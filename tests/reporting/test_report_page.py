@@ -24,12 +24,15 @@ from calibray.reporting.link_map import plan, ramp
 from calibray.reporting.link_survey import in_measured_quantity, survey
 from calibray.reporting.result_tables import values
 from calibray.reporting.summary import summary
+from calibray.reporting.trust_figures import held_out_blocks
 from calibray.reporting.viewer import INTERACTIONS, PER_LINK, Grid, strongest
+from calibray.reporting.wording import group_text
 from calibray.result.held_out import HeldOutErrors, Judgement, Model
 from calibray.scenes import read_scene, read_triangles
 from calibray.scenes.buildings import _loops
 from calibray.support.figure_style import plain_number
 from calibray.uncertainty.verdicts import Interval
+from calibray.validation.validation import Validation
 from changed import changed
 from small_scenes import block, write_scene
 
@@ -159,11 +162,11 @@ def test_the_headline_compares_the_prediction_model_with_its_rivals(result):
     judged = replace(judged, prediction=replace(judged.prediction, model=model))
     (heading, value, comparison), links, *_ = reports._tiles(judged)
     assert (heading, value) == ("RMSE, held-out links", "2.50 dB")
-    assert "'initial materials'" in comparison
-    assert "offset only 2.50 dB" in comparison
-    assert "log-distance model 4.50 dB" in comparison
+    assert comparison == (
+        "initial materials", "initial materials, offset only: 2.50 dB", "log-distance model: 4.50 dB",
+    )  # fmt: skip
     # No "0 of them held out" next to a held-out RMSE.
-    assert links[2] == f"{len(block)} of them held out in turn, in 2 blocks"
+    assert links[2] == (f"{len(block)} of them held out in turn, in 2 blocks",)
     assert dict(row[:2] for row in tables.links(judged).rows)["held out"] == str(len(block))
 
 
@@ -468,3 +471,29 @@ def test_a_failing_report_does_not_lose_the_result(written, monkeypatch, tmp_pat
     assert "calibray report" in done.stderr
     assert Result.load(tmp_path / "out").parameters == Result.load(written).parameters
     assert not (tmp_path / "out" / "report.html").exists()
+
+
+def test_groups_that_are_carriers_are_written_with_a_unit(result):
+    content = result.study.content()
+    content["links"]["frequency"], content["offset"] = "carrier", {"per": "carrier"}
+    carriers = replace(result, study=cb.Study.from_content(content, result.study.path))
+    assert [group_text(carriers, label) for label in ("28000000000", "700e6", "A")] == [
+        "28 GHz", "700 MHz", "A",
+    ]  # fmt: skip
+    assert group_text(result, "28000000000") == "28000000000"
+    offsets = {"offset": {"28000000000": 1.0, "3500000000": 2.0}}
+    rows = tables.nuisances(replace(carriers, nuisance=replace(carriers.nuisance, coefficients=offsets))).rows
+    assert rows[:2] == (("28 GHz", "+1.00"), ("3.5 GHz", "+2.00"))
+    content["links"]["frequency"], content["offset"] = "Carrier (MHz)", {"per": "Carrier (MHz)"}
+    megahertz = replace(result, study=cb.Study.from_content(content, result.study.path))
+    assert group_text(megahertz, "3500") == "3.5 GHz"
+
+
+def test_a_legend_is_not_over_the_errors_of_blocks(result):
+    block = np.arange(len(result.links)) % 2
+    errors = dict.fromkeys((Model.INITIAL, Model.CALIBRATED), np.full(len(block), 2.5))
+    measured = result.links.measured_db.to_numpy()
+    figure = held_out_blocks(Validation(("1", "2"), block, errors, np.zeros((len(block), 3)), measured))
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    assert axes.get_legend().get_window_extent().y0 >= axes.bbox.y1

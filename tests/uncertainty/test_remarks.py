@@ -11,6 +11,7 @@ import planted
 from calibray.fitting.problem import Problem
 from calibray.parameters import Parameter, Parameters
 from calibray.result import Interval, RemarkKind, Verdict
+from calibray.result.verdict import Remark
 from calibray.result.wording import remark_text
 from calibray.study import Setup, Study
 from calibray.uncertainty.noise_models import CORRELATED
@@ -92,3 +93,10 @@ def test_laws_as_parameters_have_a_remark_on_what_counts_as_exact():
     assert "Links are in chunks, so the intervals count constants" in remark_text(remark)
     # The study itself states that they are exact and equal.
     assert exact_constants(law, Study.from_content(planted.content("links.csv"))) == ()
+
+
+def test_a_remark_on_exact_constants_without_its_cause_is_read():
+    """Results of early versions lack the cause."""
+    assert remark_text(Remark(RemarkKind.EXACT_CONSTANTS, {})).startswith(
+        "Coefficients of laws are parameters"
+    )

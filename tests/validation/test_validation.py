@@ -224,15 +224,21 @@ def test_the_average_of_the_chosen_model_and_a_second_one_predicts(best, partner
     validation = synthetic_validation(size_db | dict.fromkeys(AVERAGES, 9.0) | {best: 2.0, average: 3.0})
     assert validation.chosen == average
     assert validation.nested_rmse_db == pytest.approx(3.0, rel=0.1)
-    averaged = f"The prediction is the average of {str(best)!r} and {str(partner)!r}, because"
-    assert f"{str(best)!r}, the best on held-out blocks. {averaged}" in validation.choice
+    assert (
+        f"Predictions use the average of the models {str(best)!r} and {str(partner)!r}" in validation.choice
+    )
+    assert f"The model {str(best)!r} is preferred, as the best on held-out blocks." in validation.choice
+    # Not a second sentence that says that predictions use one model.
+    assert validation.choice.count("Predictions use") == 1
     assert set(validation.table.index) == {*map(str, size_db), str(average)}
 
 
 def test_the_text_of_an_average_names_both_of_its_models():
     """Another model is the best, and is no part of the average."""
     text = choice_text(Model.OFFSETS, Model.CALIBRATED, Model.PRIOR)
-    assert f"The prediction is the average of {str(Model.OFFSETS)!r} and {str(Model.PRIOR)!r}" in text
+    assert (
+        f"Predictions use the average of the models {str(Model.OFFSETS)!r} and {str(Model.PRIOR)!r}" in text
+    )
     # The difference can be significant, and the judgement then says that calibration helped.
     assert (
         f"{str(Model.CALIBRATED)!r} is better on held-out blocks, but by too little to be preferred." in text

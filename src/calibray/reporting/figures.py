@@ -91,7 +91,7 @@ def cumulative_cost(results: Mapping[str, Record]) -> Figure:
 @styled()
 def convergence(results: Mapping[str, Record], optimum_db: float | None = None) -> Figure:
     """Draw the best RMSE so far over RT calls, and if known the RMSE of the global optimum [dB]."""
-    figure, axes = plain_figure("RT calls", "Best RMSE so far [dB]")
+    figure, axes = plain_figure("RT calls", "RMSE of the best so far [dB]")
     for method, result in results.items():
         history = result.history
         axes.step(
@@ -187,7 +187,7 @@ def residual_over_distance(survey: Survey) -> Figure:
     distance = survey.distance[np.isfinite(residuals)]
     if len(distance) and distance.max() > 8 * distance.min():
         logarithmic(axes, "x")
-    axes.legend(frameon=False, loc="best")
+    axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
     return figure
 
 

@@ -31,7 +31,7 @@ from calibray.reporting.link_map import Plan, marks, plan, ramp, ramp_limit
 from calibray.reporting.link_survey import Survey, in_measured_quantity, measured_quantity, residual, survey
 from calibray.reporting.summary import summary
 from calibray.reporting.viewer import TRIANGLES, Rays, packed, rays
-from calibray.reporting.wording import carriers_text, diagnostics_table, held_out_text
+from calibray.reporting.wording import carriers_text, diagnostics_table, group_text, held_out_text
 from calibray.result.held_out import Model
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict
@@ -48,9 +48,10 @@ WORST: Final = 10
 """Number of links with the largest residuals that are listed."""
 
 CAPTIONS: Final = {
-    "convergence": "Best RMSE over RT calls (runs of the ray tracer over all links).",
+    "convergence": "RMSE of the best candidate so far over RT calls (runs of the ray tracer over all links). It can "
+    "rise if the objective is not the RMSE alone.",
     "cumulative-cost": "RT calls and time over the iterations of the method.",
-    "path-loss": "Every link: measured, before and after calibration. Held-out links are shaded.",
+    "path-loss": "Every link: measured, before and after calibration.",
     "residual-over-distance": "Residual (predicted minus measured) over the distance between the antennas.",
     "possible-values": "Posterior of every parameter over its bounds. Wide line: 95 % interval. Dashed: value before "
     "calibration. Solid: calibrated value.",
@@ -137,6 +138,9 @@ def collect(result: Record, progress: Progress | None = None) -> PageData:
     """Collect what a page shows in addition to the result; unavailable items are listed and are not an error."""
     study, missing = result.study, []
     links = survey(result)
+    if links is not None and links.group is not None:
+        shown = {label: group_text(result, str(label)) for label in set(links.group)}
+        links = replace(links, group=np.array([shown[label] for label in links.group], dtype=object))
     if links is None:
         missing.append(f"Positions of the links: {study.links.file} cannot be read any more.")
     scene = result.scene
@@ -226,8 +230,8 @@ def _asset(name: str) -> str:
     return (files("calibray.reporting") / "templates" / name).read_text(encoding="utf-8")
 
 
-def _tiles(result: Record) -> list[tuple[str, str, str]]:
-    """The key figures at the top of the page: name, value, and a comparison."""
+def _tiles(result: Record) -> list[tuple[str, str, tuple[str, ...]]]:
+    """The key figures at the top of the page: name, value, and lines of comparison."""
     model, fit = result.prediction.model, result.fit
     judged = result.holdout_rmse_db is not None
     errors = (
@@ -236,22 +240,22 @@ def _tiles(result: Record) -> list[tuple[str, str, str]]:
         else (fit.rmse_db, fit.nuisance_only_rmse_db, fit.log_distance_rmse_db)
     )
     rmse_db, offset_only_db, log_distance_db = errors
-    rivals = {"initial materials with offset only": offset_only_db, "log-distance model": log_distance_db}
+    rivals = {"initial materials, offset only": offset_only_db, "log-distance model": log_distance_db}
     identified = sum(interval.verdict == Verdict.IDENTIFIED for interval in result.intervals.values())
     tiles = [
         (
             f"RMSE, {'held-out' if judged else 'calibration'} links",
             f"{decibels(rmse_db)} dB",
-            "; ".join(
-                [f"model {str(model.name)!r}"]
-                + [f"{name} {decibels(value)} dB" for name, value in rivals.items() if value is not None]
+            (
+                str(model.name),
+                *(f"{name}: {decibels(value)} dB" for name, value in rivals.items() if value is not None),
             ),
         ),
-        ("Links", f"{len(result.links):,}", held_out_text(result)),
-        ("RT calls", f"{result.rt_calls:,}", f"at {carriers_text(result)}"),
+        ("Links", f"{len(result.links):,}", (held_out_text(result),)),
+        ("RT calls", f"{result.rt_calls:,}", (f"at {carriers_text(result)}",)),
     ]
     if result.intervals:
-        tiles.append(("Identified parameters", f"{identified} of {len(result.parameters)}", "see Values"))
+        tiles.append(("Identified parameters", f"{identified} of {len(result.parameters)}", ("see Values",)))
     return tiles
 
 

@@ -9,7 +9,7 @@ from typing import Final
 
 from calibray.fitting.nuisance import OFFSET
 from calibray.parameters.parameter import PARAMETER_BOUNDS
-from calibray.reporting.wording import diagnostics_table
+from calibray.reporting.wording import diagnostics_table, group_text
 from calibray.result import wording
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict
@@ -151,8 +151,9 @@ def nuisances(result: Record) -> Table:
     """Offsets and the coefficients of further nuisances, by group; without rows if the study declares none."""
     nuisance = result.nuisance
     others = _nuisances_besides_offset(result)
-    rows = [(group or "all links", f"{value:+.2f}") for group, value in nuisance.offsets_db.items()]
-    rows += [(group or "all links", "no link with a path") for group in nuisance.groups_without_path]
+    offsets = {group: f"{value:+.2f}" for group, value in nuisance.offsets_db.items()}
+    offsets |= dict.fromkeys(nuisance.groups_without_path, "no link with a path")
+    rows = [(group_text(result, group) if group else "all links", text) for group, text in offsets.items()]
     for name, values in others.items():
         rows += [(f"{name}, {group}" if group else name, f"{value:+.3g}") for group, value in values.items()]
     return Table("Nuisances" if others else "Offsets", (Column(), numbers(unit="dB")), tuple(rows))

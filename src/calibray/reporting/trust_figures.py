@@ -142,7 +142,7 @@ def held_out_blocks(validation: Validation) -> Figure:
     step = -(-count // 12)
     axes.set_xticks(range(0, count, step), [shortened(label, 12) for label in validation.labels[::step]])
     axes.set_ylim(0, None)
-    axes.legend(frameon=False, fontsize=8, ncols=2)
+    axes.legend(frameon=False, fontsize=8, ncols=2, loc="lower left", bbox_to_anchor=(0, 1))
     return figure
 
 

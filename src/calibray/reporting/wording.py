@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -9,6 +10,7 @@ import pandas as pd
 
 from calibray.fitting.search import AUTO
 from calibray.measurements import FEW
+from calibray.measurements.column_names import find_frequency_unit
 from calibray.optimizers.methods import label
 from calibray.reporting.diagnostics import calibration_links, diagnostics, link_distance
 from calibray.result.held_out import HeldOutErrors, Model
@@ -60,6 +62,17 @@ def carriers_text(record: Record) -> str:
     return named(map(hertz, np.unique(record.links["frequency"].to_numpy(float)).tolist()))
 
 
+def group_text(record: Record, label: str) -> str:
+    """The label of a group of the offset; in GHz or MHz if the groups are the carriers of the links."""
+    column = record.study.links.frequency
+    if column is None or record.study.offset_groups != (column,):
+        return label
+    try:
+        return hertz(float(label) * find_frequency_unit(column))
+    except ValueError:
+        return label
+
+
 def scene_alone_text(record: Record) -> str:
     """How far the exported scene alone is from the predictions.
 
@@ -91,10 +104,10 @@ def scene_alone_text(record: Record) -> str:
         *(f"the facade {name}" for name in record.study.facades),
         *(["the errors of antennas"] if any(name.startswith((POSE, RECEIVER)) for name in values) else []),
         *(f"the roughness of {name}" for name in dict.fromkeys((*record.study.roughness_mm, *rough))),
-        *(term.name for term in model.terms),
+        *(f"the {term.name}" for term in model.terms),
         *([] if model.averaged is None else ["the average with other materials"]),
     ]
-    cause = ", ".join(missing) or "its ceiling"
+    cause = " or ".join(filter(None, (", ".join(missing[:-1]), *missing[-1:]))) or "its ceiling"
     if model.parameters is None:
         return (
             f"Predictions use the model {str(model.name)!r}, which uses no scene. The exported scene has the "
@@ -170,7 +183,7 @@ def diagnostics_table(result: Record) -> Table:
         "power": _power_text(tables),
         "over distance": _distance_text(result),
         "by depth": _class_text(tables, "depth", "paths of {} interactions"),
-        "by group": _class_text(tables, "group", "group {}"),
+        "by group": _class_text(tables, "group", "group {}", lambda label: group_text(result, label)),
         "by obstruction": _obstruction_text(tables),
         "by street": _class_text(tables, "streets", "{}"),
         "missing region": _missing_region_text(tables),
@@ -207,7 +220,9 @@ def _distance_text(result: Record) -> str:
     return f"{verdict}: the residuals change by {slope:+.1f} dB per decade, standard error {error:.1f} dB"
 
 
-def _class_text(tables: dict[str, pd.DataFrame], column: str, wording: str) -> str:
+def _class_text(
+    tables: dict[str, pd.DataFrame], column: str, wording: str, shown: Callable[[str], str] = str
+) -> str:
     """The class of links with the largest mean residual."""
     if column not in tables or len(tables[column]) < 2:
         return ""
@@ -217,7 +232,7 @@ def _class_text(tables: dict[str, pd.DataFrame], column: str, wording: str) -> s
     worst = table.iloc[int(np.argmax(table["mean_db"].abs()))]
     if abs(worst["mean_db"]) < EVEN_DB:
         return ""
-    name = f"{worst[column]:g}" if isinstance(worst[column], float) else str(worst[column])
+    name = f"{worst[column]:g}" if isinstance(worst[column], float) else shown(str(worst[column]))
     clear = abs(worst["mean_db"]) > CLEAR * worst["standard_deviation_db"] / np.sqrt(worst["links"])
     return (
         f"largest mean residual: {worst['mean_db']:+.1f} dB, {wording.format(name)}, {worst['links']:.0f} links"

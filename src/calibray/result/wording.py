@@ -224,7 +224,7 @@ def _unreached_links(values: dict[str, Any]) -> str:
 
 
 def _exact_constants(values: dict[str, Any]) -> str:
-    if values["chunks"]:
+    if values.get("chunks"):
         return (
             "Links are in chunks, so the intervals count constants that the scene fixes as exact and all buildings of "
             "a material as equal. They are much too narrow if that is wrong: calibrate without engine.chunk_links, "
@@ -363,18 +363,20 @@ def choice_text(chosen: str, best: str, partner: str | None = None) -> str:
 
     `partner` is the model with which the chosen one is averaged.
     """
-    added = (
-        ""
-        if partner is None
-        else f" The prediction is the average of {str(chosen)!r} and {str(partner)!r}, because the best model on a few "
-        "blocks is often not the best elsewhere."
-    )
+    if partner is None:
+        used, preferred = f"Predictions use the model {str(chosen)!r}", ""
+    else:
+        used = f"Predictions use the average of the models {str(chosen)!r} and {str(partner)!r}"
+        preferred = (
+            f", because the best model on a few blocks is often not the best elsewhere. The model {str(chosen)!r} is "
+            "preferred"
+        )
     if chosen == best:
-        return f"Predictions use the model {str(chosen)!r}, the best on held-out blocks.{added}"
+        return f"{used}{preferred}, {'as ' if preferred else ''}the best on held-out blocks."
     near = ", which stays near the initial materials" if chosen == Model.PRIOR else ""
     return (
-        f"Predictions use the model {str(chosen)!r}{near}. The model {str(best)!r} is better on held-out blocks, but "
-        f"by too little to be preferred.{added}"
+        f"{used}{preferred}{near}. The model {str(best)!r} is better on held-out blocks, but by too little to be "
+        "preferred."
     )
 
 

@@ -278,7 +278,7 @@ def _hold_out_blocks(links: LinksDraft, content: dict[str, Any]) -> None:
     if count_unknowns(study, measured) or places < DEFAULT_BLOCKS * LINKS_PER_UNKNOWN:
         return
     content["holdout"] = {"blocks": DEFAULT_BLOCKS}
-    reason = "each block of neighbours is predicted from the others; predictions use the model with the lowest error"
+    reason = "each block of neighbours is predicted from the others; this chooses the model of predictions"
     links.assume("holdout.blocks", DEFAULT_BLOCKS, reason)
 
 
