@@ -148,6 +148,22 @@ def test_held_out_links_do_not_change_the_fit(tmp_path, exact):
     assert results["none"].holdout_rmse_db == pytest.approx(np.sqrt(np.mean(error**2)))
 
 
+@pytest.mark.parametrize("holdout", [{"where": "rx_x > 0"}, {"blocks": 2}])
+def test_held_out_links_count_equally(tmp_path, noisy, holdout):
+    """As in the judgement, whose RMSE is that of the table, and in the intervals of predictions."""
+    result = run(
+        tmp_path,
+        noisy.assign(weight=np.where(noisy.index % 2 == 0, 1.0, 25.0)),
+        links=planted.content("links.csv")["links"] | {"weight": "weight"},
+        holdout=holdout,
+    )
+    accuracy, judgement, table = result.accuracy, result.accuracy.judgement, result.links
+    judged = table[table.held_out] if "where" in holdout else table
+    error = judged.before_db - judged.measured_db
+    assert accuracy.initial_holdout_rmse_db == pytest.approx(np.sqrt(np.mean(error**2)))
+    assert accuracy.holdout_rmse_db == pytest.approx(judgement.rmse_db)
+
+
 def test_weights_act(tmp_path, exact):
     wrong = exact.assign(path_loss_db=exact.path_loss_db + 10.0 * (exact.index == 4))
     trusting = run(tmp_path, wrong, links=planted.content("links.csv")["links"] | {"weight": "weight"})

@@ -61,9 +61,18 @@ class Models:
 
 
 def rmse_of(problem: Problem, model: NDArray[np.float64], mask: NDArray[np.bool_]) -> float:
-    """Weighted RMSE of modelled path loss [L] over a mask [L], [dB]."""
+    """Weighted RMSE of modelled path loss [L] over calibration links, selected by a mask [L], [dB]."""
     weight = problem.setup.links.weight[mask]
     return float(np.sqrt(np.average((model - problem.objective.measured)[mask] ** 2, weights=weight)))
+
+
+def held_out_rmse(problem: Problem, model: NDArray[np.float64], mask: NDArray[np.bool_]) -> float | None:
+    """RMSE of modelled path loss [L] over held-out links, selected by a mask [L], [dB]; None if there are none.
+
+    Links count equally, as in the judgement and in the intervals of predictions.
+    """
+    errors = (model - problem.objective.measured)[mask]
+    return float(np.sqrt(np.mean(errors**2))) if len(errors) else None
 
 
 def on_held_out_links(
@@ -90,15 +99,13 @@ def on_held_out_links(
         # No link has a residual in all models.
         judgement = judgement if judgement.links else None
     name, residuals = _choice(problem, trail, models, judged)
-
-    def rmse(model: NDArray[np.float64]) -> float | None:
-        return rmse_of(problem, model, judged) if judged.any() else None
-
     accuracy = Accuracy(
-        holdout_rmse_db=rmse(models.calibrated),
-        initial_holdout_rmse_db=rmse(models.initial),
-        nuisance_only_holdout_rmse_db=rmse(models.nuisance_only) if fitted else None,
-        log_distance_holdout_rmse_db=rmse(models.log_distance),
+        holdout_rmse_db=held_out_rmse(problem, models.calibrated, judged),
+        initial_holdout_rmse_db=held_out_rmse(problem, models.initial, judged),
+        nuisance_only_holdout_rmse_db=held_out_rmse(problem, models.nuisance_only, judged)
+        if fitted
+        else None,
+        log_distance_holdout_rmse_db=held_out_rmse(problem, models.log_distance, judged),
         judgement=judgement,
         observables=observable_errors(held_out_gaps(problem, trail.best, judged), problem.setup.study),
     )

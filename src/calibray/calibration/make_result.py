@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calibray.calibration.held_out_accuracy import (
     Models,
     fit_fallback,
+    held_out_rmse,
     log_distance_errors,
     on_blocks,
     on_held_out_links,
@@ -134,7 +135,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
         accuracy, name, residuals = on_held_out_links(problem, trail, models)
     else:
         accuracy, name, residuals = on_blocks(
-            validation, problem, rmse_of(problem, models.initial, validation.judged), fitted
+            validation, problem, held_out_rmse(problem, models.initial, validation.judged), fitted
         )
     chosen = fit_prediction_model(problem, trail, name, residuals, gap_db)
     table = table.assign(predicted_db=chosen.path_loss_db, scene_db=chosen.scene_db, basis=str(name))
