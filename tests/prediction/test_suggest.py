@@ -229,3 +229,21 @@ def test_where_two_ranges_fit_the_first_suggestion_distinguishes_them(result, ta
     even = np.where(np.arange(128) % 2 == 1, 14.0, values)
     gain = cb.suggest(changed(two, draws={NAME: even.tolist()}), table, 1).gain[0]
     assert f"right range of {NAME} known with" in gain
+
+
+def test_fitted_heights_are_traced_at_their_values(folder, result, table):
+    """Interpolated from the stated height, path loss would differ from that of a prediction."""
+    height, name = 1.7, "tx:*.height"
+    content = study(folder).content()
+    content["objective"] = {"combining": "power"}
+    content["parameters"] = {**content["parameters"], name: {"bounds": [-4.0, 4.0]}}
+    values = {NAME: result.parameters[NAME], name: height}
+    placed = changed(
+        result,
+        study=Study.from_content(content, folder / "heights.toml"),
+        parameters=values,
+        draws={key: [value] * 64 for key, value in values.items()},
+    )
+    suggested = cb.suggest(placed, table, len(table)).set_index("row").path_loss_db.sort_index()
+    # The offset of this fit is another one.
+    assert np.ptp(suggested.to_numpy() - placed.predict(table)) < 1e-6

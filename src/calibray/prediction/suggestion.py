@@ -28,6 +28,7 @@ from calibray.prediction.experiment_design import (
 )
 from calibray.prediction.observables import Worth, as_measured, worth_measuring
 from calibray.prediction.predict import (
+    NEIGHBOURS,
     as_links,
     check_inputs,
     refuse_far_links,
@@ -102,7 +103,7 @@ def suggest(
             "links than unknowns"
         )
     links = as_links(result, candidates)
-    calibrated = Setup.open(study)
+    calibrated = Setup.open(study).placed_at(result.parameters, NEIGHBOURS)
     # Both share one loaded tracer.
     setup = calibrated.at(links)
     check_inputs(result, setup, allow_changed_inputs)
