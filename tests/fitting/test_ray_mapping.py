@@ -212,6 +212,32 @@ def test_the_loss_of_a_scan_is_that_of_the_model_at_its_minima(known: bool) -> N
         assert found.misfit[pair, 0] == pytest.approx(loss, rel=1e-4)
 
 
+def test_constants_that_silence_an_engines_path_are_no_explanation() -> None:
+    """Behind a slab that no wave crosses, all ratios are 1, as behind a slab that no parameter changes."""
+    paths = synthetic.program([(Kind.SPECULAR,), (Kind.REFRACTION,), (Kind.REFRACTION,)] * 4, seed=6)
+    model, first, last = RayModel.of(WALLS, paths, True), np.array([3.3]), np.array([7.1])
+
+    def call(candidate: np.ndarray) -> Call:
+        replayed = replace(paths, materials=model.materials(candidate))
+        return Call(candidate, Export(paths, 10 * np.log10(powers(replayed))))
+
+    calls = [call(first), call(last)]
+    names = list(paths.materials)
+    crossed = {names[index] for index in np.unique(paths.material[paths.kind == Kind.REFRACTION])}
+    silent = model.start.copy()
+    for number, (name, field) in enumerate(model.assumed):
+        silent[number] = np.log(HALF_SPACE) if name in crossed and field == "thickness" else silent[number]
+    ratios = ray_fit.ratios_of(calls)
+    misfit = [
+        ray_fit.refined(
+            ray_fit.Understanding(model, values, (False, False), np.inf), ratios, calls[-1], 1
+        ).misfit_db
+        for values in (model.start, silent)
+    ]
+    assert misfit[0] < 1e-6
+    assert misfit[1] > 10.0
+
+
 @pytest.mark.parametrize("amplitude", [0.0, 1e-20])
 def test_a_path_without_power_has_the_least_level_and_no_slope(amplitude: float) -> None:
     paths = synthetic.program(synthetic.EVERY_KIND, seed=5, ports=(2, 2))

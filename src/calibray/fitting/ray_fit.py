@@ -23,7 +23,7 @@ from calibray.engines.rays.compile import powers
 from calibray.engines.rays.surfaces import TOLERANCE
 from calibray.engines.replay import Replay
 from calibray.fitting import ray_scan
-from calibray.fitting.ray_model import ANGLES, RANGES, TILT, Call, Ends, RayModel
+from calibray.fitting.ray_model import ANGLES, LEAST_DB, RANGES, TILT, Call, Ends, RayModel
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take
 
@@ -83,18 +83,20 @@ class Ratio(NamedTuple):
         call: The earlier call.
         here: Their indices in the last call, ascending [n].
         weight: Their weights, 1 over all ratios [n].
+        level_db: Power in the last call [n], [dB].
         observed: Power in the last call over that in the earlier one [n], [dB].
     """
 
     call: Call
     here: NDArray[np.int64]
     weight: NDArray[np.float64]
+    level_db: NDArray[np.float64]
     observed: NDArray[np.float64]
 
     def on(self, kept: NDArray[np.bool_]) -> Ratio:
         """The same where paths of the last call are kept [P]."""
         mine = kept[self.here]
-        return Ratio(self.call, self.here[mine], self.weight[mine], self.observed[mine])
+        return Ratio(self.call, self.here[mine], self.weight[mine], self.level_db[mine], self.observed[mine])
 
 
 def understand(
@@ -329,14 +331,19 @@ def _errors(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weighted errors of the ratios [m], [dB], and their derivatives by the values [m, k].
 
+    A path that the engine has and that loses all power in the model, whose correction could not give it back, has the
+    engine's power over the model's as its error.
+
     `tables` are those of the last call and of each ratio's call, see `_tables`.
     """
     (level, *others), (slope, *other_slopes) = fit.model.levels_and_slopes(tables, fit.values, fit.linear)
     residuals, slopes = [], []
     for ratio, other, other_slope in zip(ratios, others, other_slopes, strict=True):
         root = np.sqrt(ratio.weight)
-        residuals.append(root * ((level - other)[ratio.here] - ratio.observed))
-        slopes.append(root[:, None] * (slope - other_slope)[ratio.here])
+        missing = (np.minimum(level, other)[ratio.here] <= LEAST_DB) & (ratio.level_db > LEAST_DB)
+        error = np.where(missing, LEAST_DB - ratio.level_db, (level - other)[ratio.here] - ratio.observed)
+        residuals.append(root * error)
+        slopes.append(np.where(missing, 0.0, root)[:, None] * (slope - other_slope)[ratio.here])
     return np.concatenate(residuals), np.concatenate(slopes)
 
 
@@ -346,7 +353,13 @@ def ratios_of(calls: list[Call]) -> list[Ratio]:
     pairs = [(call, *common(last.paths, call.export.paths)) for call in calls[:-1]]
     total = sum(last.weight[here].sum() for _, here, _ in pairs)
     return [
-        Ratio(call, here, last.weight[here] / total, last.level_db[here] - call.export.level_db[there])
+        Ratio(
+            call,
+            here,
+            last.weight[here] / total,
+            last.level_db[here],
+            last.level_db[here] - call.export.level_db[there],
+        )
         for call, here, there in pairs
         if len(here)
     ]

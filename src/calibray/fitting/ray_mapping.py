@@ -74,7 +74,7 @@ class RayMap:
         gap_db: Root mean square over the links of the answered minus the predicted path loss at the last call [dB].
         changed: Largest number of paths that the best call or another one has alone.
         changed_db: Largest change of a link's path loss without them, of links that keep a path [dB].
-        lost: Number of links that keep none.
+        lost: Number of links that keep none, or have none in the replay at the best call.
         minima: Minima of the replay that replaces the engine, the lowest first, as points of the search space [k, d].
         remaining_db: RMSE at the best call minus that at the lowest of these minima [dB].
     """
@@ -173,7 +173,10 @@ def map_rays(
     replayed, point = with_engine(problem, replay), parameters.to_search(best.candidate)[None]
     found = least_squares(replayed, local_searches(replay.interactions), point)
     remaining = float(replayed.squares(point).value[0]) - found.best.y
-    return RayMap(replay, tuple(calls), best, final, gap, *_changes(ordered), found.minima, remaining)
+    changed, changed_db, lost = _changes(ordered)
+    answered, predicted = best.export.path_loss_db, replay.path_loss(best.candidate[None])[0]
+    lost = max(lost, int((np.isfinite(answered) & np.isinf(predicted)).sum()))
+    return RayMap(replay, tuple(calls), best, final, gap, changed, changed_db, lost, found.minima, remaining)
 
 
 def with_engine(problem: Problem, replay: Replay) -> Problem:
