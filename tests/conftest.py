@@ -16,6 +16,9 @@ for _library in ("OMP", "OPENBLAS", "MKL"):
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
+# Tables as they are written to files, whatever the width of the terminal.
+os.environ.pop("COLUMNS", None)
+
 import jax
 import pytest
 from hypothesis import settings

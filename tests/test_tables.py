@@ -25,6 +25,21 @@ def test_text_is_aligned_and_without_markup():
     ]
 
 
+def test_texts_of_the_last_column_are_folded_to_the_width_of_a_terminal(monkeypatch):
+    reason = "columns named as degrees; no height: 1.5 m"
+    table = Table("", (Column("what"), numbers("links"), Column("reason")), (("links.rx", "330", reason),))
+    sentences = Table("", (Column(),), ((reason,), (reason,)))
+    monkeypatch.setenv("COLUMNS", "40")
+    lines = render(table).splitlines()
+    assert max(map(len, lines)) <= 40
+    assert " ".join(line[len("links.rx   links   ") :].strip() for line in lines[2:]) == reason
+    # An empty line is between sentences.
+    assert render(sentences).splitlines().count("") == 1
+    # Too narrow for the other columns: nothing is cut.
+    monkeypatch.setenv("COLUMNS", "20")
+    assert reason in render(table)
+
+
 def test_long_cells_are_not_cut():
     table = Table("", (Column("message"), Column()), (("x" * 3000, "y"),))
     assert render(table).splitlines()[-1] == "x" * 3000 + "   y"

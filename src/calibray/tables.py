@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from io import StringIO
+from shutil import get_terminal_size
 from typing import Final, Literal
 
 from calibray.support.messages import printable
@@ -18,7 +19,7 @@ LISTED: Final = 12
 """Largest number of rows, names or findings that are listed; the others are only counted."""
 
 WIDEST: Final = 100_000
-"""Characters per line: many, so that no cell is cut; output also goes to files and pipes."""
+"""Characters per line outside of a terminal, and in one that is too narrow: many, so that no cell is cut."""
 
 ROWS: Final = 10
 """Largest number of rows of a table at the prompt; the others are only counted."""
@@ -203,6 +204,7 @@ def hertz(frequency: float) -> str:
 def _lines(table: Table) -> str:
     from rich import box
     from rich.console import Console
+    from rich.measure import Measurement
     from rich.table import Table as Grid
     from rich.text import Text
 
@@ -210,11 +212,18 @@ def _lines(table: Table) -> str:
         box=box.SIMPLE_HEAD if table.headed else None,
         show_header=table.headed, pad_edge=False, show_edge=False,
     )  # fmt: skip
-    for column, heading in zip(table.columns, table.headings, strict=True):
-        grid.add_column(Text(printable(heading)), justify=column.align, no_wrap=True)
-    for row in table.rows:
+    last = len(table.columns) - 1
+    for index, (column, heading) in enumerate(zip(table.columns, table.headings, strict=True)):
+        is_text = index == last and column.align == "left"
+        grid.add_column(Text(printable(heading)), justify=column.align, no_wrap=not is_text)
+    width = get_terminal_size((WIDEST, 1)).columns
+    for number, row in enumerate(table.rows):
+        if number and len(row) == 1 and width < WIDEST:
+            grid.add_row()  # between sentences that take several lines
         grid.add_row(*(Text(printable(cell)) for cell in row))
     console = Console(file=StringIO(), width=WIDEST, color_system=None)
+    if Measurement.get(console, console.options, grid).minimum <= width < WIDEST:
+        console = Console(file=StringIO(), width=width, color_system=None)
     with console.capture() as shown:
         console.print(grid)
     lines = [line.rstrip() for line in shown.get().splitlines()]

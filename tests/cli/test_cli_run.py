@@ -66,7 +66,8 @@ def test_run_writes_its_files_and_lists_them_on_stderr(folder, ran):
     )
     warning, *rest = ran.stderr.splitlines(keepends=True)
     assert "1 of 12 receivers are inside buildings" in warning
-    assert "".join(rest) == f"Written to {folder / 'out'}: {', '.join(FILES)}, report.html\n"
+    written = f"Written to {folder / 'out'}: {', '.join(FILES)}, report.html"
+    assert "".join(rest) == f"{written}; next: calibray predict {folder / 'out'} LINKS\n"
     assert Result.load(folder / "out").parameters == pytest.approx(planted.TRUTH, abs=1e-3)
 
 

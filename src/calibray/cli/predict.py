@@ -116,6 +116,8 @@ def predict(
         _warn(warning, warnings[warning], table.rows)
     if UNREACHED in warnings and result.prediction.fallback is not None:
         echo("The log-distance model predicts the links without a path; see the column basis", err=True)
+    if out is not None:
+        echo(f"Written to {out}", err=True)
 
 
 @contextmanager

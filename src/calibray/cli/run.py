@@ -115,7 +115,9 @@ def run(
     else:
         echo(render(tables.heading(result), *tables.tables(result)))
     names = [*FILES, *_write_report(result, out, output)]
-    echo(f"Written to {out}: {', '.join(names)}", err=True)
+    judged = result.accuracy.judgement is not None
+    following = f"predict {out} LINKS" if judged else f"validate {study_file} --out {out}"
+    echo(f"Written to {out}: {', '.join(names)}; next: calibray {following}", err=True)
 
 
 def _kept_text(out: Path) -> str:

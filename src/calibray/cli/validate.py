@@ -54,7 +54,7 @@ def validate(
     """Calibrate without each block of links in turn, and compare models on the held-out block."""
     with progress_bars(log()) as progress:
         from calibray.engines import open_workers
-        from calibray.result.files import VALIDATION_FILE, write_validation
+        from calibray.result.files import RESULT_FILE, VALIDATION_FILE, write_validation
         from calibray.study import Study
         from calibray.support.output_files import check_outputs
         from calibray.tables import render
@@ -71,7 +71,8 @@ def validate(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         write_validation(validation, study, out, validation.content())
-        echo(f"Written to {out / VALIDATION_FILE}", err=True)
+        following = f"; next: calibray report {out}" if (out / RESULT_FILE).is_file() else ""
+        echo(f"Written to {out / VALIDATION_FILE}{following}", err=True)
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,9 @@ from calibray.errors import InputError
 from calibray.support.output_files import write_text
 
 FOLDER: Final = ".calibray-window"
+WIDTH: Final = "80"
+"""Characters per line of a command's tables."""
+
 TAIL: Final = 16_384
 """Number of bytes of a log that are shown: some screens full."""
 
@@ -95,7 +98,7 @@ class Jobs:
             with output as log, _held_back(signal.SIGINT):
                 child = subprocess.Popen(
                     arguments, cwd=self._study_folder, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-                    start_new_session=True,
+                    start_new_session=True, env={**os.environ, "COLUMNS": WIDTH},
                 )  # fmt: skip
             # Without a wait the ended process would stay in the system's table.
             Thread(target=child.wait, daemon=True).start()

@@ -18,7 +18,7 @@ from nicegui import run, ui
 
 from calibray.errors import InputError
 from calibray.result.files import read
-from calibray.result.held_out import HeldOutErrors
+from calibray.result.held_out import HeldOutErrors, Model
 from calibray.support.output_tables import write_table
 from calibray.validation.held_out_statistics import compare
 from calibray.window.desk import CANDIDATES, PLACE, PREDICTED, STUDY, SUGGESTED, Desk, filled
@@ -145,8 +145,13 @@ def _facts(desk: Desk, name: str) -> dict[str, str]:
         "RMSE, initial materials [dB]": _shown(record, "fit", "initial_rmse_db"),
         "RMSE, calibrated [dB]": _shown(record, "fit", "rmse_db"),
         "RMSE, log-distance model [dB]": _shown(record, "fit", "log_distance_rmse_db"),
-        "RMSE of held-out links [dB]": _shown(record, "accuracy", "holdout_rmse_db"),
+        "RMSE of held-out links, calibrated [dB]": _shown(record, "accuracy", "holdout_rmse_db"),
     }
+    model = str(_inside(record, "prediction", "model", "name") or NONE)
+    if model != Model.CALIBRATED and _inside(record, "accuracy", "holdout_rmse_db") is not None:
+        residual_db = _shown(record, "prediction", "model", "residual_db")
+        facts["RMSE of held-out links, model of predictions [dB]"] = residual_db
+    facts["Model of predictions"] = model
     for parameter, value in (_inside(record, "fit", "parameters") or {}).items():
         interval = _inside(record, "uncertainty", "intervals", parameter) or {}
         ends = f" ({_number(interval.get('lower'))} to {_number(interval.get('upper'))})" if interval else ""
