@@ -20,6 +20,7 @@ from calibray.errors import InputError
 from calibray.optimizers import METHODS
 from calibray.parameters import Parameter, Parameters
 from calibray.reporting.result_tables import nuisances
+from calibray.result.held_out import Model
 from calibray.study import Setup
 from calibray.tables import render
 
@@ -162,6 +163,14 @@ def test_held_out_links_count_equally(tmp_path, noisy, holdout):
     error = judged.before_db - judged.measured_db
     assert accuracy.initial_holdout_rmse_db == pytest.approx(np.sqrt(np.mean(error**2)))
     assert accuracy.holdout_rmse_db == pytest.approx(judgement.rmse_db)
+
+
+def test_a_filter_has_the_baselines_of_blocks(tmp_path, exact, of_noisy):
+    """The initial materials with an offset explain these links, although the study declares none."""
+    shifted = exact.assign(path_loss_db=planted.path_loss(of_noisy.fit.initial_parameters) + 4.0)
+    judgement = run(tmp_path, shifted, holdout={"where": "rx_x > 0"}).accuracy.judgement
+    assert (judgement.baseline, judgement.baseline_rmse_db) == (Model.INITIAL, pytest.approx(0, abs=1e-9))
+    assert not judgement.helped
 
 
 def test_weights_act(tmp_path, exact):

@@ -17,7 +17,7 @@ from calibray.fitting.nuisance import CONSTANT
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.measurements import FEW
-from calibray.result.held_out import FittedTerm, Model, PredictionModel
+from calibray.result.held_out import BASELINES, FittedTerm, Model, PredictionModel
 from calibray.result.record import Accuracy
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study.calibration_sections import DEFAULT_BLOCKS
@@ -34,10 +34,9 @@ from calibray.validation.held_out_statistics import (
 )
 from calibray.validation.models import (
     averages,
-    has_obstruction,
     initial_objective,
     log_distance,
-    obstructed,
+    without_paths,
     without_scene,
 )
 from calibray.validation.validation import Validation
@@ -85,20 +84,14 @@ def on_held_out_links(
     judged = problem.setup.held_out & (reached | (objective.ceiling_db is not None))
     if links.censored is not None:
         judged &= ~links.censored
-    errors = (models.calibrated - objective.measured)[judged]
-    judgement = None
+    modelled, judgement = _compared(problem, models) if judged.any() else {}, None
     if judged.any():
-        baselines = {
-            "the initial materials with fitted nuisances"
-            if fitted
-            else "the initial materials": models.nuisance_only,
-            "a log-distance model": models.log_distance,
-        }
-        others = {name: (model - objective.measured)[judged] for name, model in baselines.items()}
-        judgement = compare(errors, others, moving_end(links)[judged])
+        errors = {name: (model - objective.measured)[judged] for name, model in modelled.items()}
+        baselines = {name: errors[name] for name in BASELINES if name in errors}
+        judgement = compare(errors[Model.CALIBRATED], baselines, moving_end(links)[judged])
         # No link has a residual in all models.
         judgement = judgement if judgement.links else None
-    name, residuals = _choice(problem, trail, models, judged)
+    name, residuals = _choice(problem, trail, modelled, judged)
     accuracy = Accuracy(
         holdout_rmse_db=held_out_rmse(problem, models.calibrated, judged),
         initial_holdout_rmse_db=held_out_rmse(problem, models.initial, judged),
@@ -112,25 +105,32 @@ def on_held_out_links(
     return accuracy, name, residuals
 
 
-def _choice(
-    problem: Problem, trail: Trail, models: Models, judged: NDArray[np.bool_]
-) -> tuple[str, HeldOutResiduals]:
-    """The model that held-out links choose, and its residuals there; with too few links, the calibrated model."""
+def _compared(problem: Problem, models: Models) -> dict[str, NDArray[np.float64]]:
+    """Path loss at all links by the calibrated model and every baseline [links], [dB]."""
     objective, setup = problem.objective, problem.setup
-    modelled: dict[str, NDArray[np.float64]] = {
+    return {
         Model.INITIAL: initial_objective(objective, setup).with_nuisance(problem.before),
         Model.CALIBRATED: models.calibrated,
-        Model.LOG_DISTANCE: models.log_distance,
+        **without_paths(setup, objective),
     }
-    if has_obstruction(setup.links):
-        known_db = without_scene(setup.study, setup.links)
-        modelled[Model.OBSTRUCTION] = obstructed(setup.links, objective, known_db).path_loss_db()
+
+
+def _choice(
+    problem: Problem, trail: Trail, modelled: dict[str, NDArray[np.float64]], judged: NDArray[np.bool_]
+) -> tuple[str, HeldOutResiduals]:
+    """The model that held-out links choose, and its residuals there; with too few links, the calibrated model.
+
+    `modelled` is the path loss of the models that were compared; may be empty if no link is judged.
+    """
+    objective, setup = problem.objective, problem.setup
+    # Kriging is never chosen.
+    modelled = {name: model for name, model in modelled.items() if name != Model.KRIGING}
     if problem.differentiable and np.count_nonzero(judged) >= FEW:
         variant = fit_variant(problem, trail, Model.PRIOR)
         modelled[Model.PRIOR] = variant.objective.with_nuisance(variant.modelled)
         modelled |= averages(modelled)
     errors = {name: (path_loss_db - objective.measured)[judged] for name, path_loss_db in modelled.items()}
-    finite = np.isfinite(np.stack(list(errors.values()))).all(axis=0)
+    finite = np.isfinite([*errors.values(), np.zeros(judged.sum())]).all(axis=0)
     errors, count = {name: values[finite] for name, values in errors.items()}, int(finite.sum())
     if count >= FEW:
         name = predicting(errors, moving_end(setup.links)[judged][finite])

@@ -171,6 +171,28 @@ def kriging(links: Measurements, objective: Objective, trend_db: NDArray[np.floa
     return trend_db + field.shared_db**2 * np.exp(-cdist(position, measured) / field.range_m) @ weights
 
 
+def kriged(
+    name: Model, links: Measurements, objective: Objective, trend_db: NDArray[np.float64]
+) -> dict[Model, NDArray[np.float64]]:
+    """The result of `kriging` under a name; empty if kriging is impossible.
+
+    There are too few or too many links, or all have the same position.
+    """
+    try:
+        return {name: kriging(links, objective, trend_db)}
+    except (InputError, EngineError):
+        return {}
+
+
+def without_paths(setup: Setup, objective: Objective) -> dict[Model, NDArray[np.float64]]:
+    """Path loss at all links by each baseline without paths [links], [dB], fitted to the links with weight."""
+    links, known_db = setup.links, without_scene(setup.study, setup.links)
+    path_loss_db = {Model.LOG_DISTANCE: log_distance(links, objective, known_db).path_loss_db()}
+    if has_obstruction(links):
+        path_loss_db[Model.OBSTRUCTION] = obstructed(links, objective, known_db).path_loss_db()
+    return path_loss_db | kriged(Model.KRIGING, links, objective, path_loss_db[Model.LOG_DISTANCE])
+
+
 PRIOR_SPREAD: Final = 0.3
 """Standard deviation of a parameter's logarithm around its initial value, in the variants with a prior."""
 

@@ -14,7 +14,7 @@ from calibray import engines
 from calibray.engines.cluster.workers import Workers
 from calibray.engines.protocol import Answering
 from calibray.engines.rays.export import Exporting
-from calibray.errors import EngineError, InputError
+from calibray.errors import InputError
 from calibray.fitting.nuisance import CONSTANT
 from calibray.fitting.preliminary_fits import estimate_noise, leave_out_near_floor
 from calibray.fitting.problem import Problem
@@ -39,11 +39,8 @@ from calibray.validation.models import (
     NO_MINIMA,
     averages,
     fit_variants,
-    has_obstruction,
-    kriging,
-    log_distance,
-    obstructed,
-    without_scene,
+    kriged,
+    without_paths,
 )
 from calibray.validation.validation import Validation
 
@@ -204,9 +201,9 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
 def fit_models(
     part: Problem, fits: Mapping[Model, tuple[Problem, NDArray[np.float64]]]
 ) -> dict[str, NDArray[np.float64]]:
-    """Path loss at all links by model [links], [dB], fitted to the links with weight; NaN if kriging is impossible.
+    """Path loss at all links by model [links], [dB], fitted to the links with weight.
 
-    `fits` are the fitted variants that use the scene, from `fit_variants`.
+    Kriging is left out if it is impossible. `fits` are the fitted variants that use the scene, from `fit_variants`.
     """
     setup, objective = part.setup, part.objective
     path_loss_db: dict[str, NDArray[np.float64]] = {
@@ -214,14 +211,6 @@ def fit_models(
         for name, (variant, minima) in fits.items()
     }
     path_loss_db |= averages(path_loss_db)
-    known_db = without_scene(setup.study, setup.links)
-    path_loss_db[Model.LOG_DISTANCE] = log_distance(setup.links, objective, known_db).path_loss_db()
-    if has_obstruction(setup.links):
-        path_loss_db[Model.OBSTRUCTION] = obstructed(setup.links, objective, known_db).path_loss_db()
-    for name, trend in ((Model.KRIGING, Model.LOG_DISTANCE), (Model.RESIDUAL_FIELD, Model.CALIBRATED)):
-        try:
-            path_loss_db[name] = kriging(setup.links, objective, path_loss_db[trend])
-        except (InputError, EngineError):
-            # There are too few or too many links, or all have the same position.
-            path_loss_db[name] = np.full(len(setup.links), np.nan)
-    return path_loss_db
+    path_loss_db |= without_paths(setup, objective)
+    field = kriged(Model.RESIDUAL_FIELD, setup.links, objective, path_loss_db[Model.CALIBRATED])
+    return path_loss_db | field
