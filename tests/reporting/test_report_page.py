@@ -26,7 +26,7 @@ from calibray.reporting.result_tables import values
 from calibray.reporting.summary import summary
 from calibray.reporting.trust_figures import held_out_blocks
 from calibray.reporting.viewer import INTERACTIONS, PER_LINK, Grid, strongest
-from calibray.reporting.wording import group_text
+from calibray.reporting.wording import diagnostics_table, group_text
 from calibray.result.held_out import HeldOutErrors, Judgement, Model
 from calibray.scenes import read_scene, read_triangles
 from calibray.scenes.buildings import _loops
@@ -484,6 +484,11 @@ def test_groups_that_are_carriers_are_written_with_a_unit(result):
     offsets = {"offset": {"28000000000": 1.0, "3500000000": 2.0}}
     rows = tables.nuisances(replace(carriers, nuisance=replace(carriers.nuisance, coefficients=offsets))).rows
     assert rows[:2] == (("28 GHz", "+1.00"), ("3.5 GHz", "+2.00"))
+    shared = np.linspace(0.0, 1.0, 50)
+    draws = {"offset[28000000000]": shared, "offset[3500000000]": shared}
+    certain = replace(carriers.uncertainty, draws=draws)
+    shown = replace(carriers, uncertainty=certain, nuisance=replace(carriers.nuisance, coefficients=offsets))
+    assert dict(diagnostics_table(shown).rows)["trade-offs"] == "offset[28 GHz] and offset[3.5 GHz] (+1.00)"
     content["links"]["frequency"], content["offset"] = "Carrier (MHz)", {"per": "Carrier (MHz)"}
     megahertz = replace(result, study=cb.Study.from_content(content, result.study.path))
     assert group_text(megahertz, "3500") == "3.5 GHz"

@@ -6,10 +6,11 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from calibray.result.held_out import HeldOutErrors
-from calibray.window.result_steps import better, changes
+from calibray.window.result_steps import better, changes, predicted_text
 
 LINKS, BLOCKS = 200, 4
 
@@ -73,3 +74,24 @@ def test_the_changes_of_a_study_are_its_settings_that_differ():
     second = {"scene": {"frequency": 2e9}, "trace": {"max_depth": 5}, "links": {"tx": [0, 0, 9]}, "seed": 1}
     assert changes([first, second]) == {"trace.max_depth": [3, 5], "seed": [None, 1]}
     assert changes([first, first]) == {}
+
+
+def test_a_prediction_is_stated_in_the_measured_quantity():
+    """Without a known transmitted power, path loss contains it: 38.5 dB can be less than in free space."""
+    row = pd.Series(
+        {
+            "rx_x": 1.0,
+            "rx_y": 2.0,
+            "path_loss_db": 38.5,
+            "lower_db": 31.5,
+            "upper_db": 45.5,
+            "basis": "calibrated",
+        }
+    )
+    assert predicted_text(row) == (
+        "At x 1.0 m, y 2.0 m: path loss 38.5 dB, 90 % interval 31.5 to 45.5 dB (calibrated)"
+    )
+    power = {"rsrp_dbm": -38.5, "rsrp_lower_dbm": -45.5, "rsrp_upper_dbm": -31.5}
+    assert predicted_text(pd.concat([row, pd.Series(power)])) == (
+        "At x 1.0 m, y 2.0 m: RSRP -38.5 dBm, 90 % interval -45.5 to -31.5 dBm (calibrated)"
+    )

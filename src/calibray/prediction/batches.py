@@ -152,21 +152,22 @@ LOG: Final = logging.getLogger(__name__)
 
 def announce(result: Record, links: int, what: str = "links") -> None:
     """Log how many links are traced, and about how long this takes."""
+    counted = f"{links:,} {what.removesuffix('s') if links == 1 else what}"
     if result.prediction.model.parameters is None:
-        LOG.info("%s %s, predicted without a trace: the log-distance model uses no scene", f"{links:,}", what)
+        LOG.info("%s, predicted without a trace: the log-distance model uses no scene", counted)
         return
     if (engine := result.study.engine).external:
         once = engine.exports_rays or result.prediction.model.averaged is None
         LOG.info(
-            "%s %s: the program is called %s for each batch of them; the result's RT calls do not include these calls",
-            f"{links:,}", what, "once" if once else "twice",
+            "%s: the program is called %s for each batch of them; the result's RT calls do not include these calls",
+            counted, "once" if once else "twice",
         )  # fmt: skip
         return
     calibrated, seconds = len(result.links), _seconds(result, links)
     time = f"up to about {duration(seconds)}" if seconds >= 2 else "less than 2 seconds"
     LOG.info(
-        "Tracing %s %s: %s at the rate of the %s calibration links, less if they are cached",
-        f"{links:,}", what, time, f"{calibrated:,}",
+        "Tracing %s: %s at the rate of the %s calibration links, less if they are cached",
+        counted, time, f"{calibrated:,}",
     )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
+from calibray.fitting.nuisance import OFFSET
 from calibray.fitting.search import AUTO
 from calibray.measurements import FEW
 from calibray.measurements.column_names import find_frequency_unit
@@ -189,7 +190,7 @@ def diagnostics_table(result: Record) -> Table:
         "missing region": _missing_region_text(tables),
         "neighbours": _neighbours_text(tables),
         "leverage": _leverage_text(tables),
-        "trade-offs": _trade_offs_text(tables),
+        "trade-offs": _trade_offs_text(result, tables),
         "largest change": _moved_text(tables),
     }
     rows = tuple((name, text) for name, text in findings.items() if text)
@@ -294,14 +295,18 @@ def _leverage_text(tables: dict[str, pd.DataFrame]) -> str:
     )
 
 
-def _trade_offs_text(tables: dict[str, pd.DataFrame]) -> str:
+def _trade_offs_text(result: Record, tables: dict[str, pd.DataFrame]) -> str:
     if "trade_offs" not in tables:
         return ""
     table = tables["trade_offs"]
     strong = table[table["correlation"].abs() > TRADE_OFF].head(3)
     if not len(strong):
         return f"no two unknowns have a correlation above {TRADE_OFF:g}"
-    return "; ".join(f"{row.first} and {row.second} ({row.correlation:+.2f})" for row in strong.itertuples())
+    shown = {
+        f"{OFFSET}[{label}]": f"{OFFSET}[{group_text(result, label)}]" for label in result.nuisance.offsets_db
+    }
+    pairs = strong[["first", "second"]].replace(shown).assign(correlation=strong["correlation"])
+    return "; ".join(f"{row.first} and {row.second} ({row.correlation:+.2f})" for row in pairs.itertuples())
 
 
 def _moved_text(tables: dict[str, pd.DataFrame]) -> str:

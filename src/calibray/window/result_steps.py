@@ -17,6 +17,7 @@ import pandas as pd
 from nicegui import run, ui
 
 from calibray.errors import InputError
+from calibray.reporting.link_survey import QUANTITIES
 from calibray.result.files import read
 from calibray.result.held_out import HeldOutErrors, Model
 from calibray.support.output_tables import write_table
@@ -399,11 +400,24 @@ def _predicted(desk: Desk) -> None:
     table = _read(desk, f"{Path(PLACE).stem}{PREDICTED}")
     if table is None or not len(table) or "upper_db" not in table:
         return
-    row = table.iloc[0]
-    ui.label(
-        f"At x {row['rx_x']:.1f} m, y {row['rx_y']:.1f} m: path loss {row['path_loss_db']:.1f} dB, 90 % interval "
-        f"{row['lower_db']:.1f} to {row['upper_db']:.1f} dB ({row['basis']})"
-    ).classes("predicted")
+    ui.label(predicted_text(table.iloc[0])).classes("predicted")
+
+
+def predicted_text(row: pd.Series) -> str:
+    """A prediction as a sentence, in the quantity that was measured.
+
+    If received power was measured and the transmitted power is unknown, the path loss contains this power.
+    """
+    value, lower, upper, name, unit = "path_loss_db", "lower_db", "upper_db", "path loss", "dB"
+    for key, quantity in QUANTITIES.items():
+        column = f"{key}_{quantity.unit.lower()}"
+        if key != "path_loss" and column in row:
+            value, name, unit = column, quantity.name, quantity.unit
+            lower, upper = (f"{key}_{end}_{unit.lower()}" for end in ("lower", "upper"))
+    return (
+        f"At x {row['rx_x']:.1f} m, y {row['rx_y']:.1f} m: {name} {row[value]:.1f} {unit}, 90 % interval "
+        f"{row[lower]:.1f} to {row[upper]:.1f} {unit} ({row['basis']})"
+    )
 
 
 def _suggested(desk: Desk) -> None:
