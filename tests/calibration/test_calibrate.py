@@ -14,9 +14,11 @@ from scipy.optimize import minimize
 
 import planted
 from calibray.calibration.calibrate import calibrate
+from calibray.calibration.held_out_accuracy import rmse_of
 from calibray.calibration.result import Result
 from calibray.engines import Replay
 from calibray.errors import InputError
+from calibray.fitting.problem import Problem
 from calibray.optimizers import METHODS
 from calibray.parameters import Parameter, Parameters
 from calibray.reporting.result_tables import nuisances
@@ -171,6 +173,14 @@ def test_a_filter_has_the_baselines_of_blocks(tmp_path, exact, of_noisy):
     judgement = run(tmp_path, shifted, holdout={"where": "rx_x > 0"}).accuracy.judgement
     assert (judgement.baseline, judgement.baseline_rmse_db) == (Model.INITIAL, pytest.approx(0, abs=1e-9))
     assert not judgement.helped
+
+
+def test_rmses_of_other_models_have_the_weights_of_the_fit(tmp_path, noisy):
+    """Links whose path loss was interpolated poorly between heights have less weight than the table states."""
+    problem = Problem.of(Setup.open(planted.study(tmp_path, noisy)), planted.engine())
+    objective = replace(problem.objective, weight=np.linspace(0.1, 2.0, planted.LINKS))
+    rmse_db = rmse_of(replace(problem, objective=objective), problem.before, objective.weight > 0)
+    assert rmse_db == pytest.approx(objective.rmse(problem.before[None])[0])
 
 
 def test_weights_act(tmp_path, exact):

@@ -60,8 +60,8 @@ class Models:
 
 
 def rmse_of(problem: Problem, model: NDArray[np.float64], mask: NDArray[np.bool_]) -> float:
-    """Weighted RMSE of modelled path loss [L] over calibration links, selected by a mask [L], [dB]."""
-    weight = problem.setup.links.weight[mask]
+    """RMSE of modelled path loss [L] over calibration links, selected by a mask [L], [dB], weighted as in the fit."""
+    weight = problem.objective.weight[mask]
     return float(np.sqrt(np.average((model - problem.objective.measured)[mask] ** 2, weights=weight)))
 
 
