@@ -167,7 +167,7 @@ def test_the_map_marks_cells_without_a_path_and_leaves_buildings_blank(
 
 
 def test_the_colours_of_a_map_end_at_quantiles(shadowed: Result) -> None:
-    coverage = shadowed.coverage_map(bounds=(-60.0, -60.0, -20.0, 40.0), cell=4.0, level=None)
+    coverage = shadowed.coverage_map(bounds=(-60.0, -60.0, 40.0, -20.0), cell=4.0, level=None)
     loss = coverage.path_loss_db.copy()
     loss[0, 0] = 352.0
     picture = figure(replace(coverage, path_loss_db=loss))
@@ -176,6 +176,10 @@ def test_the_colours_of_a_map_end_at_quantiles(shadowed: Result) -> None:
     (bar,) = picture.axes[1:]
     assert f"colours: {low:.3g} to {high:.3g} (2 to 98 % of the cells)" in bar.get_ylabel()
     assert "values outside have the end colour" in bar.get_ylabel()
+    # Neither end of the label is cut off.
+    bar.figure.draw_without_rendering()
+    label, page = bar.yaxis.label.get_window_extent(), bar.figure.bbox
+    assert page.y0 <= label.y0 < label.y1 <= page.y1
 
 
 def test_the_command_counts_links_without_a_path(shadowed: Result, tmp_path: Path) -> None:

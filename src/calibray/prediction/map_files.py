@@ -215,7 +215,7 @@ def _panel(axes: Axes, coverage: CoverageMap, values: NDArray[np.float64], label
     south, north = coverage.y[0] - half, coverage.y[-1] + half
     finite = np.where(np.isfinite(values), values, np.nan)
     low, high = _range(finite)
-    label = f"{label}\ncolours: {low:.3g} to {high:.3g} (2 to 98 % of the cells); values outside have the end colour"
+    label = f"{label}\ncolours: {low:.3g} to {high:.3g} (2 to 98 % of the cells);\nvalues outside have the end colour"
     axes.set_facecolor(LINE)
     image = axes.imshow(
         finite, extent=(west, east, south, north), origin="lower", cmap=colors, vmin=low, vmax=high,
