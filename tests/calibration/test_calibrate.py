@@ -23,6 +23,7 @@ from calibray.optimizers import METHODS
 from calibray.parameters import Parameter, Parameters
 from calibray.reporting.result_tables import nuisances
 from calibray.result.held_out import Model
+from calibray.result.wording import judgement_text
 from calibray.study import Setup
 from calibray.tables import render
 
@@ -173,6 +174,9 @@ def test_a_filter_has_the_baselines_of_blocks(tmp_path, exact, of_noisy):
     judgement = run(tmp_path, shifted, holdout={"where": "rx_x > 0"}).accuracy.judgement
     assert (judgement.baseline, judgement.baseline_rmse_db) == (Model.INITIAL, pytest.approx(0, abs=1e-9))
     assert not judgement.helped
+    assert "more than the initial materials with fitted nuisances, the best baseline" in judgement_text(
+        judgement
+    )
 
 
 def test_rmses_of_other_models_have_the_weights_of_the_fit(tmp_path, noisy):

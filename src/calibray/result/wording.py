@@ -345,13 +345,22 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
 }
 
 
+_BASELINES: Final[dict[str, str]] = {
+    Model.INITIAL: "the initial materials with fitted nuisances",
+    Model.LOG_DISTANCE: "a log-distance model",
+    Model.OBSTRUCTION: "a log-distance model with obstruction",
+}
+"""Names of baselines within a sentence, if they differ from those of the models; an offset is a nuisance."""
+
+
 def judgement_text(judgement: Judgement) -> str:
     """Whether calibration helped on held-out links, by how much compared with the best baseline, and how certainly."""
     error = f"RMSE {judgement.rmse_db:.2f} dB on {judgement.links} held-out links"
     certainty = "no bootstrap error: one cluster of links"
     if judgement.error_db is not None:
         certainty = f"bootstrap error {judgement.error_db:.2f} dB"
-    baseline = f"than {judgement.baseline}, the best baseline ({certainty})"
+    name = _BASELINES.get(judgement.baseline, judgement.baseline)
+    baseline = f"than {name}, the best baseline ({certainty})"
     if judgement.gain_db <= 0:
         return f"Calibration did not help on held-out links: {error}, {-judgement.gain_db:.2f} dB more {baseline}."
     verb = "helped" if judgement.helped else "did not clearly help"
