@@ -46,12 +46,10 @@ def build(desk: Desk) -> None:
             )
             canvas.classes("map")
             with ui.row().classes("tools"):
-                ui.button("Whole map", on_click=lambda: ui.run_javascript("plan.fit()")).props(
-                    "outline dense"
-                )
-                ui.button("Draw an area", on_click=lambda: ui.run_javascript("plan.drawArea()")).props(
-                    "outline dense"
-                )
+                # Without the server, so that what follows at once already finds the map as asked.
+                for name, call in (("Whole map", "fit"), ("Draw an area", "drawArea")):
+                    button = ui.button(name).props("outline dense")
+                    button.on("click", js_handler=f"() => plan.{call}()")
                 ui.button("Clear the area", on_click=lambda: clear_area()).props("outline dense")
                 view_button(desk)
             ui.label("Drag to move, wheel or two fingers to zoom, click to choose a place.").classes("quiet")
