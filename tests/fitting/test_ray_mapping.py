@@ -348,3 +348,17 @@ def test_an_engine_whose_strong_paths_come_and_go_is_not_understood(foreign: For
     assert (mapped.changed, mapped.lost) == (2, 1)
     assert not mapped.reached
     assert not mapped.understood
+
+
+def test_a_link_that_the_replay_lacks_is_lost(foreign: Foreign, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = ray_fit.Understanding.replay
+
+    def without_the_first_link(self: ray_fit.Understanding, parameters: Parameters, last: Call) -> Replay:
+        paths = whole(self, parameters, last).paths
+        return Replay(replace(paths, correction=np.where(paths.link == 0, 0.0, paths.correction)), parameters)
+
+    monkeypatch.setattr(ray_fit.Understanding, "replay", without_the_first_link)
+    mapped = map_rays(foreign.problem, foreign, most_calls=3)
+    assert mapped.gap_db < 0.05
+    assert mapped.lost == 1
+    assert not mapped.reached

@@ -363,7 +363,7 @@ def _path_loss(replayed: Replayed) -> NDArray[np.float64]:
     """Path loss for all values [n, links], [dB]; for a program, its answers and the changes of the replay."""
     if (answers := replayed.answers) is None:
         return replayed.engine.path_loss(replayed.values)
-    if not len(replayed.values) > len(answers):
+    if len(replayed.values) == len(answers):
         return answers
     path_loss_db = replayed.engine.path_loss(np.delete(replayed.values, np.s_[1 : len(answers)], axis=0))
     present = np.isfinite(path_loss_db).all(axis=0)

@@ -70,7 +70,7 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
     """Check links for common mistakes; returns the suspicions and their remedies.
 
     Raises:
-        InputError: All links are far from the scene, the scene cannot be read, or shapely or trimesh is not installed.
+        InputError: All links are far from the scene, the scene cannot be read, or shapely is not installed.
     """
     overhead = SceneSurfaces.read(study.scene_source)
     scale = scale_findings(overhead.bounds[:3], overhead.bounds[3:])
@@ -126,7 +126,7 @@ def _positions(
         if touching.any():
             yield (
                 f"{int(touching.sum())} of {len(points)} {name} touch the ground, a floor or a roof, whose reflections "
-                f"are missed there",
+                "are missed there",
                 "give the height of the antenna, at least 1 cm above the surface",
             )
     roofed = overhead.under_roof(rx)
