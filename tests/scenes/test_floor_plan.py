@@ -177,6 +177,16 @@ def test_polylines_of_vector_files_are_read(tmp_path, ending):
     assert plan == [*walls, line(1, 0, 2, 0, "glass", top=2.5), line(0, 1, 0, 1.75, "door", top=2.5)]
 
 
+@pytest.mark.parametrize(("code", "unit"), [(4, 0.001), (5, 0.01), (1, 0.0254), (6, 1.0), (0, 1.0)])
+def test_the_unit_of_a_dxf_is_that_of_its_header_unless_stated(tmp_path, caplog, code, unit):
+    path = tmp_path / "plan.dxf"
+    header = f"0 SECTION 2 HEADER 9 $ACADVER 1 AC1015 9 $INSUNITS 70 {code} 0 ENDSEC "
+    path.write_text("\n".join((header + DXF).split()) + "\n")
+    assert read_plan(path)[0].length == pytest.approx(5000 * unit)
+    assert any(f"states a unit of {unit:g} m" in message for message in caplog.messages) == (unit != 1)
+    assert read_plan(path, unit=0.001)[0].length == pytest.approx(5)
+
+
 def test_a_file_that_is_dxf_for_one_driver_and_vrt_for_another_is_refused(tmp_path):
     path = tmp_path / "plan.dxf"
     path.write_text("0\nSECTION\n<OGRVRTDataSource><OGRVRTLayer/></OGRVRTDataSource>")

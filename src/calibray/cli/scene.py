@@ -169,7 +169,10 @@ class PlanOptions:
     """Options of scenes of floor plans."""
 
     height: Annotated[float, option("M", "Height of walls for which the plan states none [m].")] = 3.0
-    unit: Annotated[float, option("M", "Unit of length of the plan [m]; 0.001 for mm.")] = 1.0
+    unit: Annotated[
+        float | None,
+        option("M", "Unit of length of the plan [m]; 0.001 for mm. Without it, that of a DXF, or metres."),
+    ] = None
     floor: Annotated[bool, typer.Option(help="Make a floor.")] = True
     ceiling: Annotated[bool, typer.Option(help="Make a ceiling.")] = True
     merge: Annotated[bool, typer.Option(help="Merge two parallel lines into one wall.")] = True

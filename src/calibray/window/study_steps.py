@@ -72,7 +72,7 @@ def show_scene(desk: Desk) -> None:
                 ui.number("Thickness of walls [m]", value=0.3, min=0.001, max=10, step=0.01),
             )
             ground = desk.keep(ui.select(ITU, label="Ground", value="concrete"))
-            unit = desk.keep(ui.number("Unit of a plan [m]", value=1.0, min=1e-6))
+            unit = desk.keep(ui.number("Unit of a plan [m]", min=1e-6))
             materials = desk.keep(
                 ui.input("Materials of a plan", placeholder="outer=brick:0.3, inner=plasterboard", value="")
             )
@@ -83,7 +83,7 @@ def show_scene(desk: Desk) -> None:
             with desk.messages():
                 words: list[object] = ["scene", kind.value, source.value, "--out", "scene"]
                 if kind.value == "plan":
-                    words += ["--unit", filled(unit)]
+                    words += ["--unit", unit.value] if unit.value else []
                     words += [f"--height={height.value}"] if _is_number(height.value) else []
                     stated = filter(None, map(str.strip, (materials.value or "").split(",")))
                     words += [f"--material={material}" for material in stated]

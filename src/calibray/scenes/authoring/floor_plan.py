@@ -18,7 +18,7 @@ from calibray.errors import InputError
 from calibray.measurements.column_names import LENGTH_UNITS, find_length_unit, without_accents, words
 from calibray.measurements.delimited_text import parse_text, read_text
 from calibray.scenes.authoring.footprints import HIGHEST
-from calibray.scenes.authoring.geodata import read_features
+from calibray.scenes.authoring.geodata import read_features, stated_unit
 from calibray.scenes.meshes import MILLIMETRE, WIDEST
 from calibray.support.lazy_imports import library
 from calibray.support.messages import did_you_mean, first_line, shortened
@@ -88,7 +88,7 @@ class Segment:
         return step / np.hypot(*step)
 
 
-def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[Segment]:
+def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) -> list[Segment]:
     """Read a floor plan.
 
     Args:
@@ -98,7 +98,7 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[
             or other vector file with these attributes, whose coordinates are those of the plan; without an attribute
             type, the layer of DXF is the type. Points and texts of such files are left out.
         height: Height of the top of segments without a height [m].
-        unit: The plan's unit of length [m]: 0.001 for millimetres.
+        unit: The plan's unit of length [m]: 0.001 for millimetres. If None, that of a DXF file, or metres.
 
     Returns:
         The segments in the plan's order; a polyline or outline becomes one for each of its sides.
@@ -106,14 +106,18 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[
     Raises:
         InputError: The file or a column is missing or malformed, or a segment has no length, height or thickness.
     """
-    for name, value in (("height", height), ("unit", unit)):
+    for name, value in (("height", height), ("unit", 1.0 if unit is None else unit)):
         if not 0 < value <= HIGHEST:
             raise InputError(
                 f"{name} = {value!r}: must be a number of metres greater than 0, at most {HIGHEST:g}"
             )
     path = Path(path)
     is_vector = path.suffix.lower() in VECTOR_SUFFIXES
-    frame, lines = _read_vector(path) if is_vector else _read_table(path, unit)
+    frame, lines = _read_vector(path) if is_vector else _read_table(path, unit or 1.0)
+    if unit is None:
+        unit = stated_unit(path) or 1.0 if is_vector else 1.0
+        if unit != 1:
+            _LOG.warning("floor plan %s: its header states a unit of %g m; --unit overrides it", path, unit)
     numbers = {name: _numbers(path, frame, name) * unit for name in ("thickness", "bottom", "height")}
     places = [f"feature {index + 1}" if is_vector else f"row {index}" for index in frame.index]
     segments = []

@@ -58,6 +58,9 @@ _LOG: Final = logging.getLogger(__name__)
 _DXF: Final = re.compile(rb"\s*(?:999\s*\n[^\n]*\n\s*)*0\s*\n\s*SECTION\s*\n[^<{]*", re.DOTALL)
 """Start of a DXF file, without `<` and `{`, which start files of other drivers."""
 
+_INSUNITS: Final = {1: 0.0254, 2: 0.3048, 4: 0.001, 5: 0.01, 6: 1.0, 14: 0.1}
+"""Units of length of DXF in metres: inches, feet, millimetres, centimetres, metres, decimetres."""
+
 _METRES: Final = {
     **dict.fromkeys(("", "m", "metre", "meter", "metres", "meters"), 1.0),
     **dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048),
@@ -118,6 +121,16 @@ def read_features(path: Path, layer: str | None) -> Features:
 def _head(path: Path, size: int = 100) -> bytes:
     with path.open("rb") as file:
         return file.read(size)
+
+
+def stated_unit(path: Path) -> float | None:
+    """The unit of length [m] that the header of a DXF file states ($INSUNITS); None without one, or for other files."""
+    code = (
+        re.search(rb"\$INSUNITS\s+70\s+(\d+)\s", _head(path, 65536))
+        if path.suffix.lower() == ".dxf"
+        else None
+    )
+    return _INSUNITS.get(int(code[1])) if code else None
 
 
 def _check_text_size(path: Path, what: str) -> None:
