@@ -245,6 +245,31 @@ def test_the_area_and_the_place_stay_on_the_map_until_they_are_cleared(walked):
     page.context.close()
 
 
+def test_two_fingers_zoom_the_map(walked):
+    _, _, browser, address = walked
+    page = opened(browser, address)
+    page.locator("#plan[data-links='84']").wait_for()
+    box = page.locator("#plan").bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    before = float(page.locator("#plan").get_attribute("data-zoom"))
+    fingers = page.context.new_cdp_session(page)
+    for kind, apart in (("touchStart", 40), ("touchMove", 60), ("touchMove", 120), ("touchEnd", None)):
+        points = (
+            []
+            if apart is None
+            else [
+                {"x": middle[0] + side * apart / 2, "y": middle[1], "id": id_}
+                for id_, side in enumerate((-1, 1))
+            ]
+        )
+        fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    page.wait_for_function(
+        "before => Math.abs(document.getElementById('plan').dataset.zoom / before - 3) < 0.01", arg=before
+    )
+    assert page.locator("#plan").get_attribute("data-place") == ""
+    page.context.close()
+
+
 def test_an_empty_field_is_named_and_starts_nothing(walked):
     folder, _, browser, address = walked
     page = opened(browser, address)
