@@ -24,13 +24,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray import trace
 from calibray.errors import InputError
 from calibray.fields import path_gains
 from calibray.paths import Kind, Paths
 from calibray.scenarios import demo_study_path
 from calibray.scenes import MeshObject, read_scene, write_scene
 from calibray.support.output_files import write_bytes
-from calibray.tracing.default_tracer import trace
 from coastal_district import Building, district, lamp_positions, lamp_posts, scene_objects
 
 SEED: Final = 1

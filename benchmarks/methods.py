@@ -28,8 +28,7 @@ from calibray.comparison.comparison import compare, figure, parse_methods, table
 from calibray.comparison.method_runs import ComparisonProblem, study_problem
 from calibray.scenarios import demo_study_path
 from calibray.support.figure_style import write
-from calibray.support.output_files import write_text
-from calibray.support.output_tables import write_table
+from calibray.support.output_files import write_table, write_text
 from markdown_tables import render_markdown
 from problem_families.problems import landscape_problem
 

@@ -22,7 +22,7 @@ from calibray import engines, fields
 from calibray.fitting.problem import Problem
 from calibray.paths import Paths, take
 from calibray.paths.interactions import Kind
-from calibray.paths.selection import concatenate
+from calibray.paths.program import concatenate
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers, render
 from districts import District

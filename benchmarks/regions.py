@@ -34,7 +34,7 @@ import calibray as cb
 from antenna_pose import FREQUENCY, MATERIALS, NOISE_DB, POSITION, district
 from calibray import engines, fields
 from calibray.reporting.diagnostics import diagnostics
-from calibray.scenes.regions import Region
+from calibray.scenes.obstruction import Region
 from calibray.study import Setup, Study
 from calibray.study.regions import RegionSection
 from calibray.uncertainty.missing_region import missing_region

@@ -87,7 +87,6 @@ WRITERS = {"write_text", "write_bytes", "to_csv", "tofile", "savefig", "copyfile
 
 PRIVATE = (
     "support/output_files.py",
-    "support/output_tables.py",
     "engines/external/",
     "engines/ledger/",
     "scenes/shapes.py",
@@ -115,7 +114,7 @@ def foreign_writes(tree: ast.Module) -> list[int]:
 
 
 def test_files_are_written_in_one_way(trees):
-    """All goes through `support.output_files` and `output_tables`: no link followed, no foreign file replaced."""
+    """All goes through `support.output_files`: no link followed, no foreign file replaced."""
     written = {name: foreign_writes(tree) for name, tree in trees.items()}
     assert {name: lines for name, lines in written.items() if lines and not name.startswith(PRIVATE)} == {}
 

@@ -30,8 +30,7 @@ from calibray.paths import Kind as InteractionKind
 from calibray.paths import Paths, concatenate, take, take_links
 from calibray.scenes import read_scene
 from calibray.support.messages import did_you_mean
-from calibray.tracing import cache
-from calibray.tracing.default_tracer import SIONNA
+from calibray.tracing import SIONNA, cache
 from calibray.tracing.settings import Antenna, TraceSettings
 from problem_families import optima
 from problem_families.numpy_replay import NumpyReplay

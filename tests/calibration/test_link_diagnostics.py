@@ -10,14 +10,13 @@ import pytest
 import shapely
 
 import two_ray
-from calibray.calibration.differing_groups import differing_groups
-from calibray.calibration.link_diagnostics import groups_remark, leverage, region_remark
+from calibray.calibration.link_diagnostics import differing_groups, groups_remark, leverage, region_remark
 from calibray.engines import Replay
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.result.verdict import RemarkKind
 from calibray.result.wording import remark_text
-from calibray.scenes.regions import Region
+from calibray.scenes.obstruction import Region
 from calibray.study import Setup
 
 

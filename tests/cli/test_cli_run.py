@@ -111,7 +111,7 @@ def test_run_with_an_external_program_needs_no_ray_tracer_here(tmp_path, monkeyp
     def refuse(*_: object) -> None:
         pytest.fail("the ray tracer was loaded")
 
-    monkeypatch.setattr("calibray.tracing.default_tracer.SionnaFactory.__call__", refuse)
+    monkeypatch.setattr("calibray.tracing.SionnaFactory.__call__", refuse)
     arguments = ("run", tmp_path / "study.toml", "--out", tmp_path / "out", "--workers", "2")
     first = run(*arguments)
     assert first.exit_code == 0, first.output

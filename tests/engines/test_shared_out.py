@@ -26,7 +26,7 @@ from calibray.measurements import Measurements, PiecedTable
 from calibray.prediction import batches
 from calibray.prediction.batches import predict_batches, predict_links
 from calibray.study import Setup
-from calibray.support.output_tables import growing_table
+from calibray.support.output_files import growing_table
 from calibray.validation.validate import validate
 from link_tables import links_from_frame
 

@@ -11,8 +11,7 @@ import pandas as pd
 import pytest
 
 from calibray.errors import InputError
-from calibray.measurements.filter_language import FUNCTIONS, METHODS, TEXT_METHODS
-from calibray.measurements.filters import evaluate
+from calibray.measurements.filters import FUNCTIONS, METHODS, TEXT_METHODS, evaluate
 from calibray.measurements.source_table import SourceTable
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "reference" / "filters.md"

@@ -56,10 +56,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory):
     links_at(np.geomspace(3, 290, 25)).to_csv(folder / "candidates.csv", index=False)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CALIBRAY_CACHE", str(folder / "cache"))
-        patch.setattr("calibray.tracing.default_tracer.SionnaFactory.versions", {"two-ray": "1"})
-        patch.setattr(
-            "calibray.tracing.default_tracer.SionnaFactory.__call__", lambda _, *arguments: TwoRay(*arguments)
-        )
+        patch.setattr("calibray.tracing.SionnaFactory.versions", {"two-ray": "1"})
+        patch.setattr("calibray.tracing.SionnaFactory.__call__", lambda _, *arguments: TwoRay(*arguments))
         cb.calibrate(study(folder), out=folder / "out")
         yield folder
 

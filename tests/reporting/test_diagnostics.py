@@ -13,7 +13,7 @@ from calibray.calibration.result import Result
 from calibray.fields import path_gains
 from calibray.reporting.wording import diagnostics_table
 from calibray.result.verdict import Remark, RemarkKind
-from calibray.scenes.regions import Region
+from calibray.scenes.obstruction import Region
 from changed import changed
 from made_up_report import made_up
 

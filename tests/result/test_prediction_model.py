@@ -22,7 +22,7 @@ from calibray.result.held_out import FittedTerm, Model, ResidualField
 from calibray.result.verdict import Interval, ReasonKind, Verdict
 from calibray.result.wording import reason_text
 from calibray.scenes import read_scene
-from calibray.scenes.export import exported_names
+from calibray.scenes.scene import exported_names
 from calibray.tables import render
 from calibray.uncertainty.verdicts import consistent
 from calibray.validation.choice import averaged_terms

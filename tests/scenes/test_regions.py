@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from calibray.scenes.regions import Region
+from calibray.scenes.obstruction import Region
 
 
 def region(*polygons, bottom=0.0, top=8.0):

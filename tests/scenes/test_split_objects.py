@@ -8,7 +8,7 @@ import pytest
 import calibray as cb
 from calibray.errors import InputError
 from calibray.scenes import Scene, export_scene, read_scene
-from calibray.scenes.export import exported_names
+from calibray.scenes.scene import exported_names
 
 CANYON = "sionna:simple_street_canyon"
 FREQUENCY = 3.5e9

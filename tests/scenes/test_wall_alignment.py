@@ -10,7 +10,7 @@ import shapely
 from shapely.affinity import rotate
 
 import calibray as cb
-from calibray.scenes.authoring import Windows, building_scene, make_scene
+from calibray.scenes.authoring import Windows, made_scene, make_scene
 from calibray.scenes.authoring.extrusion import Shell, extrude, split_overlaps
 from calibray.scenes.authoring.wall_alignment import Alignment, align
 from planted_maps import footprints
@@ -119,6 +119,6 @@ def test_a_row_of_houses_reflects_once(tmp_path, monkeypatch):
 
     aligned = make_scene(houses, tmp_path / "aligned", ground=False)
     assert paths_per_link(aligned.path).max() == 2
-    monkeypatch.setattr(building_scene, "align", keep_rounded)
+    monkeypatch.setattr(made_scene, "align", keep_rounded)
     rounded = make_scene(houses, tmp_path / "rounded", ground=False)
     assert paths_per_link(rounded.path).max() > 2

@@ -266,9 +266,7 @@ def test_wrong_directions_are_found_with_the_materials(
         assert result.parameters[name] == pytest.approx(error, abs=0.01)
     assert list(result.scene_materials) == ["ground"]
     result.save(tmp_path / "result")
-    monkeypatch.setattr(
-        "calibray.tracing.default_tracer.SionnaFactory.__call__", lambda _, *opened: TwoRay(*opened)
-    )
+    monkeypatch.setattr("calibray.tracing.SionnaFactory.__call__", lambda _, *opened: TwoRay(*opened))
     loaded = cb.Result.load(tmp_path / "result")
     powers = pd.read_csv(planted.path.parent / "powers.csv")
     loss = SITES.set_index("transmitter")["eirp"][powers["transmitter"]].to_numpy() - powers["dbm"]

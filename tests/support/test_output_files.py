@@ -18,12 +18,15 @@ from calibray.support.output_files import (
     SIGNATURES,
     check_file,
     check_outputs,
+    check_table,
     check_unchanged,
+    csv_text,
     is_unchanged_output,
     replacing,
+    without_formula_mark,
+    write_table,
     write_text,
 )
-from calibray.support.output_tables import check_table, csv_text, without_formula_mark, write_table
 
 TABLE = pd.DataFrame({"a": [1.0, 2.0]})
 

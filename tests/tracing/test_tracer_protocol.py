@@ -21,9 +21,8 @@ from calibray.fields import path_loss
 from calibray.scenes import Scene, read_scene
 from calibray.study import Setup
 from calibray.support import cache_folder as caching
-from calibray.tracing import convergence
+from calibray.tracing import SIONNA, convergence
 from calibray.tracing.antennas import AntennaPattern
-from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.protocol import EnclosedAntennas, Tracer, TracerFactory
 from calibray.tracing.settings import PATTERNS, POLARIZATIONS, Antenna, TraceSettings
 from link_tables import links_from_frame
@@ -262,7 +261,7 @@ def test_enclosed_antennas_are_told_by_row_unless_most_are() -> None:
 # What loads the ray tracer
 
 LIGHT = (
-    "calibray.tracing", "calibray.tracing.protocol", "calibray.tracing.default_tracer", "calibray.tracing.settings",
+    "calibray.tracing", "calibray.tracing.protocol", "calibray.tracing.settings",
     "calibray.tracing.antennas", "calibray.tracing.cache", "calibray.tracing.convergence",
     "calibray.tracing.antennas", "calibray.study.trace", "calibray.study", "calibray.result", "calibray.engines",
 )  # fmt: skip

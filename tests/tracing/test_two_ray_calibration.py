@@ -16,7 +16,7 @@ from two_ray import TRUTH, TwoRay
 def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Study:
     """Links over a flat ground, their path loss computed by the tracer with the planted permittivity."""
     monkeypatch.setenv("CALIBRAY_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("calibray.tracing.default_tracer.SionnaFactory.__call__", refuse)
+    monkeypatch.setattr("calibray.tracing.SionnaFactory.__call__", refuse)
     return two_ray.study(tmp_path)
 
 

@@ -15,7 +15,7 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares
 from calibray.parameters import Parameter
-from calibray.paths.selection import take_links
+from calibray.paths.program import take_links
 from calibray.result.verdict import Cause
 from calibray.scenes import Triangles, building_numbers
 from calibray.study import Setup, Study

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from calibray.scenes.regions import Region
+from calibray.scenes.obstruction import Region
 from calibray.uncertainty.missing_region import missing_region
 
 BELT = shapely.box(-42, -90, -30, -10)

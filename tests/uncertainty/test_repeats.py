@@ -17,8 +17,7 @@ from calibray.measurements.observables import Statistic
 from calibray.optimizers import LeastSquares
 from calibray.paths import take_links
 from calibray.study import Setup, Study
-from calibray.uncertainty.assessment import certainty
-from calibray.uncertainty.repeats import average_repeats
+from calibray.uncertainty.assessment import average_repeats, certainty
 from link_tables import links_from_frame
 
 ROWS = 3

@@ -35,7 +35,7 @@ from calibray.study.link_checks import suspicions
 from calibray.support.interruption import ensure_interruption, unwrap_interruption
 from calibray.support.output_files import check_outputs
 from calibray.support.progress import Progress
-from calibray.tracing.default_tracer import SIONNA
+from calibray.tracing import SIONNA
 from calibray.tracing.protocol import TracerFactory
 from calibray.uncertainty.assessment import certainty
 from calibray.validation.models import NO_MINIMA

@@ -124,7 +124,7 @@ def ledger(
     from contextlib import closing
 
     from calibray.engines import open_ledger
-    from calibray.support.output_tables import check_table, write_table
+    from calibray.support.output_files import check_table, write_table
     from calibray.tables import render
 
     if out is not None:

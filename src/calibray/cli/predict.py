@@ -83,7 +83,7 @@ def predict(
         from calibray.prediction.batches import predict_batches
         from calibray.prediction.observables import as_measured, observable_columns
         from calibray.prediction.predict import as_links
-        from calibray.support.output_tables import check_table, growing_table
+        from calibray.support.output_files import check_table, growing_table
 
         print_costs()
         result = Result.load(folder, allow_changed_inputs=permissions.allow_changed_inputs)
@@ -123,7 +123,7 @@ def predict(
 @contextmanager
 def _printer() -> Iterator[Callable[[pd.DataFrame], None]]:
     """A function that prints tables as CSV, with a header before the first table."""
-    from calibray.support.output_tables import csv_text
+    from calibray.support.output_files import csv_text
 
     header = True
 
@@ -204,7 +204,7 @@ def suggest(
         from calibray.measurements.table_files import read_table
         from calibray.prediction.predict import as_links
         from calibray.prediction.suggestion import suggest as suggest_links
-        from calibray.support.output_tables import check_table, write_table
+        from calibray.support.output_files import check_table, write_table
         from calibray.tables import render
 
         print_costs()

@@ -35,8 +35,7 @@ from calibray.optimizers import METHODS, Optimizer, label
 from calibray.support.figure_style import COLORS, PALETTE, logarithmic, plain_figure, styled
 from calibray.support.figure_style import write as write_figure
 from calibray.support.messages import did_you_mean
-from calibray.support.output_files import check_folder
-from calibray.support.output_tables import write_table
+from calibray.support.output_files import check_folder, write_table
 from calibray.support.progress import Progress
 from calibray.tables import Column, Table, numbers, short_html, short_text
 

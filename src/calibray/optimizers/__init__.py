@@ -5,37 +5,136 @@ Every class is an `Optimizer` and states what it uses, how it keeps to a budget 
 class is constructed.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from inspect import signature
+from typing import Any, Final, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calibray.errors import InputError
 from calibray.optimizers.derivative_free import POUNDERS, GaussNewton
-from calibray.optimizers.evaluations import Best
+from calibray.optimizers.evaluations import Best as Best
+from calibray.optimizers.evaluations import Objective
 from calibray.optimizers.gaussian_process import GaussianProcess
 from calibray.optimizers.grey_wolf import GWO, SGWOIM
 from calibray.optimizers.least_squares import LeastSquares
 from calibray.optimizers.libraries import CMAES, DFOLS, DifferentialEvolution
-from calibray.optimizers.methods import METHODS, label, make, method
 from calibray.optimizers.multifidelity.space_mapping import SpaceMapping
-from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.protocol import CheapModel, Optimizer
 from calibray.optimizers.sampling import LatinHypercube, RandomSearch, Sobol
 from calibray.optimizers.vector_surrogate import VectorSurrogate
+from calibray.support.messages import did_you_mean
 
-__all__ = [
-    "CMAES",
-    "DFOLS",
-    "GWO",
-    "METHODS",
-    "POUNDERS",
-    "SGWOIM",
-    "Best",
-    "DifferentialEvolution",
-    "GaussNewton",
-    "GaussianProcess",
-    "LatinHypercube",
-    "LeastSquares",
-    "Optimizer",
-    "RandomSearch",
-    "Sobol",
-    "SpaceMapping",
-    "VectorSurrogate",
-    "label",
-    "make",
-    "method",
-]
+METHODS: Final[dict[str, type[Optimizer]]] = {
+    "gwo": GWO,
+    "sgwo-im": SGWOIM,
+    "space-mapping": SpaceMapping,
+    "vector-surrogate": VectorSurrogate,
+    "least-squares": LeastSquares,
+    "cma-es": CMAES,
+    "differential-evolution": DifferentialEvolution,
+    "dfo-ls": DFOLS,
+    "pounders": POUNDERS,
+    "gauss-newton": GaussNewton,
+    "gaussian-process": GaussianProcess,
+    "random": RandomSearch,
+    "latin-hypercube": LatinHypercube,
+    "sobol": Sobol,
+}
+
+LABELS: Final = {
+    "gwo": "GWO",
+    "sgwo-im": "SGWO-IM",
+    "space-mapping": "space mapping",
+    "pounders": "POUNDERS",
+    "gauss-newton": "Gauss-Newton",
+    "auto": "auto (least squares)",
+}
+
+_NO_OPTIONS: Final = {"lower", "upper", "seed", "objective", "cheap_model"}
+"""Constructor arguments that the study sets, so that users cannot set them."""
+
+
+def method(name: str) -> type[Optimizer]:
+    """The class of a method, which states what it uses, its schedule, and whether it takes starting points.
+
+    Raises:
+        InputError: There is no such method.
+
+    Example:
+        >>> method("least-squares").needs_derivatives()
+        True
+    """
+    if name not in METHODS:
+        raise InputError(f"method {name!r}: there is no such method; {did_you_mean(name, METHODS)}")
+    return METHODS[name]
+
+
+def label(name: str) -> str:
+    """The name in tables and figures of a method, or of `METHOD@CALLS` with its budget.
+
+    Example:
+        >>> label("gwo@600")
+        'GWO, 600 calls'
+    """
+    bare, _, calls = name.partition("@")
+    text = LABELS.get(bare, bare)
+    return f"{text}, {calls} calls" if calls else text
+
+
+def make(
+    name: str,
+    lower: ArrayLike,
+    upper: ArrayLike,
+    seed: int = 0,
+    *,
+    budget: int | None = None,
+    start: ArrayLike | None = None,
+    starts: int | None = None,
+    objective: Objective | None = None,
+    cheap_model: CheapModel | None = None,
+    options: Mapping[str, Any] | None = None,
+) -> Optimizer:
+    """Make an optimizer by its method's name; each method receives the arguments that it accepts.
+
+    Args:
+        name: A method of `METHODS`.
+        lower: Lower bounds [d].
+        upper: Upper bounds [d].
+        seed: Seed.
+        budget: Number of evaluations in the budget; the method's default if None. The budget is ignored if the method
+            stops by itself.
+        start: Starting points, [d] or [k, d], for methods that use them.
+        starts: Number of further starting points, for the same methods; their default if None.
+        objective: Converts residuals to the value, for methods that use residuals; their root mean square if None.
+        cheap_model: A cheap model of the engine, for methods that use one.
+        options: Settings of the method, which override all of these.
+
+    Raises:
+        InputError: The method does not exist, it has no such setting or refuses a value, the budget is too small, or
+            its library is not installed.
+
+    Example:
+        >>> make("gwo", [0.0], [1.0], budget=90, start=[0.5]).budget
+        90
+    """
+    kind = method(name)
+    parameters = set(signature(kind).parameters)
+    settings: dict[str, Any] = {} if budget is None else dict(kind.within(budget))
+    if kind.takes_starts:
+        settings |= {key: value for key, value in (("x0", start), ("starts", starts)) if value is not None}
+    if objective is not None and "residuals" in kind.uses:
+        settings["objective"] = objective
+    if cheap_model is not None and "cheap_model" in parameters:
+        settings["cheap_model"] = cheap_model
+    options, allowed = dict(options or {}), sorted(parameters - _NO_OPTIONS)
+    for key in sorted(options.keys() - set(allowed)):
+        raise InputError(
+            f"method.options of {name!r}: there is no setting {key!r}; {did_you_mean(key, allowed)}"
+        )
+    # The constructors differ in their settings, which were looked up above.
+    construct = cast(Callable[..., Optimizer], kind)
+    return construct(np.asarray(lower), np.asarray(upper), seed=seed, **{**settings, **options})

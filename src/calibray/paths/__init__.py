@@ -6,7 +6,7 @@ from calibray.paths.interactions import Diffraction as Diffraction
 from calibray.paths.interactions import Diffuse as Diffuse
 from calibray.paths.interactions import Kind as Kind
 from calibray.paths.program import Paths as Paths
-from calibray.paths.selection import concatenate as concatenate
-from calibray.paths.selection import join_links as join_links
-from calibray.paths.selection import take as take
-from calibray.paths.selection import take_links as take_links
+from calibray.paths.program import concatenate as concatenate
+from calibray.paths.program import join_links as join_links
+from calibray.paths.program import take as take
+from calibray.paths.program import take_links as take_links

@@ -4,21 +4,17 @@ A path is a transmit field, a chain of interactions, and a receive field. An int
 material acts through: the material, the cosine of the angle of incidence, the kind, and the real rotation from the
 frame of the previous interaction into its own (first axis k x n, transverse electric). The first rotation is part of
 the transmit field, and the last one is part of the receive field.
-
-A path file from another source is first read in a process with limits. The HDF5 library can hang or crash on a file
-whose content was changed and sealed again (5 of 3,000 such files did not end within a minute). A file that this user's
-Calibray wrote or validated before is recognised by its checksum and read directly.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from html import escape
 from numbers import Real
 from pathlib import Path
 from textwrap import shorten
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import h5py
 import numpy as np
@@ -26,10 +22,18 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.materials import FIELDS, Material, constants_matrix
-from calibray.paths.file_format import BLOCK, DATASETS, Content, read, verify, write, write_checksum
+from calibray.paths.file_format import (
+    BLOCK,
+    DATASETS,
+    Content,
+    read,
+    remember,
+    validate,
+    verify,
+    write,
+    write_checksum,
+)
 from calibray.paths.interactions import Diffraction, Diffuse, Kind
-from calibray.support.cache_folder import Store, cache_folder
-from calibray.support.memory import run_limited
 from calibray.support.messages import first_line
 from calibray.support.output_files import as_path, check_file, exists, replacing
 
@@ -235,6 +239,104 @@ def read_paths(file: str | Path) -> Paths:
         raise InputError(f"is damaged or not a path file ({first_line(error)}); trace again") from None
 
 
+Table = TypeVar("Table", Diffuse, Diffraction)
+
+_PATH_ARRAYS = ("link", "delay", "spreading", "departure", "arrival", "tx_field", "rx_field")
+_INTERACTION_ARRAYS = ("kind", "material", "cos_incidence", "rotation", "vertex")
+
+
+def take(paths: Paths, index: NDArray[np.int64]) -> Paths:
+    """The program of some of its paths [n], in a given order, over the same links."""
+    index = np.asarray(index, dtype=np.int64)
+    depth = np.diff(paths.first)[index]
+    first = np.concatenate([[0], np.cumsum(depth)]).astype(np.int64)
+    interaction = np.arange(first[-1]) - np.repeat(first[:-1], depth) + np.repeat(paths.first[index], depth)
+    return replace(
+        paths,
+        **{name: getattr(paths, name)[index] for name in _PATH_ARRAYS},
+        **{name: getattr(paths, name)[interaction] for name in _INTERACTION_ARRAYS},
+        first=first,
+        correction=None if paths.correction is None else paths.correction[index],
+        diffuse=_rows(paths.diffuse, paths.kind == Kind.DIFFUSE, interaction),
+        diffraction=_rows(paths.diffraction, paths.kind == Kind.DIFFRACTION, interaction),
+    )
+
+
+def take_links(paths: Paths, links: NDArray[np.int64]) -> Paths:
+    """The program of some links [n], in a given order; a link may be used more than once."""
+    links = np.asarray(links, dtype=np.int64)
+    start = np.searchsorted(paths.link, np.arange(paths.num_links + 1))
+    count = np.diff(start)[links]
+    end = np.cumsum(count)
+    index = np.arange(count.sum()) + np.repeat(start[links] - (end - count), count)
+    return replace(
+        take(paths, index),
+        link=np.repeat(np.arange(len(links)), count).astype(paths.link.dtype),
+        tx_position=paths.tx_position[links],
+        rx_position=paths.rx_position[links],
+    )
+
+
+def concatenate(parts: Sequence[Paths]) -> Paths:
+    """Join path programs of the same links, and sort their paths by link; within a link, the order is that of `parts`.
+
+    All share frequency, materials and link table.
+    """
+    offsets = np.cumsum([0, *(part.num_interactions for part in parts)])
+    first = [part.first[:-1] + offset for part, offset in zip(parts, offsets[:-1], strict=True)]
+    joined = replace(
+        parts[0],
+        **{
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in _PATH_ARRAYS + _INTERACTION_ARRAYS
+        },
+        first=np.concatenate([*first, offsets[-1:]]),
+        correction=_joined_corrections(parts),
+        diffuse=_joined([part.diffuse for part in parts]),
+        diffraction=_joined([part.diffraction for part in parts]),
+    )
+    return take(joined, np.argsort(joined.link, kind="stable"))
+
+
+def join_links(parts: Sequence[tuple[NDArray[np.int64], Paths]]) -> Paths:
+    """Join path programs of different links, each with the indices of its links in the joined program.
+
+    Together they contain every link once. All share frequency and materials; the settings are those of the first.
+    """
+    num_links = sum(len(links) for links, _ in parts)
+    tx, rx = np.empty((num_links, 3)), np.empty((num_links, 3))
+    for links, part in parts:
+        tx[links], rx[links] = part.tx_position, part.rx_position
+    return concatenate(
+        [
+            replace(part, link=links[part.link].astype(part.link.dtype), tx_position=tx, rx_position=rx)
+            for links, part in parts
+        ]
+    )
+
+
+def _rows(table: Table, has_row: NDArray[np.bool_], interaction: NDArray[np.int64]) -> Table:
+    """The rows of some interactions in the table of their kind; `has_row` marks the interactions of that kind [I]."""
+    row = (np.cumsum(has_row) - 1)[interaction[has_row[interaction]]]
+    return type(table)(*(getattr(table, field.name)[row] for field in fields(table)))
+
+
+def _joined_corrections(parts: Sequence[Paths]) -> NDArray[np.float64] | None:
+    """Corrections of all paths; None if no part has any."""
+    if all(part.correction is None for part in parts):
+        return None
+    return np.concatenate(
+        [np.ones(part.num_paths) if part.correction is None else part.correction for part in parts]
+    )
+
+
+def _joined(tables: Sequence[Table]) -> Table:
+    table_type = type(tables[0])
+    return table_type(
+        *(np.concatenate([getattr(table, field.name) for table in tables]) for field in fields(table_type))
+    )
+
+
 def _content(paths: Paths) -> Content:
     """The program as the content of a path file."""
     materials = paths.materials.values()
@@ -322,54 +424,3 @@ def _size_text(num_bytes: int) -> str:
         return f"{num_bytes} B"
     power = min(int(np.log2(num_bytes) // 10), 4)
     return f"{num_bytes / 1024**power:.1f} {('KiB', 'MiB', 'GiB', 'TiB')[power - 1]}"
-
-
-KNOWN_BYTES: Final = 2**20
-"""Size limit of the entries of known files [bytes]; each takes 32 bytes."""
-
-_CODE: Final = """
-from calibray.errors import InputError
-from calibray.paths.program import read_paths
-try:
-    read_paths({file!r})
-except InputError as error:
-    refuse(error)
-"""
-
-_known_here: Final[set[str]] = set()
-"""Checksums of files that this process has already accepted, with or without a cache folder."""
-
-
-def remember(digest: str) -> None:
-    """Record that this user's Calibray wrote or validated the file with a checksum."""
-    _known_here.add(digest)
-    store = _known_files()
-    if store is not None and store.trusted:
-        store.put(digest, b"")
-
-
-def validate(file: Path, digest: str) -> None:
-    """Read a path file whose checksum is right, in another process unless the checksum is known.
-
-    Raises:
-        InputError: The file is damaged, or reading it does not end; the message omits its name.
-    """
-    store = _known_files()
-    if digest in _known_here or (store is not None and store.trusted and store.get(digest) is not None):
-        return
-    size = file.stat().st_size
-    try:
-        is_read = run_limited(_CODE.format(file=str(file.resolve())), 4 * 2**30 + 8 * size, size)
-    except TimeoutError as error:
-        raise InputError(
-            f"is damaged (the HDF5 library does not finish reading it {error}); trace again"
-        ) from None
-    if not is_read:
-        raise InputError("is damaged (the HDF5 library fails while reading it); trace again")
-    remember(digest)
-
-
-def _known_files() -> Store | None:
-    """The store of checksums of known files; None if caching is disabled."""
-    folder = cache_folder()
-    return None if folder is None else Store(folder / "known", ".h5sum", KNOWN_BYTES)

@@ -24,8 +24,7 @@ from calibray.scenes.buildings import footprints
 from calibray.scenes.triangles import Triangles
 from calibray.support.figure_style import FAINT, INK, LINE, ORANGE, PAPER, dress, styled, write
 from calibray.support.lazy_imports import library
-from calibray.support.output_files import check_outputs, write_bytes, write_text
-from calibray.support.output_tables import csv_text
+from calibray.support.output_files import check_outputs, csv_text, write_bytes, write_text
 
 FILES: Final = ("map.tif", "map.png", "map.csv")
 GEOTIFF, PICTURE, TABLE = FILES

@@ -20,10 +20,9 @@ from calibray.reporting.link_survey import Survey, survey
 from calibray.reporting.wording import scene_alone_text
 from calibray.result.record import Record
 from calibray.scenes import Scene, export_scene, read_scene
-from calibray.scenes.export import exported_names
+from calibray.scenes.scene import exported_names
 from calibray.support.messages import printable
-from calibray.support.output_files import check_outputs, write_text
-from calibray.support.output_tables import csv_text
+from calibray.support.output_files import check_outputs, csv_text, write_text
 from calibray.tracing.protocol import LinkPositions
 from calibray.tracing.settings import TraceSettings
 

@@ -12,7 +12,7 @@ from calibray.fitting.nuisance import OFFSET
 from calibray.fitting.search import AUTO
 from calibray.measurements import FEW
 from calibray.measurements.column_names import find_frequency_unit
-from calibray.optimizers.methods import label
+from calibray.optimizers import label
 from calibray.reporting.diagnostics import calibration_links, diagnostics, link_distance
 from calibray.result.held_out import HeldOutErrors, Model
 from calibray.result.record import Record

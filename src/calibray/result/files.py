@@ -34,12 +34,13 @@ from calibray.support.output_files import (
     as_path,
     check_outputs,
     check_unchanged,
+    csv_text,
     exists,
     file_digest,
     is_unchanged_output,
+    without_formula_mark,
     write_text,
 )
-from calibray.support.output_tables import csv_text, without_formula_mark
 from calibray.support.strict_models import Section, explain
 
 VERSION: Final = 1

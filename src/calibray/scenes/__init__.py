@@ -5,7 +5,6 @@ makes scenes from maps and floor plans. Both import from here, and not from each
 """
 
 from calibray.scenes.buildings import building_numbers as building_numbers
-from calibray.scenes.export import export_scene as export_scene
 from calibray.scenes.meshes import Mesh as Mesh
 from calibray.scenes.meshes import MeshObject as MeshObject
 from calibray.scenes.meshes import join_meshes as join_meshes
@@ -13,6 +12,7 @@ from calibray.scenes.meshes import ply_bytes as ply_bytes
 from calibray.scenes.meshes import read_mesh as read_mesh
 from calibray.scenes.scene import Scene as Scene
 from calibray.scenes.scene import check_material_name as check_material_name
+from calibray.scenes.scene import export_scene as export_scene
 from calibray.scenes.scene import has_copied_meshes as has_copied_meshes
 from calibray.scenes.scene import read_scene as read_scene
 from calibray.scenes.scene import xml_with_copied_meshes as xml_with_copied_meshes

@@ -16,7 +16,7 @@ from calibray.coordinates import WGS84
 from calibray.errors import InputError
 from calibray.parameters import Parameters
 from calibray.paths import Paths
-from calibray.scenes.regions import Region
+from calibray.scenes.obstruction import Region
 from calibray.support.lazy_imports import library
 from calibray.support.messages import did_you_mean, shortened
 from calibray.support.strict_models import Section, Text

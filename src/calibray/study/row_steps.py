@@ -26,7 +26,7 @@ from calibray.study.regions import Place
 if TYPE_CHECKING:
     from calibray.measurements import Ground, MoveOutside
     from calibray.scenes.checks import SceneSurfaces
-    from calibray.scenes.regions import Region
+    from calibray.scenes.obstruction import Region
 
 _COLUMN_KEYS: Final = {"tx", "rx", "value", "quantity", "weight", "std", "tx_power_dbm", "frequency"}
 """Keys of ``[links]`` that are fields of `LinkColumns`."""

@@ -21,8 +21,7 @@ from calibray.measurements import Measurements
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take_links
 from calibray.scenes import Scene, check_material_name, read_scene
-from calibray.scenes.obstruction import with_obstruction
-from calibray.scenes.regions import Region
+from calibray.scenes.obstruction import Region, with_obstruction
 from calibray.scenes.scene_file import read_content as scene_content
 from calibray.study.displacement import (
     ACROSS,
@@ -50,9 +49,8 @@ from calibray.study.row_steps import scene_place, study_links, study_regions
 from calibray.study.sections import AntennasSection
 from calibray.support.messages import type_name
 from calibray.support.progress import Progress
-from calibray.tracing import cache
+from calibray.tracing import SIONNA, cache
 from calibray.tracing.antennas import POSE, Mounting, mount
-from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.protocol import EnclosedAntennas, Tracer, TracerFactory
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.trace_plan import LONG_TRACE_SECONDS

@@ -34,8 +34,7 @@ from calibray.study.row_steps import position_steps, row_track, study_links
 from calibray.study.setup import Setup
 from calibray.study.toml_file import study_text
 from calibray.support.messages import first_line, shortened, type_name
-from calibray.support.output_files import check_outputs, write_text
-from calibray.support.output_tables import write_table
+from calibray.support.output_files import check_outputs, write_table, write_text
 from calibray.tables import Column, Table, hertz, numbers, short_html, short_text
 
 if TYPE_CHECKING:

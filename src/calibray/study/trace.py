@@ -23,9 +23,9 @@ from calibray.study.setup import Setup
 from calibray.study.study import Study
 from calibray.support.messages import type_name
 from calibray.support.progress import Progress
-from calibray.tracing import default_tracer
+from calibray.tracing import SIONNA
 from calibray.tracing.protocol import Links
-from calibray.tracing.settings import Antenna
+from calibray.tracing.settings import Antenna, TraceSettings, as_antenna
 
 Constants = Mapping[str, Material | Mapping[str, object]]
 
@@ -93,15 +93,12 @@ def trace(
     if measurements is None or frequency is None:
         missing = "measurements, the links" if measurements is None else "frequency, the carrier in Hz"
         raise InputError(f"trace: without a study, give {missing}")
-    return default_tracer.trace(
-        scene if isinstance(scene, Scene) else read_scene(scene, frequency, materials),
-        measurements,
-        frequency=frequency,
-        tx_antenna=tx_antenna,
-        rx_antenna=rx_antenna,
-        progress=progress,
-        **settings,
-    )
+    scene = scene if isinstance(scene, Scene) else read_scene(scene, frequency, materials)
+    antennas = as_antenna(tx_antenna), as_antenna(rx_antenna)
+    names = TraceSettings().record()
+    if unknown := set(settings) - set(names):
+        raise InputError(f"trace: unknown setting {sorted(unknown)[0]!r}; known: {', '.join(names)}")
+    return SIONNA(scene, frequency, TraceSettings(**settings), *antennas).trace(measurements, progress)
 
 
 def _trace_study(study: Study, links: Links | None, materials: Constants, progress: Progress | None) -> Paths:

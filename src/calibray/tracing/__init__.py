@@ -1,5 +1,40 @@
-"""Tracing: finding the paths of links.
+"""Tracing: finding the paths of links, by default with Sionna RT, which is imported only when a scene is opened.
 
-`protocol` defines what any ray tracer must do, `default_tracer` opens Sionna RT, and only the room `tracing.sionna`
-imports it.
+`protocol` defines what any ray tracer must do; only the room `tracing.sionna` imports Sionna RT.
 """
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from typing import Final, final
+
+from calibray.scenes import Scene
+from calibray.tracing.protocol import Tracer
+from calibray.tracing.settings import Antenna, TraceSettings
+
+
+@final
+class SionnaFactory:
+    """Opens scenes in Sionna RT; a `TracerFactory`."""
+
+    @property
+    def versions(self) -> dict[str, str]:
+        """Installed versions by package."""
+        return {name: version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
+
+    def __call__(
+        self,
+        scene: Scene,
+        frequency: float,
+        settings: TraceSettings,
+        tx_antenna: Antenna,
+        rx_antenna: Antenna,
+    ) -> Tracer:
+        """Open a scene; see `TracerFactory`. The machine has neither a GPU nor an LLVM for tracing."""
+        from calibray.tracing.sionna import Tracer as SionnaTracer
+
+        return SionnaTracer(scene, frequency, settings, tx_antenna, rx_antenna)
+
+
+SIONNA: Final = SionnaFactory()
+"""The tracer that is used unless another one is given."""

@@ -26,7 +26,7 @@ from calibray.study import Setup, Study
 from calibray.study.calibration_sections import DEFAULT_BLOCKS, MOST_BLOCKS
 from calibray.study.model import StudyModel
 from calibray.support.progress import Progress
-from calibray.tracing.default_tracer import SIONNA
+from calibray.tracing import SIONNA
 from calibray.tracing.protocol import TracerFactory
 from calibray.validation.held_out_statistics import (
     MODELS,

@@ -20,7 +20,7 @@ from calibray.errors import InputError
 from calibray.reporting.link_survey import QUANTITIES
 from calibray.result.files import read
 from calibray.result.held_out import HeldOutErrors, Model
-from calibray.support.output_tables import write_table
+from calibray.support.output_files import write_table
 from calibray.validation.held_out_statistics import compare
 from calibray.window.desk import CANDIDATES, PLACE, PREDICTED, STUDY, SUGGESTED, Desk, filled
 from calibray.window.jobs import Job

@@ -24,8 +24,7 @@ from calibray.errors import InputError
 from calibray.measurements import SourceTable, read_table
 from calibray.paths import Kind
 from calibray.support.messages import did_you_mean, shortened
-from calibray.support.output_files import check_file, exists, replacing, write_text
-from calibray.support.output_tables import write_table
+from calibray.support.output_files import check_file, exists, replacing, write_table, write_text
 from calibray.tracing.settings import RANGES
 
 TYPES: Final = {

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from calibray.support.lazy_imports import lazy_attributes
 
 if TYPE_CHECKING:
-    from calibray.scenes.authoring.building_scene import make_scene as make_scene
     from calibray.scenes.authoring.extrusion import Windows as Windows
     from calibray.scenes.authoring.floor_plan import Segment as Segment
     from calibray.scenes.authoring.floor_plan import read_plan as read_plan
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from calibray.scenes.authoring.made_scene import MadeScene as MadeScene
     from calibray.scenes.authoring.made_scene import Palette as Palette
     from calibray.scenes.authoring.made_scene import SurfaceMaterial as SurfaceMaterial
+    from calibray.scenes.authoring.made_scene import make_scene as make_scene
     from calibray.scenes.authoring.made_scene import material_name as material_name
     from calibray.scenes.authoring.terrain import Terrain as Terrain
     from calibray.scenes.authoring.terrain import lower_origin as lower_origin
@@ -38,13 +38,12 @@ if TYPE_CHECKING:
 __all__, __getattr__, __dir__ = lazy_attributes(
     __name__,
     {
-        "building_scene": "make_scene",
         "extrusion": "Windows",
         "floor_plan": "Segment read_plan",
         "floor_plan_scene": "LIDS WALL_THICKNESS make_plan_scene",
         "footprints": "FootprintColumns Footprints HeightRule HeightSource clean_footprints read_footprints "
         "read_openstreetmap",
-        "made_scene": "SCENE_FILES MadeScene Palette SurfaceMaterial material_name",
+        "made_scene": "SCENE_FILES MadeScene Palette SurfaceMaterial make_scene material_name",
         "terrain": "Terrain lower_origin read_terrain",
         "trees": "TREES_FILE Trees read_trees",
         "wall_faces": "merge_faces",

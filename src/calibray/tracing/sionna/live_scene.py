@@ -25,7 +25,7 @@ from sionna.rt.antenna_pattern import antenna_pattern_registry
 from calibray.errors import InputError
 from calibray.materials import SCALAR_CONSTANTS, Material
 from calibray.scenes import Mesh, MeshObject, read_scene
-from calibray.scenes.export import exported_names
+from calibray.scenes.scene import exported_names
 from calibray.scenes.shapes import COARSE, TOO_COARSE
 from calibray.support.messages import did_you_mean, first_line, shortened
 from calibray.tables import hertz
