@@ -59,7 +59,7 @@ def trace(
     rx_antenna: Antenna | Mapping[str, object] | None = None,
     materials: Constants | None = None,
     progress: Progress | None = None,
-    **settings: int | bool,
+    **settings: Any,
 ) -> Paths:
     """Find the paths of every link and compile them.
 
