@@ -26,6 +26,7 @@ from calibray.result.held_out import Model
 from calibray.result.wording import judgement_text
 from calibray.study import Setup
 from calibray.tables import render
+from calibray.validation.validate import validate
 
 PAPER_CALLS = {"gwo": 600, "sgwo-im": 225}
 METHOD_NAMES = ("auto", *METHODS)
@@ -400,3 +401,11 @@ def test_antennas_inside_bodies_are_reported(tmp_path, monkeypatch):
     result = calibrate(study, out=tmp_path / "out")
     assert result.provenance.enclosed.rx == (planted.INSIDE + 2,)
     assert Result.load(tmp_path / "out").provenance.enclosed == result.provenance.enclosed
+
+
+def test_days_held_out_in_turn_keep_their_rows_of_one_link(tmp_path):
+    """Rows of one position without times are one link, unless a block is one of their days."""
+    table = pd.concat([planted.campaign(noise_db=1.0).assign(day=day) for day in (1, 2)], ignore_index=True)
+    found = validate(planted.study(tmp_path, table), by="day")
+    assert found.labels == ("1", "2")
+    assert np.bincount(found.block).tolist() == [planted.LINKS, planted.LINKS]

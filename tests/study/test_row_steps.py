@@ -255,3 +255,42 @@ def test_rows_of_groups_stay_apart_and_repeats_average_observables(tmp_path):
         links = Study.from_content(stated, tmp_path / "study.toml").measurements()
         assert links.frame["phone"].tolist() == ["a", "b"]
         assert links.frame["ns"].tolist() == [15.0, 30.0]
+
+
+REPEATED = pd.DataFrame({
+    "x": [10.0, 20.0, 30.0, 30.0, 10.0, 20.0], "day": [1, 1, 1, 1, 2, 2],
+    "loss": [80.0, 82.0, 84.0, 84.0, 90.0, 92.0],
+})  # fmt: skip
+
+
+def repeated(target, holdout, **links) -> Study:
+    """A log of two days, of which the second repeats two links with 10 dB more, and one row repeats another."""
+    REPEATED.to_csv(target / "days.csv", index=False)
+    section = {"file": "days.csv", "tx": [0.0, 0.0, 5.0], "rx": ["x", 0.0, 1.5], "value": "loss"}
+    content = {**STUDY, "links": {**section, **links}, "holdout": holdout}
+    return Study.from_content(
+        {name: content[name] for name in content if name != "offset"}, target / "s.toml"
+    )
+
+
+@pytest.mark.parametrize("links", [{}, {"average": {"by": "place"}}])
+@pytest.mark.parametrize("holdout", [{"where": "day == 2"}, {"by": "day"}])
+def test_rows_that_are_held_out_separately_stay_separate_links(tmp_path, holdout, links):
+    study = repeated(tmp_path, holdout, **links)
+    found = row_steps.study_links(study)
+    assert found.path_loss_db == pytest.approx(REPEATED["loss"].drop(3))
+    assert found.frame["day"].tolist() == [1, 1, 1, 2, 2]
+    assert (
+        study.held_out(found).tolist() == (found.frame["day"] == 2).tolist() if "where" in holdout else True
+    )
+
+
+@pytest.mark.parametrize(
+    "holdout", [{"blocks": 2}, {"by": "tx"}, {"where": "x > 15"}, {"where": "loss > 85"}]
+)
+def test_other_divisions_merge_rows_as_without_held_out_links(tmp_path, holdout):
+    """A filter by the measured value selects finished links: it must not divide the samples of one by their level."""
+    found = row_steps.study_links(repeated(tmp_path, holdout))
+    powers = 10 ** (-REPEATED["loss"] / 10)
+    expected = -10 * np.log10(powers.groupby(REPEATED["x"]).mean())
+    assert found.path_loss_db == pytest.approx(expected)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,9 @@ MoveOutside = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray
 
 Compute = Callable[[SourceTable], NDArray[np.float64] | None]
 """Values of a new column [rows] from the rows of a table."""
+
+Divide = Callable[[SourceTable], NDArray[Any]]
+"""Labels [rows] of the parts to which the rows of a table belong."""
 
 
 @dataclass(frozen=True)
@@ -128,6 +131,7 @@ class Preparation:
         ground: Height of the ground, if heights are measured from it.
         averaging: How samples are averaged.
         keep: Columns whose groups averages keep apart, in addition to the transmitter's.
+        held_out: Labels of the parts that are held out separately, which averages and merged rows keep apart as well.
         observables: Columns of further measured values, which are averaged over rows that repeat a link.
         computed: Further columns by name, computed from the rows with the columns of their transmitters. A function
             returns None if a column that it needs is missing and optional.
@@ -149,6 +153,7 @@ class Preparation:
     ground: Ground | None = None
     averaging: Averaging | None = None
     keep: Sequence[str] = ()
+    held_out: Divide | None = None
     observables: Sequence[str] = ()
     computed: Mapping[str, Compute] = field(default_factory=dict)
     inside: Literal["drop", "move"] | None = None

@@ -218,6 +218,7 @@ MAX_UNCERTAINTY_DB: Final = 1.0
 """Largest uncertainty of an average from its samples below the noise floor [dB]; averages with more are left out."""
 
 _AREA: Final = "calibray area"
+_PART: Final = "calibray part"
 
 
 def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
@@ -225,9 +226,9 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
 
     A sample below the noise floor has a power between zero and the floor, and counts as half of the floor. Averages
     whose uncertainty then exceeds `MAX_UNCERTAINTY_DB` are left out, because the samples above the floor are only the
-    strong ones. The steps `averaging`, `keep`, `transmitter` and `noise_floor_dbm` are used. Returns for each average
-    the row of its first sample, with the mean receiver position, the mean value, and the columns `std_db` (standard
-    deviation of the samples [dB], NaN for one sample) and `count`.
+    strong ones. The steps `averaging`, `keep`, `held_out`, `transmitter` and `noise_floor_dbm` are used. Returns for
+    each average the row of its first sample, with the mean receiver position, the mean value, and the columns `std_db`
+    (standard deviation of the samples [dB], NaN for one sample) and `count`.
 
     Raises:
         InputError: A column is missing or not numeric, a time cannot be read, or no average remains.
@@ -252,7 +253,8 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     keys = dict.fromkeys([*steps.keep, *transmitter, *map(str, columns.tx)])
     labels = pd.DataFrame({name: table.column(name) for name in keys})
     labels[_AREA] = _areas(table, averaging, rx)
-    group = labels.groupby([*keys, _AREA], sort=False, dropna=False).ngroup().to_numpy()
+    labels[_PART] = 0 if steps.held_out is None else steps.held_out(table)
+    group = labels.groupby(list(labels), sort=False, dropna=False).ngroup().to_numpy()
 
     samples = pd.DataFrame({name: table.numbers(name) for name in rx})
     # Relative to the strongest sample, so that weak powers do not underflow.
@@ -334,9 +336,9 @@ def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) 
 
     Rows belong to one link if their positions agree within `SAME_POSITION`, and transmitter, groups, carrier,
     transmitted power and times are equal. Rows at different times stay separate links. A link below the noise floor is
-    not merged with one above it. Receivers inside buildings are moved later: two positions may be moved to the same
-    corner. The steps `keep`, `observables`, `transmitter`, `noise_floor_dbm` and `averaging` are used; averages merge
-    repeats already.
+    not merged with one above it, and a held-out row not with others. Receivers inside buildings are moved later: two
+    positions may be moved to the same corner. The steps `keep`, `held_out`, `observables`, `transmitter`,
+    `noise_floor_dbm` and `averaging` are used; averages merge repeats already.
 
     Raises:
         InputError: A column is missing or not numeric.
@@ -355,6 +357,7 @@ def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) 
     keys = pd.DataFrame({name: table.column(name) for name in _separating_columns(table, steps, columns)})
     floor = -np.inf if steps.noise_floor_dbm is None else steps.noise_floor_dbm
     keys["censored"] = value <= floor
+    keys[_PART] = 0 if steps.held_out is None else steps.held_out(table)
     group = np.asarray(keys.groupby(list(keys), sort=False, dropna=False).ngroup(), dtype=np.int64)
     link = join_positions(positions, group)
     first = ~pd.Series(link).duplicated().to_numpy()

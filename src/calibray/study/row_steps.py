@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from calibray.coordinates import WGS84, Frame
 from calibray.errors import InputError
@@ -13,12 +16,14 @@ from calibray.measurements import (
     LinkColumns,
     Measurements,
     Preparation,
+    SourceTable,
     Track,
     measured_links,
     read_table,
 )
 from calibray.scenes.obstruction import CLUSTER
 from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
+from calibray.study.calibration_sections import HoldoutSection
 from calibray.study.model import StudyModel
 from calibray.study.mounting import PORT_POWER, mounting_columns, port_power, states_port_power
 from calibray.study.regions import Place
@@ -82,11 +87,26 @@ def row_steps(study: StudyModel) -> Preparation:
                 ]
             )
         ),
+        held_out=None if study.holdout is None else partial(_held_out_parts, study.holdout, links.value),
         observables=[item.column for item in study.observables.values() if item.column is not None],
         computed={PORT_POWER: partial(port_power, study)} if states_port_power(study) else {},
         inside=inside,
         outside=None if inside is None else _move_outside(study),
     )
+
+
+def _held_out_parts(holdout: HoldoutSection, value: str, table: SourceTable) -> NDArray[Any]:
+    """Labels [rows] of the parts of a table that are held out separately; 0 for all rows where links decide.
+
+    Only links, after averages and merging, decide by the measured value and by the columns of averages.
+    """
+    table, none = replace(table, frame=table.frame.drop(columns=value, errors="ignore")), np.zeros(len(table))
+    if holdout.by is not None:
+        return table.column(holdout.by).to_numpy() if holdout.by in table.frame else none
+    try:
+        return none if holdout.where is None else table.where(holdout.where)
+    except InputError:
+        return none
 
 
 def row_track(study: StudyModel) -> Track | None:

@@ -76,6 +76,9 @@ def validate(
         InputError: The study runs on another engine, or its links cannot be divided into these blocks.
         EngineError: The engine failed.
     """
+    if by is not None and isinstance(study, Study):
+        # Rows of one link with different labels stay separate links.
+        study = Study.from_content(study.content() | {"holdout": {"by": by}}, study.path)
     setup = study if isinstance(study, Setup) else Setup.open(study, tracer)
     if blocks is not None and by is not None:
         raise InputError("validate: give blocks or by, not both")
