@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import gc
+import multiprocessing
+import os
+import signal
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import planted
-from calibray import fields
-from calibray.engines import ReplayCarriers
+from calibray import calibrate, engines, fields
+from calibray.engines import ChunkedReplay, InProcess, Replay, ReplayCarriers
+from calibray.engines.cluster.chunks import cut
+from calibray.engines.kinds.replay import trace_and_replay
 from calibray.engines.replay import CarrierPaths
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
+from calibray.measurements.observables import Statistic
 from calibray.optimizers import LeastSquares
-from calibray.parameters import Parameter
+from calibray.parameters import Parameter, Parameters
 from calibray.paths.program import take_links
 from calibray.result.verdict import Cause
 from calibray.scenes import Triangles, building_numbers
@@ -224,3 +233,158 @@ def test_errors_out_of_sight_are_tried_unless_errors_are_declared_independent(pr
         "student-t",
     }
     assert kinds(heterogeneity=0, constants_spread=0, range_m=0) == {"gaussian", "student-t"}
+
+
+# Coefficients of laws
+
+
+LAW = (Parameter("marble.itu_a", 1.5, 12.0, 8.0), Parameter("marble.itu_b", -0.5, 0.5, 0.1))
+"""Both coefficients; in the opposite order, the exponent comes first."""
+
+
+def with_law(problem: Problem, *items: Parameter) -> Problem:
+    """The problem at two carriers, with coefficients of the law of marble as parameters."""
+    paths, links = problem.engine.paths, np.arange(planted.LINKS)
+    carriers = [
+        CarrierPaths(take_links(paths, chosen).at(frequency), chosen)
+        for chosen, frequency in ((links[::2], 3.5e9), (links[1::2], 10e9))
+    ]
+    engine = ReplayCarriers(carriers, Parameters(items, 3.5e9), paths.materials)
+    return replace(problem, engine=engine)
+
+
+@pytest.mark.parametrize("items", [LAW, LAW[::-1]])
+def test_buildings_scale_a_law_and_constants_vary_beside_it(problem, items):
+    known = with_law(problem, *items)
+    scale = known.parameters.names.index("marble.itu_a")
+    thickness = Parameter("marble.thickness", 0.05, 1.0, 0.2, "log")
+    split = split_replay(known, replace(known.parameters, items=(*items, thickness)), by_building=True)
+    traced = problem.engine.paths.materials["marble"].thickness
+    value = np.append([item.start for item in items], traced)[None]
+    equal = np.ones((1, len(split.parameter_of)))
+    assert split.path_loss(value, equal) == pytest.approx(known.engine.path_loss(value[:, :2]), abs=1e-9)
+    scaled = value * np.where(np.arange(3) == scale, 1.1, 1.0)
+    factors = np.where(split.parameter_of == scale, 1.1, equal)
+    expected = known.engine.path_loss(scaled[:, :2])
+    assert split.path_loss(value, factors) == pytest.approx(expected, abs=1e-9)
+    assert set(split.parameter_of.tolist()) == {scale, 2}
+    assert (split.building_of >= 0).all()
+    thicker = split.path_loss(value * [1, 1, 0.3 / traced], equal)
+    assert np.abs(thicker - split.path_loss(value, equal)).max() > 0.1
+
+
+def test_buildings_are_equal_if_only_the_exponent_of_a_law_is_a_parameter(problem):
+    known = with_law(problem, LAW[1], Parameter("wood.relative_permittivity", 1.5, 12.0, 2.6))
+    split = split_replay(known, known.parameters, by_building=True)
+    assert set(split.building_of[split.parameter_of == 0].tolist()) == {-1}
+    value = known.parameters.start[None]
+    equal = np.ones((1, len(split.parameter_of)))
+    assert split.path_loss(value, equal) == pytest.approx(known.engine.path_loss(value), abs=1e-9)
+
+
+def test_constants_vary_beside_laws(problem):
+    known = with_law(problem, *LAW)
+    best = known.parameters.to_search(known.parameters.start)
+    measured = known.modelled(best[None])[0]
+    known = replace(known, objective=replace(known.objective, measured=measured))
+    model = joint_model(known, best, 0.3**2, known.freedom)
+    assert "marble.thickness" in model.effects_db
+    assert set(model.parameter_of.tolist()) == set(model.only_buildings.tolist()) == {0}
+
+
+# Links in chunks
+
+
+def in_chunks(setup: Setup, size: int, at_most: int | None = None) -> ChunkedReplay:
+    """The replay of a study in chunks, in this process."""
+    chunks = cut(setup.links, size)
+    return ChunkedReplay(InProcess(at_most), setup, chunks, partial(trace_and_replay, None))
+
+
+@pytest.mark.parametrize("blocked", [False, True])
+def test_chunks_split_as_all_links_do(problem, blocked):
+    """Also chunks of one link, of which a blocked one has no path, and others do not meet every material."""
+    study = Study.from_content(planted.content("links.csv", noise=None))
+    setup = Setup.open(study, links=links_from_frame(planted.links(blocked)))
+    whole = Problem.of(setup, planted.engine(blocked))
+    chunked = replace(whole, engine=in_chunks(setup, 1))
+    thickness = Parameter("marble.thickness", 0.05, 1.0, 0.2, "log")
+    both = replace(whole.parameters, items=(*whole.parameters.items, thickness))
+    for by_building in (False, True):
+        one, many = (split_replay(each, both, by_building=by_building) for each in (whole, chunked))
+        assert many.parameter_of.tolist() == one.parameter_of.tolist()
+        assert many.building_of.tolist() == one.building_of.tolist()
+        assert many.interactions == one.interactions
+        random = np.random.default_rng(3)
+        values, factors = both.from_unit(random.random((7, 4))), random.uniform(0.8, 1.2, (7, len(one.keys)))
+        assert many.path_loss(values, factors) == pytest.approx(one.path_loss(values, factors), abs=1e-9)
+        answers = (each.respond(values, factors, (Statistic("rms_delay_spread"),)) for each in (one, many))
+        expected, found = answers
+        assert found.path_loss == pytest.approx(expected.path_loss, abs=1e-9)
+        assert found.observed == pytest.approx(expected.observed, rel=1e-9, nan_ok=True)
+
+
+def paths_held() -> int:
+    """Number of paths in all replays of this process."""
+    return sum(each.paths.num_paths for each in gc.get_objects() if isinstance(each, Replay))
+
+
+def test_a_process_holds_no_more_split_paths_than_chunks_have_room(problem):
+    before = paths_held()
+    chunked = replace(problem, engine=in_chunks(problem.setup, 3, at_most=1))
+    split = split_replay(chunked, problem.parameters, by_building=True)
+    values = problem.parameters.start[None]
+    for _ in range(2):
+        split.path_loss(values, np.ones((1, len(split.keys))))
+    links = problem.engine.paths.link
+    largest = max(int(np.isin(links, chunk).sum()) for chunk in chunked.engine.chunks)
+    # The kept chunk and its split; with room for all of them, twice the paths.
+    assert 0 < paths_held() - before <= 2 * largest < problem.engine.paths.num_paths
+    roomy = replace(problem, engine=in_chunks(problem.setup, 3))
+    split_replay(roomy, problem.parameters, by_building=True)
+    assert paths_held() - before > 2 * problem.engine.paths.num_paths
+
+
+def thicker_wood() -> pd.DataFrame:
+    """The planted campaign with wood 1.3 times as thick as the scene states."""
+    paths = planted.engine().paths
+    materials = planted.engine().parameters.materials(list(planted.TRUTH.values()), paths.materials)
+    wood = materials["wood"]
+    loss = fields.path_loss(paths, {**materials, "wood": replace(wood, thickness=1.3 * wood.thickness)})
+    noise = 0.1 * np.random.default_rng(3).standard_normal(planted.LINKS)
+    return planted.links().assign(path_loss_db=loss + noise)
+
+
+def test_draws_of_chunks_are_those_of_all_links_even_if_a_worker_dies(tmp_path, monkeypatch):
+    """Constants and buildings vary in chunks as well, so that the interval covers the truth if a thickness is wrong."""
+    monkeypatch.setenv("CALIBRAY_CACHE", str(tmp_path / "cache"))
+    killed: list[int] = []
+
+    def kill_one(stage: str, done: int, total: int | None) -> None:
+        if stage == "drawing" and done > 10 and not killed:
+            killed.append(multiprocessing.active_children()[0].pid or 0)
+            os.kill(killed[0], signal.SIGKILL)
+
+    def calibrated(engine=None, **arguments):
+        study = planted.study(
+            tmp_path,
+            thicker_wood(),
+            noise={"kind": "gaussian", "range_m": 0, "constants_spread": 0.3},
+            method={"name": "least-squares", "options": {"starts": 4}},
+            engine={"name": "replay", **(engine or {})},
+        )
+        return calibrate(study, **arguments)
+
+    whole = calibrated()
+    with engines.open_workers(2) as workers:
+        found = calibrated({"chunk_links": 6}, workers=workers, progress=kill_one)
+    assert killed
+    assert "wood.thickness" in whole.uncertainty.constants_db
+    assert found.uncertainty.constants_db == pytest.approx(whole.uncertainty.constants_db, rel=1e-6)
+    for name, draws in whole.uncertainty.draws.items():
+        assert found.uncertainty.draws[name] == pytest.approx(draws, rel=1e-6)
+    for name, interval in whole.intervals.items():
+        ends = found.intervals[name].lower, found.intervals[name].upper
+        assert ends == pytest.approx((interval.lower, interval.upper), rel=1e-6)
+        assert found.intervals[name].verdict == interval.verdict
+        assert found.intervals[name].contains(planted.TRUTH[name])

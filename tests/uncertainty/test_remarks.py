@@ -9,13 +9,11 @@ import pytest
 
 import planted
 from calibray.fitting.problem import Problem
-from calibray.parameters import Parameter, Parameters
 from calibray.result import Interval, RemarkKind, Verdict
-from calibray.result.verdict import Remark
 from calibray.result.wording import remark_text
 from calibray.study import Setup, Study
 from calibray.uncertainty.noise_models import CORRELATED
-from calibray.uncertainty.remarks import departures, exact_constants, outside_interval
+from calibray.uncertainty.remarks import departures, outside_interval
 from link_tables import links_from_frame
 
 NAMES = tuple(planted.TRUTH)
@@ -78,25 +76,3 @@ def test_the_remark_on_errors_out_of_sight_advises_what_the_study_lacks(trace, a
     study = Study.from_content(planted.content("links.csv", trace=trace))
     (remark,) = departures({"out_of_sight": 1.0}, study)
     assert remark_text(remark).endswith(advice)
-
-
-def test_laws_as_parameters_have_a_remark_on_what_counts_as_exact():
-    law = Parameters((Parameter("marble.itu_a", 3.0, 9.0, 5.0),))
-    constant = Parameters((Parameter("marble.thickness", 0.1, 0.5, 0.2),))
-    study = Study.from_content(planted.content("links.csv", noise=None))
-    (remark,) = exact_constants(law, study)
-    assert "count all other constants as exact and all buildings of a material as equal" in remark_text(
-        remark
-    )
-    assert exact_constants(constant, study) == ()
-    (remark,) = exact_constants(constant, study, chunks=True)
-    assert "Links are in chunks, so the intervals count constants" in remark_text(remark)
-    # The study itself states that they are exact and equal.
-    assert exact_constants(law, Study.from_content(planted.content("links.csv"))) == ()
-
-
-def test_a_remark_on_exact_constants_without_its_cause_is_read():
-    """Results of early versions lack the cause."""
-    assert remark_text(Remark(RemarkKind.EXACT_CONSTANTS, {})).startswith(
-        "Coefficients of laws are parameters"
-    )

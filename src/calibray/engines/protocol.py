@@ -150,6 +150,13 @@ class Chunked(Differentiable, Protocol):
         """
         ...
 
+    def ask(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+        """Call a picklable function on every chunk's worker, and return the results by chunk.
+
+        Its first argument is the chunk (`engines.cluster.chunks.Chunk`); the others are the same for all chunks.
+        """
+        ...
+
     def traced_with(self, materials: Mapping[str, Material], progress: Progress | None = None) -> Chunked:
         """The same engine on paths traced with other materials; `progress` is called after every chunk."""
         ...

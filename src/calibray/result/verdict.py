@@ -118,7 +118,6 @@ class RemarkKind(StrEnum):
         "outside interval"  # names, values, pieces (ends in a row), most_probable, cause, odds, blocks
     )
     FEW_DRAWS = "few draws"
-    EXACT_CONSTANTS = "exact constants"  # chunks, whether the reason is that links are in chunks
     APPROXIMATE_INTERVALS = "approximate intervals"  # engine, calls, error_db, replay
     # understood, misfit_db, gap_db, reached, remaining_db, calls, changed (paths), changed_db and lost (links),
     # half_space (all surfaces), half_spaces (materials); names and values of constants

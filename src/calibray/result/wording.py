@@ -223,19 +223,6 @@ def _unreached_links(values: dict[str, Any]) -> str:
     )
 
 
-def _exact_constants(values: dict[str, Any]) -> str:
-    if values.get("chunks"):
-        return (
-            "Links are in chunks, so the intervals count constants that the scene fixes as exact and all buildings of "
-            "a material as equal. They are much too narrow if that is wrong: calibrate without engine.chunk_links, "
-            "--workers and --scheduler to include both."
-        )
-    return (
-        "Coefficients of laws are parameters, so the intervals count all other constants as exact and all buildings of "
-        "a material as equal. They are too narrow if that is wrong."
-    )
-
-
 def _antenna_directions(values: dict[str, Any]) -> str:
     sentences = []
     for number, name in enumerate(values["transmitters"]):
@@ -332,7 +319,6 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
         "Independent populations of draws disagree. The intervals are rough, and a range that fits may be missing, so "
         "no parameter is more than weakly identified. Calibrate fewer parameters, or give them priors."
     ),
-    RemarkKind.EXACT_CONSTANTS: _exact_constants,
     RemarkKind.APPROXIMATE_INTERVALS: _approximate_intervals,
     RemarkKind.RAY_MAPPING: _ray_mapping,
     RemarkKind.NO_CHEAP_MODEL: lambda values: f"No cheap model is used: {values['cause']}.",

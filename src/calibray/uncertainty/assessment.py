@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from calibray.engines.protocol import PATH_LOSS, Chunked
+from calibray.engines.protocol import PATH_LOSS
 from calibray.fitting.cheap_replay import ReplayedModel
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, find_minima, relevant_minima
@@ -36,7 +36,6 @@ from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, HEAVY, OUT_
 from calibray.uncertainty.remarks import (
     conflict,
     departures,
-    exact_constants,
     fit_undeclared_offset,
     missed,
     outside_interval,
@@ -217,8 +216,6 @@ def _assess(
         remarks += conflict(problem, relevant)
     if not posterior.means.agree:
         remarks.append(Remark(RemarkKind.FEW_DRAWS))
-    chunks = isinstance(problem.engine, Chunked)
-    remarks += exact_constants(problem.parameters, problem.setup.study, chunks=chunks)
     return replace(
         assessment,
         intervals=intervals,

@@ -6,20 +6,24 @@ building and material becomes a separate material.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Final
+from itertools import chain
+from typing import Final, cast, final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.engines.cluster.chunks import Chunk
 from calibray.engines.compression import strongest
-from calibray.engines.protocol import PATH_LOSS, Responses, of_links
+from calibray.engines.protocol import PATH_LOSS, Chunked, Responses, of_links
 from calibray.engines.replay import Computation, Replay, ReplayCarriers
-from calibray.fields import Effects
+from calibray.engines.section import OpenedStudy, RadioSettings
 from calibray.fitting.problem import Problem
+from calibray.materials import Material
 from calibray.measurements.observables import Statistic
 from calibray.parameters import Parameters
-from calibray.parameters.parameter import PARAMETER_BOUNDS
+from calibray.parameters.parameter import LAWS, PARAMETER_BOUNDS
 from calibray.paths import Paths
 from calibray.scenes import Scene, building_numbers, read_triangles
 
@@ -37,6 +41,9 @@ WEAK: Final = 0.1
 Auckland, 71 % of the interactions are left out, and path loss of posterior draws changes by 0.05 dB (RMS), with errors
 of 5.3 dB. With 0.03, 61 % are left out, and it changes by 0.02 dB."""
 
+EXPONENTS: Final = {exponent for _, exponent in LAWS.values()}
+"""Fields of parameters that are exponents of laws."""
+
 
 @dataclass(frozen=True, eq=False)
 class _Part:
@@ -45,140 +52,263 @@ class _Part:
     Attributes:
         engine: The replay; its k parameters are constants of one building each, or of all objects.
         links: Indices of its links.
-        constants: Indices of its constants among those of all carriers [k].
+        constants: Indices of its constants among those of all carriers [k]; empty if it depends on none.
     """
 
     engine: Replay
     links: NDArray[np.intp]
     constants: NDArray[np.intp]
 
+    def respond(self, constants: NDArray[np.float64], wanted: tuple[Statistic, ...]) -> Responses:
+        """Path loss and further observables for all constants [n, c], which are kept within their physical bounds."""
+        parameters = self.engine.parameters
+        candidates = np.tile(parameters.start, (len(constants), 1))
+        if len(self.constants):
+            bounds = [PARAMETER_BOUNDS[parameter.field] for parameter in parameters]
+            lower, upper = [bound.lower for bound in bounds], [bound.upper for bound in bounds]
+            candidates = np.clip(constants[:, self.constants], lower, upper)
+        if wanted:
+            return self.engine.respond(candidates, wanted)
+        return Responses(self.engine.path_loss(candidates), np.empty((len(constants), 0, len(self.links))))
+
 
 @dataclass(frozen=True, eq=False)
-class SplitReplay:
+class Split(ABC):
     """A replay whose candidates set more constants than the study's parameters.
 
     Attributes:
-        parts: The replay of every carrier; together they set c constants of one building each, or of all objects.
-        parameter_of: Index of the parameter to which each constant belongs [c].
+        parameter_of: Index of the parameter to which each of c constants belongs, ascending [c].
         building_of: Building of each constant, from 0; -1 for objects that are not buildings, such as the ground [c].
+        met: Numbers of the buildings that the paths meet.
+        interactions: Number of interactions that are evaluated for a candidate.
     """
 
-    parts: tuple[_Part, ...]
     parameter_of: NDArray[np.int64]
     building_of: NDArray[np.int64]
+    met: NDArray[np.int64]
+    interactions: int
 
     @property
-    def interactions(self) -> int:
-        """Number of interactions that are evaluated for a candidate."""
-        return sum(part.engine.interactions for part in self.parts)
+    def keys(self) -> NDArray[np.int64]:
+        """A number for the parameter and building of every constant, ascending [c]."""
+        return (self.parameter_of << 32) + self.building_of
 
     def path_loss(self, values: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss [n, L], [dB] with values of the parameters [n, d] and a factor for every constant [n, c]."""
-        constants = values[:, self.parameter_of] * factors
-        loss = np.empty((len(values), sum(len(part.links) for part in self.parts)))
-        for part in self.parts:
-            loss[:, part.links] = part.engine.path_loss(_possible(part, constants))
-        return loss
+        return self.respond(values, factors, ()).path_loss
+
+    @abstractmethod
+    def respond(
+        self, values: NDArray[np.float64], factors: NDArray[np.float64], wanted: tuple[Statistic, ...]
+    ) -> Responses:
+        """Path loss and further observables, if any are wanted; the other arguments are as for `path_loss`."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class SplitReplay(Split):
+    """The same in this process.
+
+    Attributes:
+        parameters: The parameters, which may be coefficients of laws.
+        parts: The replays of the carriers.
+    """
+
+    parameters: Parameters
+    parts: tuple[_Part, ...]
 
     def respond(
         self, values: NDArray[np.float64], factors: NDArray[np.float64], wanted: tuple[Statistic, ...]
     ) -> Responses:
-        """Path loss and further observables of buildings that differ; arguments as for `path_loss`."""
-        constants = values[:, self.parameter_of] * factors
-        responses = [part.engine.respond(_possible(part, constants), wanted) for part in self.parts]
+        """Path loss and further observables; see `Split.respond`."""
+        responses = []
+        for part in self.parts:
+            at_carrier, _ = self.parameters.constants_and_slopes(values, part.engine.paths.frequency)
+            responses.append(part.respond(at_carrier[:, self.parameter_of] * factors, wanted))
         return of_links(responses, [part.links for part in self.parts])
 
 
-def _possible(part: _Part, constants: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The constants of one part [n, k], from those of all [n, c], within their physical bounds."""
-    bounds = [PARAMETER_BOUNDS[parameter.field] for parameter in part.engine.parameters]
-    lower, upper = [bound.lower for bound in bounds], [bound.upper for bound in bounds]
-    return np.clip(constants[:, part.constants], lower, upper)
+@final
+@dataclass(frozen=True, eq=False)
+class SplitChunks(Split):
+    """The same for links in chunks. Every worker splits the replays of its chunks and keeps them.
+
+    Attributes:
+        engine: The chunks.
+        splitting: How they are split.
+    """
+
+    engine: Chunked
+    splitting: _Splitting
+
+    def respond(
+        self, values: NDArray[np.float64], factors: NDArray[np.float64], wanted: tuple[Statistic, ...]
+    ) -> Responses:
+        """Path loss and further observables; see `Split.respond`."""
+        parts = self.engine.ask(_chunk_respond, self.splitting, self.keys, values, factors, wanted)
+        return of_links(parts, list(self.engine.chunks))
+
+
+@dataclass(frozen=True)
+class _Splitting:
+    """How replays are split; picklable. Equal ones split equally.
+
+    Attributes:
+        parameters: The study's parameters and further constants.
+        drop_weak: Whether weak paths are left out.
+        by_building: Whether each building has its own constants.
+    """
+
+    parameters: Parameters
+    drop_weak: bool
+    by_building: bool
+
+    def __call__(self, chunk: Chunk) -> SplitReplay:
+        """Split the replay of a chunk."""
+        return self.split(chunk.study, cast(Replay | ReplayCarriers, chunk.engine))
+
+    def split(self, study: OpenedStudy, engine: Replay | ReplayCarriers) -> SplitReplay:
+        """Split the replay of a study's links."""
+        splits, met = [], set()
+        for replay, links in engine.parts:
+            paths = replay.paths
+            if self.drop_weak and not replay.effects and paths.num_interactions:
+                paths = strongest(paths, replace(engine.parameters, frequency=paths.frequency), WEAK)
+            building = np.full(paths.num_interactions, -1)
+            if self.by_building:
+                building = _interaction_buildings(paths, study.scene)
+            met |= set(building[building >= 0].tolist())
+            splits.append((*_split_paths(study.radio, replay, paths, building, self.parameters), links))
+        # By the index of its parameter and its building.
+        constants = sorted({key for _, keys, _ in splits for key in keys})
+        number = {key: index for index, key in enumerate(constants)}
+        parts = tuple(
+            _Part(split, links, np.array([number[key] for key in keys], dtype=np.intp))
+            for split, keys, links in splits
+        )
+        parameter_of, building_of = np.array(constants, dtype=np.int64).reshape(-1, 2).T
+        interactions = sum(part.engine.interactions for part in parts)
+        return SplitReplay(
+            parameter_of,
+            building_of,
+            np.array(sorted(met), dtype=np.int64),
+            interactions,
+            self.parameters,
+            parts,
+        )
+
+    def split_chunks(self, engine: Chunked) -> SplitChunks:
+        """Split the replays of chunks on their workers."""
+        answers = engine.ask(_split_chunk, self)
+        constants = np.unique(np.concatenate([key for key, _, _ in answers]), axis=0)
+        met = np.unique(np.concatenate([numbers for _, numbers, _ in answers]))
+        interactions = sum(count for _, _, count in answers)
+        return SplitChunks(constants[:, 0], constants[:, 1], met, interactions, engine, self)
 
 
 def can_split(problem: Problem) -> bool:
-    """Whether a problem's engine replays from this process, without laws, so that further constants can vary."""
+    """Whether a problem's engine replays paths with interactions, so that further constants can vary."""
     engine = problem.engine
     return (
-        isinstance(engine, Replay | ReplayCarriers)
+        isinstance(engine, Replay | ReplayCarriers | Chunked)
         and problem.observable is PATH_LOSS
-        and not engine.parameters.has_laws
-        and all(replay.paths.num_interactions > 0 for replay, _ in engine.parts)
+        and engine.interactions > 0
     )
 
 
-def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool) -> SplitReplay:
+def replayed_materials(problem: Problem) -> list[dict[str, Material]]:
+    """The materials in the replay of every carrier, of a problem that `can_split`."""
+    if isinstance(problem.engine, Chunked):
+        return list(chain.from_iterable(problem.engine.ask(_chunk_materials)))
+    return [replay.materials for replay, _ in cast(Replay | ReplayCarriers, problem.engine).parts]
+
+
+def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool) -> Split:
     """Give a problem's replay further parameters, and each building of its scene its own constants.
 
     The problem is one that `can_split`; the study's parameters come first. A further parameter is a constant that is
     equal at all carriers. If the paths meet fewer than two buildings, no constant belongs to a building.
     """
-    engine = problem.engine
-    replays = engine.parts  # type: ignore[attr-defined]
-    many = sum(replay.interactions for replay, _ in replays) > MANY
+    engine = cast(Replay | ReplayCarriers | Chunked, problem.engine)
     # Weak paths are late ones, which delay spreads depend on.
     may_drop = problem.setup.study.objective.combining == "power" and not problem.observed
-    programs = [
-        strongest(replay.paths, problem.parameters, WEAK)
-        if many and may_drop and not replay.effects
-        else replay.paths
-        for replay, _ in replays
-    ]
-    buildings = [np.full(paths.num_interactions, -1) for paths in programs]
-    if by_building:
-        found = [_interaction_buildings(paths, problem.setup.scene) for paths in programs]
-        every = np.concatenate(found)
-        buildings = buildings if len(np.unique(every[every >= 0])) < 2 else found
-    splits = [
-        _split_paths(problem, paths, building, parameters, replay.effects)
-        for paths, building, (replay, _) in zip(programs, buildings, replays, strict=True)
-    ]
-    # By the index of its parameter and its building.
-    constants = list(dict.fromkeys(key for _, keys in splits for key in keys))
-    number = {key: index for index, key in enumerate(constants)}
-    parts = tuple(
-        _Part(split, links, np.array([number[key] for key in keys], dtype=np.intp))
-        for (split, keys), (_, links) in zip(splits, replays, strict=True)
+    splitting = _Splitting(parameters, may_drop and engine.interactions > MANY, by_building)
+    split = (
+        splitting.split_chunks(engine)
+        if isinstance(engine, Chunked)
+        else splitting.split(problem.setup, engine)
     )
-    parameter_of, building_of = np.array(constants, dtype=np.int64).reshape(-1, 2).T
-    return SplitReplay(parts, parameter_of, building_of)
+    if by_building and len(split.met) < 2:
+        return split_replay(problem, parameters, by_building=False)
+    return split
 
 
 def _split_paths(
-    problem: Problem,
-    paths: Paths,
-    building: NDArray[np.int64],
-    parameters: Parameters,
-    effects: Effects,
+    radio: RadioSettings, replay: Replay, paths: Paths, building: NDArray[np.int64], parameters: Parameters
 ) -> tuple[Replay, list[tuple[int, int]]]:
-    """The replay of one carrier; for each of its constants the index of its parameter, and its building or -1."""
+    """The replay of one carrier on some of its paths; for each of its constants its parameter, and building or -1.
+
+    It is the given replay without constants if its paths depend on none.
+    """
     names = list(paths.materials)
     # One material per pair of building and material, numbered by the sorted pairs.
     pairs, split_material = np.unique((building + 1) * len(names) + paths.material, return_inverse=True)
     number, original = (pairs // len(names) - 1).tolist(), [names[k] for k in pairs % len(names)]
     split_names = [f"{name} of {of}" for name, of in zip(original, number, strict=True)]
     items, keys = [], []
-    for index, parameter in enumerate(parameters):
-        if parameter.is_effect:
-            items.append(parameter)
+    at_carrier, constant_of = parameters.at_carrier(paths.frequency)
+    for constant_index, constant in enumerate(at_carrier):
+        setting = np.flatnonzero(constant_of == constant_index).tolist()
+        # Buildings differ by factors of a constant or of its law's scale, but not if only the exponent is a parameter.
+        scaling = [index for index in setting if parameters.items[index].field not in EXPONENTS]
+        index = (scaling or setting)[0]
+        if constant.is_effect:
+            items.append(constant)
             keys.append((index, -1))
             continue
         for split_name, name, of in zip(split_names, original, number, strict=True):
-            if name == parameter.material:
-                items.append(replace(parameter, name=f"{split_name}.{parameter.field}"))
-                keys.append((index, of))
+            if name == constant.material:
+                items.append(replace(constant, name=f"{split_name}.{constant.field}"))
+                keys.append((index, of if scaling else -1))
+    if not items:
+        return replay, []
     materials = {new: paths.materials[name] for new, name in zip(split_names, original, strict=True)}
-    batch = int(np.clip(BATCH_INTERACTIONS // paths.num_interactions, *BATCHES))
-    study = problem.setup.study
+    batch = int(np.clip(BATCH_INTERACTIONS // max(paths.num_interactions, 1), *BATCHES))
     split = Replay(
-        replace(paths, material=split_material.reshape(-1), materials=materials),
-        Parameters(tuple(items), parameters.frequency),
-        study.objective.combining,
-        study.scene.bandwidth,
-        effects,
+        replace(paths, material=split_material.reshape(-1), materials=materials or paths.materials),
+        Parameters(tuple(items), paths.frequency),
+        radio.combining,
+        radio.bandwidth,
+        replay.effects,
         Computation(batch=1 << (batch.bit_length() - 1)),
     )
     return split, keys
+
+
+# Functions that are sent to the workers of chunks.
+
+
+def _chunk_materials(chunk: Chunk) -> list[dict[str, Material]]:
+    return [replay.materials for replay, _ in cast(Replay | ReplayCarriers, chunk.engine).parts]
+
+
+def _split_chunk(chunk: Chunk, splitting: _Splitting) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
+    """Parameter and building of each constant of a chunk [c, 2], the buildings met, and the interactions."""
+    split = chunk.derived(splitting)
+    return np.stack([split.parameter_of, split.building_of], axis=1), split.met, split.interactions
+
+
+def _chunk_respond(
+    chunk: Chunk,
+    splitting: _Splitting,
+    keys: NDArray[np.int64],
+    values: NDArray[np.float64],
+    factors: NDArray[np.float64],
+    wanted: tuple[Statistic, ...],
+) -> Responses:
+    """A chunk's answer; the factors are those of the constants with the given keys."""
+    split = chunk.derived(splitting)
+    return split.respond(values, factors[:, np.searchsorted(keys, split.keys)], wanted)
 
 
 def _interaction_buildings(paths: Paths, scene: Scene) -> NDArray[np.int64]:

@@ -29,7 +29,7 @@ from calibray.fitting.nuisance import CONSTANT
 from calibray.fitting.problem import Problem
 from calibray.measurements import FEW
 from calibray.parameters import LogNormal, Parameter, Parameters, fixed_constant, split_name
-from calibray.uncertainty.buildings import can_split, split_replay
+from calibray.uncertainty.buildings import can_split, replayed_materials, split_replay
 from calibray.uncertainty.noise_models import HEAVY, Marginal, excess_db, noise_models
 
 MAX_LINKS: Final = 300
@@ -299,8 +299,6 @@ def _with_constants(
     replay, effects = split_replay(problem, every, by_building=model.spread != 0), {}
 
     def loss_at(values: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
-        if not problem.observed:
-            return replay.path_loss(values, factors)
         # The same compiled program as for the gaps.
         return replay.respond(values, factors, problem.statistics).path_loss
 
@@ -332,8 +330,6 @@ def _with_constants(
         factors = np.ones((len(points), len(replay.parameter_of)))
         factors[:, of_building] = np.exp(logarithms)
         values = full(parameters.from_unit(points))
-        if not problem.observed:
-            return gap(replay.path_loss(values, factors))
         answer = replay.respond(values, factors, problem.statistics)
         return np.hstack([gap(answer.path_loss), *_further(problem, answer.observed)])
 
@@ -372,8 +368,9 @@ def has_offset(problem: Problem) -> bool:
 
 def _fixed_constants(problem: Problem) -> list[Parameter]:
     """Constants that the scene fixes, equal at all carriers, of the materials that have a parameter."""
-    replays = [replay for replay, _ in problem.engine.parts]  # type: ignore[attr-defined]
     materials, spread = problem.engine.materials, problem.setup.study.noise.constants_spread
+    replayed = replayed_materials(problem)
+    calibrated, _ = problem.parameters.at_carrier(problem.parameters.frequency)
     names = [
         f"{material}.{field_name}"
         for material in dict.fromkeys(
@@ -386,8 +383,8 @@ def _fixed_constants(problem: Problem) -> list[Parameter]:
         material, field_name = split_name(name)
         value = getattr(materials[material], field_name)
         constant = fixed_constant(name, float(value), spread)
-        varies = any(getattr(replay.materials[material], field_name) != value for replay in replays)
-        if name not in problem.parameters.names and constant is not None and not varies:
+        varies = any(getattr(each[material], field_name) != value for each in replayed)
+        if name not in calibrated.names and constant is not None and not varies:
             items.append(constant)
     return items
 

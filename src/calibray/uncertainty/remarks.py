@@ -22,7 +22,6 @@ from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.preliminary_fits import with_estimated_errors
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import BASINS, least_squares
-from calibray.parameters import Parameters
 from calibray.result.verdict import CONFIDENCE, Interval, Remark, RemarkKind, Value
 from calibray.result.wording import MOST_ODDS
 from calibray.study.model import StudyModel
@@ -199,16 +198,6 @@ def _lacking(study: StudyModel) -> list[str]:
     switches = [f"{name} = true" for name in ("refraction", "diffraction") if not getattr(study.trace, name)]
     depth = study.trace.max_depth + 1
     return switches + [f"max_depth = {depth}"] * (depth <= RANGES["max_depth"][1])
-
-
-def exact_constants(parameters: Parameters, study: StudyModel, *, chunks: bool = False) -> tuple[Remark, ...]:
-    """A remark if coefficients of laws are parameters, or links are in chunks.
-
-    Then neither constants nor buildings vary in the draws.
-    """
-    stated = study.noise.constants_spread or study.noise.heterogeneity
-    remark = Remark(RemarkKind.EXACT_CONSTANTS, {"chunks": chunks})
-    return (remark,) if (parameters.has_laws or chunks) and stated else ()
 
 
 def missed(problem: Problem, posterior: Draws, best_value: float) -> tuple[Remark, ...]:

@@ -242,12 +242,26 @@ class ChunkRecipe:
 
 @final
 class Chunk:
-    """Links that are traced and replayed together. Pickling a chunk sends its recipe instead of its paths."""
+    """Links that are traced and replayed together. Pickling a chunk sends its recipe instead of its paths.
+
+    Attributes:
+        study: The opened study of the links.
+        engine: The engine over them.
+    """
 
     def __init__(self, recipe: ChunkRecipe) -> None:
         self._recipe = recipe
+        self._derived: tuple[Any, Any] | None = None
         with _TRACING:
-            self.engine = recipe.open(recipe.shared.content.at(recipe.links), recipe.materials)
+            self.study = recipe.shared.content.at(recipe.links)
+            self.engine = recipe.open(self.study, recipe.materials)
+
+    def derived(self, make: Callable[[Chunk], Content]) -> Content:
+        """What `make` derives from this chunk; it is kept until something else is derived or the chunk is closed."""
+        if self._derived is None or self._derived[0] != make:
+            self._derived = None  # frees the memory first
+            self._derived = make, make(self)
+        return self._derived[1]
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Chunk, (self._recipe,)
@@ -330,6 +344,10 @@ class ChunkedReplay:
         parts = self._workers.ask(_respond, [self._kept], values, wanted, derivatives)
         self.calls += len(values)
         return of_links(parts, list(self.chunks))
+
+    def ask(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+        """Call a function on every chunk; see `Chunked.ask`."""
+        return self._workers.ask(function, [self._kept], *arguments)
 
     def reducing(self, reductions: Sequence[Reduction]) -> Reduced:
         """A function that reduces every chunk's path loss on its worker; see `Chunked.reducing`."""

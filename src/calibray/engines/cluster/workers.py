@@ -83,12 +83,12 @@ class Workers(Protocol):
 class InProcess:
     """This process works on one chunk after the other.
 
-    It keeps `at_most` chunks, and makes others again for each question. If None, chunks are kept until they use half of
-    the memory that was free at the start.
+    It keeps `at_most` chunks, and makes others again for each question. If None, chunks are kept until they use a third
+    of the memory that was free at the start, because what is derived from them needs as much again.
     """
 
     def __init__(self, at_most: int | None = None) -> None:
-        self._at_most, self._reserve = at_most, available_memory() // 2
+        self._at_most, self._reserve = at_most, available_memory() * 2 // 3
 
     def executor(self) -> None:
         """None: calls run one after the other."""
