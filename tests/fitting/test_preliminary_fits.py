@@ -104,6 +104,30 @@ def test_links_stay_if_all_are_faint():
     assert kept.objective.num_counted == len(links)
 
 
+def test_a_group_with_only_faint_links_keeps_all_of_them_with_a_warning(caplog):
+    """Its offset, fitted to the received half of a group at the floor, is too low by 0.8 standard deviations."""
+    random, way = np.random.default_rng(4), np.tile(np.linspace(0.0, 2.0, 60), 3)
+    weak = np.arange(len(way)) % 2 == 0
+    loss = 80.0 + SLOPE * way + np.where(weak, LIMIT_DB - 80.0 - SLOPE * way, 0.0)
+    loss += SPREAD_DB * random.standard_normal(len(way))
+    way, weak, loss = (values[loss < LIMIT_DB] for values in (way, weak, loss))
+    place = np.column_stack([way, np.zeros((len(way), 2))])
+    limit = np.full(len(way), LIMIT_DB)
+    links = Measurements(place + 1.0, place, loss, group=np.where(weak, "weak", "strong"), limit_db=limit)
+    columns = (make_term(links, "offset", labels=links.group),)
+    every = np.ones(len(way), bool)
+    engine = Ramp(np.where(weak, 0.0, way))
+    objective = make_objective(links, every, every, nuisance=Nuisance(len(way), columns))
+    before = engine.path_loss(engine.parameters.start[None])[0]
+    kept = leave_out_near_floor(Problem(SimpleNamespace(links=links), engine, objective, before))  # type: ignore[arg-type]
+    assert kept.objective.num_counted == len(way)
+    found = kept.objective.coefficients(engine.path_loss(np.array([[SLOPE]])))[0]
+    assert found == pytest.approx([0.0, LIMIT_DB - 80.0 - 0.8 * SPREAD_DB], abs=0.6)
+    (message,) = caplog.messages
+    assert f"{weak.sum()} of {len(way)} links are expected near the noise floor" in message
+    assert "do not determine offset[weak]" in message
+
+
 @pytest.mark.parametrize(
     ("quantity", "sent", "limit"), [("rsrp", None, 120.0), ("received_power", 30.0, 150.0)]
 )

@@ -16,6 +16,7 @@ Expectation maximization with a Gaussian approximation at the optimum (D. Bates 
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -30,8 +31,11 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import least_squares
 from calibray.study import Study
 from calibray.study.mounting import estimated_fields, with_spreads
+from calibray.support.messages import MAX_LISTED
 from calibray.support.progress import Progress
 from calibray.tracing.antennas import NEW, POSE
+
+_LOG: Final = logging.getLogger(__name__)
 
 MARGIN: Final = 8.0
 """Required distance of a predicted path loss from the noise floor, in standard deviations of the links' errors.
@@ -60,7 +64,8 @@ def leave_out_near_floor(problem: Problem, progress: Progress | None = None) -> 
     """Give the links whose predicted path loss is near the noise floor weight 0, and mark them in `faint`.
 
     The problem is unchanged without a noise floor, and on an engine without derivatives, because its calls are
-    expensive. The stage of `progress` is "choosing links".
+    expensive. It is also unchanged, with a warning, if the other links determine fewer unknowns. The stage of
+    `progress` is "choosing links".
     """
     limit, objective = problem.setup.links.limit_db, problem.objective
     if limit is None or not problem.differentiable:
@@ -79,6 +84,8 @@ def leave_out_near_floor(problem: Problem, progress: Progress | None = None) -> 
             progress("choosing links", turn + 1, SELECTIONS)
         selected = replace(objective, weight=np.where(faint, 0.0, all_weights))
         if np.array_equal(faint, before) or problem.freedom < 1 or not _determines_as_much(problem, selected):
+            if turn == 0 and faint.any():
+                _warn_of_bias(problem, selected, faint)
             faint = before
             break
         objective = selected
@@ -94,6 +101,19 @@ def _determines_as_much(problem: Problem, selected: Objective) -> bool:
         return False
     has_freedom = replace(problem, objective=selected).freedom >= 1
     return has_freedom and np.array_equal(selected.determined, problem.objective.determined)
+
+
+def _warn_of_bias(problem: Problem, selected: Objective, faint: NDArray[np.bool_]) -> None:
+    """Say that links near the noise floor stay, because those selected determine less, and what follows."""
+    determined = selected.determined if (selected.weight > 0).any() else np.zeros(1, dtype=bool)
+    lost = np.flatnonzero(problem.objective.determined & ~determined)
+    names = ", ".join(problem.objective.nuisance.columns[column] for column in lost[:MAX_LISTED])
+    _LOG.warning(
+        "%s: %s of %s links are expected near the noise floor, but stay, because the others do not determine %s; only "
+        "favourable errors are received there, so fitted offsets and path loss are too low; measure closer links",
+        problem.setup.links.source, f"{faint.sum():,}", f"{problem.objective.num_counted:,}",
+        names or "all unknowns",
+    )  # fmt: skip
 
 
 def estimate_noise(problem: Problem, progress: Progress | None = None) -> Problem:
