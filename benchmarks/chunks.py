@@ -5,6 +5,7 @@
     python benchmarks/chunks.py bytes               # what a candidate moves, by number of links
     python benchmarks/chunks.py links               # memory and time of a step, chunks repeated up to a million links
     python benchmarks/chunks.py city --links 100000 # a campaign in Munich end to end, in one process
+    python benchmarks/chunks.py draws               # the uncertainty in ten chunks against all links at once
 
 Each mode has its own processes and cache. Measured values follow a law of distance with noise of 6 dB, because the fit
 does not matter here.
@@ -20,6 +21,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import cast
@@ -33,9 +35,11 @@ from calibray.engines import ChunkedReplay, InProcess, Workers
 from calibray.engines.cluster.chunks import chunk_size, cut, seconds_to_trace
 from calibray.engines.cluster.dask_workers import DaskWorkers
 from calibray.engines.kinds.replay import trace_and_replay
+from calibray.engines.protocol import Differentiable
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import choose, search
 from calibray.study import Setup, Study
+from calibray.uncertainty.assessment import certainty
 
 MASTS = np.array([[8.5, 21.0, 27.0], [45.0, 90.0, 40.0]])  # [m]
 COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
@@ -220,10 +224,30 @@ def city(links: int, samples: int | str) -> None:
     print(f"{taken:.0f} s ({result.cost.trace_seconds:.0f} s tracing), peak memory {resident():.2f} GiB")
 
 
+def draws(links: int) -> None:
+    """Assess the uncertainty of links with planted path loss in one process, at once and in ten chunks."""
+    base = campaign(links, {})
+    loss = engines.make(base).path_loss(np.array([[5.0, 6.0, 4.0]]))[0]
+    reached = np.isfinite(loss)
+    noise = 6 * np.random.default_rng(1).standard_normal(reached.sum())
+    known = replace(base.links.select(reached), path_loss_db=loss[reached] + noise)
+    for engine in ({}, {"chunk_links": -(-len(known) // 10)}):
+        problem = Problem.of(setup := campaign(links, engine).at(known), engines.make(setup))
+        trail = search(problem, choose(problem))
+        started = time.process_time()
+        found = certainty(problem, trail)
+        ends = {name: (round(each.lower, 4), round(each.upper, 4)) for name, each in found.intervals.items()}
+        print(
+            f"{len(known)} links, {cast(Differentiable, problem.engine).interactions} interactions, {engine}: "
+            f"{time.process_time() - started:.1f} s of processor time for {found.calls} replays; {ends}",
+            flush=True,
+        )
+
+
 def main() -> None:
     """Run what was asked for, each size in a process of its own."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("what", choices=("speed-up", "validate", "bytes", "links", "city"))
+    parser.add_argument("what", choices=("speed-up", "validate", "bytes", "links", "city", "draws"))
     parser.add_argument("--links", type=int, default=None, help="number of links, of a chunk with `links`")
     parser.add_argument("--chunks", type=int, nargs="+", default=[1, 10, 100])
     parser.add_argument(
@@ -246,6 +270,7 @@ def main() -> None:
         "validate": lambda: speed_up(options.links or 400, validated),
         "bytes": lambda: moved(options.links or 400),
         "links": lambda: repeated(options.chunks[0], options.links),
+        "draws": lambda: draws(options.links or 16_000),
         "city": lambda: city(options.links or 100_000, options.samples),
     }[options.what]()
 

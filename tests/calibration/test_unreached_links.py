@@ -25,7 +25,9 @@ BEHIND = 9
 SHADOW_DB = 25.0
 
 
-def calibrated(folder: Path, behind: int = BEHIND, **trace: object) -> Result:
+def calibrated(
+    folder: Path, behind: int = BEHIND, engine: dict[str, int] | None = None, **trace: object
+) -> Result:
     """A calibration of the ground beside one house, in whose shadow receivers measure `SHADOW_DB` more."""
     ground = [[(-80.0, -80.0, 0.0), (80.0, -80.0, 0.0), (80.0, 80.0, 0.0), (-80.0, 80.0, 0.0)]]
     scene = write_scene(folder, {"ground": ground, "house": block((-10, -20, 0), (10, 20, 15))})
@@ -47,12 +49,16 @@ def calibrated(folder: Path, behind: int = BEHIND, **trace: object) -> Result:
         "trace": {"max_depth": 1, "samples": 20_000, **trace},
         "parameters": {"stone.relative_permittivity": {"bounds": [2.0, 12.0]}},
         "noise": {"kind": "gaussian", "range_m": 0, "heterogeneity": 0, "constants_spread": 0},
+        "engine": {"name": "replay", **(engine or {})},
     }  # fmt: skip
     return cb.calibrate(cb.Study.from_content(study, folder / "study.toml"))
 
 
-def test_many_links_without_a_path_are_reported_with_the_switch_that_reaches_them(tmp_path: Path) -> None:
-    result = calibrated(tmp_path, behind=6)
+@pytest.mark.parametrize("engine", [{}, {"chunk_links": 6}])
+def test_many_links_without_a_path_are_reported_with_the_switch_that_reaches_them(
+    tmp_path: Path, engine: dict[str, int]
+) -> None:
+    result = calibrated(tmp_path, behind=6, engine=engine)
     (remark,) = (part for part in result.uncertainty.remarks if part.kind == RemarkKind.UNREACHED_LINKS)
     assert (remark.values["links"], remark.values["of"]) == (6, 14)
     reached = dict(zip(remark.values["switches"], remark.values["reached"], strict=True))

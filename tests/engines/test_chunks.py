@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import two_ray
-from calibray import engines
+from calibray import calibrate, engines
 from calibray.engines import ChunkedReplay, InProcess
 from calibray.engines.cluster.chunks import cut
 from calibray.engines.kinds.replay import trace_and_replay
@@ -80,6 +80,18 @@ def test_sums_over_chunks_equal_sums_over_all_links(tmp_path, name):
         InProcess(at_most=1), chunked.setup, chunked.engine.chunks, partial(trace_and_replay, None)
     )
     assert replace(chunked, engine=engine).modelled(points) == pytest.approx(expected.modelled, rel=1e-12)
+
+
+def test_depth_and_power_of_paths_are_those_of_all_links(tmp_path):
+    few = {"method": {"name": "least-squares", "options": {"starts": 2}}}
+    whole, chunked = (
+        calibrate(Setup.open(two_ray.study(tmp_path, noise_db=1.0, **few, **engine), two_ray.TwoRay))
+        for engine in ({}, {"engine": {"name": "replay", "chunk_links": 12}})
+    )
+    assert set(whole.fit.power_shares) == {"ground", "line of sight"}
+    for name, by_kind in whole.fit.power_shares.items():
+        assert chunked.fit.power_shares[name] == pytest.approx(by_kind, rel=1e-9)
+    np.testing.assert_array_equal(chunked.links["depth"], whole.links["depth"])
 
 
 def made_up(count: int) -> tuple[Measurements, np.ndarray, np.ndarray]:

@@ -102,9 +102,9 @@ def test_three_transmitters_with_their_own_antennas_and_powers_are_calibrated(pl
     assert len(table) == 36
 
 
-@pytest.mark.parametrize("turned", [0.0, 12.0])
+@pytest.mark.parametrize(("turned", "engine"), [(0.0, {}), (12.0, {}), (12.0, {"chunk_links": 10})])
 def test_a_sector_that_points_elsewhere_than_stated_is_named(
-    planted: Study, tmp_path: Path, turned: float
+    planted: Study, turned: float, engine: dict[str, int]
 ) -> None:
     """Residuals of 1 dB by which only the sector to the east, 12 degrees off, is suspect; with none off, none is."""
     folder, random = planted.path.parent, np.random.default_rng(4)
@@ -115,6 +115,7 @@ def test_a_sector_that_points_elsewhere_than_stated_is_named(
     east = sites["transmitter"] == "east"
     sites.assign(bearing=sites["bearing"] - turned * east).to_csv(folder / "turned.csv", index=False)
     study = mounted(planted, file="noisy.csv", transmitters="turned.csv")
+    study = Study.from_content(study.content() | {"engine": {"name": "replay", **engine}}, study.path)
     result = cb.calibrate(study, tracer=TwoRay)
     remarks = [
         remark for remark in result.uncertainty.remarks if remark.kind == RemarkKind.ANTENNA_DIRECTIONS

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 import pandas as pd
@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from pandas.api.types import is_numeric_dtype
 from scipy.special import fdtrc, stdtr
 
+from calibray.engines.cluster.chunks import Chunk, Shared, select_links
 from calibray.engines.kinds.replay import replay
-from calibray.engines.replay import Replay
+from calibray.engines.protocol import Chunked
+from calibray.engines.replay import Replay, ReplayCarriers
 from calibray.fields import path_gains
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.fitting.search import Trail
@@ -65,11 +67,33 @@ def diagnose_links(problem: Problem, best: NDArray[np.float64], paths: Paths | N
     columns: dict[str, NDArray[np.float64]] = {}
     if problem.differentiable:
         columns["leverage"] = _leverage(problem, best)
-    if paths is None or not isinstance(problem.engine, Replay) or not paths.num_paths:
+    engine, names = problem.engine, list(problem.engine.materials)
+    if isinstance(engine, Chunked) and _at_one_carrier(problem):
+        materials = problem.parameters.materials(best, engine.materials)
+        parts, links = engine.ask(_chunk_power, materials), list(engine.chunks)
+    elif paths is not None:
+        materials = problem.parameters.materials(best, engine.materials)
+        parts, links = [_depth_and_power(paths, materials)], [np.arange(problem.num_links)]
+    else:
         return LinkDiagnostics(columns)
-    materials = problem.parameters.materials(best, problem.engine.materials)
-    depth, shares = _depth_and_power(paths, materials)
+    reached, depth = sum(part.reached for part in parts), np.full(problem.num_links, np.nan)
+    if not reached:
+        return LinkDiagnostics(columns)
+    for part, chunk in zip(parts, links, strict=True):
+        depth[chunk] = part.depth
+    share = np.sum([part.power for part in parts], axis=0) / reached
+    shares: dict[str, dict[str, float]] = {}
+    for material, kind in np.argwhere(share[:-1] > 0).tolist():
+        shares.setdefault(names[material], {})[Kind(kind).name.lower()] = float(share[material, kind])
+    if share[-1, 0] > 0:
+        shares[DIRECT] = {"": float(share[-1, 0])}
     return LinkDiagnostics({**columns, "depth": depth}, shares)
+
+
+def _at_one_carrier(problem: Problem) -> bool:
+    """Whether the problem replays all its paths, uncompressed, with the constants at the study's carrier."""
+    compressed = getattr(problem.setup.study.engine, "compress_db", None) is not None
+    return not (compressed or problem.parameters.has_laws or problem.setup.links.frequency is not None)
 
 
 def _leverage(problem: Problem, best: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -107,33 +131,44 @@ def leverage(jacobian: NDArray[np.float64], design: NDArray[np.float64]) -> NDAr
     return np.minimum(total, 1.0)
 
 
-def _depth_and_power(
-    paths: Paths, materials: dict[str, Material]
-) -> tuple[NDArray[np.float64], dict[str, dict[str, float]]]:
-    """Number of interactions of every link's strongest path [L], and power by material and kind of interaction."""
-    gain = path_gains(paths, materials).reshape(paths.num_paths, -1)
-    power = np.sum(np.abs(gain) ** 2, axis=1)
+class _Power(NamedTuple):
+    """Power of the paths of some links.
+
+    Attributes:
+        depth: Number of interactions of every link's strongest path [L].
+        power: Shares of the links' power by material and kind of interaction, summed over the links; then a row whose
+            first element is the share without interactions [M + 1, kinds].
+        reached: Number of links with power.
+    """
+
+    depth: NDArray[np.float64]
+    power: NDArray[np.float64]
+    reached: int
+
+
+def _depth_and_power(paths: Paths, materials: dict[str, Material]) -> _Power:
+    gain = path_gains(paths, materials)
+    power = np.sum(np.abs(gain) ** 2, axis=tuple(range(1, gain.ndim)))
     count, order = np.diff(paths.first), np.lexsort((power, paths.link))
     depth = np.full(paths.num_links, np.nan)
     # The last of a link's paths in this order is its strongest.
     depth[paths.link[order]] = count[order]
     total = np.bincount(paths.link, power, paths.num_links)
     part = power / np.where(total > 0, total, np.inf)[paths.link]
-    reached = max(int(np.count_nonzero(total)), 1)
     # One code per pair of material and kind; a path counts once for each pair that it meets.
+    kinds = max(Kind) + 1
     path_of = np.repeat(np.arange(paths.num_paths), count)
-    code_of = paths.material.astype(np.int64) * (max(Kind) + 1) + paths.kind
-    path_index, codes = np.unique(np.stack([path_of, code_of]), axis=1)
-    shares: dict[str, dict[str, float]] = {}
-    names = list(paths.materials)
-    for code in np.unique(codes):
-        material, kind = divmod(int(code), max(Kind) + 1)
-        share = float(part[path_index[codes == code]].sum()) / reached
-        shares.setdefault(names[material], {})[Kind(kind).name.lower()] = share
-    direct = float(part[count == 0].sum()) / reached
-    if direct:
-        shares[DIRECT] = {"": direct}
-    return depth, shares
+    path_index, codes = np.unique(
+        np.stack([path_of, paths.material.astype(np.int64) * kinds + paths.kind]), axis=1
+    )
+    shares = np.zeros((len(paths.materials) + 1, kinds))
+    np.add.at(shares.reshape(-1), codes, part[path_index])
+    shares[-1, 0] = part[count == 0].sum()
+    return _Power(depth, shares, int(np.count_nonzero(total)))
+
+
+def _chunk_power(chunk: Chunk, materials: dict[str, Material]) -> _Power:
+    return _depth_and_power(cast(Replay, chunk.engine).paths, materials)
 
 
 MOST_LABELS: Final = 50
@@ -242,7 +277,7 @@ def unreached_remark(problem: Problem, progress: Progress | None = None) -> tupl
             usable &= ~excluded
     unreached = np.flatnonzero(usable & ~np.isfinite(problem.before))
     few = len(unreached) < max(FEWEST, SHARE * usable.sum())
-    traced = setup.study.rays_path is None and isinstance(problem.engine, Replay)
+    traced = setup.study.rays_path is None and isinstance(problem.engine, Replay | ReplayCarriers | Chunked)
     if few or setup.links.frequency is not None or not traced:
         return ()
     sample = np.sort(np.random.default_rng(0).permutation(unreached)[:SAMPLE])
@@ -371,12 +406,11 @@ def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Rema
     setup, engine = problem.setup, problem.engine
     study, table = setup.study, setup.links.table
     known = any(name.startswith(POSE) for name in study.parameters)
-    compressed = getattr(study.engine, "compress_db", None) is not None
     section = study.links.mountings.get("tx")
     stated = section is not None and section.aim is None
-    if not stated or known or compressed or problem.observed:
+    if not stated or known or not _at_one_carrier(problem) or problem.observed:
         return ()
-    if not isinstance(engine, Replay) or study.links.transmitter not in table.frame:
+    if not isinstance(engine, Replay | Chunked) or study.links.transmitter not in table.frame:
         return ()
     labels = table.labels(study.links.transmitter)[problem.objective.weight > 0].tolist()
     tested = [
@@ -402,7 +436,7 @@ def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Rema
 
 
 def _derivatives(
-    problem: Problem, engine: Replay, best: NDArray[np.float64], transmitters: list[str]
+    problem: Problem, engine: Replay | Chunked, best: NDArray[np.float64], transmitters: list[str]
 ) -> tuple[Evaluation, dict[str, int]]:
     """Residuals and derivatives at the calibrated values, also by directions and gains of transmitters; columns."""
     content = problem.setup.study.content()
@@ -419,9 +453,25 @@ def _derivatives(
     setup = replace(problem.setup, study=study, parameters=parameters)
     values = problem.parameters.named(best)
     candidate = np.array([values.get(name, 0.0) for name in parameters.names])
-    trial = replace(problem, setup=setup, engine=replay(setup, engine.paths), priors=study.priors)
+    if isinstance(engine, Chunked):
+        posed = engine.derived(
+            parameters, _Posed(Shared(setup.at(select_links(setup.links, engine.chunks[0]))))
+        )
+    else:
+        posed = replay(setup, engine.paths)
+    trial = replace(problem, setup=setup, engine=posed, priors=study.priors)
     evaluation = trial.evaluate(parameters.to_search(candidate)[None], derivatives=True)
     return evaluation, {name: number for number, name in enumerate(parameters.names)}
+
+
+@dataclass(frozen=True)
+class _Posed:
+    """Derives the replay of a chunk's paths for another opened study."""
+
+    study: Shared[Setup]
+
+    def __call__(self, chunk: Chunk) -> Replay | ReplayCarriers:
+        return replay(self.study.content.at(chunk.study.links), cast(Replay, chunk.engine).paths)
 
 
 def _direction(

@@ -157,6 +157,10 @@ class Chunked(Differentiable, Protocol):
         """
         ...
 
+    def derived(self, parameters: Parameters, derive: Callable[[Any], Differentiable]) -> Chunked:
+        """The same chunks with engines for other parameters, which a picklable function derives from every chunk."""
+        ...
+
     def traced_with(self, materials: Mapping[str, Material], progress: Progress | None = None) -> Chunked:
         """The same engine on paths traced with other materials; `progress` is called after every chunk."""
         ...

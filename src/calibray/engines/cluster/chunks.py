@@ -12,6 +12,7 @@ import hashlib
 import pickle
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from threading import Lock
@@ -24,10 +25,8 @@ from numpy.typing import NDArray
 from calibray.engines.cluster.workers import Workers
 from calibray.engines.protocol import (
     Differentiable,
-    Observing,
     Reduced,
     Reduction,
-    ReplaysScene,
     Responses,
     check_candidates,
     of_links,
@@ -36,6 +35,7 @@ from calibray.engines.section import OpenedStudy
 from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.measurements.observables import Statistic
+from calibray.parameters import Parameters
 from calibray.paths import Paths, join_links
 from calibray.support.progress import Progress
 from calibray.tracing import convergence
@@ -267,6 +267,10 @@ class Chunk:
         return Chunk, (self._recipe,)
 
 
+Derive = Callable[[Chunk], Differentiable]
+"""Derives another engine from the paths of a chunk; picklable."""
+
+
 @final
 class ChunkedReplay:
     """Links in chunks on workers, evaluated for any candidate; all chunks are opened together.
@@ -296,6 +300,7 @@ class ChunkedReplay:
         progress: Progress | None = None,
     ) -> None:
         self._workers, self._study, self._open = workers, study, opening
+        self._derive: Derive | None = None
         self.chunks, self.calls, self.parameters = chunks, 0, study.parameters
         self.materials = {**study.scene.materials, **(materials or {})}
         links = [select_links(study.links, chunk) for chunk in chunks]
@@ -310,7 +315,7 @@ class ChunkedReplay:
         """Path loss of every link for candidates; see `Engine.path_loss`."""
         values = check_candidates(candidates, len(self.parameters))
         loss = np.empty((len(values), len(self._study.links)))
-        for chunk, chunk_loss in self._answers(_path_loss, values):
+        for chunk, chunk_loss in self._answers("path_loss", values):
             loss[:, chunk] = chunk_loss
         return loss
 
@@ -320,7 +325,7 @@ class ChunkedReplay:
         """Path loss of the scene alone for candidates; see `ReplaysScene.scene_path_loss`."""
         values = check_candidates(candidates, len(self.parameters))
         loss = np.empty((len(values), len(self._study.links)))
-        for chunk, chunk_loss in self._answers(partial(_scene_path_loss, walls=dict(walls)), values):
+        for chunk, chunk_loss in self._answers("scene_path_loss", values, dict(walls)):
             loss[:, chunk] = chunk_loss
         return loss
 
@@ -331,7 +336,7 @@ class ChunkedReplay:
         values = check_candidates(candidates, len(self.parameters))
         loss = np.empty((len(values), len(self._study.links)))
         jacobian = np.empty((*loss.shape, len(self.parameters)))
-        for chunk, (chunk_loss, chunk_jacobian) in self._answers(_path_loss_and_jacobian, values):
+        for chunk, (chunk_loss, chunk_jacobian) in self._answers("path_loss_and_jacobian", values):
             loss[:, chunk] = chunk_loss
             jacobian[:, chunk] = chunk_jacobian
         return loss, jacobian
@@ -341,9 +346,8 @@ class ChunkedReplay:
     ) -> Responses:
         """Path loss and further observables of every link, all sent to this process; see `Observing.respond`."""
         values = check_candidates(candidates, len(self.parameters))
-        parts = self._workers.ask(_respond, [self._kept], values, wanted, derivatives)
-        self.calls += len(values)
-        return of_links(parts, list(self.chunks))
+        answers = self._answers("respond", values, wanted, derivatives)
+        return of_links([part for _, part in answers], list(self.chunks))
 
     def ask(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
         """Call a function on every chunk; see `Chunked.ask`."""
@@ -356,7 +360,7 @@ class ChunkedReplay:
         def reduced(candidates: NDArray[np.float64], derivatives: bool) -> list[Any]:
             values = check_candidates(candidates, len(self.parameters))
             self.calls += len(values)
-            return self._workers.ask(_reduce, [self._kept, kept], values, derivatives)
+            return self._workers.ask(_reduce, [self._kept, kept], self._derive, values, derivatives)
 
         return reduced
 
@@ -366,8 +370,16 @@ class ChunkedReplay:
         """The same on paths traced with other materials; see `Chunked.traced_with`."""
         return ChunkedReplay(self._workers, self._study, self.chunks, self._open, materials, progress)
 
-    def _answers(self, function: Callable, values: NDArray[np.float64]) -> zip[tuple[NDArray[np.int64], Any]]:
-        answers = self._workers.ask(function, [self._kept], values)
+    def derived(self, parameters: Parameters, derive: Derive) -> ChunkedReplay:
+        """The same chunks with engines for other parameters; see `Chunked.derived`."""
+        other = copy(self)
+        other.parameters, other._derive = parameters, derive
+        return other
+
+    def _answers(
+        self, method: str, values: NDArray[np.float64], *arguments: Any
+    ) -> zip[tuple[NDArray[np.int64], Any]]:
+        answers = self.ask(_answer, self._derive, method, values, *arguments)
         self.calls += len(values)
         return zip(self.chunks, answers, strict=True)
 
@@ -379,29 +391,22 @@ def _size(chunk: Chunk) -> tuple[int, bool]:
     return chunk.engine.interactions, chunk.engine.large
 
 
-def _path_loss(chunk: Chunk, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-    return chunk.engine.path_loss(candidates)
+def _engine(chunk: Chunk, derive: Derive | None) -> Differentiable:
+    return chunk.engine if derive is None else chunk.derived(derive)
 
 
-def _scene_path_loss(
-    chunk: Chunk, candidates: NDArray[np.float64], walls: Mapping[str, str]
-) -> NDArray[np.float64]:
-    return cast(ReplaysScene, chunk.engine).scene_path_loss(candidates, walls)
+def _answer(chunk: Chunk, derive: Derive | None, method: str, *arguments: Any) -> Any:
+    return getattr(_engine(chunk, derive), method)(*arguments)
 
 
-def _path_loss_and_jacobian(
-    chunk: Chunk, candidates: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    return chunk.engine.path_loss_and_jacobian(candidates)
-
-
-def _respond(
-    chunk: Chunk, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool
-) -> Responses:
-    return cast(Observing, chunk.engine).respond(candidates, wanted, derivatives)
-
-
-def _reduce(chunk: Chunk, reduction: Reduction, candidates: NDArray[np.float64], derivatives: bool) -> object:
+def _reduce(
+    chunk: Chunk,
+    reduction: Reduction,
+    derive: Derive | None,
+    candidates: NDArray[np.float64],
+    derivatives: bool,
+) -> object:
+    engine = _engine(chunk, derive)
     if derivatives:
-        return reduction(*chunk.engine.path_loss_and_jacobian(candidates))
-    return reduction(chunk.engine.path_loss(candidates), None)
+        return reduction(*engine.path_loss_and_jacobian(candidates))
+    return reduction(engine.path_loss(candidates), None)
