@@ -26,10 +26,6 @@ WGS84: Final = "EPSG:4326"
 """Reference system of satellite receivers: longitude and latitude."""
 
 
-DATUM_SHIFT: Final = 3000.0
-"""Largest distance between points of equal coordinates in two geodetic datums [m]; most differ by less than 1 km."""
-
-
 @dataclass(frozen=True)
 class Frame:
     """The frame of a scene: a projection in metres, and the point in it that is the scene's origin.
@@ -204,7 +200,8 @@ def find_projection(
     known = pyproj.database.query_crs_info("EPSG", pyproj.enums.PJType.PROJECTED_CRS, here, contains=True)
     utm = [Frame.utm(longitude, latitude).crs] if -80 <= latitude <= 84 else []
     best, most = None, 0.5
-    reach = DATUM_SHIFT + 2 * float(np.max(np.subtract(high, low)))
+    # Points of equal coordinates in two geodetic datums are less than 3 km apart, most less than 1 km.
+    reach = 3000.0 + 2 * float(np.max(np.subtract(high, low)))
     for crs in dict.fromkeys([*utm, "EPSG:3857", *sorted(f"EPSG:{info.code}" for info in known)]):
         try:
             # Without its datum a projection is computed fast, and off by less than the shift between datums.

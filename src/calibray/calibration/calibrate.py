@@ -43,10 +43,6 @@ from calibray.validation.validate import check_engine, validate_problem
 
 _LOG: Final = logging.getLogger(__name__)
 
-MINIMA_WITHOUT_MULTISTART: Final = 2
-"""If a method has no multi-start, it returns at most this many minima, which are too few starting points for a
-validation."""
-
 
 # Ctrl-C during an import leaves half-initialized modules, whose errors would hide the interruption.
 @ensure_interruption()
@@ -151,7 +147,8 @@ def calibrate(
         problem = replace(problem, setup=problem.setup.with_obstruction())
     validation = None
     if by_blocks:
-        many = len(trail.minima) > MINIMA_WITHOUT_MULTISTART
+        # A method without a multi-start returns at most two minima, too few starting points for a validation.
+        many = len(trail.minima) > 2
         starts = {Model.CALIBRATED: trail.minima} if many else NO_MINIMA
         validation = validate_problem(problem, progress=progress, known_minima=starts)
     on_links = unreached_remark(problem, progress) if can_trace and exporting is None else ()

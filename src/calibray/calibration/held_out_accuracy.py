@@ -32,13 +32,7 @@ from calibray.validation.held_out_statistics import (
     predicting,
     two_levels,
 )
-from calibray.validation.models import (
-    averages,
-    initial_objective,
-    log_distance,
-    without_paths,
-    without_scene,
-)
+from calibray.validation.models import averages, initial_objective, log_distance, without_paths, without_scene
 from calibray.validation.validation import Validation
 
 

@@ -171,12 +171,6 @@ def _chunk_power(chunk: Chunk, materials: dict[str, Material]) -> _Power:
     return _depth_and_power(cast(Replay, chunk.engine).paths, materials)
 
 
-MOST_LABELS: Final = 50
-"""Largest number of groups of a column; more would be names of links or of positions."""
-
-TX_SCALE: Final = 1000.0
-"""Factor of the transmitters' coordinates, so that clusters rarely contain links of two transmitters [1]."""
-
 FEWEST_CLUSTERS: Final = 8
 """Smallest number of clusters with links inside and outside a group."""
 
@@ -227,14 +221,16 @@ def differing_groups(
         columns: Labels [n] by column.
     """
     count = min(max(len(ends) // CLUSTER_LINKS, 1), MOST_CLUSTERS)
-    cluster = spatial_blocks(ends * np.repeat([TX_SCALE, 1.0], 3), count)
+    # Scaled, so that clusters rarely contain links of two transmitters.
+    cluster = spatial_blocks(ends * np.repeat([1000.0, 1.0], 3), count)
     size = np.bincount(cluster)
     residual = residual_db - (np.bincount(cluster, residual_db) / size)[cluster]
     mean_square = float(np.mean(residual_db**2))
     tested: list[Difference] = []
     for column, labels in columns.items():
         names = np.unique(labels)
-        for name in names if 2 <= len(names) <= MOST_LABELS else ():
+        # More labels would be names of links or of positions.
+        for name in names if 2 <= len(names) <= 50 else ():
             member = (labels == name).astype(float)
             inside = member - (np.bincount(cluster, member) / size)[cluster]
             square, variance = np.bincount(cluster, inside**2), float(np.var(member))
@@ -261,9 +257,6 @@ SHARE: Final = 0.02
 FEWEST: Final = 5
 """Number of links without a path above which the switches are tried; the table of rows names smaller numbers."""
 
-SAMPLE: Final = 50
-"""Links that are traced again for each switch."""
-
 
 def unreached_remark(problem: Problem, progress: Progress | None = None) -> tuple[Remark, ...]:
     """Count the links without a path, and test on a sample which switches of the tracer reach them.
@@ -280,7 +273,7 @@ def unreached_remark(problem: Problem, progress: Progress | None = None) -> tupl
     traced = setup.study.rays_path is None and isinstance(problem.engine, Replay | ReplayCarriers | Chunked)
     if few or setup.links.frequency is not None or not traced:
         return ()
-    sample = np.sort(np.random.default_rng(0).permutation(unreached)[:SAMPLE])
+    sample = np.sort(np.random.default_rng(0).permutation(unreached)[:50])
     trace = setup.study.trace
     switches: dict[str, dict[str, Any]] = {"max_depth": {"max_depth": trace.max_depth + 2}}
     switches |= {name: {name: True} for name in ("diffraction", "refraction") if not getattr(trace, name)}

@@ -42,9 +42,6 @@ from calibray.tables import Column, Table, numbers, short_html, short_text
 CALLS: Final = (30, 60, 225)
 """Numbers of RT calls for which the excess is tabulated, in addition to the end."""
 
-EXCESSES_DB: Final = (0.05, 0.02, 0.01)
-"""Levels of excess; the table shows how many RT calls each needs [dB]."""
-
 COLUMNS: Final = (
     Column("method"), Column("uses"), numbers("RT calls"),
     numbers("excess at 30", "dB"), numbers("at 60", "dB"), numbers("at 225", "dB"), numbers("at the end", "dB"),
@@ -144,7 +141,7 @@ class Comparison:
             excess = self.excess(method.name, 2**62 if calls is None else calls)
             for statistic, share in (("median", 0.5), ("q25", 0.25), ("q75", 0.75), ("worst", 1.0)):
                 row[f"{statistic}_excess_db_{column}"] = quantile(excess, share) if reached else np.nan
-        for level in EXCESSES_DB:
+        for level in (0.05, 0.02, 0.01):
             calls_to = self.calls_to(method.name, level)
             median = quantile(calls_to, 0.5)
             row[f"calls_to_{level:g}_db"] = median if np.isfinite(median) else np.nan

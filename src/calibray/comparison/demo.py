@@ -33,9 +33,6 @@ FILES: Final = (RECORD, *FIGURES, page.FILE)
 MAPPING_CALLS: Final = 8
 """RT calls of space mapping; each is a trace."""
 
-CHEAP_DEPTH: Final = 2
-"""Largest number of interactions in its cheap model; the study allows twice as many."""
-
 
 def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = None) -> Demo:
     """Run the experiment on "replay" (trace once) or "retrace" (trace for every RT call, as in the paper).
@@ -98,7 +95,8 @@ def _space_mapping(setup: Setup, seed: int, progress: Progress | None) -> Result
         Setup.open(Study.from_content(content | changes, setup.study.path), setup.factory)
         for changes in (
             {"method": method, "engine": {"name": "retrace"}},
-            {"trace": content["trace"] | {"max_depth": CHEAP_DEPTH}},
+            # The study allows twice as many interactions.
+            {"trace": content["trace"] | {"max_depth": 2}},
         )
     )
     return calibrate(expensive, cheap_model=cheap, progress=progress)

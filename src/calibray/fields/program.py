@@ -184,10 +184,7 @@ class Layout:
 
 @jax_settings()
 def layout(
-    paths: Paths,
-    dtype: type = np.float64,
-    intervals: Intervals | None = None,
-    phases: bool = True,
+    paths: Paths, dtype: type = np.float64, intervals: Intervals | None = None, phases: bool = True
 ) -> Layout:
     """Lay a path program out for evaluation, in a precision, on JAX's default device.
 

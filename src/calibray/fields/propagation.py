@@ -31,9 +31,7 @@ class Keep(Protocol):
 
 
 def path_fields(
-    program: GroupedProgram,
-    responses: tuple[GroupResponse, ...],
-    keep: Keep = lambda values: values,
+    program: GroupedProgram, responses: tuple[GroupResponse, ...], keep: Keep = lambda values: values
 ) -> Pair:
     """Gains of all paths in the order of the groups, real and imaginary part [R, T, P].
 
@@ -161,11 +159,7 @@ class Combining:
 
     @classmethod
     def make(
-        cls,
-        kind: str,
-        link: NDArray[np.integer],
-        delay: NDArray[np.float64],
-        bandwidth: float | None = None,
+        cls, kind: str, link: NDArray[np.integer], delay: NDArray[np.float64], bandwidth: float | None = None
     ) -> Combining:
         """Check a way of combining, "power", "coherent" or "band" with a bandwidth [Hz], and prepare it for paths.
 

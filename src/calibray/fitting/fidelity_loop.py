@@ -18,11 +18,6 @@ from calibray.fitting.search import AUTO, Trail, choose, search
 from calibray.study.displacement import displaces
 from calibray.support.progress import Progress, with_stage
 
-ROUNDS: Final = 3
-"""Default number of traces if paths are sampled by the materials."""
-DISPLACED_ROUNDS: Final = 4
-"""Default number of traces if positions are parameters: one wrong height of 5 m is approached in 2, five wrong
-positions in 2 to 4."""
 AROUND: Final = (0.0625, 0.125, 0.25, 0.5, 1.0)
 """Traced displacements on each side of calibrated positions, as shares of the largest one: 0.5 to 8 m of 8 m. The inner
 ones are equidistant, so that they show the error of interpolation."""
@@ -48,7 +43,8 @@ def retrace(
     displaced = any(displaces(name) for name in parameters.names)
     rounds = study.fidelity.rounds
     if rounds is None:
-        rounds = DISPLACED_ROUNDS if displaced else ROUNDS
+        # One wrong height of 5 m is approached in 2 traces, five wrong positions in 2 to 4.
+        rounds = 4 if displaced else 3
     if not isinstance(section, ReplaySection) or section.rays or rounds == 0 or not (sampled or displaced):
         return problem, trail, None
     gap, stated, before = None, problem.objective, np.full(len(parameters), np.inf)

@@ -137,14 +137,7 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
         std = float(np.nanstd(measured)) or 1.0 if section.std is None else section.std
         every.append(
             Observed(
-                name,
-                section.statistic,
-                measured,
-                section.scale,
-                group,
-                labels,
-                std,
-                section.std is not None,
+                name, section.statistic, measured, section.scale, group, labels, std, section.std is not None
             )
         )
     return tuple(every)

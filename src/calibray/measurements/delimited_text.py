@@ -33,7 +33,6 @@ UNITS: Final = frozenset({
 """Units, in lower case, that a row of units below the header may contain."""
 
 _HEAD: Final = 64  # records that show the layout of a file
-_MOST_ABOVE: Final = 30  # lines above a header at most
 
 
 @dataclass(frozen=True)
@@ -140,7 +139,7 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
 
 def _layout(text: str, separator: str | None) -> _Layout:
     """The first line from which all lines have the same number of cells, and the mark that gives the most cells."""
-    for above in range(_MOST_ABOVE + 1):
+    for above in range(31):  # lines above a header
         layouts: list[tuple[int, _Layout]] = []
         head = list(islice(io.StringIO(text, newline=""), above, above + 4 * _HEAD))
         if above and (len(head) < 2 or not head[0].strip()):

@@ -35,9 +35,6 @@ MAX_UNPACKED: Final = 2**28
 MAX_CELLS: Final = 10_000_000
 """Largest number of cells of a sheet."""
 
-MAX_ROWS: Final = 1_048_576
-"""Number of rows of an Excel sheet, fixed by the format."""
-
 _Cells = tuple[Any, ...]
 _ROW: Final = re.compile(rb"""<(?:\w+:)?row\s(?:[^>]*?\s)?r=["']([^"']*)["']""")
 
@@ -90,7 +87,8 @@ def _check_row_order(path: Path, sheet: bytes) -> None:
     previous = 0
     for text in _ROW.findall(sheet):
         number = int(text) if text.isdigit() and len(text) < 10 else 0
-        if not previous < number <= MAX_ROWS:
+        # An Excel sheet has at most 2^20 rows.
+        if not previous < number <= 1_048_576:
             raise InputError(
                 f"{path}: not an Excel file (row {shortened(text.decode(errors='replace'))!r} follows row {previous}); "
                 "save it again"

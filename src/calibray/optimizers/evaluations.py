@@ -283,10 +283,7 @@ def _finite(name: str, array: NDArray[np.float64], rows: NDArray[np.bool_] | Non
 
 
 def _check_value(
-    values: NDArray[np.float64],
-    residuals: NDArray[np.float64],
-    good: NDArray[np.bool_],
-    objective: Objective,
+    values: NDArray[np.float64], residuals: NDArray[np.float64], good: NDArray[np.bool_], objective: Objective
 ) -> None:
     computed = np.where(good, objective(np.where(good[:, None], residuals, 0.0)), 0.0)
     slack = OBJECTIVE_TOLERANCE * np.abs(computed) + 1e-9

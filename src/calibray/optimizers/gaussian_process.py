@@ -23,12 +23,6 @@ from calibray.optimizers.sampling import SEPARATION, distance_to_nearest, draw_a
 CANDIDATES = 300
 """Number of candidates drawn over the box, and of candidates around the best points."""
 
-REFINEMENTS = (0.1, 0.01, 0.001)
-"""Standard deviations, in the unit cube, of further candidates around the most promising one."""
-
-OFTEN = 40
-"""Number of evaluations up to which the scales are estimated every time; beyond it, every tenth time."""
-
 
 @final
 class GaussianProcess(Optimizer):
@@ -74,7 +68,8 @@ class GaussianProcess(Optimizer):
                 x = self._rng.random(d)
             else:
                 kernel = None if model is None else model.process.kernel
-                if kernel is None or len(points) <= OFTEN or turn % 10 == 0:
+                # The scales are estimated every time at first, later every tenth time.
+                if kernel is None or len(points) <= 40 or turn % 10 == 0:
                     model = fit(points, values, guess=kernel)
                 else:
                     model = solve(points, values, kernel)
@@ -87,7 +82,7 @@ class GaussianProcess(Optimizer):
         around = draw_around(taken[:5], CANDIDATES, -3.0, self._rng)
         candidates = np.vstack([self._rng.random((CANDIDATES, d)), around])
         promise = log_improvement(model, candidates, best)
-        for reach in REFINEMENTS:
+        for reach in (0.1, 0.01, 0.001):
             closer = reach * self._rng.standard_normal((CANDIDATES // 3, d))
             closer = np.clip(candidates[np.argmax(promise)] + closer, 0.0, 1.0)
             candidates = np.vstack([candidates, closer])

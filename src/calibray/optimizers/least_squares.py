@@ -175,11 +175,7 @@ class LeastSquares(Optimizer):
         return ended
 
     def _descended(
-        self,
-        unit: NDArray[np.float64],
-        earlier: Starts | None,
-        catch_up: float,
-        followed: int | None = None,
+        self, unit: NDArray[np.float64], earlier: Starts | None, catch_up: float, followed: int | None = None
     ) -> Generator[NDArray[np.float64], Evaluations, Starts]:
         descent = descend(unit, self.iterations, self.tolerance, catch_up, earlier, followed)
         try:

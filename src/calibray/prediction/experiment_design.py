@@ -119,11 +119,7 @@ class Beliefs:
 
 
 def choose_candidates(
-    beliefs: Beliefs,
-    predicted: NDArray[np.float64],
-    slope: NDArray[np.float64],
-    errors: Errors,
-    count: int,
+    beliefs: Beliefs, predicted: NDArray[np.float64], slope: NDArray[np.float64], errors: Errors, count: int
 ) -> list[Outlook]:
     """Choose candidates one after another.
 

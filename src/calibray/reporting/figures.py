@@ -40,9 +40,6 @@ sorted."""
 RASTERIZED: Final = 2000
 """Largest number of points that are drawn as vectors; more points are rasterized."""
 
-UNEQUAL: Final = 4
-"""Ratio between the RT calls of two methods above which their axis is logarithmic."""
-
 LONG: Final = 1000
 """Number of RT calls above which their axis is logarithmic, because the first calls improve the RMSE most."""
 
@@ -235,7 +232,7 @@ def result_figures(result: Record, links: Survey | None) -> dict[str, Figure]:
 
 def _unequal(results: Mapping[str, Record]) -> bool:
     calls = [result.history["call"].max() for result in results.values()]
-    return bool(max(calls) > UNEQUAL * min(calls))
+    return bool(max(calls) > 4 * min(calls))
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:

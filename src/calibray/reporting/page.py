@@ -69,8 +69,7 @@ CAPTIONS: Final = {
     "observables": "Measured over modelled values of further observables, link by link, without biases of devices: the "
     "line marks equal values.",
     "residual-by-direction": "Predicted minus measured path loss around each transmitter, by compass direction: points "
-    "outside the black circle received more power than predicted. Orange: the stated pattern "
-    "on the horizon, from its "
+    "outside the black circle received more power than predicted. Orange: the stated pattern on the horizon, from its "
     "maximum at the rim to 30 dB less at the centre.",
     "residual-by-group": "Residual by group: median, quartiles, and whiskers that contain 90 % of the links.",
 }

@@ -108,10 +108,6 @@ def warning_lines(findings: Sequence[Finding]) -> str:
     )
 
 
-VISIBLE_DB: Final = 0.005
-"""Smallest change that is not 0 when rounded to 0.01 dB [dB]."""
-
-
 def overview(paths: Paths, row: NDArray[np.int64], enclosed: EnclosedAntennas | None) -> Table:
     """Numbers of links, paths and interactions, and the links to check by their rows in the source file [L].
 
@@ -175,7 +171,8 @@ def _most_changed(change: Convergence, row: NDArray[np.int64]) -> Table:
             f"{change.paths_after[link]:,}",
         )
         for link in change.largest[:LISTED]
-        if abs(change.change_db[link]) >= VISIBLE_DB
+        # Smaller changes are 0 when rounded to 0.01 dB.
+        if abs(change.change_db[link]) >= 0.005
     )
     return Table("", columns, rows)
 

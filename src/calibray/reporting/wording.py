@@ -22,9 +22,6 @@ from calibray.tables import Column, Table, hertz, named, rows_text
 from calibray.tracing.antennas import POSE
 from calibray.uncertainty.verdicts import TRADE_OFF
 
-SCENE_ALONE_DB: Final = 0.05
-"""Largest difference between the exported scene and the predictions that is not reported."""
-
 
 def prediction_text(record: Record) -> str:
     """What predictions use."""
@@ -96,7 +93,7 @@ def scene_alone_text(record: Record) -> str:
             "Predictions at new links and maps call the program. The exported scene contains materials alone: another "
             f"ray tracer gives other path loss with it, as far as antennas and physics differ.{near}"
         )
-    if rms_db < SCENE_ALONE_DB:
+    if rms_db < 0.05:
         return near.lstrip()
     values = model.parameters or {}
     rough = [name.removesuffix(".roughness_mm") for name in values if name.endswith(".roughness_mm")]
@@ -173,10 +170,6 @@ CLEAR: Final = 2.0
 """Number of standard errors above which a difference counts as significant."""
 
 
-EVEN_DB: Final = 0.1
-"""Mean residual [dB] below which no class of links is reported."""
-
-
 def diagnostics_table(result: Record) -> Table:
     """Summarize the diagnostics in a line each."""
     tables = diagnostics(result)
@@ -231,7 +224,7 @@ def _class_text(
     if not len(table):
         return ""
     worst = table.iloc[int(np.argmax(table["mean_db"].abs()))]
-    if abs(worst["mean_db"]) < EVEN_DB:
+    if abs(worst["mean_db"]) < 0.1:
         return ""
     name = f"{worst[column]:g}" if isinstance(worst[column], float) else shown(str(worst[column]))
     clear = abs(worst["mean_db"]) > CLEAR * worst["standard_deviation_db"] / np.sqrt(worst["links"])

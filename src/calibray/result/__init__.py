@@ -2,16 +2,7 @@
 
 from calibray.result.files import FILES
 from calibray.result.held_out import FittedTerm, HeldOutErrors, Judgement, PredictionModel, ResidualField
-from calibray.result.record import (
-    Accuracy,
-    Cost,
-    Fit,
-    Nuisance,
-    Prediction,
-    Provenance,
-    Record,
-    Uncertainty,
-)
+from calibray.result.record import Accuracy, Cost, Fit, Nuisance, Prediction, Provenance, Record, Uncertainty
 from calibray.result.verdict import Interval, Reason, ReasonKind, Remark, RemarkKind, Verdict
 
 __all__ = [

@@ -166,9 +166,8 @@ def _outside_interval(values: dict[str, Any]) -> str:
     )
     text = (
         f"The candidate with the lowest RMSE is not the most probable one: {parameters}. RMSE treats the noise of all "
-        f"links as independent; the intervals do not, because {_CAUSES[values['cause']]}. The most probable "
-        f"values are {times} times as probable. Do not use the values with the lowest RMSE as constants of the "
-        "materials."
+        f"links as independent; the intervals do not, because {_CAUSES[values['cause']]}. The most probable values are "
+        f"{times} times as probable. Do not use the values with the lowest RMSE as constants of the materials."
     )
     if values["blocks"]:
         return text + " Held-out blocks show which model predicts best."
@@ -200,14 +199,13 @@ def _conflict(values: dict[str, Any]) -> str:
             f"{answers}. Check that the values belong to these links and this scene, and the receiver's range."
         )
     return (
-        f"Path loss and {observables} require parameter values that differ by "
-        f"{values['standard_errors']:.1f} standard errors: {answers}. Check units, the receiver's range and "
-        "the scene; the common fit explains neither."
+        f"Path loss and {observables} require parameter values that differ by {values['standard_errors']:.1f} standard "
+        f"errors: {answers}. Check units, the receiver's range and the scene; the common fit explains neither."
     )
 
 
 def _unreached_links(values: dict[str, Any]) -> str:
-    trials = zip(values["switches"], values["reached"], strict=True)
+    trials, sample = zip(values["switches"], values["reached"], strict=True), values["sample"]
     reached = ", ".join(f"{switch} gives {count:.0f} of them a path" for switch, count in trials)
     text = (
         f"{values['links']:,} of {values['of']:,} links have no path. They enter no RMSE, and no material is fitted to "
@@ -215,12 +213,9 @@ def _unreached_links(values: dict[str, Any]) -> str:
     )
     if max(values["reached"], default=0.0) == 0:
         return (
-            f"{text} No setting of [trace] gives any of {values['sample']} sampled links a path: check their "
-            "positions."
+            f"{text} No setting of [trace] gives any of {sample} sampled links a path: check their positions."
         )
-    return (
-        f"{text} Of {values['sample']} sampled links, {reached}: change these keys of [trace] in the study."
-    )
+    return f"{text} Of {sample} sampled links, {reached}: change these keys of [trace] in the study."
 
 
 def _antenna_directions(values: dict[str, Any]) -> str:

@@ -22,9 +22,6 @@ from calibray.scenes.scene import Scene
 from calibray.scenes.triangles import BATCH, LEVEL, Triangles, read_triangles, vertical_crossings
 from calibray.support.lazy_imports import library
 
-UPRIGHT = 1e-6
-"""Length in plan below which a line counts as upright [m]."""
-
 
 @dataclass(frozen=True, eq=False)
 class Region:
@@ -63,7 +60,7 @@ class Region:
         line, prism, low, high = line[near], prism[near], low[near], high[near]
         step = (end - start)[line]
         plan = np.hypot(step[:, 0], step[:, 1])
-        upright = plan < UPRIGHT
+        upright = plan < 1e-6
         spans = [np.column_stack([line, low, high])[upright]]
         sloping = np.flatnonzero(~upright)
         parts, of = shapely.get_parts(

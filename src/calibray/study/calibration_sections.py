@@ -23,8 +23,7 @@ class ObjectiveSection(Section):
     Attributes:
         combining: "power" (sum of path powers), "coherent" (sum of fields) or "band" (coherent power averaged
             over the bandwidth).
-        no_path: "exclude" leaves a link without a path out of the objective; "censor" counts it with
-            `ceiling_db`.
+        no_path: "exclude" leaves a link without a path out of the objective; "censor" counts it with `ceiling_db`.
         ceiling_db: Largest path loss that can be measured [dB], with "censor" only.
     """
 

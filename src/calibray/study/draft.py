@@ -199,12 +199,6 @@ def _add_flight_times(draft: LinksDraft) -> None:
 INDOOR_DEPTHS: Final = (3, 5)
 """Smallest and largest number of interactions of an indoor study."""
 
-METAL_CONDUCTIVITY: Final = 1e6
-"""Conductivity above which path loss does not depend on its value [S/m]."""
-
-MOST_MATERIALS: Final = 6
-"""Largest number of materials that are calibrated; links seldom identify more."""
-
 
 @dataclass(frozen=True)
 class Draft:
@@ -346,9 +340,10 @@ def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dic
     materials = {
         name: material
         for name, material in scene.materials.items()
-        if material.conductivity < METAL_CONDUCTIVITY and material.relative_permittivity > 1.5
+        if material.conductivity < 1e6 and material.relative_permittivity > 1.5
     }
-    names = list(materials)[:MOST_MATERIALS]
+    # Links seldom identify more materials.
+    names = list(materials)[:6]
     if not names:
         raise InputError(f"{links.scene}: no material to calibrate; all are metal or air")
     entries: dict[str, dict[str, Any]] = {}

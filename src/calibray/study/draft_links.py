@@ -39,14 +39,8 @@ RECEIVER_HEIGHT: Final = 1.5
 TRANSMITTER_HEIGHT: Final = 10.0
 """Height of a transmitter without a column of heights [m]: a small cell on a mast."""
 
-LEVEL_GROUND: Final = 0.5
-"""Largest height of the ground that counts as z = 0 [m]."""
-
 SAME_CARRIER: Final = 0.01
 """Largest relative difference of carriers that count as one: free-space loss changes by 0.09 dB."""
-
-DISTANCE_TOLERANCE: Final = 0.05
-"""Largest median difference between a table's distances and its positions [m]."""
 
 
 @dataclass(frozen=True)
@@ -425,7 +419,7 @@ class LinksDraft:
         ):
             z = frame[rx.height] if rx.height else pd.Series(np.full(len(frame), RECEIVER_HEIGHT))
             distance = np.sqrt(frame[rx.x] ** 2 + frame[rx.y] ** 2 + (z - frame[height]) ** 2)
-            if float(np.median(np.abs(distance - frame[name]))) < DISTANCE_TOLERANCE:
+            if float(np.median(np.abs(distance - frame[name]))) < 0.05:
                 up = float(frame[height].iloc[0])
                 self.assume("links.tx", f"0, 0, {up:g}", f"column {name} is the distance from there")
                 return [0.0, 0.0, up]
@@ -447,7 +441,7 @@ class LinksDraft:
             ground = self.overhead.ground_height(*np.concatenate([links.tx, links.rx])[:, :2].T)
         except InputError:
             return  # a link is beyond the scene, or there is no ground
-        if np.abs(ground).max() > LEVEL_GROUND:
+        if np.abs(ground).max() > 0.5:
             self.section["heights"] = "ground"
             reason = f"the ground is at {ground.min():.0f} to {ground.max():.0f} m; heights count from there"
             self.assume("links.heights", "ground", reason)

@@ -68,8 +68,7 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
     if (steering[single] != 0).any():
         raise InputError(
             f"{study.path}: links.{end}_antenna.steering_deg: the antenna is not an array; give antennas.{end} rows "
-            f"and "
-            f"columns, or remove the key"
+            "and columns, or remove the key"
         )
     return Mounting(antennas, index, Pose(yaw, downtilt, electrical, steering))
 

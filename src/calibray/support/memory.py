@@ -80,9 +80,6 @@ def _libraries() -> ThreadpoolController:
 SECONDS: Final = 20.0
 """Time limit for reading a small file [s]; on a busy machine, most of it is the start of the process."""
 
-BYTES_PER_SECOND: Final = 20e6
-"""Slowest rate at which a large file is read [bytes/s]."""
-
 REFUSED: Final = 3
 """Exit status of code that refuses its file; the reason is on stdout."""
 
@@ -117,7 +114,8 @@ def run_limited(code: str, memory: int, size: int) -> bool:
     """
     if not sys.executable:
         return True  # an embedded interpreter cannot start another one
-    limit = SECONDS + size / BYTES_PER_SECOND
+    # Large files are read at 20 MB/s or faster.
+    limit = SECONDS + size / 20e6
     program = _LIMITS.format(path=sys.path, memory=memory, refused=REFUSED) + code
     try:
         done = subprocess.run(

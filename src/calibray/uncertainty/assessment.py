@@ -47,9 +47,6 @@ from calibray.uncertainty.verdicts import Verdict as VerdictOnDraws
 EQUAL: Final = 0.1
 """Difference between emulators, relative to the errors of the links, below which only their mean is used."""
 
-MOST_PROBABLE: Final = 64
-"""Number of draws of highest density from which the most probable one is chosen."""
-
 KEPT_DRAWS: Final = 128
 """Draws kept with the result."""
 
@@ -258,7 +255,7 @@ def _noise_weights(model: JointModel, posterior: Posterior, *, offset: bool) -> 
 def _most_probable(model: JointModel, posterior: Posterior) -> NDArray[np.float64]:
     """The most probable of the draws, with the constants of the scene, in the search space [d]."""
     draws = posterior.means
-    top = draws.point[np.argsort(-draws.density)[:MOST_PROBABLE]]
+    top = draws.point[np.argsort(-draws.density)[:64]]
     return np.asarray(top[np.argmax(model.at_scene_constants(top))])
 
 
@@ -384,9 +381,6 @@ REPEAT_M: Final = 0.01
 REPEAT_DB: Final = 0.1
 """Difference of modelled path loss up to which they do [dB]; another antenna or carrier changes it by more."""
 
-REPEAT_UNIT: Final = 1e-3
-"""Difference of a nuisance's column up to which they do, in its unit."""
-
 
 def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     """The problem whose rows of one link are replaced by their mean; the problem itself if no row repeats a link.
@@ -416,7 +410,7 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     terms = objective.nuisance.terms
     columns = np.array([
         *np.nan_to_num(problem.modelled(candidates)[:, counted] / REPEAT_DB),  # inf without a path
-        *(term.value[counted] / REPEAT_UNIT for term in terms),
+        *(term.value[counted] / 1e-3 for term in terms),
         *(term.group[counted] * 2.0 for term in terms),
         *(observable.group[counted] * 2.0 for observable in problem.observed),
     ])  # fmt: skip

@@ -28,11 +28,7 @@ from calibray.optimizers.arguments import Box
 from calibray.optimizers.evaluations import merge_repeated
 from calibray.optimizers.multifidelity import discrepancy
 from calibray.optimizers.multifidelity.correction import Corrected, UnitModel, correct
-from calibray.optimizers.multifidelity.discrepancy import (
-    SampledFunction,
-    sample_function,
-    standardized_error,
-)
+from calibray.optimizers.multifidelity.discrepancy import SampledFunction, sample_function, standardized_error
 from calibray.optimizers.multifidelity.space_mapping import CLOUD, JUDGED, MISLED, error_ratio
 from calibray.optimizers.regression import Inputs
 from calibray.optimizers.sampling import design
@@ -336,8 +332,7 @@ def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Call
     else:
         value = problem.objective.value(modelled[complete])
     unit, rows_and_value = merge_repeated(
-        box.to_unit(parameters.to_search(candidates[complete])),
-        np.column_stack([every[complete], value]),
+        box.to_unit(parameters.to_search(candidates[complete])), np.column_stack([every[complete], value])
     )
     order = np.argsort(rows_and_value[:, -1], kind="stable")
     if len(order) > MAX_CALLS:

@@ -25,9 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln, log_ndtr, stdtr
 
-CENSORED_STEPS: Final = 40
-"""Largest number of Newton steps."""
-
 CENSORED_TOLERANCE: Final = 1e-9
 """Predicted gain of the log density at which the iteration ends."""
 
@@ -78,7 +75,7 @@ def log_evidence(
     point = _start(gap, censored, design, ridge)
     value, slope, curvature = joint(point, gap, censored, design, ridge, freedom)
     damping = np.full(len(gap), 1e-3)
-    for _ in range(CENSORED_STEPS):
+    for _ in range(40):
         step = np.linalg.solve(_damped(curvature, damping), slope[..., None])[..., 0]
         if not (np.sum(step * slope, axis=1) > CENSORED_TOLERANCE).any():
             break

@@ -34,9 +34,6 @@ MOST: Final = 20_000
 SHUFFLES: Final = 99
 """Number of random orders of the residuals; a rectangle is reported if none of them has a better one."""
 
-NEGLIGIBLE: Final = 1e-6
-"""Sum of squares of a rectangle's column, relative to the largest, below which rounding dominates."""
-
 
 class Explained(NamedTuple):
     """The best rectangle of a width.
@@ -183,7 +180,8 @@ def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> 
             strip[:, north, north] - strip[:, north, south] - strip[:, south, north] + strip[:, south, south]
         )
         band = moment[columns:] - moment[:-columns]
-        used = square > NEGLIGIBLE * largest
+        # Below this, rounding dominates.
+        used = square > 1e-6 * largest
         root = np.where(used, 1.0 / np.sqrt(np.where(used, square, 1.0)), 0.0)
         loss = band[:, north]
         loss -= band[:, south]

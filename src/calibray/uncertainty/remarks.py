@@ -155,9 +155,6 @@ SLACK: Final = 0.02
 MISSED_DB: Final = 0.01
 """Improvement of the objective by a draw above which the method is reported to have missed the optimum [dB]."""
 
-BEST_DRAWS: Final = 16
-"""Number of draws of highest density that are checked for a missed optimum."""
-
 STARTS: Final = 16
 """Number of local searches with a free offset, in addition to those from the minima without it."""
 
@@ -202,7 +199,7 @@ def _lacking(study: StudyModel) -> list[str]:
 
 def missed(problem: Problem, posterior: Draws, best_value: float) -> tuple[Remark, ...]:
     """A remark if a draw has a lower objective [dB] than the best candidate of the method."""
-    top = posterior.point[np.argsort(-posterior.density)[:BEST_DRAWS]]
+    top = posterior.point[np.argsort(-posterior.density)[:16]]
     lowest = float(problem.squares(top).value.min())
     if lowest > best_value - MISSED_DB:
         return ()

@@ -77,9 +77,7 @@ class Correlation:
 
 
 def fit_correlation(
-    errors: NDArray[np.float64],
-    position: NDArray[np.float64],
-    design: NDArray[np.float64] | None = None,
+    errors: NDArray[np.float64], position: NDArray[np.float64], design: NDArray[np.float64] | None = None
 ) -> Correlation:
     """Fit range and size of the correlated part of errors [m], [dB], by restricted maximum likelihood.
 

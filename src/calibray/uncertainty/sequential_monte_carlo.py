@@ -216,11 +216,7 @@ def _posterior(model: JointModel, members: Population, weight: NDArray[np.float6
 
 
 def _anneal(
-    model: JointModel,
-    size: int,
-    last: int,
-    random: np.random.Generator,
-    stepped: Callable[[float], None],
+    model: JointModel, size: int, last: int, random: np.random.Generator, stepped: Callable[[float], None]
 ) -> tuple[Population, float]:
     """Members of a population that followed the likelihood's power from 0 to 1, and its log evidence.
 

@@ -317,12 +317,7 @@ def _outlying_pieces(
     return tuple(others)
 
 
-def _effect(
-    index: int,
-    modelled: Modelled,
-    best: NDArray[np.float64],
-    axes: Axes,
-) -> float:
+def _effect(index: int, modelled: Modelled, best: NDArray[np.float64], axes: Axes) -> float:
     """Largest change of a link's path loss over the range of a parameter, the others fixed [dB]."""
     line = np.tile(best, (LINE, 1))
     line[:, index] = np.linspace(axes.lower[index], axes.upper[index], LINE)

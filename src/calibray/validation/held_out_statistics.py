@@ -103,10 +103,7 @@ def place_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]
 
 
 def compare(
-    errors: NDArray[np.float64],
-    baselines: Errors,
-    position: NDArray[np.float64],
-    seed: int = 0,
+    errors: NDArray[np.float64], baselines: Errors, position: NDArray[np.float64], seed: int = 0
 ) -> Judgement:
     """Compare a model with its best baseline, by residuals on the same held-out links [n], [dB].
 

@@ -35,13 +35,7 @@ from calibray.validation.held_out_statistics import (
     observable_errors,
     place_blocks,
 )
-from calibray.validation.models import (
-    NO_MINIMA,
-    averages,
-    fit_variants,
-    kriged,
-    without_paths,
-)
+from calibray.validation.models import NO_MINIMA, averages, fit_variants, kriged, without_paths
 from calibray.validation.validation import Validation
 
 _LOG: Final = logging.getLogger(__name__)

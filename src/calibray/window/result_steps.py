@@ -26,8 +26,6 @@ from calibray.window.desk import CANDIDATES, PLACE, PREDICTED, STUDY, SUGGESTED,
 from calibray.window.jobs import Job
 from calibray.window.study_steps import safe
 
-RUNS_SHOWN = 20
-
 
 @ui.refreshable
 def show_run(desk: Desk) -> None:
@@ -58,7 +56,7 @@ def show_run(desk: Desk) -> None:
 @ui.refreshable
 def show_commands(desk: Desk) -> None:
     """Draw what has run or is running in the folder."""
-    jobs = [*desk.jobs.elsewhere(), *desk.jobs.list()][:RUNS_SHOWN]
+    jobs = [*desk.jobs.elsewhere(), *desk.jobs.list()][:20]
     if not jobs:
         ui.label("Nothing has run here yet.").classes("quiet")
         return

@@ -59,17 +59,17 @@ def show_scene(desk: Desk) -> None:
             source = desk.keep(
                 ui.select(sources, label="Map, footprints or plan", value=_likely_map(sources)).classes(
                     "wide"
-                ),
+                )
             )
             kind = desk.keep(
-                ui.select(["osm", "footprints", "plan"], label="Kind", value=_kind(source.value)),
+                ui.select(["osm", "footprints", "plan"], label="Kind", value=_kind(source.value))
             )
             source.on_value_change(lambda event: kind.set_value(_kind(event.value)))
         with ui.expansion("Settings of the scene").classes("wide"), ui.row():
             height = desk.keep(ui.input("Height: a column, or metres", value=""))
             wall = desk.keep(ui.select(ITU, label="Walls (ITU-R P.2040)", value="concrete"))
             thickness = desk.keep(
-                ui.number("Thickness of walls [m]", value=0.3, min=0.001, max=10, step=0.01),
+                ui.number("Thickness of walls [m]", value=0.3, min=0.001, max=10, step=0.01)
             )
             ground = desk.keep(ui.select(ITU, label="Ground", value="concrete"))
             unit = desk.keep(ui.number("Unit of a plan [m]", min=1e-6))
@@ -161,14 +161,12 @@ def show_measurements(desk: Desk) -> None:
         return
     likely_links, likely_sites = likely_tables(desk.folder, tables)
     with ui.row():
-        links = desk.keep(
-            ui.select(tables, label="Table of links", value=likely_links).classes("wide"),
-        )
+        links = desk.keep(ui.select(tables, label="Table of links", value=likely_links).classes("wide"))
         sites = desk.keep(
-            ui.select(["", *tables], label="Table of transmitters", value=likely_sites).classes("wide"),
+            ui.select(["", *tables], label="Table of transmitters", value=likely_sites).classes("wide")
         )
         track = desk.keep(
-            ui.select(["", *tracks], label="Track", value=tracks[0] if tracks else "").classes("wide"),
+            ui.select(["", *tracks], label="Track", value=tracks[0] if tracks else "").classes("wide")
         )
         frequency = desk.keep(ui.input("Carrier frequency [Hz]", placeholder="3.5e9, unless a column has it"))
         tx = desk.keep(ui.input("Transmitter x,y,z [m]", placeholder="unless a table has it"))

@@ -172,8 +172,7 @@ def read_answer(
     if observed.shape != shape:
         raise Unusable(
             f"its response contains {OBSERVABLES} of shape {observed.shape}, must be {shape}: a list with one value "
-            f"per "
-            "link for each observable, in the order of the request"
+            "per link for each observable, in the order of the request"
         )
     return values, np.where(np.isfinite(observed), observed, np.nan)
 

@@ -40,7 +40,6 @@ _CLAIMS: Final = """CREATE TABLE IF NOT EXISTS claims (
 EXPIRY: Final = 300.0  # time without a renewal after which a claim ends, as the observer measures it [s]
 SKEW: Final = 86_400.0  # largest difference between the clocks of two machines [s]; older claims end at once
 RENEWAL: Final = EXPIRY / 5  # interval between renewals [s]; a few may fail
-RELEASE_WAIT: Final = 500  # longest wait of `release` for other writers [ms]
 _active_runs: set[str] = set()  # the runs of this process
 _observed: dict[tuple[str, bytes, str], tuple[float, float]] = {}
 """Claims of other runs: their `expires` at its last change, and this process's clock at that time [s]."""
@@ -96,7 +95,7 @@ def release(connection: sqlite3.Connection, run: str) -> None:
     _active_runs.discard(run)
     with suppress(sqlite3.Error):
         (timeout,) = connection.execute("PRAGMA busy_timeout").fetchone()
-        connection.execute(f"PRAGMA busy_timeout = {RELEASE_WAIT}")
+        connection.execute(f"PRAGMA busy_timeout = {500}")
         try:
             connection.execute("DELETE FROM claims WHERE run = ?", (run,))
         finally:
@@ -269,8 +268,7 @@ def _set_up(connection: sqlite3.Connection, path: Path) -> None:
         )
     if version == 0 and tables - set(_COLUMNS):
         raise InputError(
-            f"{path}: is not a ledger but a database with a table {min(tables - set(_COLUMNS))!r}; "
-            "name another folder"
+            f"{path}: is not a ledger but a database with a table {min(tables - set(_COLUMNS))!r}; name another folder"
         )
     if tables and (fault := run("PRAGMA integrity_check(1)").fetchone()[0]) != "ok":
         raise sqlite3.DatabaseError(f"database disk image is malformed: {fault.splitlines()[-1]}")

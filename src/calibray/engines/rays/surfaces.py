@@ -20,9 +20,6 @@ TOLERANCE: Final = 0.02
 SAME: Final = 1e-3
 """Faces coincide at a point if their distances from it differ by less [m]."""
 
-PAIRS: Final = 20_000_000
-"""Number of points times faces whose bounding boxes are compared at once, which takes 0.5 GB."""
-
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
@@ -79,7 +76,8 @@ class Surfaces:
 
     def _box_pairs(self, point: NDArray[np.float64], within: float) -> Iterator[tuple[NDArray, NDArray]]:
         low, high = self.corners.min(axis=1) - within, self.corners.max(axis=1) + within
-        size = max(PAIRS // max(len(low), 1), 1)
+        # About 0.5 GB at once.
+        size = max(20_000_000 // max(len(low), 1), 1)
         for start in range(0, len(point), size):
             part = point[start : start + size, None]
             inside = np.ones((len(part), len(low)), dtype=bool)

@@ -42,9 +42,6 @@ ROUNDS: Final = 4
 GAINED: Final = 1.0
 """Decrease of the negative log density below which a round has gained nothing."""
 
-IDLE: Final = 2
-"""Number of successive rounds without a gain, one with each kernel, after which an input mapping ends."""
-
 TRIALS: Final = 300
 """Largest number of sets of constants tried in a round."""
 
@@ -216,7 +213,8 @@ def correct(
         fitted = [corrected(constants, best) for constants in _likelier(shaped, random)]
         present, best = best, min([best, *fitted], key=_own_misfit)
         idle = idle + 1 if _own_misfit(present) - _own_misfit(best) < GAINED else 0
-        if idle == IDLE:
+        # One round with each kernel gained nothing.
+        if idle == 2:
             break
     return best
 
@@ -249,9 +247,7 @@ def _own_misfit(corrected: Corrected) -> float:
 
 
 def constants_fit(
-    corrected: Corrected,
-    centre: NDArray[np.float64] | None = None,
-    noise: NDArray[np.float64] | None = None,
+    corrected: Corrected, centre: NDArray[np.float64] | None = None, noise: NDArray[np.float64] | None = None
 ) -> Callable[[NDArray[np.float64]], Residuals]:
     """The least squares problem of the constants, with a fixed covariance of the discrepancy.
 

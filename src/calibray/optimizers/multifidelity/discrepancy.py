@@ -100,10 +100,6 @@ def solve(inputs: Inputs, values: NDArray[np.float64], kernel: Kernel) -> Proces
     return condition(inputs, values, kernel, freedom=FREEDOM)
 
 
-SCALINGS: Final = 30
-"""Steps of the fixed-point iteration for the scale of the variances."""
-
-
 def scaled_density(whitened: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Negative log density [s] of discrepancies [s, n, m] with the most probable scale, and that scale [s].
 
@@ -113,7 +109,7 @@ def scaled_density(whitened: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
     """
     count, links = whitened.shape[-2:]
     square, scale = np.sum(whitened**2, axis=-2), np.ones(len(whitened))
-    for _ in range(SCALINGS):
+    for _ in range(30):
         weight = (FREEDOM + count) / (FREEDOM + square / scale[:, None])
         scale = np.maximum(np.mean(weight * square, axis=1) / count, NUGGET)
     density = 0.5 * (FREEDOM + count) * np.log1p(square / scale[:, None] / FREEDOM).sum(axis=1)

@@ -261,11 +261,7 @@ class SpaceMapping(Optimizer):
         return np.mean(prediction.mean**2, axis=1) + self._errors.stretch * prediction.variance
 
     def _explore(
-        self,
-        model: Averaged,
-        taken: NDArray[np.float64],
-        fresh: NDArray[np.float64],
-        best: float,
+        self, model: Averaged, taken: NDArray[np.float64], fresh: NDArray[np.float64], best: float
     ) -> NDArray[np.float64]:
         """The point of the largest expected improvement [d]; `taken` are the evaluated points, best first."""
         d, stretch = self.box.dimension, self._errors.stretch

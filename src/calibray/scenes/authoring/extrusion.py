@@ -33,9 +33,6 @@ Interval = tuple[float, float, int]
 
 Length = TypeVar("Length", int, float)
 
-SLIVER: Final = 0.1
-"""Overlaps of less area come from rounding to the grid and are not counted [m^2]."""
-
 THINNEST: Final = GRID / 2
 """Intervals thinner than this come from rounding and are dropped [m]."""
 
@@ -71,7 +68,8 @@ def split_overlaps(
             cells += [Cell(part, (stand,)) for part in shapely.get_parts(footprints.polygon[single])]
             continue
         pieces, covers = _overlay(footprints.polygon[members])
-        shared = (covers.sum(axis=0) > 1) & (shapely.area(pieces) > SLIVER)
+        # Smaller overlaps come from rounding to the grid [m^2].
+        shared = (covers.sum(axis=0) > 1) & (shapely.area(pieces) > 0.1)
         overlapping += int(covers[:, shared].any(axis=1).sum())
         for piece, cover in zip(pieces, covers.T, strict=True):
             buildings = members[cover]

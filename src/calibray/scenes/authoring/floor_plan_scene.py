@@ -52,9 +52,6 @@ LIDS: Final = ("floor", "ceiling")
 WALL_THICKNESS: Final = 0.12
 """Thickness of a wall of an ITU material if the plan does not state it [m]."""
 
-NAMED: Final = 10
-"""Largest number of types without a material that a message names."""
-
 STOREY: Final = 1.8
 """Smallest height of a storey [m]; lower parts of walls, such as parapets, are no storeys."""
 
@@ -135,7 +132,7 @@ def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) 
     """The material of each sheet; a type with several thicknesses has several materials."""
     unknown = dict.fromkeys(sheet.kind for sheet in sheets if sheet.kind not in {*types, *ITU_NAMES})
     if unknown:
-        listed = list(unknown)[:NAMED]
+        listed = list(unknown)[:10]
         options = " ".join(f"--material {shlex.quote(kind)}=concrete" for kind in listed)
         raise InputError(
             f"floor plan: no material for {', '.join(map(repr, listed))}; give each the material of ITU-R P.2040 that "

@@ -39,9 +39,6 @@ MOST_CELLS: Final = 25_000_000
 LARGEST_BLOCK: Final = 2**28
 """Largest block of a raster [bytes]; GDAL decompresses a block as a whole."""
 
-FEATURE_BYTES: Final = 500
-"""Smallest memory of a feature with its outline and attributes [bytes]."""
-
 TEXT_GROWTH: Final = 15
 """Memory of parsed GeoJSON or DXF as a multiple of the file's size."""
 
@@ -158,10 +155,10 @@ def _read_with_gdal(path: Path, layer: str | None, driver: str) -> Features:
         count = int(info["features"])
         if info["driver"] != driver:
             raise InputError(f"{path}: is damaged; give {VECTOR_FORMATS}")
-        if count * FEATURE_BYTES > available_memory():
+        # A feature with its outline and attributes takes at least 500 bytes.
+        if count * 500 > available_memory():
             raise InputError(
-                f"{path}: declares {count:,} features, more than fit into memory; cut out the area that you "
-                "need"
+                f"{path}: declares {count:,} features, more than fit into memory; cut out the area that you need"
             )
         meta, _, geometry, fields = pyogrio.raw.read(file, layer=layer)
         outline = shapely.from_wkb(geometry)

@@ -22,8 +22,6 @@ THICKEST: Final = 0.6
 
 _PARALLEL: Final = np.cos(np.radians(2.0))
 _TOUCHING: Final = 0.02  # distance of ends that meet [m]
-# A plan of faces pairs nearly all its length, a plan of single lines only the odd two walls.
-_FACED: Final = 0.5
 _SAME: Final = ("kind", "bottom", "top", "thickness")  # what sheets of one wall have in common
 
 
@@ -122,7 +120,8 @@ def _types_drawn_as_faces(segments: Sequence[Segment], pairs: Sequence[tuple[int
     for one, other in pairs:
         low, high = _span(segments[one], segments[other])
         faced[segments[one].kind] += 2 * (high - low)
-    return {kind for kind in length if faced[kind] >= _FACED * length[kind]}
+    # A plan of faces pairs nearly all its length, a plan of single lines only the odd two walls.
+    return {kind for kind in length if faced[kind] >= 0.5 * length[kind]}
 
 
 def _face_distance(one: Segment, other: Segment) -> float | None:

@@ -43,10 +43,6 @@ QUIET_ROUNDS: Final = 2
 """Number of consecutive rounds without a larger change after which the search ends."""
 MAX_LAUNCHES: Final = 256
 """Number of launches of a source after which the search ends in any case: 64 million rays."""
-CACHED_SOURCES: Final = 4
-"""Number of sources whose sequences are kept for the next links."""
-SEQUENCE_BUFFER: Final = 100_000
-"""Initial number of sequences in the buffer of a launch."""
 GEOMETRY_BATCH: Final = 500_000
 """Largest number of sequences x receivers whose geometry is computed together; it limits the memory."""
 
@@ -75,7 +71,7 @@ class SequenceCache:
         """The sequences of a source [3], [m], found with the same materials, which determine how rays continue."""
         key = source.tobytes(), solver.settings, tuple(materials.items())
         if key not in self._sequences:
-            while len(self._sequences) >= CACHED_SOURCES:
+            while len(self._sequences) >= 4:  # some are kept for the next links
                 del self._sequences[next(iter(self._sequences))]
             self._sequences[key] = SourceSequences(solver, source)
         return self._sequences[key]
@@ -110,7 +106,7 @@ class SourceSequences:
             seed=launch_seed(seed, number),
             directions=(lattice_directions(0, RAYS_PER_ROUND, RAYS_PER_ROUND) + shift) % 1.0,
             direct=False,
-            buffer_size=SEQUENCE_BUFFER,
+            buffer_size=100_000,
             max_paths=max_paths,
         )
         # Sionna needs a target; in an unobstructed scene any will do.

@@ -95,9 +95,8 @@ def _check_surfaces(mitsuba_scene: Any, scene: Scene) -> None:
         if not surfaces_agree(traced, stored, scene.local_origin):
             raise InputError(
                 f"{scene.path}: Mitsuba contains another surface of material {material!r} than the mesh files "
-                f"({sum(size.area for size in traced):.6g} m^2 instead of "
-                f"{sum(size.area for size in stored):.6g} m^2); export the meshes again, as binary PLY with "
-                "coordinates of type float"
+                f"({sum(size.area for size in traced):.6g} m^2 instead of {sum(size.area for size in stored):.6g} "
+                "m^2); export the meshes again, as binary PLY with coordinates of type float"
             )
 
 

@@ -45,8 +45,6 @@ LANES: Final = 20_000_000
 """Largest product of rays, interactions and receivers of one launch."""
 BUFFER: Final = 1_000_000
 """Initial number of paths in the buffer of one launch."""
-MAX_CROSSINGS: Final = 64
-"""Largest number of surfaces that a ray crosses in the search for enclosed points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +245,7 @@ class Tracer:
         origin = np.repeat(local, directions.shape[1], axis=0)
         ray = mi.Ray3f(mi.Point3f(*origin.T), mi.Vector3f(*np.tile(directions, len(points))))
         odd, active = np.zeros(len(origin), dtype=bool), np.ones(len(origin), dtype=bool)
-        for _ in range(MAX_CROSSINGS):
+        for _ in range(64):
             hit = self.solver.mitsuba_scene.ray_intersect(ray, mi.Bool(active))
             active &= np.array(hit.is_valid(), dtype=bool)
             if not active.any():
