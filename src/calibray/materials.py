@@ -303,7 +303,8 @@ def itu_law(name: str, frequency: float, revision: str = DEFAULT_REVISION) -> It
     """
     if revision not in ITU_MATERIALS:
         raise InputError(f"revision = {revision!r}: unknown, {did_you_mean(revision, ITU_MATERIALS)}")
-    _check_frequency(frequency)
+    if not (isinstance(frequency, Real) and isfinite(frequency) and frequency > 0):
+        raise InputError(f"frequency = {frequency!r}: must be a finite number greater than 0 Hz")
     table = ITU_MATERIALS[revision]
     if name not in table:
         others = [other for other in ITU_MATERIALS if name in ITU_MATERIALS[other]]
@@ -317,8 +318,3 @@ def itu_law(name: str, frequency: float, revision: str = DEFAULT_REVISION) -> It
         f"ITU-R {revision} gives {name!r} for {ranges}, not for {frequency / 1e9:g} GHz: "
         "give relative_permittivity and conductivity instead"
     )
-
-
-def _check_frequency(frequency: float) -> None:
-    if not (isinstance(frequency, Real) and isfinite(frequency) and frequency > 0):
-        raise InputError(f"frequency = {frequency!r}: must be a finite number greater than 0 Hz")

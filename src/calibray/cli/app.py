@@ -109,25 +109,10 @@ def calibray(
     """Calibrate the radio materials of a ray-traced scene with measured path loss."""
 
 
-COMMANDS = (  # in the order of `--help`
-    doctor,
-    demo,
-    open,
-    init,
-    schema,
-    run,
-    report,
-    compare,
-    validate,
-    trace,
-    predict,
-    map,
-    suggest,
-    export,
-    ledger,
+for command in (  # in the order of `--help`
+    doctor, demo, open, init, schema, run, report, compare, validate, trace, predict, map, suggest, export, ledger,
     cache,
-)
-for command in COMMANDS:
+):  # fmt: skip
     # Without a short help, Typer shortens the summary.
     app.command(short_help=(command.__doc__ or "").partition("\n\n")[0])(command)
 app.add_typer(scene)

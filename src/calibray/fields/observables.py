@@ -25,21 +25,8 @@ from calibray.fields.jax_context import compiled, jax_settings
 from calibray.fields.material_response import material_response, split_by_step
 from calibray.fields.program import GroupedProgram
 from calibray.fields.propagation import decibel, path_fields, path_power
-from calibray.measurements.observables import (
-    ARRIVAL_ELEVATION,
-    DELAY_BIN,
-    DELAY_SPREAD,
-    DEPARTURE_ELEVATION,
-    DEPARTURE_SECTOR,
-    DEPARTURE_SPREAD,
-    EXCESS_DELAY,
-    FLIGHTS,
-    K_FACTOR,
-    ROUND_TRIP,
-    SECTORS,
-    SHARE_RANGE_DB,
-    Statistic,
-)
+from calibray.measurements import observables as kinds
+from calibray.measurements.observables import Statistic
 
 SOFT_DB: Final = 0.5
 """Width of the limit of a receiver's range [dB]."""
@@ -230,22 +217,22 @@ def _statistic(channel: Channel, power: jax.Array, wanted: Statistic) -> jax.Arr
     if wanted.window is not None:
         seen = jnp.where(tap_delay - first[tap_link] <= wanted.window, seen, 0.0)
     weight = tap_power * seen
-    if wanted.kind == DELAY_SPREAD:
+    if wanted.kind == kinds.DELAY_SPREAD:
         return delay_spread(weight, tap_delay, tap_link, num_links)
-    if wanted.kind == EXCESS_DELAY:
+    if wanted.kind == kinds.EXCESS_DELAY:
         mean = link_mean(weight, tap_delay, tap_link, num_links)
         return jnp.where(jnp.isfinite(first), mean - first, jnp.nan)
-    if wanted.kind == K_FACTOR:
+    if wanted.kind == kinds.K_FACTOR:
         return k_factor_db(weight, tap_link, num_links)
-    if wanted.kind == DELAY_BIN:
+    if wanted.kind == kinds.DELAY_BIN:
         return _share(weight, tap_delay - first[tap_link], tap_link, num_links, wanted)
     of_paths = seen if taps is None else taps.of_paths(seen)
     path_weight = power * of_paths
-    if wanted.kind in FLIGHTS:
+    if wanted.kind in kinds.FLIGHTS:
         time = _flight(path_weight, of_paths, delay, link, num_links, wanted)
-        return 2.0 * time if wanted.kind == ROUND_TRIP else time
+        return 2.0 * time if wanted.kind == kinds.ROUND_TRIP else time
     angle = jnp.asarray(_angles(channel, wanted.kind))
-    if wanted.kind in SECTORS:
+    if wanted.kind in kinds.SECTORS:
         start, _ = wanted.bin
         turned = (angle - start) % (2 * np.pi) + start
         return _share(path_weight, turned, link, num_links, wanted)
@@ -271,7 +258,7 @@ def _share(
     """Share of every link's weight whose value lies in the bin [L], [dB]; at least minus the dynamic range."""
     low, high = wanted.bin
     share = link_mean(weight, ((value >= low) & (value < high)).astype(weight.dtype), link, num_links)
-    range_db = SHARE_RANGE_DB if wanted.dynamic_range_db is None else wanted.dynamic_range_db
+    range_db = kinds.SHARE_RANGE_DB if wanted.dynamic_range_db is None else wanted.dynamic_range_db
     return 10 * jnp.log10(share + 10 ** (-range_db / 10))
 
 
@@ -295,6 +282,6 @@ def _flight(
 
 def _angles(channel: Channel, kind: str) -> NDArray[np.float64]:
     """Zenith or azimuth of every path at one end [P], [rad]."""
-    at_departure = kind in (DEPARTURE_SPREAD, DEPARTURE_ELEVATION, DEPARTURE_SECTOR)
+    at_departure = kind in (kinds.DEPARTURE_SPREAD, kinds.DEPARTURE_ELEVATION, kinds.DEPARTURE_SECTOR)
     angles = channel.departure if at_departure else channel.arrival
-    return angles[:, 0 if kind in (DEPARTURE_ELEVATION, ARRIVAL_ELEVATION) else 1]
+    return angles[:, 0 if kind in (kinds.DEPARTURE_ELEVATION, kinds.ARRIVAL_ELEVATION) else 1]

@@ -200,7 +200,9 @@ class Arrowhead:
         held = np.concatenate([_dependent(inner).ravel(), np.zeros(edge, dtype=bool)])
         arrowhead = cls(scale, inner, border, corner, held)
         # Border columns count as dependent if the blocks leave nothing of them.
-        held[split:] = _dependent(arrowhead._schur_complement(~held[None])[0])
+        free, tip, outer = arrowhead._restricted(~held[None])
+        left = outer - np.einsum("mgbp,mgbr->mpr", tip, np.linalg.solve(free, tip), optimize=True)
+        held[split:] = _dependent(left[0])
         return arrowhead
 
     def solve(self, free: NDArray[np.bool_], side: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -275,11 +277,6 @@ class Arrowhead:
         outer = np.linalg.solve(schur, side[:, split:] - np.einsum("mgbp,mgbk->mpk", border, within))
         within = within - across @ outer[:, None]
         return np.concatenate([within.reshape(len(side), split, -1), outer], axis=1)
-
-    def _schur_complement(self, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Schur complement of the blocks: the corner with the blocks eliminated [m, p, p]."""
-        blocks, border, corner = self._restricted(free)
-        return corner - np.einsum("mgbp,mgbr->mpr", border, np.linalg.solve(blocks, border), optimize=True)
 
     def _restricted(
         self, free: NDArray[np.bool_]

@@ -22,17 +22,8 @@ import scipy.io
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.measurements.observables import (
-    DELAY_SPREAD,
-    EXCESS_DELAY,
-    FLIGHTS,
-    K_FACTOR,
-    KINDS,
-    ROUND_TRIP,
-    SECTORS,
-    SHARE_RANGE_DB,
-    Statistic,
-)
+from calibray.measurements import observables as kinds
+from calibray.measurements.observables import Statistic
 from calibray.measurements.table_files import read_table
 from calibray.support.messages import shortened
 
@@ -41,7 +32,7 @@ POWER: Final = r"(^|_)(path_?loss|pl|path_?gain|gain|power|rx_?power|level)(_|$)
 AZIMUTH: Final = r"(^|_)(azimuth|azi?|aoa|phi)(_|$)"
 ELEVATION: Final = r"(^|_)(elevation|ele?|zenith|theta)(_|$)"
 SNAPSHOT: Final = r"(^|_)(rotation|snapshot|sweep|scan|repetition|orientation)(_|$)"
-ANGLES: Final = (*(kind for kind, unit in KINDS.items() if unit == "rad"), *SECTORS)
+ANGLES: Final = (*(kind for kind, unit in kinds.KINDS.items() if unit == "rad"), *kinds.SECTORS)
 """Kinds of statistics that need an angle."""
 
 SECONDS: Final = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
@@ -167,20 +158,20 @@ def _value(
     delay, power = multipath.delay[seen], 10 ** (multipath.level_db[seen] / 10)
     weight, first = power / power.sum(), float(delay.min())
     mean, kind = float(np.sum(weight * delay)), statistic.kind
-    if kind == DELAY_SPREAD:
+    if kind == kinds.DELAY_SPREAD:
         return float(np.sqrt(np.sum(weight * (delay - mean) ** 2)))
-    if kind == EXCESS_DELAY:
+    if kind == kinds.EXCESS_DELAY:
         return mean - first
-    if kind in FLIGHTS:
+    if kind in kinds.FLIGHTS:
         of_path = {"mean": mean, "first": first, "strongest": float(delay[weight.argmax()])}
-        return of_path[statistic.path] * (2 if kind == ROUND_TRIP else 1)
-    if kind == K_FACTOR:
+        return of_path[statistic.path] * (2 if kind == kinds.ROUND_TRIP else 1)
+    if kind == kinds.K_FACTOR:
         strongest = float(weight.max())
         return 10 * float(np.log10(strongest / (1 - strongest))) if strongest < 1 else np.nan
     if statistic.edges is not None:
         low, high = statistic.edges
         values = delay - first if angle is None else (angle - low) % (2 * np.pi) + low
-        range_db = SHARE_RANGE_DB if statistic.dynamic_range_db is None else statistic.dynamic_range_db
+        range_db = kinds.SHARE_RANGE_DB if statistic.dynamic_range_db is None else statistic.dynamic_range_db
         share = float(weight[(values >= low) & (values < high)].sum())
         return 10 * float(np.log10(share + 10 ** (-range_db / 10)))
     resultant = float(np.clip(abs(np.sum(weight * np.exp(1j * np.asarray(angle)))), 1e-300, 1.0))

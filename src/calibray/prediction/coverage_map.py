@@ -82,7 +82,9 @@ def coverage_map(
         EngineError: The paths do not fit into memory.
     """
     if samples is not None:
-        result = _with_samples(result, samples)
+        content = result.study.content()
+        content["trace"]["samples"] = samples
+        result = replace(result, study=Study.from_content(content, result.study.path))
     study = result.study
     transmitter = _transmitter(result, tx)
     constants = _column_values(result, transmitter, columns or {})
@@ -151,12 +153,6 @@ def _transmitter(result: Record, tx: Sequence[float] | None) -> NDArray[np.float
             f"{result.study.path}: the result {cause}; give the position for the map: --tx X Y Z (tx=[x, y, z])"
         )
     return positions[0]
-
-
-def _with_samples(result: Record, samples: int | Literal["auto"]) -> Record:
-    content = result.study.content()
-    content["trace"]["samples"] = samples
-    return replace(result, study=Study.from_content(content, result.study.path))
 
 
 def _column_values(

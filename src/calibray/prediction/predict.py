@@ -211,7 +211,8 @@ def interval(
             "residuals; measure more, or predict without a level"
         )
     field_db, known_share = _residual_field(result, links)
-    draws = _draws(result)
+    # Draws belong to the calibrated model; errors on held-out blocks already include the parameters' uncertainty.
+    draws = result.uncertainty.draws if model.name == Model.CALIBRATED and result.held_out is None else {}
     shift = nuisance_shift(model_terms(model, links), links, draws, new_groups=True)
     replayed = _replay(result, setup, draws, progress)
     modelled = _modelled(result, links, replayed) + shift.value_db
@@ -293,16 +294,6 @@ def with_constants(result: Record, setup: Setup) -> Setup:
         items += [] if item is None else [item]
     parameters = replace(setup.parameters, items=(*setup.parameters.items, *items))
     return replace(setup, parameters=parameters)
-
-
-def _draws(result: Record) -> dict[str, list[float]]:
-    """Draws from the posterior, whose spread widens the intervals of predictions.
-
-    They belong to the calibrated model. Errors of a model on held-out blocks already include the uncertainty of its
-    parameters.
-    """
-    calibrated = result.prediction.model.name == Model.CALIBRATED and result.held_out is None
-    return result.uncertainty.draws if calibrated else {}
 
 
 def _replay(

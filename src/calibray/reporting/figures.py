@@ -15,19 +15,7 @@ from calibray.reporting.link_survey import Survey, in_measured_quantity, measure
 from calibray.reporting.trust_figures import PANELS, residuals_by_direction, trust_figures
 from calibray.reporting.wording import method_text
 from calibray.result.record import Record
-from calibray.support.figure_style import (
-    BLUE,
-    COLORS,
-    FAINT,
-    INK,
-    LINE,
-    ORANGE,
-    dress,
-    logarithmic,
-    plain_figure,
-    residual_figure,
-    styled,
-)
+from calibray.support import figure_style as style
 from calibray.support.messages import shortened
 
 SYMBOLS: Final = 60
@@ -47,7 +35,7 @@ GROUPS: Final = 24
 """Largest number of groups that are shown: those with the most links."""
 
 
-@styled()
+@style.styled()
 def cumulative_cost(results: Mapping[str, Record]) -> Figure:
     """Draw RT calls and time over iterations (the paper's figure of cumulative cost)."""
     figure = Figure(figsize=(6.4, 4.2), dpi=150, layout="constrained")
@@ -55,56 +43,44 @@ def cumulative_cost(results: Mapping[str, Record]) -> Figure:
     for axes, column, y in zip(
         panels, ("call", "seconds"), ("RT calls so far", "Time so far [s]"), strict=True
     ):
-        dress(axes, "Iteration" if column == "seconds" else "", y)
+        style.dress(axes, "Iteration" if column == "seconds" else "", y)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         for method, result in results.items():
             value = result.history.groupby("iteration")[column].max()
-            end = f"{value.iloc[-1]:.4g}"
-            axes.plot(
-                value.index,
-                value,
-                "o-",
-                ms=4,
-                color=COLORS.get(method),
-                label=f"{method_text(result, method)}: {end}",
-            )
+            label = f"{method_text(result, method)}: {value.iloc[-1]:.4g}"
+            axes.plot(value.index, value, "o-", ms=4, color=style.COLORS.get(method), label=label)
             if method == "sgwo-im":
                 calls = result.history.groupby("iteration")["call"].max().diff()
-                reduced = calls[calls < calls.iloc[1]]
-                if len(reduced):
+                for first in calls[calls < calls.iloc[1]].index[:1]:
                     axes.axvline(
-                        reduced.index[0] - 1,
-                        color=COLORS[method],
-                        ls="--",
-                        lw=1,
-                        label="surrogate takes over",
+                        first - 1, color=style.COLORS[method], ls="--", lw=1, label="surrogate takes over"
                     )
         axes.legend(frameon=False)
     if _unequal(results):
-        logarithmic(panels[0], "y")
+        style.logarithmic(panels[0], "y")
     return figure
 
 
-@styled()
+@style.styled()
 def convergence(results: Mapping[str, Record], optimum_db: float | None = None) -> Figure:
     """Draw the best RMSE so far over RT calls, and if known the RMSE of the global optimum [dB]."""
-    figure, axes = plain_figure("RT calls", "RMSE of the best so far [dB]")
+    figure, axes = style.plain_figure("RT calls", "RMSE of the best so far [dB]")
     for method, result in results.items():
         history = result.history
         axes.step(
-            history["call"], history["best_db"], where="post", color=COLORS.get(method),
+            history["call"], history["best_db"], where="post", color=style.COLORS.get(method),
             label=f"{method_text(result, method)}: {result.rmse_db:.3f} dB",
         )  # fmt: skip
     if _unequal(results) or max(result.history["call"].max() for result in results.values()) > LONG:
-        logarithmic(axes, "x")
+        style.logarithmic(axes, "x")
         axes.set_xlim(left=1)
     if optimum_db is not None:
-        axes.axhline(optimum_db, color=INK, ls="--", lw=1, label=f"global optimum: {optimum_db:.3f} dB")
+        axes.axhline(optimum_db, color=style.INK, ls="--", lw=1, label=f"global optimum: {optimum_db:.3f} dB")
     axes.legend(frameon=False)
     return figure
 
 
-@styled()
+@style.styled()
 def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
     """Draw the path loss of every link: measured, before and after calibration; all results are of the same links."""
     links = next(iter(results.values())).links
@@ -115,66 +91,41 @@ def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
     x_label = "Receiver" if few else "Link, by measured path loss" if many else "Link"
     first, quantity = next(iter(results.values())), measured_quantity(next(iter(results.values())))
     y_label = f"{quantity.name[:1].upper()}{quantity.name[1:]} [{quantity.unit}]"
-    figure, axes = plain_figure(x_label, y_label, width=10.0)
+    figure, axes = style.plain_figure(x_label, y_label, width=10.0)
     held_out = links["held_out"].to_numpy(bool)
     if not many and 0 < held_out.sum() < len(links):
         for run, (start, end) in enumerate(_runs(held_out)):
             name = None if run else "held out"
-            axes.axvspan(start + 0.5, end + 0.5, color=FAINT, alpha=0.12, lw=0, label=name)
+            axes.axvspan(start + 0.5, end + 0.5, color=style.FAINT, alpha=0.12, lw=0, label=name)
 
-    def draw(column: NDArray[np.float64], line: str, dots: str, layer: int = 2, **style: Any) -> None:
-        values = column[order]
+    def draw(result: Record, name: str, line: str, dots: str, layer: int = 2, **look: Any) -> None:
+        values = in_measured_quantity(result, name)[order]
         shown = np.where(np.isfinite(values), values, np.nan)
         axes.plot(
-            number, shown, line if few else dots, rasterized=len(links) > RASTERIZED, zorder=layer, **style
+            number, shown, line if few else dots, rasterized=len(links) > RASTERIZED, zorder=layer, **look
         )
 
-    draw(
-        in_measured_quantity(first, "measured"),
-        "o-",
-        "-" if many else ".",
-        3,
-        color=INK,
-        ms=5,
-        lw=1.5,
-        label="measured",
-    )
-    draw(
-        in_measured_quantity(first, "before"),
-        "s--",
-        ".",
-        color=FAINT,
-        ms=4 if few else 2,
-        lw=1,
-        label="before calibration",
-    )
+    draw(first, "measured", "o-", "-" if many else ".", 3, color=style.INK, ms=5, lw=1.5, label="measured")
+    draw(first, "before", "s--", ".", color=style.FAINT, ms=4 if few else 2, lw=1, label="before calibration")
     for index, (method, result) in enumerate(results.items()):
-        color, size = COLORS.get(method, BLUE), 2 if many else 4
+        color, size = style.COLORS.get(method, style.BLUE), 2 if many else 4
         # Upper lines are thinner, so that lines below them remain visible.
         width = 1.3 + 1.4 * (len(results) - 1 - index)
-        draw(
-            in_measured_quantity(result, "after"),
-            "-",
-            ".",
-            color=color,
-            label=method_text(result, method),
-            ms=size,
-            lw=width,
-        )
+        draw(result, "after", "-", ".", color=color, label=method_text(result, method), ms=size, lw=width)
     axes.set_xlim(0, len(links) + 1)
     axes.legend(frameon=False, ncols=6, loc="lower left", bbox_to_anchor=(0, 1))
     return figure
 
 
-@styled()
+@style.styled()
 def residual_over_distance(survey: Survey) -> Figure:
     """Draw the residual of each link over the distance between its antennas."""
-    figure, axes = residual_figure("Distance [m]")
+    figure, axes = style.residual_figure("Distance [m]")
     residuals, held_out = survey.residual_db, survey.table["held_out"].to_numpy(bool)
     for mask, color, marker, name in (
-        (~held_out & survey.has_path, BLUE, "o", "calibration links"),
-        (held_out & survey.has_path, ORANGE, "^", "held out"),
-        (~survey.has_path, FAINT, "s", "no path: log-distance model"),
+        (~held_out & survey.has_path, style.BLUE, "o", "calibration links"),
+        (held_out & survey.has_path, style.ORANGE, "^", "held out"),
+        (~survey.has_path, style.FAINT, "s", "no path: log-distance model"),
     ):
         shown = mask & np.isfinite(residuals)
         if shown.any():
@@ -183,26 +134,28 @@ def residual_over_distance(survey: Survey) -> Figure:
                          label=f"{name} ({shown.sum():,})", rasterized=len(residuals) > RASTERIZED)  # fmt: skip
     distance = survey.distance[np.isfinite(residuals)]
     if len(distance) and distance.max() > 8 * distance.min():
-        logarithmic(axes, "x")
+        style.logarithmic(axes, "x")
     axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
     return figure
 
 
-@styled()
+@style.styled()
 def residual_by_group(survey: Survey) -> Figure:
     """Draw the residuals of each group: quartiles, median, and whiskers that contain 90 % of the links."""
     frame = pd.DataFrame({"group": survey.group, "residual": survey.residual_db})[survey.has_path].dropna()
     sizes = frame.groupby("group").size().sort_values(ascending=False, kind="stable")
     names = sorted(sizes.index[:GROUPS])
-    figure, axes = plain_figure("Predicted − measured [dB]", "", height=max(2.2, 1.2 + 0.32 * len(names)))
+    figure, axes = style.plain_figure(
+        "Predicted − measured [dB]", "", height=max(2.2, 1.2 + 0.32 * len(names))
+    )
     axes.grid(axis="y", visible=False)
-    axes.grid(axis="x", color=LINE)
-    axes.axvline(0, color=INK, lw=0.8)
+    axes.grid(axis="x", color=style.LINE)
+    axes.axvline(0, color=style.INK, lw=0.8)
     values = [frame.loc[frame["group"] == name, "residual"].to_numpy() for name in names]
     if values:
-        lines = {"color": BLUE, "linewidth": 1.2}
+        lines, median = {"color": style.BLUE, "linewidth": 1.2}, {"color": style.ORANGE, "linewidth": 2}
         axes.boxplot(values, orientation="horizontal", whis=(5, 95), showfliers=False, widths=0.5, boxprops=lines,
-                     whiskerprops=lines, capprops=lines, medianprops={"color": ORANGE, "linewidth": 2})  # fmt: skip
+                     whiskerprops=lines, capprops=lines, medianprops=median)  # fmt: skip
     labels = [f"{shortened(name, 28)} ({len(value):,})" for name, value in zip(names, values, strict=True)]
     axes.set_yticks(range(1, len(names) + 1), labels)
     axes.invert_yaxis()
@@ -221,13 +174,11 @@ def result_figures(result: Record, links: Survey | None) -> dict[str, Figure]:
         figures["residual-over-distance"] = residual_over_distance(links)
         if links.group is not None:
             figures["residual-by-group"] = residual_by_group(links)
-    observables = measured_over_modelled(result)
-    if observables is not None:
-        figures["observables"] = observables
-    directions = residuals_by_direction(result)
-    if directions is not None:
-        figures["residual-by-direction"] = directions
-    return figures | trust_figures(result)
+    further = {
+        "observables": measured_over_modelled(result),
+        "residual-by-direction": residuals_by_direction(result),
+    }
+    return figures | {name: drawn for name, drawn in further.items() if drawn} | trust_figures(result)
 
 
 def _unequal(results: Mapping[str, Record]) -> bool:
@@ -241,7 +192,7 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(start), int(end)) for start, end in edges.reshape(-1, 2)]
 
 
-@styled()
+@style.styled()
 def measured_over_modelled(result: Record) -> Figure | None:
     """Draw measured over modelled values of the first observables, without biases of devices; None without any."""
     fits = dict(list(result.fit.observables.items())[:PANELS])
@@ -253,20 +204,23 @@ def measured_over_modelled(result: Record) -> Figure | None:
     held_out = result.links["held_out"].to_numpy(bool)
     for number, (name, fit) in enumerate(fits.items(), start=1):
         axes = figure.add_subplot(rows, columns, number)
-        dress(axes, f"modelled [{fit.unit}]", f"measured [{fit.unit}]")
+        style.dress(axes, f"modelled [{fit.unit}]", f"measured [{fit.unit}]")
         measured, modelled = (
             result.links[f"{name}_{when}_{fit.unit}"].to_numpy(float) for when in ("measured", "after")
         )
         if (bias := f"{name}_bias_{fit.unit}") in result.links:
             measured = measured - result.links[bias].to_numpy(float)
         shown = np.isfinite(measured) & np.isfinite(modelled)
-        for part, color, role in ((~held_out, BLUE, "calibration"), (held_out, ORANGE, "held out")):
+        for part, color, role in (
+            (~held_out, style.BLUE, "calibration"),
+            (held_out, style.ORANGE, "held out"),
+        ):
             if (part & shown).any():
                 axes.scatter(modelled[part & shown], measured[part & shown], s=10, c=color, lw=0, label=role)
         if shown.any():
             both = np.concatenate([measured[shown], modelled[shown]])
             ends = [both.min(), both.max()]
-            axes.plot(ends, ends, color=INK, lw=0.8)
+            axes.plot(ends, ends, color=style.INK, lw=0.8)
         axes.set_title(shortened(name, 28), fontsize=9)
-        axes.legend(fontsize=7, labelcolor=FAINT, frameon=False)
+        axes.legend(fontsize=7, labelcolor=style.FAINT, frameon=False)
     return figure

@@ -278,17 +278,16 @@ def _laws(result: Record) -> Table:
 
 def _worst(result: Record, links: Survey | None) -> Table:
     """The links with the largest residuals."""
-    grouped, unit = links is not None and links.group is not None, measured_quantity(result).unit
+    grouped, quantity = links is not None and links.group is not None, measured_quantity(result)
     columns = (
         numbers("Row"),
         *([Column("group")] if grouped else []),
-        numbers("measured", unit),
-        numbers("predicted", unit),
+        numbers("measured", quantity.unit),
+        numbers("predicted", quantity.unit),
         numbers("residual", "dB"),
         Column("held out"),
         Column("path"),
     )
-    quantity = measured_quantity(result)
     residuals = residual(result.links, quantity.sign)
     measured, predicted = (in_measured_quantity(result, name) for name in ("measured", "predicted"))
     order = np.argsort(-np.nan_to_num(np.abs(residuals), nan=-1.0), kind="stable")[:WORST]

@@ -35,15 +35,10 @@ def contents(scene: MadeScene) -> Table:
         *((_HEIGHT_SOURCES[source], _listed(names)) for source, names in scene.guessed.items()),
     ]
     if scene.frame is not None:
-        rows.append(("origin", _origin(scene)))
+        longitude, latitude, height = scene.frame.to_geographic([0.0, 0.0, 0.0])
+        place = f"longitude {longitude:.7f}, latitude {latitude:.7f}, height {height:g} m ({scene.frame.crs})"
+        rows.append(("origin", place))
     return Table("", (Column(), Column()), tuple(rows))
-
-
-def _origin(scene: MadeScene) -> str:
-    if scene.frame is None:
-        return ""
-    longitude, latitude, height = scene.frame.to_geographic([0.0, 0.0, 0.0])
-    return f"longitude {longitude:.7f}, latitude {latitude:.7f}, height {height:g} m ({scene.frame.crs})"
 
 
 def _listed(names: Sequence[str]) -> str:

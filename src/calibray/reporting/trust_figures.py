@@ -16,20 +16,7 @@ from calibray.reporting.diagnostics import diagnostics
 from calibray.reporting.link_survey import residual
 from calibray.result.record import Record
 from calibray.study.mounting import link_mountings
-from calibray.support.figure_style import (
-    BLUE,
-    FAINT,
-    GREEN,
-    INK,
-    LINE,
-    ORANGE,
-    PALETTE,
-    dress,
-    logarithmic,
-    plain_figure,
-    residual_figure,
-    styled,
-)
+from calibray.support import figure_style as style
 from calibray.support.messages import shortened
 from calibray.tracing.antennas import AntennaPattern, Mounting, Pose, jones_vectors, wave_basis
 from calibray.validation.validation import Validation
@@ -59,18 +46,15 @@ def trust_figures(result: Record) -> dict[str, Figure]:
         validation = Validation.of(result.held_out)
         figures["held-out-errors"] = held_out_errors(validation)
         figures["held-out-blocks"] = held_out_blocks(validation)
-    if "power" in tables:
-        figures["power"] = power(tables["power"])
-    if "neighbours" in tables:
-        figures["neighbours"] = neighbours(tables["neighbours"])
-    if "leverage" in tables:
-        figures["leverage"] = leverage(tables["leverage"])
+    for name, draw in (("power", power), ("neighbours", neighbours), ("leverage", leverage)):
+        if name in tables:
+            figures[name] = draw(tables[name])
     if "depth" in tables and len(tables["depth"]) > 1:
         figures["residual-by-depth"] = by_depth(tables["depth"])
     return figures
 
 
-@styled()
+@style.styled()
 def possible_values(result: Record) -> Figure:
     """Draw the posterior of every parameter over its bounds, with its 95 % interval."""
     names = sorted(result.parameters, key=lambda name: -_spread(result, name))[:PARAMETERS]
@@ -90,19 +74,21 @@ def _draw_posterior(axes: Axes, result: Record, name: str) -> None:
     lower, upper = map(float, section.bounds)
     log = section.scale == "log"
     ends = np.geomspace(lower, upper, BARS + 1) if log else np.linspace(lower, upper, BARS + 1)
-    dress(axes, shortened(name, 34), "")
+    style.dress(axes, shortened(name, 34), "")
     count, _ = np.histogram(result.uncertainty.draws[name], ends)
-    axes.stairs(count / len(result.uncertainty.draws[name]), ends, fill=True, color=BLUE, alpha=0.45, lw=0)
+    axes.stairs(
+        count / len(result.uncertainty.draws[name]), ends, fill=True, color=style.BLUE, alpha=0.45, lw=0
+    )
     for low, high in () if interval is None else (interval.pieces or ((interval.lower, interval.upper),)):
-        axes.plot([low, high], [0, 0], color=BLUE, lw=4, solid_capstyle="butt", clip_on=False, zorder=3)
-    axes.axvline(result.fit.initial_parameters[name], color=FAINT, lw=1.2, ls="--")
-    axes.axvline(result.parameters[name], color=ORANGE, lw=1.6)
+        axes.plot([low, high], [0, 0], color=style.BLUE, lw=4, solid_capstyle="butt", clip_on=False, zorder=3)
+    axes.axvline(result.fit.initial_parameters[name], color=style.FAINT, lw=1.2, ls="--")
+    axes.axvline(result.parameters[name], color=style.ORANGE, lw=1.6)
     axes.set(xlim=(lower, upper), ylim=(0, None), yticks=[])
     if log:
-        logarithmic(axes, "x")
+        style.logarithmic(axes, "x")
     axes.spines["left"].set_visible(False)
     if interval is not None:
-        axes.set_title(interval.verdict, fontsize=9, color=FAINT, loc="right")
+        axes.set_title(interval.verdict, fontsize=9, color=style.FAINT, loc="right")
 
 
 def _spread(result: Record, name: str) -> float:
@@ -113,10 +99,12 @@ def _spread(result: Record, name: str) -> float:
     return float(np.std(scale(result.uncertainty.draws[name])) / np.ptp(scale(bounds)))
 
 
-@styled()
+@style.styled()
 def held_out_errors(validation: Validation) -> Figure:
     """Draw the distribution of absolute errors on held-out links, by model."""
-    figure, axes = plain_figure("Absolute error of held-out links [dB]", "Share of links up to this error")
+    figure, axes = style.plain_figure(
+        "Absolute error of held-out links [dB]", "Share of links up to this error"
+    )
     judged, reach = validation.block >= 0, 0.0
     for name, color in _colors(validation):
         error = np.sort(np.abs(validation.errors[name][judged]))
@@ -129,11 +117,11 @@ def held_out_errors(validation: Validation) -> Figure:
     return figure
 
 
-@styled()
+@style.styled()
 def held_out_blocks(validation: Validation) -> Figure:
     """Draw the RMSE of every model on every block."""
     count = len(validation.labels)
-    figure, axes = plain_figure("Block", "Held-out RMSE [dB]")
+    figure, axes = style.plain_figure("Block", "Held-out RMSE [dB]")
     for name, color in _colors(validation):
         values = [_rmse(validation.errors[name][validation.block == number]) for number in range(count)]
         best = name == validation.best
@@ -148,10 +136,10 @@ def held_out_blocks(validation: Validation) -> Figure:
 
 def _colors(validation: Validation) -> list[tuple[str, str]]:
     """Models with their colours; calibrated models have the main colours of the page."""
-    calibrated = iter((BLUE, ORANGE, GREEN))
-    others = iter((FAINT, *PALETTE, *PALETTE))
+    calibrated = iter((style.BLUE, style.ORANGE, style.GREEN))
+    others = iter((style.FAINT, *style.PALETTE, *style.PALETTE))
     return [
-        (name, next(calibrated, INK) if name.startswith("calibrated") else next(others))
+        (name, next(calibrated, style.INK) if name.startswith("calibrated") else next(others))
         for name in validation.table.index
     ]
 
@@ -160,46 +148,46 @@ def _rmse(error: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(error**2))) if len(error) else float("nan")
 
 
-@styled()
+@style.styled()
 def power(table: pd.DataFrame) -> Figure:
     """Draw power by material and type of interaction."""
     shown = table.head(ROWS)
     names = [f"{row.material} {row.interaction}".strip() for row in shown.itertuples()]
-    figure, axes = plain_figure("Mean share of a link's power [%]", "", height=1.2 + 0.3 * len(shown))
+    figure, axes = style.plain_figure("Mean share of a link's power [%]", "", height=1.2 + 0.3 * len(shown))
     axes.grid(axis="y", visible=False)
-    axes.grid(axis="x", color=LINE)
-    axes.barh(range(len(shown)), 100 * shown["share"], color=BLUE, height=0.6)
+    axes.grid(axis="x", color=style.LINE)
+    axes.barh(range(len(shown)), 100 * shown["share"], color=style.BLUE, height=0.6)
     axes.set_yticks(range(len(shown)), [shortened(name, 30) for name in names])
     axes.invert_yaxis()
     return figure
 
 
-@styled()
+@style.styled()
 def neighbours(table: pd.DataFrame) -> Figure:
     """Draw the semivariance of residuals over the distance between links."""
-    figure, axes = plain_figure("Distance between links [m]", "Semivariance of residuals [dB²]")
-    axes.plot(table["distance_m"], table["semivariance_db2"], "o-", color=BLUE)
+    figure, axes = style.plain_figure("Distance between links [m]", "Semivariance of residuals [dB²]")
+    axes.plot(table["distance_m"], table["semivariance_db2"], "o-", color=style.BLUE)
     axes.set(xlim=(0, None), ylim=(0, None))
     return figure
 
 
-@styled()
+@style.styled()
 def leverage(table: pd.DataFrame) -> Figure:
     """Draw the residual of every link over its leverage."""
-    figure, axes = residual_figure("Leverage")
+    figure, axes = style.residual_figure("Leverage")
     size = 40 if len(table) <= 100 else 16 if len(table) <= 1000 else 5
-    axes.scatter(table["leverage"], table["residual_db"], s=size, c=BLUE, alpha=0.7, lw=0,
+    axes.scatter(table["leverage"], table["residual_db"], s=size, c=style.BLUE, alpha=0.7, lw=0,
                  rasterized=len(table) > 2000)  # fmt: skip
     axes.set_xlim(0, None)
     return figure
 
 
-@styled()
+@style.styled()
 def by_depth(table: pd.DataFrame) -> Figure:
     """Draw the mean residual by the number of interactions of the strongest path, with two standard errors."""
-    figure, axes = residual_figure("Interactions of the strongest path")
+    figure, axes = style.residual_figure("Interactions of the strongest path")
     error = table["standard_deviation_db"] / np.sqrt(table["links"])
-    axes.errorbar(table["depth"], table["mean_db"], 2 * error, fmt="o", color=BLUE, capsize=3)
+    axes.errorbar(table["depth"], table["mean_db"], 2 * error, fmt="o", color=style.BLUE, capsize=3)
     labels = [f"{row.depth:.0f}\n({row.links:,})" for row in table.itertuples()]
     axes.set_xticks(table["depth"].to_numpy(float), labels)
     axes.set_xlim(table["depth"].min() - 0.5, table["depth"].max() + 0.5)
@@ -234,7 +222,7 @@ def residuals_by_direction(result: Record) -> Figure | None:
     )
 
 
-@styled()
+@style.styled()
 def _polar_figures(
     names: list[str],
     links: dict[str, NDArray[np.bool_]],
@@ -255,13 +243,15 @@ def _polar_figures(
         axes.set_theta_zero_location("N")  # type: ignore[attr-defined]
         axes.set_theta_direction(-1)  # type: ignore[attr-defined]
         axes.set_ylim(-limit, limit)
-        axes.set_yticks([-limit, 0, limit], [f"{-limit:g}", "0", f"{limit:g} dB"], color=INK, fontsize=7)
-        axes.tick_params(axis="x", labelsize=7, colors=FAINT)
-        axes.plot(np.linspace(0, 2 * np.pi, 181), np.zeros(181), color=INK, lw=0.8)
-        axes.scatter(bearing[mask], residuals[mask], s=10, c=BLUE, alpha=0.7, lw=0)
+        axes.set_yticks(
+            [-limit, 0, limit], [f"{-limit:g}", "0", f"{limit:g} dB"], color=style.INK, fontsize=7
+        )
+        axes.tick_params(axis="x", labelsize=7, colors=style.FAINT)
+        axes.plot(np.linspace(0, 2 * np.pi, 181), np.zeros(181), color=style.INK, lw=0.8)
+        axes.scatter(bearing[mask], residuals[mask], s=10, c=style.BLUE, alpha=0.7, lw=0)
         turn = np.linspace(0, 2 * np.pi, 361)
         level = np.maximum(_pattern_db(mounting, int(np.flatnonzero(mask)[0]), turn), DEEPEST_DB)
-        axes.plot(turn, limit * (1 - 2 * level / DEEPEST_DB), color=ORANGE, lw=1.2)
+        axes.plot(turn, limit * (1 - 2 * level / DEEPEST_DB), color=style.ORANGE, lw=1.2)
         axes.set_title(f"{shortened(name, 28)} ({mask.sum():,})", fontsize=9)
     return figure
 

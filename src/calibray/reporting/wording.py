@@ -173,27 +173,29 @@ CLEAR: Final = 2.0
 def diagnostics_table(result: Record) -> Table:
     """Summarize the diagnostics in a line each."""
     tables = diagnostics(result)
+
+    def text(name: str, described: Callable[[pd.DataFrame], str]) -> str:
+        return described(tables[name]) if name in tables else ""
+
     findings = {
-        "power": _power_text(tables),
+        "power": text("power", _power_text),
         "over distance": _distance_text(result),
         "by depth": _class_text(tables, "depth", "paths of {} interactions"),
         "by group": _class_text(tables, "group", "group {}", lambda label: group_text(result, label)),
-        "by obstruction": _obstruction_text(tables),
+        "by obstruction": text("obstruction", _obstruction_text),
         "by street": _class_text(tables, "streets", "{}"),
-        "missing region": _missing_region_text(tables),
-        "neighbours": _neighbours_text(tables),
-        "leverage": _leverage_text(tables),
-        "trade-offs": _trade_offs_text(result, tables),
-        "largest change": _moved_text(tables),
+        "missing region": text("missing_region", _missing_region_text),
+        "neighbours": text("neighbours", _neighbours_text),
+        "leverage": text("leverage", _leverage_text),
+        "trade-offs": text("trade_offs", lambda table: _trade_offs_text(result, table)),
+        "largest change": text("moved", _moved_text),
     }
     rows = tuple((name, text) for name, text in findings.items() if text)
     return Table("Diagnostics", (Column(), Column()), rows)
 
 
-def _power_text(tables: dict[str, pd.DataFrame]) -> str:
-    if "power" not in tables:
-        return ""
-    rows = tables["power"].head(5).to_dict("records")
+def _power_text(table: pd.DataFrame) -> str:
+    rows = table.head(5).to_dict("records")
     shares = (
         f"{row['material']} {row['interaction']} {percent(float(row['share']))}".replace("  ", " ")
         for row in rows
@@ -234,23 +236,19 @@ def _class_text(
     )
 
 
-def _obstruction_text(tables: dict[str, pd.DataFrame]) -> str:
+def _obstruction_text(table: pd.DataFrame) -> str:
     """Mean residual of links in sight, and of those out of sight by the length of the line below roofs."""
-    if "obstruction" not in tables:
-        return ""
     parts = []
-    for row in tables["obstruction"].to_dict("records"):
+    for row in table.to_dict("records"):
         below = f"with {row['from_m']:.0f} to {row['to_m']:.0f} m below roofs"
         where = "in sight" if not row["out_of_sight"] else below if row["to_m"] >= 1.0 else "out of sight"
         parts.append(f"{row['mean_db']:+.1f} dB {where} ({row['links']} links)")
     return f"mean residual: {', '.join(parts)}"
 
 
-def _missing_region_text(tables: dict[str, pd.DataFrame]) -> str:
+def _missing_region_text(table: pd.DataFrame) -> str:
     """Where a region of extra loss would explain residuals, if it explains more than chance."""
-    if "missing_region" not in tables:
-        return ""
-    row = tables["missing_region"].iloc[0]
+    row = table.iloc[0]
     if not row["significant"]:
         return "no region of extra loss, such as trees, would explain more of the residuals than chance"
     return (
@@ -260,10 +258,9 @@ def _missing_region_text(tables: dict[str, pd.DataFrame]) -> str:
     )
 
 
-def _neighbours_text(tables: dict[str, pd.DataFrame]) -> str:
-    if "neighbours" not in tables or len(tables["neighbours"]) < 3:
+def _neighbours_text(table: pd.DataFrame) -> str:
+    if len(table) < 3:
         return ""
-    table = tables["neighbours"]
     nearest, sill = table.iloc[0], float(table["semivariance_db2"].iloc[len(table) // 2 :].mean())
     share = 1.0 - nearest["semivariance_db2"] / sill if sill > 0 else 0.0
     # The relative standard error of a semivariance of n independent pairs is sqrt(2 / n).
@@ -272,10 +269,7 @@ def _neighbours_text(tables: dict[str, pd.DataFrame]) -> str:
     return f"links {nearest['distance_m']:.0f} m apart share {percent(share)} of the variance of their errors"
 
 
-def _leverage_text(tables: dict[str, pd.DataFrame]) -> str:
-    if "leverage" not in tables:
-        return ""
-    table = tables["leverage"]
+def _leverage_text(table: pd.DataFrame) -> str:
     deciding = table[table["leverage"] > DECIDING]
     if len(deciding):
         links = "1 link determines" if len(deciding) == 1 else f"{len(deciding)} links determine"
@@ -288,10 +282,7 @@ def _leverage_text(tables: dict[str, pd.DataFrame]) -> str:
     )
 
 
-def _trade_offs_text(result: Record, tables: dict[str, pd.DataFrame]) -> str:
-    if "trade_offs" not in tables:
-        return ""
-    table = tables["trade_offs"]
+def _trade_offs_text(result: Record, table: pd.DataFrame) -> str:
     strong = table[table["correlation"].abs() > TRADE_OFF].head(3)
     if not len(strong):
         return f"no two unknowns have a correlation above {TRADE_OFF:g}"
@@ -302,10 +293,7 @@ def _trade_offs_text(result: Record, tables: dict[str, pd.DataFrame]) -> str:
     return "; ".join(f"{row.first} and {row.second} ({row.correlation:+.2f})" for row in pairs.itertuples())
 
 
-def _moved_text(tables: dict[str, pd.DataFrame]) -> str:
-    if "moved" not in tables:
-        return ""
-    table = tables["moved"]
+def _moved_text(table: pd.DataFrame) -> str:
     row = table.iloc[int(np.argmax(table["moved"].abs()))]
     moved = percent(abs(row["moved"]))
     return f"{row['parameter']}, from {row['before']:.4g} to {row['after']:.4g}: {moved} of its range"

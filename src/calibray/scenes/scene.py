@@ -141,7 +141,10 @@ def read_scene(
             materials[name], laws[name] = _material(
                 name, original, definitions.get(original), constants, frequency, path
             )
-        _refer(shape, f"{TRACED}{index.setdefault(name, len(index))}")
+        for child in [*shape.findall("ref"), *shape.findall("bsdf")]:
+            shape.remove(child)
+        reference = {"id": f"{TRACED}{index.setdefault(name, len(index))}", "name": "bsdf"}
+        ElementTree.SubElement(shape, "ref", reference)
         objects.append(SceneObject(object_name, name))
     if not objects:
         raise InputError(f"{path}: the scene has no <shape>; export the scene with its meshes")
@@ -341,13 +344,6 @@ def _floats(bsdf: ElementTree.Element | None) -> dict[str, float]:
 def _slab(bsdf: ElementTree.Element | None) -> dict[str, float]:
     """The numbers of a BSDF that describe the slab and its surface, not the bulk."""
     return {key: value for key, value in _floats(bsdf).items() if key not in _BULK_FIELDS}
-
-
-def _refer(shape: ElementTree.Element, identifier: str) -> None:
-    """Replace the material of a shape by a reference."""
-    for child in [*shape.findall("ref"), *shape.findall("bsdf")]:
-        shape.remove(child)
-    ElementTree.SubElement(shape, "ref", {"id": identifier, "name": "bsdf"})
 
 
 def material_element(identifier: str, material: Material) -> ElementTree.Element:

@@ -34,7 +34,7 @@ MAX_DEPTH: Final = 64
 """Largest depth of nested elements in a scene file."""
 
 _NOT_RADIO: Final = frozenset(
-    {
+    (
         "default",
         "emitter",
         "film",
@@ -45,18 +45,13 @@ _NOT_RADIO: Final = frozenset(
         "sensor",
         "spectrum",
         "texture",
-    }
+    )
 )
 """Elements of Mitsuba's scenes without effect on radio waves."""
 
 _PROPERTIES: Final[Mapping[str, tuple[str, ...]]] = {
-    "boolean": (
-        "face_normals",
-        "flip_normals",
-        "flip_tex_coords",
-        "faceNormals",
-        "flipNormals",
-        "flipTexCoords",
+    "boolean": tuple(
+        ["face_normals", "flip_normals", "flip_tex_coords", "faceNormals", "flipNormals", "flipTexCoords"]
     ),
     "integer": ("shape_index", "shapeIndex"),
     "string": ("filename",),
@@ -203,11 +198,12 @@ def shape_mesh(shape: ElementTree.Element, path: Path) -> Mesh | None:
             "export it as a PLY mesh of triangles"
         )
     _check_transform(shape, path)
-    filename = mesh_filename(shape)
-    if filename is None:
+    named = shape.find("string[@name='filename']")
+    if named is None:
         if kind in ("obj", "ply"):
             raise InputError(f"{path}: shape {name!r} names no file; give it a filename")
         return None
+    filename = named.get("value", "")
     mesh = path.parent / filename
     if not exists(mesh):
         raise InputError(
@@ -215,12 +211,6 @@ def shape_mesh(shape: ElementTree.Element, path: Path) -> Mesh | None:
             "meshes folder next to the scene"
         )
     return read_mesh(mesh, kind)
-
-
-def mesh_filename(shape: ElementTree.Element) -> str | None:
-    """The file that a shape, texture or emitter names, relative to the scene's folder, if any."""
-    filename = shape.find("string[@name='filename']")
-    return None if filename is None else filename.get("value", "")
 
 
 def _check_transform(shape: ElementTree.Element, path: Path) -> None:

@@ -376,13 +376,19 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
         antennas |= _patterns(links, folder, mount)
     for key, column in transmitter_columns.find_angles(frame, of_transmitters).items():
         cause = transmitter_columns.unusable(frame, key, column)
-        if not cause and folder is not None and key.startswith("electrical") and not _is_additional(column):
+        if (
+            not cause
+            and folder is not None
+            and key.startswith("electrical")
+            and not matches(column, "additional")
+        ):
             cause = "it is part of the files' vertical cuts"
         if cause:
             links.assume(f"links.tx_antenna.{key}", "none", f"column {column}: {cause}")
             continue
         mount[key] = column
-        links.assume(f"links.tx_antenna.{key}", column, f"a column named so, {_range(frame[column])}")
+        low, high = frame[column].min(), frame[column].max()
+        links.assume(f"links.tx_antenna.{key}", column, f"a column named so, {low:g} to {high:g} degrees")
     if folder is None and "azimuth_deg" in mount:
         antennas["tx"]["pattern"] = "tr38901"
     if mount:
@@ -398,14 +404,6 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
         reason += f"; give --antennas, a folder of the MSI files that column {name} names"
     links.assume("antennas", f"{antennas['tx']['pattern']}, V" if folder is None else folder.name, reason)
     return antennas
-
-
-def _is_additional(column: str) -> bool:
-    return matches(column, "additional")
-
-
-def _range(values: Any) -> str:
-    return f"{values.min():g} to {values.max():g} degrees"
 
 
 def _patterns(links: LinksDraft, folder: Path, mount: dict[str, str]) -> dict[str, Any]:

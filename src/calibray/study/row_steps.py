@@ -29,7 +29,7 @@ from calibray.study.mounting import PORT_POWER, mounting_columns, port_power, st
 from calibray.study.regions import Place
 
 if TYPE_CHECKING:
-    from calibray.measurements import Ground, MoveOutside
+    from calibray.measurements import MoveOutside
     from calibray.scenes.checks import SceneSurfaces
     from calibray.scenes.obstruction import Region
 
@@ -68,6 +68,8 @@ def row_steps(study: StudyModel) -> Preparation:
     inside = None if links.inside == "keep" else links.inside
     groups = [label for term in study.nuisance_terms.values() for label in term.per]
     groups += [item.bias for item in study.observables.values() if item.bias not in (None, "all")]
+    keep = [label for label in groups if label not in (*OBSTRUCTION, CLUSTER)]
+    keep += [links.frequency] if links.frequency else []
     return replace(
         position_steps(study),
         track=row_track(study),
@@ -78,14 +80,7 @@ def row_steps(study: StudyModel) -> Preparation:
         censored=links.below_floor == "censor",
         averaging=None if links.average is None else Averaging(**links.average.model_dump()),
         keep=list(
-            dict.fromkeys(
-                [
-                    *(label for label in groups if label not in (*OBSTRUCTION, CLUSTER)),
-                    *([links.frequency] if links.frequency else []),
-                    *mounting_columns(study),
-                    *([links.device] if links.device else []),
-                ]
-            )
+            dict.fromkeys([*keep, *mounting_columns(study), *([links.device] if links.device else [])])
         ),
         held_out=None if study.holdout is None else partial(_held_out_parts, study.holdout, links.value),
         observables=[item.column for item in study.observables.values() if item.column is not None],
@@ -123,7 +118,7 @@ def position_steps(study: StudyModel) -> Preparation:
     """
     links, transmitters = study.links, study.transmitters_path
     return Preparation(
-        ground=None if links.heights is None else _ground(study),
+        ground=None if links.heights is None else _surfaces(study.scene_source).ground_height,
         transmitters=None if transmitters is None else read_table(transmitters),
         transmitter=links.transmitter,
         crs=links.crs or WGS84,
@@ -134,10 +129,6 @@ def position_steps(study: StudyModel) -> Preparation:
 
 
 # Code that reads a scene's meshes imports SciPy; only studies that need it load it.
-
-
-def _ground(study: StudyModel) -> Ground:
-    return _surfaces(study.scene_source).ground_height
 
 
 def _move_outside(study: StudyModel) -> MoveOutside:

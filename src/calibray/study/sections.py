@@ -108,14 +108,10 @@ class AverageSection(Section):
     minimum_count: Annotated[int, Field(ge=1)] = 1
 
     @model_validator(mode="after")
-    def _sized(self) -> Self:
+    def _sized_or_timed(self) -> Self:
         if (self.by == "place") != (self.size is None):
             remedy = "takes no size; remove it" if self.by == "place" else "needs size, in m or s"
             raise InputError(f"links.average: by = {self.by!r} {remedy}")
-        return self
-
-    @model_validator(mode="after")
-    def _timed(self) -> Self:
         if (self.by == "time") != (self.time is not None):
             remedy = "needs time, the column of times" if self.by == "time" else "takes no time; remove it"
             raise InputError(f"links.average: by = {self.by!r} {remedy}")
@@ -264,25 +260,17 @@ class LinksSection(Section):
     average: _Average = None
 
     @model_validator(mode="after")
-    def _unit_of_lengths(self) -> Self:
+    def _consistent(self) -> Self:
         if self.position == "geographic" and self.position_unit != 1:
             raise InputError(
                 f"links.position_unit = {self.position_unit:g} with position = 'geographic': degrees have no length; "
                 f"remove it"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _place_on_the_globe(self) -> Self:
         if self.crs is not None and (self.position != "geographic" or self.track is not None):
             raise InputError(
                 f"links.crs = {self.crs!r}: it is the reference system of columns with positions on the globe; set "
                 "links.position = 'geographic', without a track"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _one_power(self) -> Self:
         if self.eirp_dbm is not None and (self.tx_power_dbm is not None or self.cable_loss_db is not None):
             raise InputError(
                 "links.eirp_dbm includes the transmitted power, cables and the antenna's gain; remove tx_power_dbm and "
@@ -290,16 +278,6 @@ class LinksSection(Section):
             )
         if self.cable_loss_db is not None and self.tx_power_dbm is None:
             raise InputError("links.cable_loss_db needs tx_power_dbm [dBm], the power before the cable")
-        return self
-
-    @property
-    def mountings(self) -> dict[str, MountingSection]:
-        """The ends, "tx" and "rx", whose antennas differ between links."""
-        stated = {"tx": self.tx_antenna, "rx": self.rx_antenna}
-        return {end: section for end, section in stated.items() if section is not None}
-
-    @model_validator(mode="after")
-    def _power_above_its_floor(self) -> Self:
         if self.noise_floor_dbm is not None and self.quantity not in ("received_power", "rsrp"):
             raise InputError(
                 f"links.noise_floor_dbm = {self.noise_floor_dbm:g} with quantity = {self.quantity!r}: the noise floor "
@@ -315,6 +293,12 @@ class LinksSection(Section):
                 "floor at half of the floor; remove one of them"
             )
         return self
+
+    @property
+    def mountings(self) -> dict[str, MountingSection]:
+        """The ends, "tx" and "rx", whose antennas differ between links."""
+        stated = {"tx": self.tx_antenna, "rx": self.rx_antenna}
+        return {end: section for end, section in stated.items() if section is not None}
 
 
 class AntennasSection(Section):

@@ -221,7 +221,10 @@ def _write_live_study(
     live = LiveScene.of(scene)
     links = dict(sections.get("links", {}))
     table = _links(live, measured)
-    constants = {name: _numbers(item) for name, item in live.materials.items()}
+    constants = {
+        name: {key: value for key, value in asdict(item).items() if not isinstance(value, str)}
+        for name, item in live.materials.items()
+    }
     write_scene(folder, live.objects, constants, overwrite=overwrite)
     write_table(folder / "links.csv", table)
     power = {"tx_power_dbm": "tx_power_dbm"} if links.get("quantity") == "received_power" else {}
@@ -244,10 +247,6 @@ def _write_live_study(
         **sections,
         "links": {"file": "links.csv", **ends, "value": VALUE, **power, **links},
     }
-
-
-def _numbers(material: Material) -> dict[str, float]:
-    return {name: value for name, value in asdict(material).items() if not isinstance(value, str)}
 
 
 def _parameters(materials: Mapping[str, Material]) -> dict[str, dict[str, Any]]:

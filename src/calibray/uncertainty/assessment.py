@@ -200,7 +200,9 @@ def _assess(
     model, posterior = models[0], _draw(models, problem.setup.study.method.seed, progress)
     noise = _noise_weights(model, posterior, offset=not has_offset(problem))
     intervals = _intervals(problem, model, posterior, local)
-    best, most_probable = problem.parameters.named(trail.best), _most_probable(model, posterior)
+    best = problem.parameters.named(trail.best)
+    top = posterior.means.point[np.argsort(-posterior.means.density)[:64]]
+    most_probable = top[np.argmax(model.at_scene_constants(top))]
     at_both = model.at_scene_constants(np.stack([relevant[0], most_probable]))
     log_odds = float(at_both[1] - at_both[0])
     most_probable = problem.parameters.named(problem.parameters.from_search(most_probable))
@@ -252,13 +254,6 @@ def _noise_weights(model: JointModel, posterior: Posterior, *, offset: bool) -> 
     return weights
 
 
-def _most_probable(model: JointModel, posterior: Posterior) -> NDArray[np.float64]:
-    """The most probable of the draws, with the constants of the scene, in the search space [d]."""
-    draws = posterior.means
-    top = draws.point[np.argsort(-draws.density)[:64]]
-    return np.asarray(top[np.argmax(model.at_scene_constants(top))])
-
-
 def _intervals(
     problem: Problem, model: JointModel, posterior: Posterior, local: dict[str, Interval]
 ) -> dict[str, Interval]:
@@ -271,10 +266,11 @@ def _intervals(
         point[index] = coordinate
         return float(parameters.from_search(point)[index])
 
+    customary = np.array([CUSTOMARY.get((item.field, item.scale), np.inf) for item in parameters])
     judged = verdicts(
         posterior.means,
         lambda points: problem.objective.capped(problem.modelled(points))[:, counted],
-        Axes(parameters.names, lower, upper, value_at, _customary(parameters)),
+        Axes(parameters.names, lower, upper, value_at, customary),
         model.marginal.noise_db,
         level=CONFIDENCE,
         seen=posterior.seen,
@@ -296,12 +292,6 @@ def _intervals(
             without=without[index],
         )
     return intervals
-
-
-def _customary(parameters: Parameters) -> NDArray[np.float64]:
-    """Usual widths of the parameters' ranges in the search space [d]; infinite if there is none."""
-    keys = ((parameter.field, parameter.scale) for parameter in parameters)
-    return np.array([CUSTOMARY.get(key, np.inf) for key in keys])
 
 
 def _differ(verdict: VerdictOnDraws) -> bool:

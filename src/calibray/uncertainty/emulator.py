@@ -27,7 +27,7 @@ from calibray.measurements.observables import Statistic
 from calibray.optimizers.arguments import Box
 from calibray.optimizers.evaluations import merge_repeated
 from calibray.optimizers.multifidelity import discrepancy
-from calibray.optimizers.multifidelity.correction import Corrected, UnitModel, correct
+from calibray.optimizers.multifidelity.correction import UnitModel, correct
 from calibray.optimizers.multifidelity.discrepancy import SampledFunction, sample_function, standardized_error
 from calibray.optimizers.multifidelity.space_mapping import CLOUD, JUDGED, MISLED, error_ratio
 from calibray.optimizers.regression import Inputs
@@ -200,7 +200,9 @@ class EmulatedEngine:
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
     ) -> Responses:
         """See `Observing.respond`; the emulator computes the study's observables, or none of them."""
-        unit, count = self._unit(candidates), len(candidates)
+        count = len(candidates)
+        self.calls += count
+        unit = self._box.to_unit(self.parameters.to_search(candidates))
         if not derivatives:
             base, inputs = self.mean.base(unit)
             return Responses(*self._for_all_links(base + self.function.values(inputs), wanted))
@@ -219,10 +221,6 @@ class EmulatedEngine:
     @property
     def _box(self) -> Box:
         return Box(*self.parameters.search_bounds)
-
-    def _unit(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        self.calls += len(candidates)
-        return self._box.to_unit(self.parameters.to_search(candidates))
 
     def _for_all_links(
         self, rows: NDArray[np.float64], wanted: tuple[Statistic, ...]
@@ -273,10 +271,13 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
     box, rows = Box(*parameters.search_bounds), ResponseRows(problem, np.flatnonzero(objective.weight > 0))
     calls = _calls(problem, trail, box, rows)
     random, noisy = np.random.default_rng([method.seed, 8]), bool(method.options.get("noisy", False))
-    replayed = None if model is None else _replayed(model, rows)
+    # The replay with responses as residuals, if it predicts any link.
+    replayed = None if model is None else ReplayedModel(model.engine, model.count, rows)
+    replayed = replayed if replayed is not None and replayed.known.any() else None
     corrected = None
     if replayed is not None and len(calls.unit) > 1:
-        corrected = _corrected(replayed, box, calls, random, noisy)
+        cloud = design("sobol", CLOUD, box.dimension, random)
+        corrected = correct(UnitModel(replayed, box), (calls.unit, calls.rows), cloud, random, noisy=noisy)
         if len(calls.unit) >= JUDGED and error_ratio(corrected) > MISLED:
             corrected = None
     if corrected is not None:
@@ -347,20 +348,6 @@ def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Call
             others = others[np.unique(np.linspace(0, len(others) - 1, half).astype(np.int64))]
         order = np.concatenate([best, others])
     return Calls(unit[order], rows_and_value[order, :-1], rows_and_value[order, -1])
-
-
-def _corrected(
-    model: ReplayedModel, box: Box, calls: Calls, random: np.random.Generator, noisy: bool
-) -> Corrected:
-    """The replay, corrected by the calls."""
-    cloud = design("sobol", CLOUD, box.dimension, random)
-    return correct(UnitModel(model, box), (calls.unit, calls.rows), cloud, random, noisy=noisy)
-
-
-def _replayed(model: ReplayedModel, rows: ResponseRows) -> ReplayedModel | None:
-    """The replay with responses as residuals; None if it predicts no link."""
-    replayed = ReplayedModel(model.engine, model.count, rows)
-    return replayed if replayed.known.any() else None
 
 
 def _steepness(unit: NDArray[np.float64]) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -261,12 +262,11 @@ def _view(shown: Solid) -> None:
 
     move()
     with ui.row():
-        ui.button("Turn left", on_click=lambda: move(turn=-0.4)).props("outline dense")
-        ui.button("Turn right", on_click=lambda: move(turn=0.4)).props("outline dense")
-        ui.button("Higher", on_click=lambda: move(rise=0.25)).props("outline dense")
-        ui.button("Lower", on_click=lambda: move(rise=-0.25)).props("outline dense")
-        ui.button("Closer", on_click=lambda: move(factor=0.7)).props("outline dense")
-        ui.button("Farther", on_click=lambda: move(factor=1.4)).props("outline dense")
+        for name, change in (
+            ("Turn left", {"turn": -0.4}), ("Turn right", {"turn": 0.4}), ("Higher", {"rise": 0.25}),
+            ("Lower", {"rise": -0.25}), ("Closer", {"factor": 0.7}), ("Farther", {"factor": 1.4}),
+        ):  # fmt: skip
+            ui.button(name, on_click=partial(move, **change)).props("outline dense")
     with ui.row().props('role=group aria-label="Materials"'):
         for (name, mesh), color in zip(objects.items(), COLORS * len(objects), strict=False):
             with ui.element("span").classes("material"):

@@ -164,7 +164,10 @@ def _comparison(desk: Desk, names: list[str]) -> None:
     ui.label("Differences between the studies").classes("title")
     if changed:
         rows = [
-            {name: _text(value) for name, value in zip(names, values, strict=True)}
+            {
+                name: NONE if value is None else json.dumps(value, ensure_ascii=False)[:300]
+                for name, value in zip(names, values, strict=True)
+            }
             for values in changed.values()
         ]
         _facts_table(names, dict(zip(changed, rows, strict=True)))
@@ -180,10 +183,6 @@ def _comparison(desk: Desk, names: list[str]) -> None:
 
     ui.button("Which predicts better?", on_click=judge).props("outline")
     verdict = ui.label().classes("predicted").props("role=status")
-
-
-def _text(value: Any) -> str:
-    return NONE if value is None else json.dumps(value, ensure_ascii=False)[:300]
 
 
 def _inside(record: Any, *keys: str) -> Any:
@@ -338,7 +337,12 @@ def show_prediction(desk: Desk) -> None:
         with ui.row():
             table = desk.keep(ui.select(tables, label="Table of new links", value=tables[-1]))
             ui.button("Predict the table", on_click=lambda: predict_table(table.value)).props("outline")
-    ui.label(f"Area: {_bounds(desk.area) if desk.area else 'the whole scene'}").classes("quiet")
+    area = (
+        "x {0:.1f} to {2:.1f} m, y {1:.1f} to {3:.1f} m".format(*desk.area)
+        if desk.area
+        else "the whole scene"
+    )
+    ui.label(f"Area: {area}").classes("quiet")
     _predicted(desk)
     _suggested(desk)
     for name in names:
@@ -347,11 +351,6 @@ def show_prediction(desk: Desk) -> None:
             ui.element("img").props(
                 f'src="/result/{quote(name)}/map.png?{age}" alt="Map of {safe(name)}"'
             ).classes("coverage")
-
-
-def _bounds(area: tuple[float, float, float, float]) -> str:
-    west, south, east, north = area
-    return f"x {west:.1f} to {east:.1f} m, y {south:.1f} to {north:.1f} m"
 
 
 def _links(desk: Desk, tx: list[float], rx: Any) -> pd.DataFrame:

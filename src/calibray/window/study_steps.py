@@ -55,11 +55,11 @@ def show_scene(desk: Desk) -> None:
     """Draw the step of the scene: a map, footprints or a floor plan is converted, or a scene is chosen."""
     sources, terrain = desk.folder.files(MAPS), desk.folder.files((".tif", ".tiff"))
     if sources:
+        # Tables are seldom plans.
+        likely = min(sources, key=lambda name: (name.endswith(".csv"), "plan" not in name.lower()))
         with ui.row():
             source = desk.keep(
-                ui.select(sources, label="Map, footprints or plan", value=_likely_map(sources)).classes(
-                    "wide"
-                )
+                ui.select(sources, label="Map, footprints or plan", value=likely).classes("wide")
             )
             kind = desk.keep(
                 ui.select(["osm", "footprints", "plan"], label="Kind", value=_kind(source.value))
@@ -102,8 +102,8 @@ def show_scene(desk: Desk) -> None:
                 desk.start(words)
 
         ui.button("Make the scene", on_click=make)
-    scenes, of_study = desk.folder.scenes(), _scene_of_study(desk)
-    if of_study:
+    scenes = desk.folder.scenes()
+    if of_study := desk.folder.valid_content().get("scene", {}).get("file", ""):
         ui.label(f"Scene of the study: {of_study}")
         ui.label("The step Measurements changes it: its section scene, or Draft again.").classes("quiet")
         return
@@ -116,18 +116,6 @@ def show_scene(desk: Desk) -> None:
             desk.refresh()
 
         ui.select(scenes, label="Scene", value=desk.scene, on_change=choose).classes("wide")
-
-
-def _scene_of_study(desk: Desk) -> str:
-    """The scene that the study names, which the map shows; empty without a study."""
-    scene = desk.folder.valid_content().get("scene", {})
-    return str(scene.get("file", ""))
-
-
-def _likely_map(sources: list[str]) -> str:
-    """The file that is most likely a map; tables are seldom plans."""
-    ranked = sorted(sources, key=lambda name: (name.endswith(".csv"), "plan" not in name.lower()))
-    return ranked[0]
 
 
 def _kind(source: str) -> str:
@@ -333,6 +321,7 @@ def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | No
     """The controls of a parameter, and a function that reads its entry; None if it is not calibrated."""
     low, high = (float(bound) for bound in entry.get("bounds", [1.5, 15.0]))
     prior = entry.get("prior", {})
+    known = prior["itu"] if prior.get("itu") in ITU else ""
     with ui.element("fieldset"):
         with ui.element("legend"):
             ui.label(name)
@@ -340,7 +329,7 @@ def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | No
             chosen = ui.switch("Calibrate", value=True)
             lower = ui.number("Lowest", value=low, format="%.6g")
             upper = ui.number("Highest", value=high, format="%.6g")
-            itu = ui.select(["", *ITU], label="Prior: ITU-R P.2040", value=_known(prior.get("itu")))
+            itu = ui.select(["", *ITU], label="Prior: ITU-R P.2040", value=known)
             spread = ui.number(
                 "Spread of the prior", value=prior.get("spread", 0.3), min=0.01, max=10, step=0.05
             )
@@ -367,10 +356,6 @@ def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | No
         return changed
 
     return read
-
-
-def _known(name: object) -> str:
-    return name if isinstance(name, str) and name in ITU else ""
 
 
 def safe(name: str) -> str:

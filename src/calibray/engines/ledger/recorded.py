@@ -106,7 +106,9 @@ class Recorded:
         yield from self._from_ledger(missing)
         pause, awaited = SHORTEST_WAIT, 0
         while missing and not stop.is_set():
-            self._describe()
+            if not self._described and not self._ledger.read_only:
+                self._ledger.describe(self._problem, self._name, self.parameters.names)
+                self._described = True
             if claimed := self._ledger.claim(self._problem, list(missing), self._engine.num_links):
                 yield from self._from_engine(
                     values, {candidate: missing.pop(candidate) for candidate in claimed}, stop
@@ -120,11 +122,6 @@ class Recorded:
                     self._progress("waiting", max(0, awaited - len(missing)), max(awaited, len(missing)))
                 time.sleep(pause)
                 pause = min(2 * pause, LONGEST_WAIT)
-
-    def _describe(self) -> None:
-        if not self._described and not self._ledger.read_only:
-            self._ledger.describe(self._problem, self._name, self.parameters.names)
-            self._described = True
 
     def _from_ledger(self, missing: dict[bytes, list[int]]) -> Iterator[Answer]:
         """The answers in the ledger; their candidates are removed from `missing`."""

@@ -117,7 +117,9 @@ def _lines(segments: NDArray[np.float64], edges: NDArray[np.int64], tolerance: f
     np.minimum.at(first, run, ends.min(axis=1))
     np.maximum.at(last, run, ends.max(axis=1))
     runs = middle[:, None] + np.stack([first, last], axis=1)[..., None] * direction[:, None]
-    line = _group(runs, _parallel(runs, _near(runs)), tolerance)
+    # Pairs of runs with ends within reach of each other.
+    near = KDTree(runs.reshape(-1, 2)).query_pairs(REACH, output_type="ndarray").reshape(-1, 2) // 2
+    line = _group(runs, _parallel(runs, near), tolerance)
     # A run of several edges is a line even if no other run continues it.
     alone = (line < 0) & (np.bincount(run) > 1)
     line[alone] = line.max() + 1 + np.arange(alone.sum())
@@ -133,11 +135,6 @@ def _touching(edges: NDArray[np.int64]) -> NDArray[np.int64]:
     corner = np.repeat(np.arange(len(degree)), pairs)
     within = np.arange(len(corner)) - np.repeat(np.cumsum(pairs) - pairs, pairs)
     return np.column_stack([order[first[corner] + k] // 2 for k in divmod(within, degree[corner])])
-
-
-def _near(segments: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Pairs of segments with ends within reach of each other [P, 2]."""
-    return KDTree(segments.reshape(-1, 2)).query_pairs(REACH, output_type="ndarray").reshape(-1, 2) // 2
 
 
 def _parallel(segments: NDArray[np.float64], pairs: NDArray[np.int64]) -> NDArray[np.int64]:
