@@ -132,7 +132,7 @@ def transmitter_labels(study: StudyModel, table: SourceTable, items: Sequence[Pa
     Raises:
         InputError: The column of transmitters is missing.
     """
-    if all(item.material in (POSE + EVERY,) for item in items if turns(item.name)):
+    if all(item.material == POSE + EVERY for item in items if turns(item.name)):
         return np.full(len(table), "")
     return table.labels(study.links.transmitter)
 
