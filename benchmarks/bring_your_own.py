@@ -227,7 +227,7 @@ def judged(walk: Walk, seed: int, keep_faint: bool) -> dict[str, object]:
     problem = walk.problem(seed)
     problem = problem if keep_faint else leave_out_near_floor(problem)
     trail = search(problem, choose(problem))
-    record = certainty(problem, trail).intervals
+    record = certainty(problem, trail).record.intervals
     best = problem.parameters.named(trail.best)
     found = {
         name: {

@@ -143,7 +143,7 @@ def repetition(name: str, noise_db: float, turn: int, folder: Path) -> dict[str,
         before = time.process_time()
         assessed = certainty(asked, trail, model=model)
         if assessed.posterior is None:
-            raise RuntimeError(f"{name}, {way}: no draws; {assessed.remarks}")
+            raise RuntimeError(f"{name}, {way}: no draws; {assessed.record.remarks}")
         draws = assessed.posterior.means
         sets = [
             {
@@ -155,7 +155,7 @@ def repetition(name: str, noise_db: float, turn: int, folder: Path) -> dict[str,
             for k in range(count)
         ]
         found[way] = {
-            "verdicts": [each.verdict for each in assessed.intervals.values()],
+            "verdicts": [each.verdict for each in assessed.record.intervals.values()],
             "held": [
                 {level: _holds(pieces, value) for level, pieces in each.items()}
                 for value, each in zip(point, sets, strict=True)

@@ -75,7 +75,7 @@ def seeds(problem: Problem, count: int) -> Table:
         found = certainty(replace(problem, setup=setup), trail)
         spent = time.process_time() - started
         if found.posterior is None:
-            sys.exit(f"no draws: {found.remarks}")
+            sys.exit(f"no draws: {found.record.remarks}")
         draws = found.posterior.means
         widths.append([
             sum(high - low for low, high in pieces)

@@ -186,7 +186,7 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
     assessed = certainty(problem, trail)
     posterior, found = assessed.posterior, []
     if posterior is None:
-        raise RuntimeError(f"{name}, {world}, {turn}: no draws; {assessed.remarks}")
+        raise RuntimeError(f"{name}, {world}, {turn}: no draws; {assessed.record.remarks}")
     means = posterior.means
     references = {
         reference: _known(district, world, problem, trail, turn, exact)
@@ -206,7 +206,7 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
             }  # fmt: skip
         found.append({
             "name": parameter,
-            "verdict": assessed.intervals[parameter].verdict,
+            "verdict": assessed.record.intervals[parameter].verdict,
             "held": {level: bool(_holds(pieces, point[k])) for level, pieces in sets.items()},
             "width": _width(sets["0.9"]) / (upper[k] - lower[k]),
             "control": bool(_holds(control, point[k])),
@@ -214,7 +214,7 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
         })  # fmt: skip
     return {
         "district": name, "world": world, "repetition": turn, "seed": seed, "parameters": found,
-        "noise": assessed.noise, "agree": means.agree, "calls": assessed.calls,
+        "noise": assessed.record.noise, "agree": means.agree, "calls": assessed.calls,
         "seconds": time.process_time() - started,
     }  # fmt: skip
 

@@ -90,21 +90,21 @@ def intervals(planted: Problem, trail: Trail, point: np.ndarray) -> dict[str, An
     parameters, (lower, upper) = planted.parameters, planted.parameters.search_bounds
     assessed = certainty(planted, trail)
     if assessed.posterior is None:
-        raise RuntimeError(f"no draws; {assessed.remarks}")
+        raise RuntimeError(f"no draws; {assessed.record.remarks}")
     means, inside, widths = assessed.posterior.means, [], []
     for k, value in enumerate(point):
         pieces = credible_sets(means.point[:, k], means.weight, lower[k], upper[k], [LEVEL])[0]
         inside.append(any(low <= value <= high for low, high in pieces))
         widths.append(sum(high - low for low, high in pieces) / (upper[k] - lower[k]))
     truth = parameters.from_search(point)
-    held = [each.contains(v) for each, v in zip(assessed.intervals.values(), truth, strict=True)]
+    held = [each.contains(v) for each, v in zip(assessed.record.intervals.values(), truth, strict=True)]
     own = directions_remark(planted, trail.best) or region_remark(planted, trail)
-    remarks = (*assessed.remarks, *own)
+    remarks = (*assessed.record.remarks, *own)
     return {
         "names": parameters.names,
-        "verdicts": [str(interval.verdict) for interval in assessed.intervals.values()],
+        "verdicts": [str(interval.verdict) for interval in assessed.record.intervals.values()],
         "inside": inside, "widths": widths, "held": held, "remarks": [str(remark.kind) for remark in remarks],
-        "noise": assessed.noise, "rmse_db": trail.best_value, "agree": means.agree,
+        "noise": assessed.record.noise, "rmse_db": trail.best_value, "agree": means.agree,
         "certainty": assessed.seconds, "calls": assessed.calls,
     }  # fmt: skip
 

@@ -307,7 +307,7 @@ def test_a_well_determined_parameter_is_never_not_identifiable():
         density = np.exp(-0.5 * np.sum(gap**2, axis=1) / noise_db**2).reshape(3 * (STEPS,))
         here = replace(problem, objective=replace(problem.objective, measured=measured))
         told = certainty(here, search(here, LeastSquares(lower, upper, starts=32)))
-        for k, interval in enumerate(told.intervals.values()):
+        for k, interval in enumerate(told.record.intervals.values()):
             share = np.sort(density.sum(axis=tuple({0, 1, 2} - {k})))[::-1]
             held = 1 + np.searchsorted(np.cumsum(share) / share.sum(), 0.9)
             if held <= 0.1 * STEPS:

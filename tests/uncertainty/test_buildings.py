@@ -145,9 +145,9 @@ def test_a_thickness_that_is_not_known_exactly_widens_the_interval(problem):
     assert uncertain.posterior.joint.shape[1] > exact.posterior.joint.shape[1] == 3
     # The result states an upper bound of the width that exact constants would leave.
     widest = int(np.argmax(ratio))
-    without = list(uncertain.intervals.values())[widest].without
+    without = list(uncertain.record.intervals.values())[widest].without
     assert 1.0 / ratio[widest] < without[Cause.CONSTANTS] < 0.85
-    assert all(Cause.CONSTANTS not in interval.without for interval in exact.intervals.values())
+    assert all(Cause.CONSTANTS not in interval.without for interval in exact.record.intervals.values())
 
 
 def at_carriers(problem: Problem) -> Problem:

@@ -68,7 +68,7 @@ def test_emulated_intervals_cover_the_truth(asked, tmp_path):
     trail = search(problem, LeastSquares(*problem.parameters.search_bounds, starts=16))
     exact = certainty(problem, trail)
     for name, truth in zip(result.parameters, programs.TRUTH, strict=True):
-        found, other = result.intervals[name], exact.intervals[name]
+        found, other = result.intervals[name], exact.record.intervals[name]
         assert found.lower < truth < found.upper
         assert found.approximate
         assert not other.approximate
@@ -90,7 +90,7 @@ def test_too_few_calls_give_the_whole_range(asked):
     setup = Setup.open(asked)
     problem = Problem.of(setup, Calls(setup))
     told = certainty(problem, search(problem, VectorSurrogate(*setup.parameters.search_bounds, budget=3)))
-    for name, found in told.intervals.items():
+    for name, found in told.record.intervals.items():
         assert [found.lower, found.upper] == planted.BOUNDS
         assert found.verdict == "not identifiable"
         assert found.approximate, name

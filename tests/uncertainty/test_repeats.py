@@ -147,7 +147,7 @@ def test_intervals_are_those_of_the_means():
     lower, upper = once.parameters.search_bounds
 
     def widths(one: Problem) -> np.ndarray:
-        intervals = certainty(one, search(one, LeastSquares(lower, upper, starts=16))).intervals
+        intervals = certainty(one, search(one, LeastSquares(lower, upper, starts=16))).record.intervals
         return np.array([interval.upper - interval.lower for interval in intervals.values()])
 
     reference = widths(once)

@@ -41,7 +41,6 @@ from calibray.result.record import (
     ObservableFit,
     Prediction,
     Provenance,
-    Uncertainty,
 )
 from calibray.result.verdict import Remark, RemarkKind
 from calibray.scenes.obstruction import OUT_OF_SIGHT, REGION
@@ -129,7 +128,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             **diagnostics.columns,
         }
     )
-    further, further_columns = observable_fits(run, certainty.draws)
+    further, further_columns = observable_fits(run, certainty.record.draws)
     table = table.assign(**_as_measured(study, links, table), **further_columns)
     if validation is None:
         accuracy, name, residuals = on_held_out_links(problem, trail, models)
@@ -163,17 +162,12 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             observables=further,
         ),
         accuracy=accuracy,
-        uncertainty=Uncertainty(
-            intervals=certainty.intervals,
-            draws=certainty.draws,
-            constants_db=certainty.constants_db,
-            noise=certainty.noise,
-            undeclared_offset_db=certainty.undeclared_offset_db,
-            undeclared_offset_error_db=certainty.undeclared_offset_error_db,
+        uncertainty=replace(
+            certainty.record,
             remarks=(
                 *([cheap.remark] if cheap.remark else []),
                 *run.on_links,
-                *certainty.remarks,
+                *certainty.record.remarks,
                 *_not_judged(study, accuracy),
             ),
         ),

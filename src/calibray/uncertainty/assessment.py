@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -16,6 +16,7 @@ from calibray.fitting.cheap_replay import ReplayedModel
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, find_minima, relevant_minima
 from calibray.parameters import Parameters
+from calibray.result.record import Uncertainty
 from calibray.result.verdict import (
     CONFIDENCE,
     Cause,
@@ -82,26 +83,14 @@ class Certainty:
     """Uncertainty of a calibration.
 
     Attributes:
-        intervals: Interval and verdict by parameter.
-        draws: Posterior draws of parameters and nuisance coefficients, by name.
+        record: What a result states.
         posterior: All draws; None if none were made.
-        constants_db: Change of path loss by one standard deviation of each constant that the scene fixes [dB].
-        noise: Posterior weights of the kinds of noise, and of an undeclared offset.
-        undeclared_offset_db: The best offset in addition to the study's model; None if the study declares one [dB].
-        undeclared_offset_error_db: Its standard error [dB].
-        remarks: Warnings and advice.
         calls: Replays that the draws took.
         seconds: Time of the assessment [s].
     """
 
-    intervals: dict[str, Interval] = field(default_factory=dict)
-    draws: dict[str, list[float]] = field(default_factory=dict)
+    record: Uncertainty
     posterior: Posterior | None = None
-    constants_db: dict[str, float] = field(default_factory=dict)
-    noise: dict[str, float] = field(default_factory=dict)
-    undeclared_offset_db: float | None = None
-    undeclared_offset_error_db: float | None = None
-    remarks: tuple[Remark, ...] = ()
     calls: int = 0
     seconds: float = 0.0
 
@@ -135,7 +124,7 @@ def _assess_emulated(
     ensemble, name = emulate(problem, trail, model), problem.setup.study.engine.name
     if ensemble is None:
         reason = Reason(ReasonKind.TOO_FEW_CALLS, {"calls": len(trail.candidates)})
-        return Certainty(_full_ranges(problem.parameters, reason)), 0
+        return Certainty(Uncertainty(_full_ranges(problem.parameters, reason))), 0
     mean, *drawn = (
         replace(problem, engine=engine, observable=PATH_LOSS) for engine in (ensemble.mean, *ensemble.drawn)
     )
@@ -150,9 +139,10 @@ def _assess_emulated(
             "replay": ensemble.replayed is not None,
         },
     )
-    intervals = {name: replace(interval, approximate=True) for name, interval in assessment.intervals.items()}
-    calls = 0 if ensemble.replayed is None else ensemble.replayed.calls
-    return replace(assessment, intervals=intervals, remarks=(remark, *assessment.remarks)), calls
+    told = assessment.record
+    intervals = {name: replace(interval, approximate=True) for name, interval in told.intervals.items()}
+    told = replace(told, intervals=intervals, remarks=(remark, *told.remarks))
+    return replace(assessment, record=told), 0 if ensemble.replayed is None else ensemble.replayed.calls
 
 
 def _full_ranges(parameters: Parameters, reason: Reason) -> dict[str, Interval]:
@@ -182,20 +172,20 @@ def _assess(
         unknown = {
             name: replace(interval, verdict=Verdict.NOT_IDENTIFIABLE) for name, interval in local.items()
         }
-        return Certainty(with_reason(unknown, reason))
+        return Certainty(Uncertainty(with_reason(unknown, reason)))
     if optimum.value[0] < EXACT_DB:
-        return Certainty(with_reason(local, Reason(ReasonKind.NO_NOISE)))
+        return Certainty(Uncertainty(with_reason(local, Reason(ReasonKind.NO_NOISE))))
     minima, squares = find_minima(problem, trail)
     relevant, least = relevant_minima(minima, squares, freedom), float(squares.min())
     offset = fit_undeclared_offset(problem, relevant, least, freedom)
-    assessment = Certainty(
+    told = Uncertainty(
         undeclared_offset_db=offset.offset_db,
         undeclared_offset_error_db=offset.error_db,
         remarks=offset.remarks,
     )
     if problem.objective.num_counted > MAX_LINKS:
         reason = Reason(ReasonKind.TOO_MANY_LINKS, {"limit": MAX_LINKS})
-        return replace(assessment, intervals=with_reason(local, reason))
+        return Certainty(replace(told, intervals=with_reason(local, reason)))
     models = [joint_model(engine, relevant[0], least, freedom) for engine in engines]
     model, posterior = models[0], _draw(models, problem.setup.study.method.seed, progress)
     noise = _noise_weights(model, posterior, offset=not has_offset(problem))
@@ -215,15 +205,15 @@ def _assess(
         remarks += conflict(problem, relevant)
     if not posterior.means.agree:
         remarks.append(Remark(RemarkKind.FEW_DRAWS))
-    return replace(
-        assessment,
+    told = replace(
+        told,
         intervals=intervals,
         draws=_named_draws(problem, model, posterior),
         constants_db=model.effects_db,
-        posterior=posterior,
         noise=noise,
         remarks=tuple(remarks),
     )
+    return Certainty(told, posterior)
 
 
 def _draw(models: Sequence[JointModel], seed: int, progress: Progress | None) -> Posterior:
