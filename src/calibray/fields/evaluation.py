@@ -143,7 +143,7 @@ def path_losses(
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
-        return np.asarray(_losses_by_formula(program, tables, count, combining))[:count], WITHOUT_TABLES
+        return np.asarray(_losses(program, tables, None, count, combining))[:count], WITHOUT_TABLES
     # Tables are looked up where coefficients are used, which is fastest if each is used once.
     single_use = all(set(group.signature) <= {COEFFICIENT} for group in program.groups)
     powers, errors = [], []
@@ -205,7 +205,7 @@ def path_losses_with_effects(
 ) -> NDArray[np.floating]:
     """Path loss [count, L], [dB], for material constants [n, M, 8] and effects; see `path_losses`."""
     count = len(tables) if count is None else count
-    return np.asarray(_losses_with_effects(program, tables, effects, count, combining))[:count]
+    return np.asarray(_losses(program, tables, effects, count, combining))[:count]
 
 
 @jax_settings()
@@ -339,19 +339,6 @@ def _link_power(program: GroupedProgram, response: MaterialResponse, combining: 
     return _power(program, split_by_step(program, response), combining)
 
 
-@compiled
-def _losses_by_formula(
-    program: GroupedProgram, tables: jax.Array, count: int, combining: Combining
-) -> jax.Array:
-    """Path loss [n, L] of the first candidates, one after the other."""
-
-    def evaluate(index: jax.Array, losses: jax.Array) -> jax.Array:
-        loss = program_path_loss(program, tables[index], combining)
-        return losses.at[index].set(loss.astype(losses.dtype))
-
-    return jax.lax.fori_loop(0, count, evaluate, jnp.zeros((len(tables), program.num_links), tables.dtype))
-
-
 @compiled(static_argnums=3)
 def _slopes_by_formula(
     program: GroupedProgram, tables: jax.Array, count: int, columns: tuple[int, ...], combining: Combining
@@ -375,13 +362,15 @@ def _slopes_by_formula(
 
 
 @compiled
-def _losses_with_effects(
-    program: GroupedProgram, tables: jax.Array, effects: EffectBatch, count: int, combining: Combining
+def _losses(
+    program: GroupedProgram, tables: jax.Array, effects: EffectBatch | None, count: int, combining: Combining
 ) -> jax.Array:
     """Path loss [n, L] of the first candidates, one after the other."""
 
     def evaluate(index: jax.Array, losses: jax.Array) -> jax.Array:
-        changed = apply_effects(program, effects.effects, effects.values[index])
+        changed = program
+        if effects is not None:
+            changed = apply_effects(program, effects.effects, effects.values[index])
         return losses.at[index].set(program_path_loss(changed, tables[index], combining).astype(losses.dtype))
 
     return jax.lax.fori_loop(0, count, evaluate, jnp.zeros((len(tables), program.num_links), tables.dtype))
