@@ -110,22 +110,12 @@ AUTO: Final = "auto"
 
 PAPER: Final = {
     "gwo": {
-        "rt_calls": 600,
-        "seconds": 831.68,
-        "rmse_db": 3.65,
-        "concrete": 6.45,
-        "glass": 4.12,
-        "soil": 3.88,
+        "rt_calls": 600, "seconds": 831.68, "rmse_db": 3.65, "concrete": 6.45, "glass": 4.12, "soil": 3.88,
     },
     "sgwo-im": {
-        "rt_calls": 225,
-        "seconds": 336.51,
-        "rmse_db": 2.97,
-        "concrete": 5.82,
-        "glass": 4.65,
-        "soil": 4.21,
+        "rt_calls": 225, "seconds": 336.51, "rmse_db": 2.97, "concrete": 5.82, "glass": 4.65, "soil": 4.21,
     },
-}
+}  # fmt: skip
 """The paper's results at its own site (its tables III and IV, and section IV-B)."""
 
 

@@ -88,16 +88,6 @@ def _contains(column: pd.Series, pat: Any, case: Any = True, regex: Any = True, 
     return column.str.contains(pat, case=case, regex=regex, na=na)
 
 
-def _startswith(column: pd.Series, pat: Any, na: Any = False) -> pd.Series:
-    _check_prefix(pat, na)
-    return column.str.startswith(pat, na=na)
-
-
-def _endswith(column: pd.Series, pat: Any, na: Any = False) -> pd.Series:
-    _check_prefix(pat, na)
-    return column.str.endswith(pat, na=na)
-
-
 def _strip(column: pd.Series, to_strip: Any = None) -> pd.Series:
     if to_strip is not None:
         _check_types(str, to_strip=to_strip)
@@ -115,9 +105,9 @@ METHODS: Final[Mapping[str, Callable[..., pd.Series]]] = {
 
 TEXT_METHODS: Final[Mapping[str, Callable[..., pd.Series]]] = {
     "contains": _contains,
-    "endswith": _endswith,
+    "endswith": lambda column, pat, na=False: column.str.endswith(_affix(pat, na), na=na),
     "lower": lambda column: column.str.lower(),
-    "startswith": _startswith,
+    "startswith": lambda column, pat, na=False: column.str.startswith(_affix(pat, na), na=na),
     "strip": _strip,
     "upper": lambda column: column.str.upper(),
 }  # fmt: skip
@@ -130,10 +120,12 @@ def _check_types(kind: type, **values: Any) -> None:
             raise InputError(f"{name} must be {'a text in quotes' if kind is str else 'True or False'}")
 
 
-def _check_prefix(pat: Any, na: Any) -> None:
+def _affix(pat: Any, na: Any) -> Any:
+    """The checked beginning or end of a text, or a tuple of them."""
     _check_types(bool, na=na)
     for text in pat if isinstance(pat, tuple) else (pat,):
         _check_types(str, pat=text)
+    return pat
 
 
 # A regular expression with several repetitions, or with a repeated group, can take longer than anyone waits. Allowed
@@ -375,7 +367,7 @@ class _Interpreter:
         return COMPARISONS[kind](left, right)
 
     def _arithmetic(self, node: ast.BinOp) -> _Value:
-        operation = ARITHMETIC.get(type(node.op))
+        operation: Callable[[Any, Any], Any] | None = ARITHMETIC.get(type(node.op))
         if operation is None:
             raise self._refusal(node, "only + - * / // % ** are allowed between numbers")
         left, right = self._number(node.left), self._number(node.right)

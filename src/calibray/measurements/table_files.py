@@ -63,7 +63,10 @@ def sheet_text(path: Path) -> tuple[list[int], str]:
         raise InputError(f"{path}: not an Excel file ({first_line(error)}); save it again") from None
     table = _below_header(path, sorted(rows.items()))
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([_csv_cell(cell) for cell in cells] for _, cells in table)
+    csv.writer(text, lineterminator="\n").writerows(
+        ["" if cell is None else repr(cell) if isinstance(cell, float) else str(cell) for cell in cells]
+        for _, cells in table
+    )
     return [number for number, _ in table], text.getvalue()
 
 
@@ -145,10 +148,6 @@ def _below_header(path: Path, rows: list[tuple[int, _Cells]]) -> list[tuple[int,
             )
         table.append((number, tuple(cells[index] if index < len(cells) else None for index in named)))
     return table
-
-
-def _csv_cell(cell: Any) -> str:
-    return "" if cell is None else repr(cell) if isinstance(cell, float) else str(cell)
 
 
 def _has_value(cell: Any) -> bool:

@@ -14,7 +14,6 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.materials import Material
 from calibray.measurements import (
     POSITION_COLUMNS,
     TRACK_COLUMNS,
@@ -243,16 +242,15 @@ def _write_live_study(
             },
             "known": True,
         },
-        "parameters": _parameters(live.materials),
+        # The permittivity of every material but air and metal.
+        "parameters": {
+            f"{name}.relative_permittivity": {"bounds": [1.5, LARGEST_PERMITTIVITY]}
+            for name, item in live.materials.items()
+            if item.relative_permittivity > 1.5
+        },
         **sections,
         "links": {"file": "links.csv", **ends, "value": VALUE, **power, **links},
     }
-
-
-def _parameters(materials: Mapping[str, Material]) -> dict[str, dict[str, Any]]:
-    """The permittivity of every material but air and metal."""
-    names = [name for name, item in materials.items() if item.relative_permittivity > 1.5]
-    return {f"{name}.relative_permittivity": {"bounds": [1.5, LARGEST_PERMITTIVITY]} for name in names}
 
 
 def _links(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> pd.DataFrame:

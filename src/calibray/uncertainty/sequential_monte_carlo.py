@@ -167,17 +167,12 @@ def draw_posterior(
             evidences.append(evidence)
         half = total // 2
         distance = _distance(model, [_together(populations[:half]), _together(populations[half:])])
-        agree = distance < _apart(size * half)
+        agree = distance < max(APART, APART_BY_CHANCE * float(np.sqrt(2.0 / (size * half))))
     members = len(populations[0].spread)
     # Populations that disagree count alike: the estimates of their evidence are then unreliable.
     share = _weights(np.array(evidences)) if agree else np.full(len(populations), 1.0 / len(populations))
     posterior = _posterior(model, _together(populations), np.repeat(share, members) / members, agree)
     return replace(posterior, replays=replays, shape=(len(populations), members // size, size))
-
-
-def _apart(size: int) -> float:
-    """Largest distance between the distribution functions of two sets of members that agree."""
-    return max(APART, APART_BY_CHANCE * float(np.sqrt(2.0 / size)))
 
 
 def _together(populations: Sequence[Population]) -> Population:

@@ -162,11 +162,7 @@ def predicting(errors: Errors, position: NDArray[np.float64]) -> str:
 
 def least(errors: Errors, names: tuple[str, ...]) -> str:
     """The model with the lowest RMSE among those names that have residuals by model [n], [dB]."""
-    return min((name for name in names if name in errors), key=lambda name: _rmse(errors[name]))
-
-
-def _rmse(errors: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(errors**2)))
+    return min((name for name in names if name in errors), key=lambda name: float(np.mean(errors[name] ** 2)))
 
 
 def two_levels(

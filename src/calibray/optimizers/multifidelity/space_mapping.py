@@ -246,7 +246,9 @@ class SpaceMapping(Optimizer):
             within = fresh[np.abs(fresh - taken[0]).max(axis=1) <= self._reach]
             # Steps of a batch alternate; after a stall the first one explores.
             if (index % 2 == 1) == self._stalled and len(within):
-                point = within[np.argmin(self._expected_square(model, within))]
+                expected = model.predict(within)
+                square = np.mean(expected.mean**2, axis=1) + self._errors.stretch * expected.variance
+                point = within[np.argmin(square)]
             else:
                 point = self._explore(model, taken, fresh, best)
             prediction = model.predict(point[None])
@@ -254,11 +256,6 @@ class SpaceMapping(Optimizer):
             if index + 1 < count:
                 model, taken = model.with_point(point), np.vstack([taken, point])
         return np.array([point for point, _, _ in self._predicted])
-
-    def _expected_square(self, model: Averaged, unit: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Expected mean square of the residuals at points [k]."""
-        prediction = model.predict(unit)
-        return np.mean(prediction.mean**2, axis=1) + self._errors.stretch * prediction.variance
 
     def _explore(
         self, model: Averaged, taken: NDArray[np.float64], fresh: NDArray[np.float64], best: float

@@ -177,19 +177,13 @@ def count_crossings(corners: NDArray[np.float64], start: ArrayLike, end: ArrayLi
     """
     first, last = (np.asarray(ends, dtype=float).reshape(-1, 3) for ends in (start, end))
     batch = max(1, BATCH // max(len(corners), 1))
-    counts = [
-        _count_crossings(corners, first[number : number + batch], last[number : number + batch])
-        for number in range(0, len(first), batch)
-    ]
-    return np.concatenate([np.zeros(0, dtype=np.int64), *counts])
-
-
-def _count_crossings(
-    corners: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
-) -> NDArray[np.int64]:
-    # Misses are NaN, which sorts last and is no new crossing.
-    distance = np.sort(crossing(start[:, None], end[:, None], corners), axis=1)
-    return (np.diff(distance, axis=1, prepend=-np.inf) > SAME_CROSSING).sum(axis=1)
+    counts = [np.zeros(0, dtype=np.int64)]
+    for number in range(0, len(first), batch):
+        part = slice(number, number + batch)
+        # Misses are NaN, which sorts last and is no new crossing.
+        distance = np.sort(crossing(first[part, None], last[part, None], corners), axis=1)
+        counts.append((np.diff(distance, axis=1, prepend=-np.inf) > SAME_CROSSING).sum(axis=1))
+    return np.concatenate(counts)
 
 
 def building_outlines(source: str | Path) -> Any:
