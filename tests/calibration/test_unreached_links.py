@@ -17,7 +17,7 @@ from calibray.prediction.batches import LOG, announce
 from calibray.prediction.corrections import fill_missing
 from calibray.prediction.map_files import figure
 from calibray.reporting.wording import prediction_text
-from calibray.result import RemarkKind
+from calibray.result.verdict import RemarkKind
 from link_tables import links_from_frame
 from small_scenes import block, write_scene
 

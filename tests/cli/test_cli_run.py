@@ -18,7 +18,7 @@ from calibray.calibration.result import Result
 from calibray.cli.console import progress_bars
 from calibray.paths import Paths
 from calibray.reporting import result_tables
-from calibray.result import FILES
+from calibray.result.files import FILES
 from calibray.support.output_files import SIGNATURES
 from calibray.tables import render
 from calibray.tracing.protocol import EnclosedAntennas

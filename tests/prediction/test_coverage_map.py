@@ -24,8 +24,7 @@ from calibray.prediction import batches
 from calibray.prediction.coverage_map import _column_values
 from calibray.prediction.map_files import CoverageMap, geotiff
 from calibray.reporting.link_map import footprints
-from calibray.result import FittedTerm, PredictionModel
-from calibray.result.held_out import Model
+from calibray.result.held_out import FittedTerm, Model, PredictionModel
 from calibray.scenes import Triangles, ground_heights, read_triangles
 from calibray.scenes.obstruction import obstruction
 from changed import changed

@@ -14,7 +14,7 @@ import planted
 from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.errors import InputError
-from calibray.result import FILES
+from calibray.result.files import FILES
 from calibray.scenes import read_scene
 from calibray.study import Study
 from calibray.support.output_files import SIGNATURES

@@ -9,7 +9,7 @@ import pytest
 
 import planted
 from calibray.fitting.problem import Problem
-from calibray.result import Interval, RemarkKind, Verdict
+from calibray.result.verdict import Interval, RemarkKind, Verdict
 from calibray.result.wording import remark_text
 from calibray.study import Setup, Study
 from calibray.uncertainty.noise_models import CORRELATED

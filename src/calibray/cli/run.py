@@ -93,7 +93,7 @@ def run(
             from calibray.engines import open_workers
             from calibray.fitting.search import check_method
             from calibray.reporting import result_tables as tables
-            from calibray.result import FILES
+            from calibray.result.files import FILES
             from calibray.study import Study
             from calibray.support.output_files import check_outputs
             from calibray.tables import render
