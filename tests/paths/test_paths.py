@@ -40,7 +40,7 @@ SEQUENCES = st.lists(st.lists(st.sampled_from(Kind), max_size=4), max_size=8)
 @pytest.fixture(autouse=True)
 def _files_are_read_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Most files of these tests are damaged and sealed again; `test_validation.py` tests the process they get."""
-    monkeypatch.setattr("calibray.paths.program.validate", lambda *_: None)
+    monkeypatch.setattr("calibray.paths.file_format.validate", lambda *_: None)
 
 
 @pytest.fixture

@@ -22,17 +22,7 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.materials import FIELDS, Material, constants_matrix
-from calibray.paths.file_format import (
-    BLOCK,
-    DATASETS,
-    Content,
-    read,
-    remember,
-    validate,
-    verify,
-    write,
-    write_checksum,
-)
+from calibray.paths import file_format
 from calibray.paths.interactions import Diffraction, Diffuse, Kind
 from calibray.support.messages import first_line
 from calibray.support.output_files import as_path, check_file, exists, replacing
@@ -190,10 +180,10 @@ class Paths:
         target = check_file(path, overwrite=overwrite)
         try:
             with replacing(target, signed=False) as partial:
-                with h5py.File(partial, "w", userblock_size=BLOCK) as file:
-                    write(file, _content(self))
-                digest = write_checksum(partial)
-            remember(digest)
+                with h5py.File(partial, "w", userblock_size=file_format.BLOCK) as file:
+                    file_format.write(file, _content(self))
+                digest = file_format.write_checksum(partial)
+            file_format.remember(digest)
         except OSError as error:
             raise InputError(
                 f"{target}: cannot be written ({error}); name a file in a writable folder"
@@ -216,7 +206,7 @@ class Paths:
         if not exists(source):
             raise InputError(f"{source}: does not exist; write one with `calibray trace STUDY -o {source}`")
         try:
-            validate(source, verify(source))
+            file_format.validate(source, file_format.verify(source))
             return read_paths(source)
         except InputError as error:
             raise InputError(f"{source}: {error}") from None
@@ -232,7 +222,7 @@ def read_paths(file: str | Path) -> Paths:
     """
     try:
         with h5py.File(file, "r") as stream:
-            return _paths(read(stream))
+            return _paths(file_format.read(stream))
     except InputError:
         raise
     except (OSError, KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
@@ -337,14 +327,14 @@ def _joined(tables: Sequence[Table]) -> Table:
     )
 
 
-def _content(paths: Paths) -> Content:
+def _content(paths: Paths) -> file_format.Content:
     """The program as the content of a path file."""
     materials = paths.materials.values()
     arrays: dict[str, Any] = {
         "materials/name": list(paths.materials),
         "materials/scattering_pattern": [material.scattering_pattern for material in materials],
     }
-    for name in DATASETS:
+    for name in file_format.DATASETS:
         group, _, attribute = name.partition("/")
         if group == "materials" and attribute in FIELDS:
             arrays[name] = [getattr(material, attribute) for material in materials]
@@ -359,10 +349,10 @@ def _content(paths: Paths) -> Content:
             arrays[name] = getattr(paths, attribute)
     if paths.correction is not None:
         arrays["paths/correction"] = paths.correction
-    return Content(paths.frequency, paths.settings, arrays)
+    return file_format.Content(paths.frequency, paths.settings, arrays)
 
 
-def _paths(content: Content) -> Paths:
+def _paths(content: file_format.Content) -> Paths:
     """The program from the content of a path file."""
     groups: dict[str, dict[str, NDArray[Any]]] = {}
     for name, values in content.arrays.items():

@@ -15,16 +15,7 @@ from calibray.materials import DEFAULT_REVISION, itu_material
 from calibray.parameters import Parameter, Parameters, itu_start, split_name
 from calibray.parameters.parameter import ROUGHNESS
 from calibray.scenes.obstruction import REGION
-from calibray.study.calibration_sections import (
-    FidelitySection,
-    HoldoutSection,
-    MethodSection,
-    NoiseSection,
-    NuisanceSection,
-    ObjectiveSection,
-    OffsetSection,
-    ParameterSection,
-)
+from calibray.study import calibration_sections as sections
 from calibray.study.displacement import RECEIVER, displaces
 from calibray.study.facades import FacadeSection
 from calibray.study.observables import ObservableSection, by_column
@@ -59,16 +50,16 @@ class StudyContent(Section, ABC):
     links: LinksSection
     antennas: AntennasSection = Field(default_factory=AntennasSection)
     trace: TraceSection = Field(default_factory=TraceSection)  # type: ignore[valid-type]
-    objective: ObjectiveSection = Field(default_factory=ObjectiveSection)
-    parameters: dict[str, ParameterSection]
+    objective: sections.ObjectiveSection = Field(default_factory=sections.ObjectiveSection)
+    parameters: dict[str, sections.ParameterSection]
     observables: dict[str, ObservableSection] = Field(default_factory=dict)
     regions: dict[str, RegionSection] = Field(default_factory=dict)
-    offset: OffsetSection | None = None
-    nuisance: dict[str, NuisanceSection] = Field(default_factory=dict)
-    noise: NoiseSection = Field(default_factory=NoiseSection)
-    holdout: HoldoutSection | None = None
-    fidelity: FidelitySection = Field(default_factory=FidelitySection)
-    method: MethodSection = Field(default_factory=MethodSection)
+    offset: sections.OffsetSection | None = None
+    nuisance: dict[str, sections.NuisanceSection] = Field(default_factory=dict)
+    noise: sections.NoiseSection = Field(default_factory=sections.NoiseSection)
+    holdout: sections.HoldoutSection | None = None
+    fidelity: sections.FidelitySection = Field(default_factory=sections.FidelitySection)
+    method: sections.MethodSection = Field(default_factory=sections.MethodSection)
     engine: AnyEngine = Field(default_factory=default)
 
     _path: Path = PrivateAttr(default=Path("study.toml"))

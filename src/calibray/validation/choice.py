@@ -30,16 +30,7 @@ from calibray.result.held_out import (
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study.displacement import displaces
 from calibray.study.model import StudyModel
-from calibray.validation.models import (
-    OUT_OF_SIGHT_DB,
-    TX_OFFSET,
-    find_minima,
-    initial_objective,
-    log_distance,
-    obstructed,
-    variants,
-    without_scene,
-)
+from calibray.validation import models
 
 SEARCHES: Final = 16
 """Number of local searches for the model's optimum, in addition to the one from the calibrated optimum."""
@@ -113,8 +104,10 @@ def fit_prediction_model(
     candidate, scene_db = variant.candidate, variant.modelled
     objective, modelled = variant.objective, scene_db
     if not uses_scene:
-        make = log_distance if name == Model.LOG_DISTANCE else obstructed
-        objective, modelled = make(setup.links, problem.objective, without_scene(setup.study, setup.links))
+        make = models.log_distance if name == Model.LOG_DISTANCE else models.obstructed
+        objective, modelled = make(
+            setup.links, problem.objective, models.without_scene(setup.study, setup.links)
+        )
     terms, path_loss_db = fitted_terms(objective, modelled, setup.study), objective.with_nuisance(modelled)
     for other in others:
         terms = averaged_terms(terms, fitted_terms(other.objective, other.modelled, setup.study))
@@ -161,13 +154,13 @@ class FittedVariant:
 def fit_variant(problem: Problem, trail: Trail, name: Model) -> FittedVariant:
     """Search the minimum of a variant from the calibrated optimum and new starting points, where it has any."""
     if name == Model.INITIAL:
-        objective = initial_objective(problem.objective, problem.setup)
+        objective = models.initial_objective(problem.objective, problem.setup)
         return FittedVariant(problem.parameters.start, objective, problem.before)
     if name == Model.CALIBRATED:
         return FittedVariant(trail.best, problem.objective, trail.best_modelled)
     best = problem.parameters.to_search(trail.best)
-    variant = variants(problem, best)[name]
-    point = find_minima(variant, best[None], SEARCHES)[0]
+    variant = models.variants(problem, best)[name]
+    point = models.find_minima(variant, best[None], SEARCHES)[0]
     modelled = variant.evaluate(point[None]).modelled[0]
     return FittedVariant(problem.parameters.from_search(point), variant.objective, modelled)
 
@@ -198,7 +191,8 @@ def with_prior_mean(terms: tuple[FittedTerm, ...], study: StudyModel) -> tuple[F
     """
     return tuple(
         replace(
-            term, coefficients={key: OUT_OF_SIGHT_DB[0] + value for key, value in term.coefficients.items()}
+            term,
+            coefficients={key: models.OUT_OF_SIGHT_DB[0] + value for key, value in term.coefficients.items()},
         )
         if term.by == OUT_OF_SIGHT and term.name not in study.nuisance
         else term
@@ -240,7 +234,7 @@ def fitted_terms(
     for name, term in grouped.items():
         if term.labels == ("",):
             per = ""
-        elif name == TX_OFFSET:
+        elif name == models.TX_OFFSET:
             per = "transmitter"
         else:
             per = OFFSET if name == OFFSET else str(study.nuisance[name].per)

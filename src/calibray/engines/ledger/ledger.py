@@ -23,18 +23,6 @@ import numpy as np
 import pandas as pd
 
 from calibray.engines.ledger import database
-from calibray.engines.ledger.database import (
-    LedgerEntry,
-    check_own_file,
-    explain,
-    insert_answer,
-    insert_problem,
-    read_entry,
-    rescue_files,
-    set_up,
-    transaction,
-    write_rescue_file,
-)
 from calibray.errors import EngineError, InputError
 
 LEDGER_FILE: Final = "ledger.sqlite"
@@ -66,17 +54,18 @@ class Ledger:
         )
         self._run, self._copy = uuid.uuid4().hex, None
         try:
-            check_own_file(self.path)
+            database.check_own_file(self.path)
             self._connection = self._connect()
             try:
-                check_own_file(self.path)  # SQLite opens the file by its name: it may have been exchanged
-                set_up(self._connection, self.path)
+                # SQLite opens the file by its name: it may have been exchanged.
+                database.check_own_file(self.path)
+                database.set_up(self._connection, self.path)
                 self._file = _identity(self.path)
             except BaseException:
                 self.close()
                 raise
         except (sqlite3.Error, OSError) as error:
-            raise InputError(f"{self.path}: cannot be used as a ledger ({explain(error)})") from None
+            raise InputError(f"{self.path}: cannot be used as a ledger ({database.explain(error)})") from None
         if not self.read_only:
             self._insert_rescued()
 
@@ -95,12 +84,12 @@ class Ledger:
 
     def _insert_rescued(self) -> None:
         columns = "problem, candidate, path_loss_db, seconds, failure, time, digest"
-        for file in rescue_files(self.path):
+        for file in database.rescue_files(self.path):
             run = self._connection.execute
             with self._errors():
                 run("ATTACH ? AS rescue", (str(file),))
                 try:
-                    with transaction(self._connection):
+                    with database.transaction(self._connection):
                         run("INSERT OR IGNORE INTO problems SELECT * FROM rescue.problems")
                         answers = run(
                             f"INSERT OR IGNORE INTO answers ({columns}) SELECT {columns} FROM rescue.answers"
@@ -125,9 +114,9 @@ class Ledger:
             EngineError: The ledger cannot be written.
         """
         with self._errors():
-            insert_problem(self._connection, problem, engine, parameters)
+            database.insert_problem(self._connection, problem, engine, parameters)
 
-    def find(self, problem: str, candidate: bytes, num_links: int) -> LedgerEntry | None:
+    def find(self, problem: str, candidate: bytes, num_links: int) -> database.LedgerEntry | None:
         """The entry of a candidate, or None; a damaged entry is deleted with a warning.
 
         Raises:
@@ -139,8 +128,8 @@ class Ledger:
             ).fetchone()
             if row is None:
                 return None
-            entry = read_entry(problem, candidate, row[1:], num_links)
-            if isinstance(entry, LedgerEntry):
+            entry = database.read_entry(problem, candidate, row[1:], num_links)
+            if isinstance(entry, database.LedgerEntry):
                 return entry
             _LOG.warning("%s: call %d is damaged (%s); deleted, and run again", self.path, row[0], entry)
             self._connection.execute("DELETE FROM answers WHERE id = ?", (row[0],))
@@ -164,7 +153,7 @@ class Ledger:
                 "make it and its folder writable, or name another folder"
             )
         self._check_identity()
-        with self._errors(), transaction(self._connection):
+        with self._errors(), database.transaction(self._connection):
             missing = [
                 candidate for candidate in candidates if self.find(problem, candidate, num_links) is None
             ]
@@ -179,16 +168,16 @@ class Ledger:
         finally:
             database.release(self._connection, self._run)
 
-    def commit(self, problem: str, candidate: bytes, entry: LedgerEntry) -> LedgerEntry:
+    def commit(self, problem: str, candidate: bytes, entry: database.LedgerEntry) -> database.LedgerEntry:
         """Write an entry, unless another run has written one first; return the stored entry.
 
         Raises:
             EngineError: The ledger cannot store it; `rescue` keeps it in a file.
         """
-        with self._errors(), transaction(self._connection):
+        with self._errors(), database.transaction(self._connection):
             earlier = self.find(problem, candidate, len(entry.path_loss_db))
             if earlier is None:
-                insert_answer(self._connection, problem, candidate, entry)
+                database.insert_answer(self._connection, problem, candidate, entry)
             self._connection.execute(
                 "DELETE FROM claims WHERE problem = ? AND candidate = ?", (problem, candidate)
             )
@@ -200,18 +189,18 @@ class Ledger:
         problem: str,
         engine: str,
         parameters: Sequence[str],
-        answers: Sequence[tuple[bytes, LedgerEntry]],
+        answers: Sequence[tuple[bytes, database.LedgerEntry]],
     ) -> str:
         """Keep answers that the ledger could not store in a rescue file, and return a sentence that names it."""
 
         def fill(connection: sqlite3.Connection) -> None:
-            set_up(connection, self.path)
-            with transaction(connection):
-                insert_problem(connection, problem, engine, parameters)
+            database.set_up(connection, self.path)
+            with database.transaction(connection):
+                database.insert_problem(connection, problem, engine, parameters)
                 for candidate, entry in answers:
-                    insert_answer(connection, problem, candidate, entry)
+                    database.insert_answer(connection, problem, candidate, entry)
 
-        return _describe_rescue(write_rescue_file(self.path, fill), len(answers))
+        return _describe_rescue(database.write_rescue_file(self.path, fill), len(answers))
 
     def forget_failures(self, problem: str | None = None) -> int:
         """Delete failed calls of a problem, or of all problems, so that they run again, and return their number.
@@ -243,13 +232,13 @@ class Ledger:
             ).fetchall()
         records = []
         for number, problem, engine, when, parameters, candidate, *columns in rows:
-            entry = read_entry(problem, candidate, tuple(columns))
+            entry = database.read_entry(problem, candidate, tuple(columns))
             try:
                 names, numbers = json.loads(parameters), np.frombuffer(candidate, "<f8").tolist()
                 values = dict(zip(names, numbers, strict=True))
             except (TypeError, ValueError):
                 entry, values = "no candidate", {}
-            if not isinstance(entry, LedgerEntry):
+            if not isinstance(entry, database.LedgerEntry):
                 _LOG.warning("%s: call %d is damaged (%s); left out", self.path, number, entry)
                 continue
             status = "failed" if entry.failure else "ok"
@@ -266,7 +255,7 @@ class Ledger:
         try:
             yield
         except sqlite3.Error as error:
-            raise EngineError(f"{self.path}: the ledger cannot be used ({explain(error)})") from None
+            raise EngineError(f"{self.path}: the ledger cannot be used ({database.explain(error)})") from None
 
     def _check_identity(self) -> None:
         """Rescue all answers and end the run if the file was removed or replaced."""
@@ -275,7 +264,7 @@ class Ledger:
         with self._errors():
             # A removed file can still be read while it is open.
             (count,) = self._connection.execute("SELECT COUNT(*) FROM answers").fetchone()
-            rescued = _describe_rescue(write_rescue_file(self.path, self._connection.backup), count)
+            rescued = _describe_rescue(database.write_rescue_file(self.path, self._connection.backup), count)
         raise EngineError(f"{self.path}: was removed or replaced during the run; {rescued}")
 
 
