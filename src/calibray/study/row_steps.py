@@ -29,7 +29,7 @@ from calibray.study.mounting import PORT_POWER, mounting_columns, port_power, st
 from calibray.study.regions import Place
 
 if TYPE_CHECKING:
-    from calibray.measurements import MoveOutside
+    from calibray.measurements import Ground, MoveOutside
     from calibray.scenes.checks import SceneSurfaces
     from calibray.scenes.obstruction import Region
 
@@ -118,7 +118,7 @@ def position_steps(study: StudyModel) -> Preparation:
     """
     links, transmitters = study.links, study.transmitters_path
     return Preparation(
-        ground=None if links.heights is None else _surfaces(study.scene_source).ground_height,
+        ground=None if links.heights is None else _ground(study),
         transmitters=None if transmitters is None else read_table(transmitters),
         transmitter=links.transmitter,
         crs=links.crs or WGS84,
@@ -129,6 +129,10 @@ def position_steps(study: StudyModel) -> Preparation:
 
 
 # Code that reads a scene's meshes imports SciPy; only studies that need it load it.
+
+
+def _ground(study: StudyModel) -> Ground:
+    return _surfaces(study.scene_source).ground_height
 
 
 def _move_outside(study: StudyModel) -> MoveOutside:
