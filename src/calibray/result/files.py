@@ -29,8 +29,18 @@ from calibray.result.record import (
 )
 from calibray.scenes import export_scene, read_scene
 from calibray.study import Study
-from calibray.support import output_files
 from calibray.support.messages import shortened
+from calibray.support.output_files import (
+    as_path,
+    check_outputs,
+    check_unchanged,
+    csv_text,
+    exists,
+    file_digest,
+    is_unchanged_output,
+    without_formula_mark,
+    write_text,
+)
 from calibray.support.strict_models import Section, explain
 
 VERSION: Final = 1
@@ -128,7 +138,7 @@ def write(
     Raises:
         InputError: The folder cannot be written, or a file there must not be replaced.
     """
-    target = output_files.check_outputs(folder, (*FILES, VALIDATION_FILE), record.study.files(), overwrite)
+    target = check_outputs(folder, (*FILES, VALIDATION_FILE), record.study.files(), overwrite)
     try:
         target.mkdir(parents=True, exist_ok=True)
         study = record.study
@@ -136,16 +146,14 @@ def write(
             study.scene_source, study.scene.frequency, study.overrides, study.objects
         )
         export_scene(scene, record.scene_materials, target / SCENE_FILE)
-        output_files.write_text(target / LINKS_FILE, output_files.csv_text(record.links, "%.10g"))
-        output_files.write_text(target / HISTORY_FILE, output_files.csv_text(record.history, "%.9g"))
+        write_text(target / LINKS_FILE, csv_text(record.links, "%.10g"))
+        write_text(target / HISTORY_FILE, csv_text(record.history, "%.9g"))
         # A validation of an earlier calibration does not belong to this result.
         (target / VALIDATION_FILE).unlink(missing_ok=True)
         if record.held_out is not None:
             write_validation(record.held_out, study, target, validation or {})
-        digests = {name: output_files.file_digest(target / name) for name in SIGNED_FILES}
-        output_files.write_text(
-            target / RESULT_FILE, json.dumps(content(record, sentences, digests), indent=2) + "\n"
-        )
+        digests = {name: file_digest(target / name) for name in SIGNED_FILES}
+        write_text(target / RESULT_FILE, json.dumps(content(record, sentences, digests), indent=2) + "\n")
     except OSError as error:
         raise InputError(
             f"output folder {target}: cannot be written ({error.strerror}); name another"
@@ -161,13 +169,13 @@ def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str,
         InputError: The folder contains no result, one of another version, one that was damaged or edited, or files of
             several runs.
     """
-    source = output_files.as_path(folder, "result") / RESULT_FILE
+    source = as_path(folder, "result") / RESULT_FILE
     stored, study = _read_stored(source)
     links, history = (read_rows(source.parent, name, columns) for name, columns in COLUMNS.items())
     if not allow_changed_inputs:
         for name in (RESULT_FILE, *COLUMNS, VALIDATION_FILE):
             if (source.parent / name).exists():
-                output_files.check_unchanged(source.parent / name)
+                check_unchanged(source.parent / name)
     _check_one_run(source.parent, stored.files, allow_changed_inputs)
     held_out = read_validation(source.parent, study, links["measured_db"].to_numpy())
     sections = {name: getattr(stored, name) for name in SECTIONS}
@@ -181,9 +189,9 @@ def _check_one_run(folder: Path, digests: dict[str, str], allow_edits: bool) -> 
         if name not in digests:
             raise InputError(f"{folder / RESULT_FILE}: files.{name} is missing; run the study again")
         # Nothing is read from the scene file, so it may be absent.
-        if not output_files.exists(file) or output_files.file_digest(file) == digests[name]:
+        if not exists(file) or file_digest(file) == digests[name]:
             continue
-        if output_files.is_unchanged_output(file):
+        if is_unchanged_output(file):
             raise InputError(
                 f"{file}: belongs to another run than {RESULT_FILE}, because a run into this folder was interrupted or "
                 "files were copied; run the study again"
@@ -284,7 +292,7 @@ def write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figure
             "errors_db": {str(name): _rounded(errors) for name, errors in held_out.errors.items()},
         },
     }
-    output_files.write_text(folder / VALIDATION_FILE, json.dumps(values, indent=2) + "\n")
+    write_text(folder / VALIDATION_FILE, json.dumps(values, indent=2) + "\n")
 
 
 def _rounded(values: NDArray[np.float64]) -> list[float | None]:
@@ -365,11 +373,11 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
         InputError: The file does not exist, lacks a column, or has invalid values in one.
     """
     file = folder / name
-    if not output_files.exists(file):
+    if not exists(file):
         raise InputError(f"{file}: does not exist; give the --out folder of `calibray run`")
     try:
         # Group labels such as 7 or NA must stay text.
-        table = pd.read_csv(file, converters={"group": output_files.without_formula_mark})
+        table = pd.read_csv(file, converters={"group": without_formula_mark})
     except (OSError, ValueError) as error:
         raise InputError(
             f"{file}: is not a table of `calibray run` ({str(error).splitlines()[0]}); give its --out folder"
