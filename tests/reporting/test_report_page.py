@@ -502,3 +502,9 @@ def test_a_legend_is_not_over_the_errors_of_blocks(result):
     figure.draw_without_rendering()
     (axes,) = figure.axes
     assert axes.get_legend().get_window_extent().y0 >= axes.bbox.y1
+
+
+def test_signed_numbers_that_round_to_zero_are_not_negative(result):
+    offsets = {"offset": {"north": -0.004, "south": -0.006}}
+    rows = tables.nuisances(replace(result, nuisance=replace(result.nuisance, coefficients=offsets))).rows
+    assert [row[1] for row in rows] == ["+0.00", "-0.01"]

@@ -295,7 +295,7 @@ def _worst(result: Record, links: Survey | None) -> Table:
     for link in order[np.isfinite(residuals[order])]:
         row = result.links.iloc[int(link)]
         group = [str(links.group[link])] if links is not None and links.group is not None else []
-        cells = (f"{measured[link]:.1f}", f"{predicted[link]:.1f}", f"{residuals[link]:+.1f}")
+        cells = (f"{measured[link]:.1f}", f"{predicted[link]:.1f}", f"{residuals[link]:+z.1f}")
         marks = ("yes" if row[name] else "no" for name in ("held_out", "has_path"))
         rows.append((str(row["row"]), *group, *cells, *marks))
     return Table("", columns, tuple(rows))

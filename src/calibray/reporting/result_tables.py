@@ -151,7 +151,7 @@ def nuisances(result: Record) -> Table:
     """Offsets and the coefficients of further nuisances, by group; without rows if the study declares none."""
     nuisance = result.nuisance
     others = _nuisances_besides_offset(result)
-    offsets = {group: f"{value:+.2f}" for group, value in nuisance.offsets_db.items()}
+    offsets = {group: f"{value:+z.2f}" for group, value in nuisance.offsets_db.items()}
     offsets |= dict.fromkeys(nuisance.groups_without_path, "no link with a path")
     rows = [(group_text(result, group) if group else "all links", text) for group, text in offsets.items()]
     for name, values in others.items():

@@ -161,7 +161,7 @@ def _most_changed(change: Convergence, row: NDArray[np.int64]) -> Table:
     rows = tuple(
         (
             str(row[link]),
-            f"{change.change_db[link]:+.2f}",
+            f"{change.change_db[link]:+z.2f}",
             f"{change.paths_before[link]:,}",
             f"{change.paths_after[link]:,}",
         )

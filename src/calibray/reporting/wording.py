@@ -213,7 +213,7 @@ def _distance_text(result: Record) -> str:
     rest = residuals - residuals.mean() - slope * decades
     error = float(np.sqrt(rest @ rest / (len(residuals) - 2) / (decades @ decades)))
     verdict = "a trend" if abs(slope) > CLEAR * error else "no trend"
-    return f"{verdict}: the residuals change by {slope:+.1f} dB per decade, standard error {error:.1f} dB"
+    return f"{verdict}: the residuals change by {slope:+z.1f} dB per decade, standard error {error:.1f} dB"
 
 
 def _class_text(
@@ -231,7 +231,7 @@ def _class_text(
     name = f"{worst[column]:g}" if isinstance(worst[column], float) else shown(str(worst[column]))
     clear = abs(worst["mean_db"]) > CLEAR * worst["standard_deviation_db"] / np.sqrt(worst["links"])
     return (
-        f"largest mean residual: {worst['mean_db']:+.1f} dB, {wording.format(name)}, {worst['links']:.0f} links"
+        f"largest mean residual: {worst['mean_db']:+z.1f} dB, {wording.format(name)}, {worst['links']:.0f} links"
         + ("" if clear else " (not significant)")
     )
 
@@ -242,7 +242,7 @@ def _obstruction_text(table: pd.DataFrame) -> str:
     for row in table.to_dict("records"):
         below = f"with {row['from_m']:.0f} to {row['to_m']:.0f} m below roofs"
         where = "in sight" if not row["out_of_sight"] else below if row["to_m"] >= 1.0 else "out of sight"
-        parts.append(f"{row['mean_db']:+.1f} dB {where} ({row['links']} links)")
+        parts.append(f"{row['mean_db']:+z.1f} dB {where} ({row['links']} links)")
     return f"mean residual: {', '.join(parts)}"
 
 
@@ -290,7 +290,7 @@ def _trade_offs_text(result: Record, table: pd.DataFrame) -> str:
         f"{OFFSET}[{label}]": f"{OFFSET}[{group_text(result, label)}]" for label in result.nuisance.offsets_db
     }
     pairs = strong[["first", "second"]].replace(shown).assign(correlation=strong["correlation"])
-    return "; ".join(f"{row.first} and {row.second} ({row.correlation:+.2f})" for row in pairs.itertuples())
+    return "; ".join(f"{row.first} and {row.second} ({row.correlation:+z.2f})" for row in pairs.itertuples())
 
 
 def _moved_text(table: pd.DataFrame) -> str:

@@ -222,7 +222,7 @@ def _antenna_directions(values: dict[str, Any]) -> str:
     sentences = []
     for number, name in enumerate(values["transmitters"]):
         angles = [
-            f"its {angle} {values[f'{angle}_deg'][number]:+.1f} deg (standard error {error:.1f} deg)"
+            f"its {angle} {values[f'{angle}_deg'][number]:+z.1f} deg (standard error {error:.1f} deg)"
             for angle in ("azimuth", "downtilt")
             if (error := values[f"{angle}_error_deg"][number]) > 0
         ]
@@ -278,7 +278,7 @@ def _missing_region(values: dict[str, Any]) -> str:
 def _differing_groups(values: dict[str, Any]) -> str:
     rows = list(zip(values["labels"], values["differences_db"], values["errors_db"], strict=True))
     groups = "; ".join(
-        f"{label!r} {difference:+.1f} dB (standard error {error:.1f} dB)"
+        f"{label!r} {difference:+z.1f} dB (standard error {error:.1f} dB)"
         for label, difference, error in rows[:SHOWN_GROUPS]
     )
     more = f"; and {len(rows) - SHOWN_GROUPS} more" if len(rows) > SHOWN_GROUPS else ""
@@ -300,7 +300,7 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
         "Errors are larger on links that depend more on the materials, as if buildings of one material differed"
     ),
     RemarkKind.UNDECLARED_OFFSET: lambda values: (
-        f"The data show an undeclared offset of {values['offset_db']:+.1f} dB, standard error {values['error_db']:.1f} "
+        f"The data show an undeclared offset of {values['offset_db']:+z.1f} dB, standard error {values['error_db']:.1f} "
         f"dB. With this offset, the RMSE would be {values['rmse_db']:.2f} instead of "
         f"{values['rmse_without_db']:.2f} dB. Add [offset] if cable losses or antenna gains are uncertain."
     ),
