@@ -110,6 +110,35 @@ def test_a_promised_width_keeps_how_much_other_buildings_differ(result, table):
     assert promised == pytest.approx(np.sqrt(every**2 - seen**2 + plain**2))
 
 
+def test_devices_of_a_random_effect_that_do_not_differ_promise_the_same(folder, table):
+    """The spread between groups is the estimated one, here nearly none, so a new device says as much as a known one."""
+    content = study(folder).content()
+    rows = pd.read_csv(folder / "links.csv").assign(site=list("abcdefg") * 2)
+    rows.to_csv(folder / "devices.csv", index=False, float_format="%.17g")
+    content["links"]["file"] = "devices.csv"
+    del content["offset"]
+    content["nuisance"] = {"device": {"by": "constant", "per": "site", "prior": "auto"}}
+    found = cb.calibrate(Study.from_content(content, folder / "devices.toml"))
+    before = found.intervals[NAME].upper - found.intervals[NAME].lower
+    known, new = (
+        before - cb.suggest(found, table.assign(site=site), 1)[f"{NAME}_width"][0] for site in ("a", "new")
+    )
+    assert known > 0.04 * before
+    assert new == pytest.approx(known, rel=0.2)
+
+
+def test_links_that_the_calibration_left_out_near_the_noise_floor_have_no_influence(result, table, folder):
+    faint = np.arange(len(result.links)) % 2 == 1
+    marked = replace(result, links=result.links.assign(faint=faint))
+    content, rows = result.study.content(), pd.read_csv(folder / "links.csv")
+    rows["path_loss_db"] += np.where(faint, 30.0, 0.0)
+    rows.to_csv(folder / "wrong.csv", index=False, float_format="%.17g")
+    content["links"]["file"] = str(folder / "wrong.csv")
+    wrong = replace(marked, study=Study.from_content(content, result.study.path))
+    one, other = (cb.suggest(each, table, 2, allow_changed_inputs=True) for each in (marked, wrong))
+    pd.testing.assert_frame_equal(one, other)
+
+
 def _slope(result: Result, links: pd.DataFrame) -> np.ndarray:
     """Derivative of path loss with respect to the permittivity, by central differences [dB]."""
     loss = [_predicted(result, links, result.parameters[NAME] * factor) for factor in (0.99, 1.01)]

@@ -14,6 +14,7 @@ from calibray.engines.kinds.replay import ReplaySection, replay
 from calibray.engines.protocol import Differentiable, Observing
 from calibray.errors import InputError
 from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, Term
+from calibray.fitting.preliminary_fits import with_estimated_spreads
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.measurements import Measurements
 from calibray.measurements.placement import POSITION_COLUMNS
@@ -179,7 +180,7 @@ class _ReplayedDraws:
     def __init__(self, result: Record, setup: Setup, progress: Progress | None) -> None:
         self.result, self.progress = result, progress
         self.engine = self._engine(setup)
-        problem = _with_priors(result, Problem.of(setup, self.engine))
+        problem = _as_calibrated(result, Problem.of(setup, self.engine))
         parameters, objective = problem.parameters, problem.objective
         if problem.freedom < 1:
             raise InputError(
@@ -334,21 +335,32 @@ class _ReplayedDraws:
     def _correlation(self) -> Correlation | None:
         """Correlation of the residuals of neighbouring links; None if there is none."""
         problem, objective = self.problem, self.problem.objective
-        known = dict(zip(problem.parameters.names, problem.parameters.start, strict=True))
-        values = np.array([list((known | self.result.parameters).values())])
-        evaluation = problem.evaluate(problem.parameters.to_search(values))
+        evaluation = problem.evaluate(_calibrated_point(self.result, problem)[None])
         residuals = evaluation.residuals[0, : objective.num_counted]
         links = problem.setup.links
         return shared_errors(residuals, np.hstack([links.rx, links.tx])[objective.weight > 0])
 
 
-def _with_priors(result: Record, problem: Problem) -> Problem:
-    """The problem with the priors of the scene's constants that vary in the draws."""
+def _as_calibrated(result: Record, problem: Problem) -> Problem:
+    """The problem of the calibration: its links, its spreads of random effects, and priors of the drawn constants.
+
+    Links near the noise floor are not among its links.
+    """
     constants, priors = problem.parameters.items[len(result.study.parameters) :], problem.priors
     first = len(result.study.parameters)
     numbers, centres = range(first, first + len(constants)), [item.start for item in constants]
-    spread = result.study.noise.constants_spread
-    return replace(problem, priors=priors.extended(numbers, centres, spread))
+    spread, objective = result.study.noise.constants_spread, problem.objective
+    if "faint" in result.links:
+        weight = np.where(result.links["faint"].to_numpy(bool), 0.0, objective.weight)
+        objective = replace(objective, weight=weight)
+    problem = replace(problem, priors=priors.extended(numbers, centres, spread), objective=objective)
+    return with_estimated_spreads(problem, _calibrated_point(result, problem))[0]
+
+
+def _calibrated_point(result: Record, problem: Problem) -> NDArray[np.float64]:
+    """The calibrated values in the search space [d], with the scene's constants that vary in the draws."""
+    scene = dict(zip(problem.parameters.names, problem.parameters.start, strict=True))
+    return problem.parameters.to_search(np.array([*(scene | result.parameters).values()]))
 
 
 def _table(

@@ -300,8 +300,8 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
         "Errors are larger on links that depend more on the materials, as if buildings of one material differed"
     ),
     RemarkKind.UNDECLARED_OFFSET: lambda values: (
-        f"The data show an undeclared offset of {values['offset_db']:+z.1f} dB, standard error {values['error_db']:.1f} "
-        f"dB. With this offset, the RMSE would be {values['rmse_db']:.2f} instead of "
+        f"The data show an undeclared offset of {values['offset_db']:+z.1f} dB, standard error "
+        f"{values['error_db']:.1f} dB. With this offset, the RMSE would be {values['rmse_db']:.2f} instead of "
         f"{values['rmse_without_db']:.2f} dB. Add [offset] if cable losses or antenna gains are uncertain."
     ),
     RemarkKind.MISSED_OPTIMUM: lambda values: (
