@@ -139,10 +139,10 @@ def _assess_emulated(
             "replay": ensemble.replayed is not None,
         },
     )
-    told = assessment.record
-    intervals = {name: replace(interval, approximate=True) for name, interval in told.intervals.items()}
-    told = replace(told, intervals=intervals, remarks=(remark, *told.remarks))
-    return replace(assessment, record=told), 0 if ensemble.replayed is None else ensemble.replayed.calls
+    record = assessment.record
+    intervals = {name: replace(interval, approximate=True) for name, interval in record.intervals.items()}
+    record = replace(record, intervals=intervals, remarks=(remark, *record.remarks))
+    return replace(assessment, record=record), 0 if ensemble.replayed is None else ensemble.replayed.calls
 
 
 def _full_ranges(parameters: Parameters, reason: Reason) -> dict[str, Interval]:
@@ -178,14 +178,14 @@ def _assess(
     minima, squares = find_minima(problem, trail)
     relevant, least = relevant_minima(minima, squares, freedom), float(squares.min())
     offset = fit_undeclared_offset(problem, relevant, least, freedom)
-    told = Uncertainty(
+    record = Uncertainty(
         undeclared_offset_db=offset.offset_db,
         undeclared_offset_error_db=offset.error_db,
         remarks=offset.remarks,
     )
     if problem.objective.num_counted > MAX_LINKS:
         reason = Reason(ReasonKind.TOO_MANY_LINKS, {"limit": MAX_LINKS})
-        return Certainty(replace(told, intervals=with_reason(local, reason)))
+        return Certainty(replace(record, intervals=with_reason(local, reason)))
     models = [joint_model(engine, relevant[0], least, freedom) for engine in engines]
     model, posterior = models[0], _draw(models, problem.setup.study.method.seed, progress)
     noise = _noise_weights(model, posterior, offset=not has_offset(problem))
@@ -205,15 +205,15 @@ def _assess(
         remarks += conflict(problem, relevant)
     if not posterior.means.agree:
         remarks.append(Remark(RemarkKind.FEW_DRAWS))
-    told = replace(
-        told,
+    record = replace(
+        record,
         intervals=intervals,
         draws=_named_draws(problem, model, posterior),
         constants_db=model.effects_db,
         noise=noise,
         remarks=tuple(remarks),
     )
-    return Certainty(told, posterior)
+    return Certainty(record, posterior)
 
 
 def _draw(models: Sequence[JointModel], seed: int, progress: Progress | None) -> Posterior:
