@@ -11,6 +11,9 @@ import shown
 from calibray.calibration.link_diagnostics import _depth_and_power
 from calibray.calibration.result import Result
 from calibray.fields import path_gains
+from calibray.reporting.diagnostics import CLASSES
+from calibray.reporting.link_map import marks, plan
+from calibray.reporting.link_survey import survey
 from calibray.reporting.wording import diagnostics_table
 from calibray.result.verdict import Remark, RemarkKind
 from calibray.scenes.obstruction import Region
@@ -71,23 +74,36 @@ def test_held_out_links_are_excluded(result):
     assert half.diagnostics["distance"].mean_db.abs().max() == 0
 
 
+def test_links_near_or_below_the_noise_floor_are_no_residuals(result):
+    faint = np.arange(60) < 15
+    half = planted(result, np.where(faint, 100.0, 1.0), faint=faint)
+    assert half.diagnostics["distance"].mean_db.tolist() == pytest.approx([1.0] * CLASSES)
+    assert half.diagnostics["distance"].links.sum() == half.counts["calibrated_on"] == 45
+    links = survey(half)
+    assert links is not None
+    assert np.array_equal(np.isnan(links.residual_db), faint)
+    drawn = marks(links, plan(links, None))
+    assert sum(color == "none" for *_, color, _ in drawn["links"]) == 15
+    assert drawn["kinds"] == ["faint"]
+
+
 def test_shares_of_power_are_those_of_paths_that_interact_with_a_material(result):
     paths = result.paths
-    depth, shares = _depth_and_power(paths, paths.materials)
+    depth, shares, reached = _depth_and_power(paths, paths.materials)
     gain = np.abs(path_gains(paths).reshape(paths.num_paths, -1)) ** 2
     power = gain.sum(axis=1)
-    for index, name in enumerate(paths.materials):
+    for index in range(len(paths.materials)):
         expected = []
         for link in np.unique(paths.link):
             of_link = np.flatnonzero(paths.link == link)
             interacts = [index in paths.material[paths.first[p] : paths.first[p + 1]] for p in of_link]
             expected.append(power[of_link][np.array(interacts)].sum() / power[of_link].sum())
         # With several types of interaction, the shares overlap.
-        kinds = shares.get(name, {})
+        kinds = shares[index][shares[index] > 0] / reached
         if len(kinds) == 1:
-            assert next(iter(kinds.values())) == pytest.approx(np.mean(expected))
+            assert kinds[0] == pytest.approx(np.mean(expected))
         else:
-            assert sum(kinds.values()) >= np.mean(expected) - 1e-12
+            assert kinds.sum() >= np.mean(expected) - 1e-12
     for link in range(len(result.links)):
         of_link = np.flatnonzero(paths.link == link)
         if len(of_link):

@@ -61,7 +61,7 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
 
 
 def calibration_links(result: Record) -> tuple[pd.DataFrame, NDArray[np.float64]]:
-    """The calibration links with a path, and their residuals in the measured quantity [dB]."""
+    """The links that the calibration used, and their residuals in the measured quantity [dB]."""
     residuals, links = residual(result.links, measured_quantity(result).sign), result.links
     used = links["has_path"].to_numpy(bool) | (result.study.objective.no_path == "censor")
     mask = used & np.isfinite(residuals) & ~links["held_out"].to_numpy(bool)

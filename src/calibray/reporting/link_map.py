@@ -116,7 +116,11 @@ def marks(links: Survey, layout: Plan) -> dict[str, Any]:
             (*position[link], color[link], "lost" if lost[link] else "held" if held_out[link] else "")
             for link in order
         ],
-        "kinds": [kind for kind, which in (("held", held_out), ("lost", lost)) if which.any()],
+        "kinds": [
+            kind
+            for kind, which in (("held", held_out), ("lost", lost), ("faint", links.faint))
+            if which.any()
+        ],
         "masts": np.unique(layout.project(fixed).round(1), axis=0).tolist(),
         "bar": layout.bar * layout.scale,
     }

@@ -38,8 +38,13 @@ class Survey:
 
     @property
     def residual_db(self) -> NDArray[np.float64]:
-        """Predicted minus measured, in the measured quantity [L], [dB]; NaN without a prediction."""
+        """Predicted minus measured, in the measured quantity [L], [dB]; NaN as `residual` states."""
         return residual(self.table, self.sign)
+
+    @property
+    def faint(self) -> NDArray[np.bool_]:
+        """Whether a link is near or below the noise floor and therefore left out of the calibration [L]."""
+        return _faint(self.table)
 
     @property
     def has_path(self) -> NDArray[np.bool_]:
@@ -96,10 +101,15 @@ def residual(table: pd.DataFrame, sign: int) -> NDArray[np.float64]:
     """Predicted minus measured value of a result's links, in the measured quantity [L], [dB].
 
     The sign is 1 if the quantity rises with path loss, otherwise -1. For links without a path, the fallback predicts;
-    NaN without a prediction.
+    NaN without a prediction, and for links near or below the noise floor: those that were received have favourable
+    errors, and the others only a bound.
     """
     difference = table["predicted_db"].to_numpy(float) - table["measured_db"].to_numpy(float)
-    return sign * np.where(np.isfinite(difference), difference, np.nan)
+    return sign * np.where(np.isfinite(difference) & ~_faint(table), difference, np.nan)
+
+
+def _faint(table: pd.DataFrame) -> NDArray[np.bool_]:
+    return table["faint"].to_numpy(bool) if "faint" in table else np.zeros(len(table), dtype=bool)
 
 
 def survey(result: Record) -> Survey | None:

@@ -343,6 +343,7 @@ def _script_data(result: Record, data: PageData, layout: Plan | None) -> dict[st
             },
             "held": links.table["held_out"].astype(int).tolist(),
             "lost": (~links.has_path).astype(int).tolist(),
+            "faint": links.faint.astype(int).tolist(),
             "color": ramp(residuals, ramp_limit(residuals)),
         },
         "groups": names,

@@ -22,8 +22,8 @@
   const decibel = (value) => (value === null ? "none" : `${fixed(value)} ${data.quantity.unit}`);
   const signed = (value) => (value === null ? "none" : `${fixed(value) < 0 ? "−" : "+"}${fixed(Math.abs(value))} dB`);
   const links = data.links, count = links.row.length;
-  const residual = links.predicted.map((predicted, i) => (predicted === null ? null : predicted - links.measured[i]));
-  const marks = (i) => (links.held[i] ? ", held out" : "") + (links.lost[i] ? ", no path: log-distance model" : "");
+  const residual = links.predicted.map((predicted, i) => (predicted === null || links.faint[i] ? null : predicted - links.measured[i]));
+  const marks = (i) => (links.held[i] ? ", held out" : "") + (links.lost[i] ? ", no path: log-distance model" : "") + (links.faint[i] ? ", near or below the noise floor" : "");
   const tx = decode(data.solid.tx, Uint16Array), rx = decode(data.solid.rx, Uint16Array);
   // The end with more positions represents the link: receivers, or transmitters if there are more of these.
   const places = (ends) => new Set(Array.from({ length: count }, (_, i) => ends.slice(3 * i, 3 * i + 3).join())).size;
@@ -77,7 +77,7 @@
   const list = byId("links"), order = byId("order"), chosen = { link: -1, paths: [], path: -1 };
   const fill = () => {
     const index = Array.from({ length: count }, (_, i) => i);
-    const size = (i) => (residual[i] === null ? Infinity : Math.abs(residual[i]));
+    const size = (i) => (links.faint[i] ? -1 : residual[i] === null ? Infinity : Math.abs(residual[i]));
     if (order.value === "residual") index.sort((a, b) => size(b) - size(a));
     list.replaceChildren(...index.map((i) => {
       const option = make("option", `${title(i)}: ${signed(residual[i])}${marks(i)}`);
