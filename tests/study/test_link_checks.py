@@ -187,3 +187,18 @@ def test_averages_that_span_much_of_the_scene_are_named(town):
     assert "averages span 20 m, " in suspicions(town, links(), links={"average": average})
     average["size"] = 5.0
     assert "averages span" not in suspicions(town, links(), links={"average": average})
+
+
+def test_a_log_with_many_rows_while_parked_is_named(town):
+    """Kish's effective number: n^2 over the sum of squares; equal repeats of every position change nothing."""
+    frame = links()
+    repeats = np.where(np.arange(len(frame)) == 7, 100, 1)
+    parked = frame.loc[np.repeat(frame.index, repeats)].reset_index(drop=True)
+    parked["time"] = np.arange(len(parked))
+    effective = len(parked) ** 2 / np.sum(repeats**2)
+    found = suspicions(town, parked)
+    assert "100 of 159 links have the same position" in found
+    assert f"the 60 positions count as about {effective:.0f}" in found
+    equal = frame.loc[np.repeat(frame.index, 10)].reset_index(drop=True)
+    assert suspicions(town, equal.assign(time=np.arange(len(equal)))) == ""
+    assert suspicions(town, parked, links={"average": "place"}) == ""

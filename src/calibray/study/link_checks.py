@@ -34,6 +34,11 @@ FAR: Final = 10.0
 CELL_SHARE: Final = 0.05
 """Largest width of the areas over which samples are averaged, as a share of the scene's shorter side."""
 
+DOMINATED: Final = 0.5
+"""Effective share of the positions below which a few with many rows dominate the fit. In district 383, three of about
+47 positions with 60 rows each (effectively 10 %) raise the error of predictions from 3.0 to 3.5 dB, and 90 % intervals
+cover 0.86 instead of 0.93 of the links; ten rows at each (100 %) change neither."""
+
 LINKS_PER_UNKNOWN: Final = 5
 """Number of links per unknown below which a fit hardly constrains its unknowns."""
 
@@ -80,6 +85,7 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
         *_levels(study, links),
         *_angles(study, links),
         *_averages(study, overhead),
+        *_dominant_positions(links),
     )
     return tuple(Finding("warning", links.source, problem, remedy) for problem, remedy in checks)
 
@@ -109,6 +115,19 @@ def _averages(study: StudyModel, overhead: SceneSurfaces) -> Iterator[tuple[str,
         yield (
             f"averages span {average.size:g} m, {average.size / largest * CELL_SHARE:.0%} of the scene's shorter side",
             f"set links.average.size to {largest:.2g} m or less",
+        )
+
+
+def _dominant_positions(links: Measurements) -> Iterator[tuple[str, str]]:
+    """Whether rows at a few positions, such as those of a log while parked, outweigh all others (Kish, 1965)."""
+    ends = np.round(np.hstack([links.tx, links.rx]), 2)
+    count = np.unique(ends, axis=0, return_counts=True)[1]
+    effective = len(links) ** 2 / float(np.sum(count.astype(float) ** 2))
+    if effective < DOMINATED * len(count):
+        yield (
+            f"{count.max():,} of {len(links):,} links have the same position, and each counts in fits, accuracy and "
+            f"intervals of predictions: the {len(count):,} positions count as about {effective:.0f}",
+            "average rows of one position: links.average = 'place'",
         )
 
 
