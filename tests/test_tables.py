@@ -40,6 +40,22 @@ def test_texts_of_the_last_column_are_folded_to_the_width_of_a_terminal(monkeypa
     assert reason in render(table)
 
 
+@pytest.mark.parametrize("width", [40, 60, 80])
+def test_no_cell_is_cut_in_a_narrow_terminal(monkeypatch, width):
+    interval, columns = "1.5 to 11.74, 12.3 to 15", "Cell_Longitude, Cell_Latitude, Height [m]"
+    names = ("walls.relative_permittivity", "links.tx_antenna.azimuth_deg")
+    shapes = (
+        (Column("value"), numbers("95 % interval"), Column("verdict")),
+        (Column("key"), Column("value"), Column("why")),
+    )
+    rows = ((names[0], interval, "weakly identified"), (names[1], columns, "the model of predictions"))
+    monkeypatch.setenv("COLUMNS", str(width))
+    for head, row in zip(shapes, rows, strict=True):
+        text = render(Table("", head, (row,)))
+        written = "".join(text.splitlines()[2:])
+        assert sorted("".join(row).replace(" ", "")) == sorted(written.replace(" ", ""))
+
+
 def test_long_cells_are_not_cut():
     table = Table("", (Column("message"), Column()), (("x" * 3000, "y"),))
     assert render(table).splitlines()[-1] == "x" * 3000 + "   y"

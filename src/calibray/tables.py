@@ -203,6 +203,7 @@ def hertz(frequency: float) -> str:
 
 def _lines(table: Table) -> str:
     from rich import box
+    from rich.cells import cell_len
     from rich.console import Console
     from rich.measure import Measurement
     from rich.table import Table as Grid
@@ -212,10 +213,19 @@ def _lines(table: Table) -> str:
         box=box.SIMPLE_HEAD if table.headed else None,
         show_header=table.headed, pad_edge=False, show_edge=False,
     )  # fmt: skip
-    last = len(table.columns) - 1
     for index, (column, heading) in enumerate(zip(table.columns, table.headings, strict=True)):
-        is_text = index == last and column.align == "left"
-        grid.add_column(Text(printable(heading)), justify=column.align, no_wrap=not is_text)
+        # The first column names the rows, and a single column contains sentences.
+        is_text = column.align == "left" and (index > 0 or len(table.columns) == 1)
+        # Rich measures the longest word, also where it may not wrap.
+        cells = (heading, *(row[index] for row in table.rows))
+        least = None if is_text else max(cell_len(printable(cell)) for cell in cells)
+        grid.add_column(
+            Text(printable(heading)),
+            justify=column.align,
+            no_wrap=not is_text,
+            min_width=least,
+            overflow="fold",
+        )
     width = get_terminal_size((WIDEST, 1)).columns
     for number, row in enumerate(table.rows):
         if number and len(row) == 1 and width < WIDEST:
