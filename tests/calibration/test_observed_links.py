@@ -146,7 +146,7 @@ def test_a_conflict_is_reported_with_both_answers(tmp_path, table, engine):
         (SPREAD | {"path": "first"}, "only a time of flight"),
         (SPREAD | {"kind": "doppler"}, "rms_delay_spread"),
         (SPREAD | {"std": 0.0}, "std"),
-        (SPREAD | {"file": "multipath.csv"}, "give only one of column"),
+        (SPREAD | {"file": "multipath.csv"}, "give exactly one of column"),
         (SPREAD | {"edges": [0.0, 1e-7]}, "takes no edges"),
         (PROFILE | {"edges": [0.0, 1e-7]}, "2 bin"),
         (PROFILE | {"edges": [0.0, 2e-7, 1e-7]}, "increasing"),
@@ -167,6 +167,14 @@ def test_impossible_observables_are_refused(tmp_path, table, section, message):
 def test_columns_and_engines_that_cannot_be_used_are_refused(tmp_path, table):
     with pytest.raises(InputError, match="no column 'nothing'"):
         run(tmp_path, table, observables={"spread": SPREAD | {"column": "nothing"}})
+    with pytest.raises(
+        InputError, match=r"row 5, column 'spread_ns': -3: a rms_delay_spread must be at least 0 ns"
+    ):
+        run(
+            tmp_path,
+            table.assign(spread_ns=np.where(table.index == 3, -3.0, table.spread_ns)),
+            observables={"spread": SPREAD},
+        )
     with pytest.raises(InputError, match="at least two links"):
         run(tmp_path, table.assign(spread_ns=np.nan), observables={"spread": SPREAD})
 

@@ -203,6 +203,7 @@ def test_arrays_are_steered_per_transmitter_from_columns(planted: Study) -> None
         ({"type": "transmitter"}, {}, r"row 2, column 'transmitter': 'north' is not an antenna of .antennas.types."),
         ({"azimuth_deg": "heading"}, {}, "no column 'heading'"),
         ({"azimuth_deg": 720.0}, {}, "links.tx_antenna.azimuth_deg: 720 must be -360 to 360; give degrees"),
+        ({"downtilt_deg": 91.0}, {}, "links.tx_antenna.downtilt_deg: 91 must be -90 to 90; give degrees"),
         ({"azimuth_deg": 1.0, "aim": "other end"}, {}, "remove azimuth_deg and downtilt_deg"),
         ({}, {"cable_loss_db": 2.0}, "remove tx_power_dbm and cable_loss_db"),
     ],

@@ -12,7 +12,7 @@ from calibray.coordinates import Frame
 from calibray.errors import InputError
 from calibray.measurements import POSITION_COLUMNS, SourceTable
 from calibray.scenes.authoring import Footprints, make_scene
-from calibray.study import Study, row_steps
+from calibray.study import Setup, Study, row_steps
 
 FRAME = Frame.local(9.99, 50.01)
 SITES = {"a": (0.0, 0.0, 20.0), "b": (60.0, 0.0, 15.0)}
@@ -166,6 +166,15 @@ def test_an_unknown_transmit_power_needs_an_offset(folder):
     content = {key: value for key, value in STUDY.items() if key != "offset"}
     with pytest.raises(InputError, match=r"links\.quantity = 'rsrp' needs \[offset\]"):
         Study.from_content(content, folder / "study.toml")
+
+
+def test_a_column_of_labels_is_missed_before_anything_is_traced(folder):
+    content = json.loads(json.dumps(STUDY))
+    for by, links in (("phone", 16), ("tx", 16), ("out_of_sight", 16)):
+        opened = Setup.open(Study.from_content(content | {"holdout": {"by": by}}, folder / "study.toml"))
+        assert len(opened.links) == links
+    with pytest.raises(InputError, match=r"log.csv: no column 'street'"):
+        Setup.open(Study.from_content(content | {"holdout": {"by": "street"}}, folder / "study.toml"))
 
 
 def test_geographic_positions_need_a_scene_with_an_origin(folder):

@@ -224,6 +224,8 @@ TRACE = "max_depth = 4"
         ("bandwidth = 2e8", "bandwidth = 0", "scene.bandwidth = 0: must be greater than 0"),
         (TRACE, "max_depth = -1", "study.toml: trace.max_depth = -1: must be a whole number of at least 0"),
         (TRACE, "max_depth = true", "trace.max_depth = True: must be a whole number"),
+        ("[offset]", "[noise]\nheterogeneity = 3\n[offset]", "= 3: must be one of 'auto', or must be at most 2"),
+        ("[offset]", "[noise]\nheterogeneity = 'a'\n[offset]", "must be one of 'auto', or must be a number"),
         (TRACE, "samples = 1.5", "trace.samples = 1.5: must be a whole number"),
         ("refraction = true", "refraction = 1", "trace.refraction = 1: must be true or false"),
         ('"dipole"', '"dipol"', "antennas.tx: antenna pattern = 'dipol': must be"),
@@ -275,7 +277,7 @@ def test_the_file_of_every_case_is_sound_before_its_change(folder):
 def test_all_faults_are_told_at_once_a_line_each(folder):
     text = FULL.replace(TRACE, "max_dept = 4\nsamples = '3'").replace("seed = 7", "seed = -7")
     assert refusal(folder, text).splitlines() == [
-        "study.toml: trace.samples = '3': must be a whole number",
+        "study.toml: trace.samples = '3': must be a whole number, or must be one of 'auto'",
         "study.toml: trace.max_dept: unknown key; did you mean 'max_depth'?",
         "study.toml: method.seed = -7: must be at least 0",
     ]

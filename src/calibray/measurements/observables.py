@@ -41,6 +41,9 @@ SECTORS: Final = (DEPARTURE_SECTOR, ARRIVAL_SECTOR)
 PROFILES: Final = (DELAY_BIN, *SECTORS)
 """Kinds that are shares of a link's power in bins: one value per bin, each a separate observable."""
 
+SIGNED: Final = (K_FACTOR, *FLIGHTS, *PROFILES)
+"""Kinds whose measured values can be negative: decibels, and times of a clock with a bias."""
+
 SHARE_RANGE_DB: Final = 30.0
 """Dynamic range of the share of power in a bin, unless a study states one [dB]."""
 

@@ -207,9 +207,10 @@ def _weights(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
     values = table.numbers(source)
     if (wrong := values <= 0).any():
         first = int(np.flatnonzero(wrong)[0])
-        name = table.cell(first, source) if isinstance(source, str) else "std"
+        if not isinstance(source, str):
+            raise InputError(f"std: {source:g} must be greater than 0 dB")
         raise InputError(
-            f"{name}: {values[first]:g} must be greater than 0; remove the row with a where filter"
+            f"{table.cell(first, source)}: {values[first]:g} must be greater than 0; remove the row with a where filter"
         )
     return values if columns.std is None else 1 / values**2
 

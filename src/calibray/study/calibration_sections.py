@@ -75,7 +75,7 @@ class PriorSection(Section):
             raise InputError("a prior needs spread, the standard deviation of its logarithm, or std")
         if sum(stated is not None for stated in (self.itu, self.value, self.like)) != 1:
             raise InputError(
-                "a prior is centred on an ITU material, a value or another parameter: give only one of itu, value and "
+                "a prior is centred on an ITU material, a value or another parameter: give exactly one of itu, value and "
                 "like"
             )
         return self
@@ -260,7 +260,7 @@ class HoldoutSection(Section):
     @model_validator(mode="after")
     def _one_way(self) -> Self:
         if sum(way is not None for way in (self.where, self.blocks, self.by)) != 1:
-            raise InputError("holdout: give only one of where, blocks and by")
+            raise InputError("holdout: give exactly one of where, blocks and by")
         return self
 
 

@@ -277,10 +277,10 @@ class StudyContent(Section, ABC):
     def _check_like(self, name: str, like: str | None) -> None:
         if like is None:
             return
-        other = self.parameters.get(like)
+        other, others = self.parameters.get(like), [known for known in self.parameters if known != name]
         if other is None or like == name:
             raise InputError(
-                f"{name}: prior.like = {like!r}: no other parameter; {did_you_mean(like, self.parameters)}"
+                f"{name}: prior.like = {like!r}: no other parameter; {did_you_mean(like, others)}"
             )
         if split_name(like)[1] != split_name(name)[1]:
             raise InputError(f"{name}: prior.like = {like!r}: must be of the same constant")

@@ -354,8 +354,11 @@ class StudyModel(StudyContent, ABC):
         """Mask of the held-out links [L]: none without ``[holdout]``, or if blocks are held out in turn.
 
         Raises:
-            InputError: The filter is malformed, lacks a column, or selects all links or none.
+            InputError: The filter is malformed, lacks a column, or selects all links or none; or the links have no
+                column of labels by which they are held out in turn.
         """
+        if self.holdout is not None and self.holdout.by not in (None, "tx", *OBSTRUCTION):
+            links.table.labels(self.holdout.by)
         if self.holdout is None or self.holdout.where is None:
             return np.zeros(len(links), dtype=bool)
         return links.held_out(self.holdout.where)

@@ -52,9 +52,10 @@ def link_mountings(study: StudyModel, links: Measurements) -> dict[str, Mounting
 def _mounting(study: StudyModel, end: str, section: MountingSection, links: Measurements) -> Mounting:
     antennas, index = link_antennas(study, end, links.table)
     away = links.rx - links.tx if end == "tx" else links.tx - links.rx
+    limits = {"azimuth_deg": 360, "downtilt_deg": 90, "electrical_downtilt_deg": 90, "steering_deg": 360}
     degrees = [
-        np.radians(_degrees(links.table, f"links.{end}_antenna.{key}", getattr(section, key) or 0.0))
-        for key in ("azimuth_deg", "downtilt_deg", "electrical_downtilt_deg", "steering_deg")
+        np.radians(_degrees(links.table, f"links.{end}_antenna.{key}", getattr(section, key) or 0.0, limit))
+        for key, limit in limits.items()
     ]
     yaw, downtilt, electrical, steering = degrees
     if section.aim is not None:
@@ -160,12 +161,12 @@ def link_antennas(
     return tuple(types[name] for name in names.tolist()), index.reshape(-1)
 
 
-def _degrees(table: SourceTable, key: str, stated: float | str) -> NDArray[np.float64]:
+def _degrees(table: SourceTable, key: str, stated: float | str, limit: int) -> NDArray[np.float64]:
     values = table.numbers(stated)
-    wrong = np.flatnonzero(np.abs(values) > 360)
+    wrong = np.flatnonzero(np.abs(values) > limit)
     if len(wrong):
         place = table.cell(int(wrong[0]), stated) if isinstance(stated, str) else key
-        raise InputError(f"{place}: {values[wrong[0]]:g} must be -360 to 360; give degrees")
+        raise InputError(f"{place}: {values[wrong[0]]:g} must be -{limit} to {limit}; give degrees")
     return values
 
 

@@ -95,7 +95,7 @@ class ObservableSection(Section):
             )
         if (self.column is not None) + bool(self.columns) + (self.file is not None) != 1:
             raise InputError(
-                "give only one of column, the measured values; columns, one for each bin; and file"
+                "give exactly one of column, the measured values; columns, one for each bin; and file"
             )
         self._check_bins()
         return self

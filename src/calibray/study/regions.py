@@ -78,7 +78,7 @@ class RegionSection(Section):
     @model_validator(mode="after")
     def _one_source(self) -> Self:
         if sum((self.file is not None, self.canopy is not None, bool(self.boxes))) != 1:
-            raise InputError("a region is given by a file, by a canopy or by boxes: give only one of them")
+            raise InputError("a region is given by a file, by a canopy or by boxes: give exactly one of them")
         for box in self.boxes:
             west, south, east, north = box
             if not (west < east and south < north):

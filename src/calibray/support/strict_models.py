@@ -31,6 +31,7 @@ _WORDS: Final[Mapping[str, str]] = {
     "greater_than_equal": "must be at least {ge:g}",
     "greater_than": "must be greater than {gt:g}",
     "less_than_equal": "must be at most {le:g}",
+    "less_than": "must be less than {lt:g}",
     "literal_error": "must be one of {expected}",
     "union_tag_invalid": "must be one of {expected_tags}",
     "int_type": "must be a whole number",
@@ -77,8 +78,11 @@ def explain(
             text = describe_fault(fault)
             # A message about a whole table names the key itself.
             line = text if text.startswith(key) else f"{key}{_shown(path, content)}: {text}"
-        # A value that matches none of several types has one error per type; the first is enough.
-        lines.setdefault(key, line)
+        # A value that matches none of several types has one error per type.
+        if key not in lines:
+            lines[key] = line
+        elif fault["type"] in _WORDS and not lines[key].endswith(text := describe_fault(fault)):
+            lines[key] += f", or {text}"
     listed = list(lines.values())[:MAX_LISTED]
     if len(lines) > len(listed):
         listed.append(f"and {len(lines) - len(listed)} more errors of this kind; correct these first")
