@@ -69,9 +69,13 @@ def row(parameter: Any) -> str:
     name = (
         metavar
         if parameter.param_type_name == "argument"
-        else " ".join([", ".join(parameter.opts), metavar]).strip()
+        else " ".join([", ".join([*parameter.opts, *parameter.secondary_opts]), metavar]).strip()
     )
-    return f"| `{name}` | {parameter.help} |"
+    default = parameter.default
+    if isinstance(default, bool) and parameter.secondary_opts:
+        default = (parameter.opts if default else parameter.secondary_opts)[0]
+    shown = not (default is None or default is False or parameter.required or callable(default))
+    return f"| `{name}` | {parameter.help}{f' Default: `{default}`.' if shown else ''} |"
 
 
 if __name__ == "__main__":

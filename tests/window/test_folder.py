@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 
+import pandas as pd
 import pytest
 
 from calibray.errors import InputError
-from calibray.window.desk import StudyFolder
+from calibray.study import Study
+from calibray.window.desk import StudyFolder, sites
 from calibray.window.study_steps import likely_tables
 
 STUDY = """version = 1
@@ -139,3 +141,25 @@ def test_tables_whose_columns_show_nothing_are_told_apart_by_their_names(tmp_pat
         (tmp_path / name).write_text("a,b\n1,2\n")
     folder = StudyFolder(tmp_path)
     assert likely_tables(folder, folder.tables()) == ("rounds.csv", "cells.csv")
+
+
+def test_sectors_of_one_mast_are_separate_transmitters(tmp_path):
+    east, south = {"cell": "east", "azimuth": 90, "tilt": 4.0}, {"cell": "south", "azimuth": 180, "tilt": 6.5}
+    rows = [cell | {"rx_x": x, "loss": 80.0 + x} for x in (20.0, 40.0) for cell in (east, south)]
+    pd.DataFrame(rows).to_csv(tmp_path / "log.csv", index=False)
+    angles = {"azimuth_deg": "azimuth", "downtilt_deg": "tilt"}
+    links = {
+        "file": "log.csv",
+        "tx": [0, 0, 25],
+        "rx": ["rx_x", 5, 1.5],
+        "value": "loss",
+        "tx_antenna": angles,
+    }
+    content = {
+        "version": 1, "scene": {"file": "scene.xml", "frequency": 2e9}, "links": links, "offset": {"per": "cell"},
+        "parameters": {"walls.relative_permittivity": {"bounds": [2, 9]}},
+    }  # fmt: skip
+    study = Study.from_content(content, tmp_path / "study.toml")
+    found = sites(study, study.measurements())
+    assert [site["name"] for site in found] == ["east at 0, 0, 25", "south at 0, 0, 25"]
+    assert [site["columns"] for site in found] == [east, south]

@@ -113,6 +113,7 @@ for command in (  # in the order of `--help`
     doctor, demo, open, init, schema, run, report, compare, validate, trace, predict, map, suggest, export, ledger,
     cache,
 ):  # fmt: skip
-    # Without a short help, Typer shortens the summary.
-    app.command(short_help=(command.__doc__ or "").partition("\n\n")[0])(command)
+    # Without a short help, Typer shortens the summary. Errors are for callers from Python.
+    text = (command.__doc__ or "").partition("\n    Raises:")[0]
+    app.command(help=text, short_help=text.partition("\n\n")[0])(command)
 app.add_typer(scene)

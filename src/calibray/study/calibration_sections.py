@@ -75,8 +75,8 @@ class PriorSection(Section):
             raise InputError("a prior needs spread, the standard deviation of its logarithm, or std")
         if sum(stated is not None for stated in (self.itu, self.value, self.like)) != 1:
             raise InputError(
-                "a prior is centred on an ITU material, a value or another parameter: give exactly one of itu, value and "
-                "like"
+                "a prior is centred on an ITU material, a value or another parameter: give exactly one of itu, value "
+                "and like"
             )
         return self
 

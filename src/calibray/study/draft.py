@@ -395,14 +395,16 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
         links.section["tx_antenna"] = mount
     name = transmitter_columns.find_antenna_names(frame) if of_transmitters else None
     if folder is not None:
-        reason = f"files of {folder.name}; the receiver's antenna is unknown"
+        reason = f"files of {folder.resolve().name}; the receiver's antenna is unknown"
     elif "azimuth_deg" in mount:
         reason = "azimuths are stated: 3GPP's 65-degree sectors, iso receivers"
     else:
         reason = "unknown; state your antennas with their orientation"
     if folder is None and name is not None:
         reason += f"; give --antennas, a folder of the MSI files that column {name} names"
-    links.assume("antennas", f"{antennas['tx']['pattern']}, V" if folder is None else folder.name, reason)
+    links.assume(
+        "antennas", f"{antennas['tx']['pattern']}, V" if folder is None else folder.resolve().name, reason
+    )
     return antennas
 
 

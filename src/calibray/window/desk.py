@@ -19,17 +19,20 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
+import pandas as pd
 from nicegui import run, ui
 from nicegui.elements.mixins.value_element import ValueElement
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
+from calibray.measurements import Measurements
 from calibray.measurements.delimited_text import SUFFIXES
 from calibray.reporting.link_map import lay_out
 from calibray.scenes import read_scene, read_triangles
 from calibray.scenes.checks import SceneSurfaces
 from calibray.study import Study
 from calibray.study.link_checks import count_unknowns, examine
+from calibray.study.mounting import mounting_columns
 from calibray.support.lazy_imports import library
 from calibray.support.messages import shortened
 from calibray.support.output_files import write_text
@@ -250,7 +253,7 @@ class Desk:
         scene: The chosen scene, relative to the folder.
         point: The chosen place, x and y [m].
         area: The chosen area: west, south, east, north [m].
-        transmitters: Transmitters of the measured links, x, y, z [m].
+        sites: Transmitters of the measured links, as `sites` lists them.
         findings: Suspicions about the links.
         solid: The scene that is shown in 3-D.
         entered: Values that the user entered, by the label of their control.
@@ -262,7 +265,7 @@ class Desk:
     scene: str | None = None
     point: tuple[float, float] | None = None
     area: tuple[float, float, float, float] | None = None
-    transmitters: list[list[float]] = field(default_factory=list)
+    sites: list[dict[str, Any]] = field(default_factory=list)
     findings: list[str] = field(default_factory=list)
     solid: Solid | None = None
     entered: dict[str, Any] = field(default_factory=dict)
@@ -320,14 +323,14 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
     """The map of a study, or of a scene of the folder if there is no study.
 
     `west`, `north` [m] and `scale` [1/m] of the outlines, `buildings` and `walls` as data of SVG paths; `links`, each
-    with x, y [m], path loss [dB] and 1 where it is suspicious; `transmitters`, x, y, z [m].
+    with x, y [m], path loss [dB] and 1 where it is suspicious; `transmitters`, x, y, z [m]; `sites`.
 
     Raises:
         InputError: The scene or the links cannot be read.
     """
     source, study = opened(folder, scene)
     if source is None:
-        return {"links": [], "transmitters": []}
+        return {"links": [], "transmitters": [], "sites": []}
     links = None if study is None else study.measurements()
     triangles = read_triangles(read_scene(source, 1e9 if study is None else study.scene.frequency))
     corners = triangles.corners.reshape(-1, 3)
@@ -335,7 +338,7 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
     layout = lay_out(np.concatenate([corners, *measured]), triangles)
     shown: dict[str, Any] = {
         "west": layout.west, "north": layout.north, "scale": layout.scale, "height": layout.height,
-        "buildings": layout.buildings, "walls": layout.walls, "links": [], "transmitters": [],
+        "buildings": layout.buildings, "walls": layout.walls, "links": [], "transmitters": [], "sites": [],
     }  # fmt: skip
     if study is None or links is None:
         return shown
@@ -345,7 +348,31 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
     rows = zip(links.rx.tolist(), links.path_loss_db.tolist(), suspicious.tolist(), strict=True)
     shown["links"] = [[round(x, 2), round(y, 2), round(loss, 1), int(mark)] for (x, y, _), loss, mark in rows]
     shown["transmitters"] = np.unique(links.tx, axis=0).round(2).tolist()
+    shown["sites"] = sites(study, links)
     return shown
+
+
+def sites(study: Study, links: Measurements) -> list[dict[str, Any]]:
+    """The transmitters of the links, once for each group and carrier, because a mast may carry several sectors.
+
+    Each has its `name`, `tx` [m], and the `columns` that a prediction needs, such as the azimuth, with their values.
+    """
+    names = [study.links.transmitter, *study.offset_groups, study.links.frequency]
+    key = list(dict.fromkeys(name for name in names if name is not None and name in links.frame))
+    columns = links.frame[list(dict.fromkeys([*key, *mounting_columns(study)]))]
+    tx = pd.DataFrame(links.tx.round(2), columns=["x", "y", "z"])
+    first = ~pd.concat([tx, columns[key].reset_index(drop=True)], axis=1).duplicated().to_numpy()
+    rows = json.loads(columns[first].to_json(orient="records"))
+    return [
+        {
+            "name": " ".join(
+                [*(str(row[name]) for name in key), "at", ", ".join(f"{value:g}" for value in place)]
+            ),
+            "tx": place,
+            "columns": row,
+        }
+        for row, place in zip(rows, tx[first].to_numpy().tolist(), strict=True)
+    ]
 
 
 def opened(folder: StudyFolder, scene: str | None) -> tuple[str | None, Study | None]:

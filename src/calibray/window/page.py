@@ -93,7 +93,8 @@ def build(desk: Desk) -> None:
         ui.run_javascript(f"plan.load({json.dumps(desk.scene)})")
 
     def picked(event: events.GenericEventArguments) -> None:
-        desk.point = float(event.args["x"]), float(event.args["y"])
+        # Adding 0 removes the sign of a negative zero.
+        desk.point = round(float(event.args["x"]), 1) + 0.0, round(float(event.args["y"]), 1) + 0.0
         place.set_text(f"Chosen place: x {desk.point[0]:.1f} m, y {desk.point[1]:.1f} m")
         show_prediction.refresh()
 
@@ -113,7 +114,7 @@ def build(desk: Desk) -> None:
 
     def loaded(event: events.GenericEventArguments) -> None:
         data: dict[str, Any] = event.args
-        desk.transmitters = data["transmitters"]
+        desk.sites = data["sites"]
         show_prediction.refresh()
 
     def examined(event: events.GenericEventArguments) -> None:

@@ -276,10 +276,10 @@ def show_prediction(desk: Desk) -> None:
     if not names:
         ui.label("Calibrate first.").classes("quiet")
         return
-    sites = {json.dumps(site): f"{site[0]:g}, {site[1]:g}, {site[2]:g}" for site in desk.transmitters}
+    sites = {json.dumps(site): site["name"] for site in desk.sites}
     with ui.row():
         chosen = desk.keep(ui.select(names, label="Result", value=names[-1]))
-        tx = desk.keep(ui.select(sites, label="Transmitter x, y, z [m]", value=next(iter(sites), None)))
+        tx = desk.keep(ui.select(sites, label="Transmitter at x, y, z [m]", value=next(iter(sites), None)))
         height = desk.keep(ui.number("Height of the receiver [m]", value=1.5, step=0.1))
         cell = desk.keep(ui.number("Width of a cell [m]", value=5.0, min=0.1, step=1))
     x, y = desk.point or (None, None)
@@ -295,7 +295,7 @@ def show_prediction(desk: Desk) -> None:
     for coordinate in (east, north):
         coordinate.on_value_change(placed)
 
-    def site() -> list[float]:
+    def site() -> dict[str, Any]:
         if tx.value is None:
             raise InputError("choose a transmitter")
         return json.loads(tx.value)
@@ -305,7 +305,7 @@ def show_prediction(desk: Desk) -> None:
             if east.value is None or north.value is None:
                 raise InputError("choose a place: click on the map, or give x and y")
             places = np.array([[east.value, north.value, filled(height)]])
-            write_table(desk.folder.path / PLACE, _links(desk, site(), places))
+            write_table(desk.folder.path / PLACE, _links(site(), places))
             predict_table(PLACE)
 
     def predict_table(name: str) -> None:
@@ -313,16 +313,16 @@ def show_prediction(desk: Desk) -> None:
 
     def cover() -> None:
         with desk.messages():
-            words: list[object] = ["map", chosen.value, "--tx", *site()]
+            words: list[object] = ["map", chosen.value, "--tx", *site()["tx"]]
             words += ["--height", filled(height), "--cell", filled(cell)]
             words += ["--bounds", *desk.area] if desk.area else []
-            words += [f"--column={name}={value}" for name, value in _shared(desk, site()).items()]
+            words += [f"--column={name}={value}" for name, value in site()["columns"].items()]
             desk.start(words)
 
     def suggest() -> None:
         with desk.messages():
             places = _grid(desk, filled(cell), filled(height))
-            write_table(desk.folder.path / CANDIDATES, _links(desk, site(), places))
+            write_table(desk.folder.path / CANDIDATES, _links(site(), places))
             desk.start(["suggest", chosen.value, CANDIDATES, "--count", 5, "--out", SUGGESTED])
 
     def export() -> None:
@@ -353,24 +353,12 @@ def show_prediction(desk: Desk) -> None:
             ).classes("coverage")
 
 
-def _links(desk: Desk, tx: list[float], rx: Any) -> pd.DataFrame:
-    """Links from a transmitter to places, with the groups and the carrier of its measured links."""
+def _links(site: dict[str, Any], rx: Any) -> pd.DataFrame:
+    """Links from a transmitter to places, with its groups, its carrier and the direction of its antenna."""
     table = pd.DataFrame({f"rx_{axis}": rx[:, k] for k, axis in enumerate("xyz")})
     for k, axis in enumerate("xyz"):
-        table[f"tx_{axis}"] = tx[k]
-    return table.assign(**_shared(desk, tx))
-
-
-def _shared(desk: Desk, tx: list[float]) -> dict[str, Any]:
-    """The groups and the carrier of the links that were measured at a transmitter, by their columns."""
-    from calibray.study import Study
-
-    study = Study.load(desk.folder.study_file)
-    links = study.measurements()
-    same = np.flatnonzero(np.abs(links.tx - tx).max(axis=1) < 0.01)
-    row = links.table.frame.iloc[int(same[0]) if len(same) else 0]
-    columns = [*study.offset_groups, study.links.transmitter, study.links.frequency]
-    return {name: row[name] for name in columns if isinstance(name, str) and name in row.index}
+        table[f"tx_{axis}"] = site["tx"][k]
+    return table.assign(**site["columns"])
 
 
 def _grid(desk: Desk, cell: float, height: float) -> Any:

@@ -51,7 +51,7 @@ def application(desk: Desk) -> FastAPI:
         try:
             return JSONResponse(await run.io_bound(plan, desk.folder, scene or desk.scene))
         except InputError as error:
-            return JSONResponse({"links": [], "transmitters": [], "error": str(error)})
+            return JSONResponse({"links": [], "transmitters": [], "sites": [], "error": str(error)})
 
     # Apart from the map, which need not wait for it.
     @app.get("/data/findings.json")

@@ -185,7 +185,7 @@ const plan = (() => {
     buildings = data.scale ? new Path2D(data.buildings) : null;
     walls = data.scale ? new Path2D(data.walls) : null;
     size();
-    emitEvent("plan", { transmitters: data.transmitters });
+    emitEvent("plan", { sites: data.sites });
     const suspicions = data.error ? [data.error] : await (await fetch("/data/findings.json")).json();
     emitEvent("findings", { findings: suspicions });
   }
