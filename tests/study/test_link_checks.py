@@ -202,3 +202,25 @@ def test_a_log_with_many_rows_while_parked_is_named(town):
     equal = frame.loc[np.repeat(frame.index, 10)].reset_index(drop=True)
     assert suspicions(town, equal.assign(time=np.arange(len(equal)))) == ""
     assert suspicions(town, parked, links={"average": "place"}) == ""
+
+
+def test_a_parked_receiver_whose_gps_positions_spread_is_named(town):
+    rng, frame = np.random.default_rng(0), links()
+    parked = frame.loc[[*frame.index, *[7] * 99]].reset_index(drop=True)
+    parked.loc[60:, ["x", "y"]] += rng.normal(0, 1, (99, 2))
+    metre = np.array([1 / (111_320 * np.cos(np.radians(50))), 1 / 111_230])
+    geographic = {
+        "position": "geographic",
+        "tx": [*(np.array([10, 50]) + MAST[:2] * metre).tolist(), MAST[2]],
+    }
+    scene = {"file": "scene.xml", "frequency": 3.5e9, "origin": [10.0, 50.0]}
+
+    def found(table: pd.DataFrame, **changes: object) -> str:
+        table = table.assign(
+            **dict(zip("xy", (np.array([10, 50]) + table[["x", "y"]] * metre).T.values, strict=True))
+        )
+        return suspicions(town, table, links=geographic | changes, scene=scene)
+
+    assert "links have the same position within 5 m" in found(parked)
+    assert found(parked, average={"by": "cell", "size": 5.0}) == ""
+    assert found(frame) == ""

@@ -39,6 +39,10 @@ DOMINATED: Final = 0.5
 47 positions with 60 rows each (effectively 10 %) raise the error of predictions from 3.0 to 3.5 dB, and 90 % intervals
 cover 0.86 instead of 0.93 of the links; ten rows at each (100 %) change neither."""
 
+SPREAD: Final = 5.0
+"""Width of the cells [m] in which positions of a parked GPS receiver lie: phones are accurate to 4.9 m under an open
+sky (GPS.gov, GPS accuracy)."""
+
 LINKS_PER_UNKNOWN: Final = 5
 """Number of links per unknown below which a fit hardly constrains its unknowns."""
 
@@ -85,7 +89,7 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
         *_levels(study, links),
         *_angles(study, links),
         *_averages(study, overhead),
-        *_dominant_positions(links),
+        *_dominant_positions(links, study.links.position == "geographic"),
     )
     return tuple(Finding("warning", links.source, problem, remedy) for problem, remedy in checks)
 
@@ -118,16 +122,19 @@ def _averages(study: StudyModel, overhead: SceneSurfaces) -> Iterator[tuple[str,
         )
 
 
-def _dominant_positions(links: Measurements) -> Iterator[tuple[str, str]]:
+def _dominant_positions(links: Measurements, is_geographic: bool) -> Iterator[tuple[str, str]]:
     """Whether rows at a few positions, such as those of a log while parked, outweigh all others (Kish, 1965)."""
-    ends = np.round(np.hstack([links.tx, links.rx]), 2)
+    cell = SPREAD if is_geographic else 0.01
+    ends = np.round(np.hstack([links.tx, links.rx]) / cell)
     count = np.unique(ends, axis=0, return_counts=True)[1]
     effective = len(links) ** 2 / float(np.sum(count.astype(float) ** 2))
     if effective < DOMINATED * len(count):
+        within = f" within {cell:g} m" if is_geographic else ""
+        average = f"{{ by = 'cell', size = {cell:g} }}" if is_geographic else "'place'"
         yield (
-            f"{count.max():,} of {len(links):,} links have the same position, and each counts in fits, accuracy and "
-            f"intervals of predictions: the {len(count):,} positions count as about {effective:.0f}",
-            "average rows of one position: links.average = 'place'",
+            f"{count.max():,} of {len(links):,} links have the same position{within}, and each counts in fits, "
+            f"accuracy and intervals of predictions: the {len(count):,} positions count as about {effective:.0f}",
+            f"average rows of one position: links.average = {average}",
         )
 
 
