@@ -28,6 +28,7 @@ from calibray.reporting.trust_figures import held_out_blocks
 from calibray.reporting.viewer import INTERACTIONS, PER_LINK, Grid, strongest
 from calibray.reporting.wording import diagnostics_table, group_text
 from calibray.result.held_out import HeldOutErrors, Judgement, Model
+from calibray.result.verdict import Remark, RemarkKind
 from calibray.scenes import read_scene, read_triangles
 from calibray.scenes.buildings import _loops
 from calibray.support.figure_style import plain_number
@@ -346,6 +347,11 @@ def test_the_summary_says_which_parameters_are_identified(result):
     text = answer(known, "How certain are the values?")
     assert f"The links identify 1 of 3 parameters: {identified}" in text
     assert f"{unidentified} is not identifiable" in text
+    assert "outside their intervals" not in text
+    outside = changed(known, remarks=(Remark(RemarkKind.OUTSIDE_INTERVAL, {"names": [unidentified]}),))
+    assert f"Calibrated values outside their intervals: {unidentified}." in answer(
+        outside, "How certain are the values?"
+    )
     material = unidentified.rpartition(".")[0]
     for count, words in ((0, "no path of any link interacts with it"), (1, "paths that interact with it")):
         sentences = summary(known, {material: count})

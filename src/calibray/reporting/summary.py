@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, cast
 
 from calibray.parameters.parameter import PARAMETER_BOUNDS
 from calibray.reporting.wording import (
@@ -15,7 +15,7 @@ from calibray.reporting.wording import (
     scene_alone_text,
 )
 from calibray.result.record import Record
-from calibray.result.verdict import Verdict
+from calibray.result.verdict import RemarkKind, Verdict
 from calibray.result.wording import NOT_JUDGED, judgement_text
 from calibray.tables import named, rows_text
 from calibray.validation.validation import Validation
@@ -138,6 +138,15 @@ def _certainty(result: Record) -> Iterator[Sentence]:
         if names := _by_verdict(result, verdict):
             verb = "is" if len(names) == 1 else "are"
             yield Sentence("", f"{_list(names)} {verb} {meaning}.", "caution")
+    for remark in result.uncertainty.remarks:
+        if remark.kind == RemarkKind.OUTSIDE_INTERVAL:
+            names = _list(cast("list[str]", remark.values["names"]))
+            yield Sentence(
+                "",
+                f"Calibrated values outside their intervals: {names}. They have the lowest RMSE, but values inside are "
+                "more probable. Do not use them as constants of the materials.",
+                "caution",
+            )
 
 
 def _advice(result: Record, links_by_material: Mapping[str, int] | None) -> Iterator[Sentence]:
@@ -167,8 +176,8 @@ def _coverage(count: int, total: int) -> str:
     if count < RARE * total:
         return f"only {count:,} of {total:,} links have paths that interact with it; measure more links of this kind"
     return (
-        f"{count:,} of {total:,} links have paths that interact with it, but these paths are too weak, or other "
-        "unknowns compensate; measure where a path of this kind is the strongest"
+        f"{count:,} of {total:,} links have paths that interact with it, but the errors are too large, these "
+        "paths are too weak, or other unknowns compensate; measure where a path of this kind is the strongest"
     )
 
 

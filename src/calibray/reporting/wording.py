@@ -37,7 +37,7 @@ def prediction_text(record: Record) -> str:
     if model.averaged is not None:
         source += f", averaged with {_AVERAGED[Model(model.name)]},"
     terms = [term.name for term in model.terms]
-    added = f" and the fitted {', '.join(terms)}" if terms else ""
+    added = f" and the fitted {' and '.join(terms)}" if terms else ""
     fallback = record.prediction.fallback
     text = f"Predictions and maps use the model {str(model.name)!r}, with {source}{added}."
     if fallback is None:
