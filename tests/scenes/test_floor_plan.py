@@ -221,6 +221,15 @@ def test_doors_and_windows_replace_the_wall(tmp_path):
     assert set(uses) == {1, 2}
 
 
+@pytest.mark.parametrize("first", [True, False])
+def test_a_door_of_any_name_replaces_the_wall(tmp_path, first):
+    types = {"tuer": SurfaceMaterial("tuer", "wood", 0.04)}
+    door = line(2, 0, 3, 0, "tuer", 0.0, 2.1)
+    make_plan_scene([door, *OUTER] if first else [*OUTER, door], tmp_path, types, lids=())
+    assert mesh(tmp_path, "tuer").area == pytest.approx(2.1)
+    assert mesh(tmp_path, "brick_wall").area == pytest.approx(32 * 3 - 2.1)
+
+
 def test_types_become_materials(tmp_path):
     plan = [*OUTER, line(3, 0, 3, 6, "drywall"), line(5, 0, 5, 6, "brick", thickness=0.1)]
     types = {"drywall": SurfaceMaterial("drywall", "plasterboard", 0.09)}

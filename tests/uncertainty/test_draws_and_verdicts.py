@@ -140,6 +140,9 @@ def test_a_parameter_at_its_bound_is_reported():
     assert told.name == "at bound"
     assert told.upper == 1.0
     assert told.lower == pytest.approx(1 - 3.0 / 20, abs=0.02)
+    # The reason states the end of the set of 90 %, which is not that of the interval of 95 %.
+    assert told.reason.values["value"] == pytest.approx(1 - np.log(10) / 20, abs=0.01)
+    assert reason_text(told.reason).endswith(", with a probability of 90 %")
 
 
 def test_credible_sets_cover_their_level():

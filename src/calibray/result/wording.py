@@ -89,7 +89,7 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
     ),
     ReasonKind.AT_BOUND: lambda values, _: (
         f"the interval reaches the {values['side']} bound: the links only show that the value is "
-        f"{'below' if values['side'] == 'lower' else 'above'} {values['value']:.4g}"
+        f"{'below' if values['side'] == 'lower' else 'above'} {values['value']:.4g}, with a probability of 90 %"
     ),
     ReasonKind.NO_EFFECT: lambda values, _: (
         f"no link's path loss changes by more than {values['change_db']:.1f} dB over the whole range"

@@ -76,7 +76,7 @@ def make_plan_scene(
 
     Walls that cross or meet share their corners, and ends at the face of another wall are extended to its centre line.
     A door or window replaces the wall on which it is drawn, between its own bottom and top; the wall continues above
-    and below.
+    and below. The same applies to any shorter line on a longer one, such as a door of another name.
 
     Args:
         segments: Lines of the plan.
@@ -202,7 +202,11 @@ def _extend(
 
 
 def _pieces(sheets: Sequence[Segment], materials: Sequence[str]) -> Pieces:
-    """The lines cut where they cross, and the sheets over each piece; doors and windows have priority over walls."""
+    """The lines cut where they cross, and the sheets over each piece; doors, windows and shorter lines come first."""
+
+    def priority(number: int) -> tuple[bool, float, int]:
+        return sheets[number].kind not in OPENINGS, round(sheets[number].length, 3), number
+
     shapely = library("shapely", "scenes")
     lines = np.array([shapely.LineString([sheet.start, sheet.end]) for sheet in sheets], dtype=object)
     cut = shapely.get_parts(shapely.union_all(lines, grid_size=MILLIMETRE))
@@ -214,7 +218,7 @@ def _pieces(sheets: Sequence[Segment], materials: Sequence[str]) -> Pieces:
     pieces: Pieces = {}
     for index, owners in over.items():
         stands: list[Stand] = []
-        for owner in sorted(owners, key=lambda number: (sheets[number].kind not in OPENINGS, number)):
+        for owner in sorted(owners, key=priority):
             free = [(to_millimetres(sheets[owner].bottom), to_millimetres(sheets[owner].top), owner)]
             for low, high, _ in stands:
                 free = [part for stand in free for part in subtract(stand, low, high)]
