@@ -134,7 +134,10 @@ def test_sectors_of_a_planners_table_become_a_study(scene, tmp_path):
     assert "--antennas, a folder of the MSI files that column Antenna Model names" in reasons["antennas"]
 
 
-def test_files_are_matched_by_name_and_hold_the_electrical_tilt(scene, tmp_path, files):
+def test_files_are_matched_by_name_and_hold_the_electrical_tilt(scene, tmp_path, files, monkeypatch):
+    monkeypatch.chdir(files)
+    here = drafted(scene, tmp_path, SECTORS, antennas=Path())
+    assert [each.value for each in here.assumptions if each.what == "antennas"] == [files.name]
     found = drafted(scene, tmp_path, SECTORS, antennas=files)
     links = found.study.links
     assert links.tx_antenna.type == "Antenna Model"
