@@ -252,6 +252,10 @@ def test_two_fingers_zoom_the_map(walked):
     box = page.locator("#plan").bounding_box()
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     before = float(page.locator("#plan").get_attribute("data-zoom"))
+    predict = step(page, "Predict and use")
+    predict.get_by_label("x [m]").fill("2.5")
+    predict.get_by_label("y [m]").fill("3.5")
+    page.locator("#plan[data-place='2.5,3.5']").wait_for()
     fingers = page.context.new_cdp_session(page)
     for kind, apart in (("touchStart", 40), ("touchMove", 60), ("touchMove", 120), ("touchEnd", None)):
         points = (
@@ -266,7 +270,7 @@ def test_two_fingers_zoom_the_map(walked):
     page.wait_for_function(
         "before => Math.abs(document.getElementById('plan').dataset.zoom / before - 3) < 0.01", arg=before
     )
-    assert page.locator("#plan").get_attribute("data-place") == ""
+    assert page.locator("#plan").get_attribute("data-place") == "2.5,3.5"
     page.context.close()
 
 
