@@ -318,6 +318,7 @@ def repetition(place: Place, foreign: Foreign, name: str, seed: int) -> dict[str
         "calls": next((k + 1 for k, value in enumerate(excess.tolist()) if value <= REACHED_DB), FAILED),
         "made": len(excess), "excess_db": excess.round(6).tolist(), "misfit_db": mapped.understanding.misfit_db,
         "gap_db": mapped.gap_db, "changed_db": mapped.changed_db, "remaining_db": mapped.remaining_db,
+        "moved_db": mapped.moved_db,
         "reached": mapped.reached, "understood": mapped.understood, "seconds": seconds,
     }  # fmt: skip
 

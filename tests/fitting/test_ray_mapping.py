@@ -319,6 +319,21 @@ def test_an_engine_of_other_physics_is_not_understood(
     assert strange.remaining_db > 1e-3
 
 
+def test_calls_go_on_while_the_minimum_is_not_at_the_best_call(
+    foreign: Foreign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Any gap is accepted, as after a step that is too short to show how well the model predicts."""
+    monkeypatch.setattr(ray_fit, "TRIALS", 5)
+    strange = replace(foreign, ripple=0.1)
+    first, second = (map_rays(foreign.problem, strange, tolerance_db=10.0, most_calls=n) for n in (3, 4))
+    assert first.moved_db > 0.05
+    lowest = foreign.problem.parameters.from_search(first.minima[:1])
+    best, moved = first.engine.path_loss(np.vstack([first.best.candidate, lowest]))
+    assert first.moved_db == pytest.approx(np.sqrt(np.mean((moved - best) ** 2)))
+    assert len(second.calls) == 4
+    assert len(map_rays(foreign.problem, foreign, tolerance_db=10.0, most_calls=4).calls) == 3
+
+
 def test_the_optimum_is_reached_without_understanding(mapped: RayMap) -> None:
     """Misfit and changed paths matter for the replay elsewhere, the gap and the remaining gain for the optimum."""
     assert mapped.reached
@@ -326,7 +341,12 @@ def test_the_optimum_is_reached_without_understanding(mapped: RayMap) -> None:
     for foreign in (misfit, replace(mapped, changed_db=0.6)):
         assert foreign.reached
         assert not foreign.understood
-    for missed in (replace(mapped, gap_db=0.06), replace(mapped, remaining_db=0.06), replace(mapped, lost=1)):
+    for missed in (
+        replace(mapped, gap_db=0.06),
+        replace(mapped, remaining_db=0.06),
+        replace(mapped, moved_db=0.06),
+        replace(mapped, lost=1),
+    ):
         assert not missed.reached
         assert not missed.understood
 

@@ -47,8 +47,8 @@ SIGMA_DB: Final = 0.1
 """Error of a ratio in the information [dB]."""
 
 UNDERSTOOD_DB: Final = 0.05
-"""Largest gap at the last call of an engine that counts as understood, and largest gain that is left if its optimum
-counts as reached [dB]."""
+"""Largest gap at the last call of an engine that counts as understood, and, if its optimum counts as reached, largest
+gain that is left and largest change of path loss to where it is left [dB]."""
 
 MISFIT_DB: Final = 0.2
 """Largest misfit of the ratios of such an engine [dB]. Wrong minima had 0.8 dB and more. With 0.07 to 0.19 dB, the
@@ -77,6 +77,7 @@ class RayMap:
         lost: Number of links that keep none, or have none in the replay at the best call.
         minima: Minima of the replay that replaces the engine, the lowest first, as points of the search space [k, d].
         remaining_db: RMSE at the best call minus that at the lowest of these minima [dB].
+        moved_db: Root mean square over the links of the replay's path loss there minus that at the best call [dB].
     """
 
     engine: Replay
@@ -89,14 +90,15 @@ class RayMap:
     lost: int
     minima: NDArray[np.float64]
     remaining_db: float
+    moved_db: float
 
     @property
     def reached(self) -> bool:
-        """Whether the last call was predicted, and nothing is left to gain.
+        """Whether the last call was predicted, and nothing is left to gain, at the best call or away from it.
 
         The optimum is then reached, even if the engine's assumptions are not identified.
         """
-        return max(self.gap_db, self.remaining_db) <= UNDERSTOOD_DB and not self.lost
+        return max(self.gap_db, self.remaining_db, self.moved_db) <= UNDERSTOOD_DB and not self.lost
 
     @property
     def understood(self) -> bool:
@@ -146,7 +148,9 @@ def map_rays(
 ) -> RayMap:
     """Call an engine until the path loss at the minimum is predicted to the tolerance, or for most calls.
 
-    The result is the replay that replaces the engine, and its accuracy. The engine of the problem is not called.
+    The result is the replay that replaces the engine, and its accuracy. If its minimum is not at the best call, calls
+    go on: after a short step, the last call does not show how well the model predicts. The engine of the problem is not
+    called.
     """
     parameters, known = problem.parameters, problem.setup.known_antennas is not None
     understanding: Understanding | None = None
@@ -156,27 +160,47 @@ def map_rays(
 
     calls = [call(parameters.start)]
     calls.append(call(_most_informative(problem, calls[0], np.random.default_rng(seed))))
+    ordered = calls
     while True:
-        understanding = understand(parameters, calls, known, understanding)
-        replay = understanding.replay(parameters, calls[-1])
+        understanding = understand(parameters, ordered, known, understanding)
+        replay = understanding.replay(parameters, ordered[-1])
         starts = parameters.to_search(np.array([candidate for candidate, _ in calls]))
         searches = local_searches(replay.interactions)  # a call costs more than many searches
         minimum = least_squares(with_engine(problem, replay), searches, starts).best.x
-        calls.append(call(parameters.from_search(minimum)))
+        calls = [*calls, call(parameters.from_search(minimum))]
+        ordered = calls
         gap = _gap(replay, calls[-1])
-        if gap <= tolerance_db or len(calls) >= most_calls:
-            break
-    best = min(calls, key=lambda each: _objective(problem, each))
-    ordered = [*(each for each in calls if each is not best), best]
-    final = understand(parameters, ordered, known, understanding)
+        if gap > tolerance_db and len(calls) < most_calls:
+            continue
+        mapped = _finish(problem, calls, known, understanding, gap)
+        if mapped.moved_db <= UNDERSTOOD_DB or len(calls) >= most_calls:
+            return mapped
+        ordered, understanding = _best_last(problem, calls), mapped.understanding
+
+
+def _finish(
+    problem: Problem, calls: list[Call], known: bool, understanding: Understanding, gap: float
+) -> RayMap:
+    """The replay that agrees with the engine at the best call, its minima, and its accuracy."""
+    parameters, ordered = problem.parameters, _best_last(problem, calls)
+    final, best = understand(parameters, ordered, known, understanding), ordered[-1]
     replay = final.replay(parameters, best)
     replayed, point = with_engine(problem, replay), parameters.to_search(best.candidate)[None]
     found = least_squares(replayed, local_searches(replay.interactions), point)
     remaining = float(replayed.squares(point).value[0]) - found.best.y
     changed, changed_db, lost = _changes(ordered)
-    answered, predicted = best.export.path_loss_db, replay.path_loss(best.candidate[None])[0]
+    answered = best.export.path_loss_db
+    predicted, lowest = replay.path_loss(np.stack([best.candidate, parameters.from_search(found.best.x)]))
     lost = max(lost, int((np.isfinite(answered) & np.isinf(predicted)).sum()))
-    return RayMap(replay, tuple(calls), best, final, gap, changed, changed_db, lost, found.minima, remaining)
+    moved = _distance(lowest, predicted)
+    return RayMap(
+        replay, tuple(calls), best, final, gap, changed, changed_db, lost, found.minima, remaining, moved
+    )
+
+
+def _best_last(problem: Problem, calls: list[Call]) -> list[Call]:
+    best = min(calls, key=lambda each: _objective(problem, each))
+    return [*(each for each in calls if each is not best), best]
 
 
 def with_engine(problem: Problem, replay: Replay) -> Problem:
@@ -195,9 +219,13 @@ def _objective(problem: Problem, call: Call) -> float:
 
 def _gap(replay: Replay, call: Call) -> float:
     """Root mean square over the links of the answered minus the predicted path loss [dB]."""
-    answered, predicted = call.export.path_loss_db, replay.path_loss(call.candidate[None])[0]
-    both = np.isfinite(answered) & np.isfinite(predicted)
-    return float(np.sqrt(np.mean((answered[both] - predicted[both]) ** 2)))
+    return _distance(call.export.path_loss_db, replay.path_loss(call.candidate[None])[0])
+
+
+def _distance(path_loss: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Root mean square of the difference over the links that have a path in both [dB]."""
+    both = np.isfinite(path_loss) & np.isfinite(other)
+    return float(np.sqrt(np.mean((path_loss[both] - other[both]) ** 2)))
 
 
 def _most_informative(problem: Problem, call: Call, random: np.random.Generator) -> NDArray[np.float64]:
@@ -249,6 +277,7 @@ def _remark(mapped: RayMap) -> Remark:
             "gap_db": mapped.gap_db,
             "reached": mapped.reached,
             "remaining_db": mapped.remaining_db,
+            "moved_db": mapped.moved_db,
             "calls": len(mapped.calls),
             "changed": mapped.changed,
             "changed_db": mapped.changed_db,

@@ -119,8 +119,8 @@ class RemarkKind(StrEnum):
     )
     FEW_DRAWS = "few draws"
     APPROXIMATE_INTERVALS = "approximate intervals"  # engine, calls, error_db, replay
-    # understood, misfit_db, gap_db, reached, remaining_db, calls, changed (paths), changed_db and lost (links),
-    # half_space (all surfaces), half_spaces (materials); names and values of constants
+    # understood, misfit_db, gap_db, reached, remaining_db, moved_db, calls, changed (paths), changed_db and lost
+    # (links), half_space (all surfaces), half_spaces (materials); names and values of constants
     RAY_MAPPING = "ray mapping"
     NO_CHEAP_MODEL = "no cheap model"  # cause
     NOT_JUDGED = "not judged"

@@ -252,8 +252,8 @@ def _ray_mapping(values: dict[str, Any]) -> str:
         optimum = "the optimum is reached" if values["reached"] else "the optimum may be missed"
         text = (
             f"The model does not represent the program. {text}. A replay that agrees with the program at the best call "
-            f"replaces it. Its minimum is {values['remaining_db']:.3f} dB below that call: {optimum}, and intervals "
-            "are approximate."
+            f"replaces it. Its minimum is {values['remaining_db']:.3f} dB below that call, where path loss differs by "
+            f"{values['moved_db']:.3f} dB: {optimum}, and intervals are approximate."
         )
     if values["changed"]:
         text += (
