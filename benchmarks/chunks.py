@@ -236,7 +236,10 @@ def draws(links: int) -> None:
         trail = search(problem, choose(problem))
         started = time.process_time()
         found = certainty(problem, trail)
-        ends = {name: (round(each.lower, 4), round(each.upper, 4)) for name, each in found.intervals.items()}
+        ends = {
+            name: (round(each.lower, 4), round(each.upper, 4))
+            for name, each in found.record.intervals.items()
+        }
         print(
             f"{len(known)} links, {cast(Differentiable, problem.engine).interactions} interactions, {engine}: "
             f"{time.process_time() - started:.1f} s of processor time for {found.calls} replays; {ends}",
