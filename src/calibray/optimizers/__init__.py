@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike
 
 from calibray.errors import InputError
 from calibray.optimizers.derivative_free import POUNDERS, GaussNewton
-from calibray.optimizers.evaluations import Best as Best
-from calibray.optimizers.evaluations import Objective
+from calibray.optimizers.evaluations import Best, Objective
 from calibray.optimizers.gaussian_process import GaussianProcess
 from calibray.optimizers.grey_wolf import GWO, SGWOIM
 from calibray.optimizers.least_squares import LeastSquares
@@ -27,6 +26,29 @@ from calibray.optimizers.protocol import CheapModel, Optimizer
 from calibray.optimizers.sampling import LatinHypercube, RandomSearch, Sobol
 from calibray.optimizers.vector_surrogate import VectorSurrogate
 from calibray.support.messages import did_you_mean
+
+__all__ = [
+    "CMAES",
+    "DFOLS",
+    "GWO",
+    "METHODS",
+    "POUNDERS",
+    "SGWOIM",
+    "Best",
+    "DifferentialEvolution",
+    "GaussNewton",
+    "GaussianProcess",
+    "LatinHypercube",
+    "LeastSquares",
+    "Optimizer",
+    "RandomSearch",
+    "Sobol",
+    "SpaceMapping",
+    "VectorSurrogate",
+    "label",
+    "make",
+    "method",
+]
 
 METHODS: Final[dict[str, type[Optimizer]]] = {
     "gwo": GWO,
