@@ -6,6 +6,7 @@ import gc
 import multiprocessing
 import os
 import signal
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -17,14 +18,16 @@ import planted
 from calibray import calibrate, engines, fields
 from calibray.engines import ChunkedReplay, InProcess, Replay, ReplayCarriers
 from calibray.engines.cluster.chunks import cut
-from calibray.engines.kinds.replay import trace_and_replay
+from calibray.engines.kinds.replay import replay, trace_and_replay
 from calibray.engines.replay import CarrierPaths
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
+from calibray.materials import Material
 from calibray.measurements.observables import Statistic
 from calibray.optimizers import LeastSquares
 from calibray.parameters import Parameter, Parameters
-from calibray.paths.program import take_links
+from calibray.paths import Paths
+from calibray.paths.program import take, take_links
 from calibray.result.verdict import Cause
 from calibray.scenes import Triangles, building_numbers
 from calibray.study import Setup, Study
@@ -303,7 +306,7 @@ def in_chunks(setup: Setup, size: int, at_most: int | None = None) -> ChunkedRep
 
 @pytest.mark.parametrize("blocked", [False, True])
 def test_chunks_split_as_all_links_do(problem, blocked):
-    """Also chunks of one link, of which a blocked one has no path, and others do not meet every material."""
+    """Also chunks of one link, of which a blocked one has no path."""
     study = Study.from_content(planted.content("links.csv", noise=None))
     setup = Setup.open(study, links=links_from_frame(planted.links(blocked)))
     whole = Problem.of(setup, planted.engine(blocked))
@@ -322,6 +325,33 @@ def test_chunks_split_as_all_links_do(problem, blocked):
         expected, found = answers
         assert found.path_loss == pytest.approx(expected.path_loss, abs=1e-9)
         assert found.observed == pytest.approx(expected.observed, rel=1e-9, nan_ok=True)
+
+
+def without_ground_in_the_west(paths: Paths, rx: np.ndarray) -> Paths:
+    """Without the paths to receivers at x < 0 that meet concrete."""
+    path = np.repeat(np.arange(paths.num_paths), np.diff(paths.first))
+    met = np.unique(path[paths.material == list(paths.materials).index("concrete")])
+    return take(paths, np.setdiff1d(np.arange(paths.num_paths), met[rx[paths.link[met], 0] < 0]))
+
+
+def test_chunks_may_lack_constants_of_others(problem):
+    """Paths in the west do not meet concrete, whose constants come first: the other constants keep their factors."""
+    setup = problem.setup
+
+    def opening(study: Setup, materials: Mapping[str, Material]) -> Replay | ReplayCarriers:
+        return replay(study, without_ground_in_the_west(study.trace(materials), study.links.rx))
+
+    paths = without_ground_in_the_west(problem.engine.paths, setup.links.rx)
+    chunked = ChunkedReplay(InProcess(), setup, cut(setup.links, 1), opening)
+    one, many = (
+        split_replay(replace(problem, engine=engine), problem.parameters, by_building=True)
+        for engine in (replay(setup, paths), chunked)
+    )
+    assert many.keys.tolist() == one.keys.tolist()
+    random = np.random.default_rng(3)
+    values = problem.parameters.from_unit(random.random((7, len(problem.parameters))))
+    factors = random.uniform(0.8, 1.2, (7, len(one.keys)))
+    assert many.path_loss(values, factors) == pytest.approx(one.path_loss(values, factors), abs=1e-9)
 
 
 def paths_held() -> int:
