@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import t
 
-from calibray.uncertainty.verdicts import intervals
+from calibray.uncertainty.verdicts import linear_intervals
 
 
 def linear_problem(noise: np.ndarray, offset: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -25,7 +25,7 @@ LOWER, UPPER = np.zeros(2), np.full(2, 10.0)
 @pytest.mark.parametrize("offset", [False, True])
 def test_intervals_of_a_linear_problem_are_the_textbook_ones(offset):
     best, residuals, slope = linear_problem(np.random.default_rng(1).normal(0, 0.5, 25), offset)
-    found = intervals(best, residuals, slope, LOWER, UPPER, 25 - 2 - int(offset))
+    found = linear_intervals(best, residuals, slope, LOWER, UPPER, 25 - 2 - int(offset))
     variance = residuals @ residuals / (25 - 2 - offset)
     errors = np.sqrt(np.diag(variance * np.linalg.inv(slope.T @ slope)))
     assert [interval.standard_error for interval in found] == pytest.approx(errors)
@@ -38,7 +38,7 @@ def coverage(noise: np.ndarray, factor: float = 1.0) -> np.ndarray:
     """Share of intervals, scaled by a factor, that cover the truth [d], over many campaigns [n, m]."""
     hits = np.zeros(2)
     for sample in noise:
-        found = intervals(*linear_problem(sample, True), LOWER, UPPER, len(sample) - 3)
+        found = linear_intervals(*linear_problem(sample, True), LOWER, UPPER, len(sample) - 3)
         middle = np.array([(each.lower + each.upper) / 2 for each in found])
         half = np.array([(each.upper - each.lower) / 2 for each in found])
         hits += abs(middle - TRUTH) <= factor * half
@@ -59,7 +59,7 @@ def test_intervals_cover_the_truth_95_times_in_100():
 def verdicts(slope: np.ndarray, best: np.ndarray = TRUTH, noise: float = 0.5) -> list[str]:
     """Verdicts at an optimum, with residuals of a given size."""
     residuals = noise * np.where(np.arange(len(slope)) % 2, 1.0, -1.0)
-    return [each.verdict for each in intervals(best, residuals, slope, LOWER, UPPER, len(slope) - 2)]
+    return [each.verdict for each in linear_intervals(best, residuals, slope, LOWER, UPPER, len(slope) - 2)]
 
 
 def test_verdicts_follow_the_information_in_the_data():
@@ -74,8 +74,8 @@ def test_verdicts_follow_the_information_in_the_data():
 
 def test_intervals_end_at_the_bounds():
     sharp = np.random.default_rng(3).normal(size=(40, 2))
-    found = intervals(np.array([0.0, 9.9]), np.full(40, 0.5), sharp, LOWER, UPPER, 38)
+    found = linear_intervals(np.array([0.0, 9.9]), np.full(40, 0.5), sharp, LOWER, UPPER, 38)
     assert found[0].lower == 0.0 < found[0].upper
     assert found[1].upper == 10.0 > found[1].lower
-    blind = intervals(TRUTH, np.full(40, 0.5), sharp * [1.0, 0.0], LOWER, UPPER, 38)
+    blind = linear_intervals(TRUTH, np.full(40, 0.5), sharp * [1.0, 0.0], LOWER, UPPER, 38)
     assert (blind[1].lower, blind[1].upper) == (0.0, 10.0)

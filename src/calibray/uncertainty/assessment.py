@@ -42,8 +42,7 @@ from calibray.uncertainty.remarks import (
     outside_interval,
 )
 from calibray.uncertainty.sequential_monte_carlo import Posterior, draw_posterior, joined
-from calibray.uncertainty.verdicts import Axes, consistent, local_intervals, verdicts, with_reason
-from calibray.uncertainty.verdicts import Verdict as VerdictOnDraws
+from calibray.uncertainty.verdicts import Axes, JudgedSet, consistent, local_intervals, verdicts, with_reason
 
 EQUAL: Final = 0.1
 """Difference between emulators, relative to the errors of the links, below which only their mean is used."""
@@ -284,7 +283,7 @@ def _intervals(
     return intervals
 
 
-def _differ(verdict: VerdictOnDraws) -> bool:
+def _differ(verdict: JudgedSet) -> bool:
     """Whether the interval for the measured buildings differs from that of the mean by a tenth of its width."""
     one, other = np.array(verdict.pieces), np.array(verdict.seen)
     return one.shape != other.shape or np.abs(one - other).max() > SHOWN_DIFFERENCE * (

@@ -20,8 +20,7 @@ from scipy.special import ndtr, stdtrit
 
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.fitting.search import Trail
-from calibray.result.verdict import CONFIDENCE, Interval, Reason, ReasonKind
-from calibray.result.verdict import Verdict as VerdictName
+from calibray.result.verdict import CONFIDENCE, Interval, Reason, ReasonKind, Verdict
 from calibray.uncertainty.draws import Draws, systematic_resampling
 
 
@@ -33,7 +32,7 @@ def local_intervals(problem: Problem, trail: Trail, optimum: Evaluation) -> dict
     parameters = problem.parameters
     # Compressed residuals are scaled to the sum of squares of the full ones.
     scale = np.sqrt(optimum.num_rows / optimum.residuals.shape[1])
-    searched = intervals(
+    searched = linear_intervals(
         parameters.to_search(trail.best),
         optimum.residuals[0] * scale,
         optimum.slopes[0] * scale,
@@ -57,15 +56,15 @@ def with_reason(local: dict[str, Interval], reason: Reason) -> dict[str, Interva
     Curvature alone does not show other minima and correlated errors, so no parameter is more than weakly identified,
     unless the data contain no noise.
     """
-    exact, identified = reason.kind == ReasonKind.NO_NOISE, VerdictName.IDENTIFIED
-    capped = {identified: identified if exact else VerdictName.WEAKLY_IDENTIFIED}
+    exact, identified = reason.kind == ReasonKind.NO_NOISE, Verdict.IDENTIFIED
+    capped = {identified: identified if exact else Verdict.WEAKLY_IDENTIFIED}
     return {
         name: replace(interval, verdict=capped.get(interval.verdict, interval.verdict), reason=reason)
         for name, interval in local.items()
     }
 
 
-def intervals(
+def linear_intervals(
     best: NDArray[np.float64],
     residuals: NDArray[np.float64],
     jacobian: NDArray[np.float64],
@@ -90,11 +89,11 @@ def intervals(
     for value, error, low, high in zip(best, errors, lower, upper, strict=True):
         ends = max(value - quantile * error, low), min(value + quantile * error, high)
         span = high - low
-        verdict = VerdictName.IDENTIFIED
+        verdict = Verdict.IDENTIFIED
         if 2 * quantile * error > span / 2:
-            verdict = VerdictName.NOT_IDENTIFIABLE
+            verdict = Verdict.NOT_IDENTIFIABLE
         elif min(value - low, high - value) < 1e-6 * span:
-            verdict = VerdictName.AT_BOUND
+            verdict = Verdict.AT_BOUND
         result.append(Interval(float(error), float(ends[0]), float(ends[1]), verdict))
     return result
 
@@ -186,8 +185,8 @@ class Axes:
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """What the data show about one parameter.
+class JudgedSet:
+    """The credible set of one parameter, with its verdict.
 
     Attributes:
         pieces: Lower and upper end of every piece of the credible set, ascending, within the bounds.
@@ -197,7 +196,7 @@ class Verdict:
     """
 
     pieces: tuple[tuple[float, float], ...]
-    name: VerdictName
+    name: Verdict
     reason: Reason
     seen: tuple[tuple[float, float], ...] = ()
 
@@ -220,7 +219,7 @@ def verdicts(
     *,
     level: float = 0.95,
     seen: Draws | None = None,
-) -> list[Verdict]:
+) -> list[JudgedSet]:
     """Judge every parameter by its posterior, of the means over all buildings if these differ.
 
     The links' errors have the standard deviation `noise_db` [dB]. Intervals cover the share `level` of the posterior.
@@ -243,29 +242,29 @@ def verdicts(
         ends = _bounds_reached(pieces, lower, upper)
         ends = ends or _bounds_reached(seen_pieces, lower, upper)
         if share > WEAKLY >= seen_share and len(seen_pieces) == 1 and not ends:
-            name = VerdictName.WEAKLY_IDENTIFIED
+            name = Verdict.WEAKLY_IDENTIFIED
             reason = Reason(ReasonKind.SEEN_BUILDINGS, {"share": float(seen_share), **range_})
         elif share > WEAKLY and seen_share > WEAKLY:
-            name, change = VerdictName.NOT_IDENTIFIABLE, _effect(index, modelled, best, axes)
+            name, change = Verdict.NOT_IDENTIFIABLE, _effect(index, modelled, best, axes)
             if change < NO_EFFECT_DB:
                 reason = Reason(ReasonKind.NO_EFFECT, {"change_db": change})
                 reported = (_without_chance(reported, lower, upper),)
             else:
                 reason = _confounding(index, draws, axes.names, change, noise_db)
         elif len(seen_pieces) > 1:
-            name, reason = VerdictName.AMBIGUOUS, _modes(index, seen_pieces, seen, axes)
+            name, reason = Verdict.AMBIGUOUS, _modes(index, seen_pieces, seen, axes)
         elif len(pieces) > 1:
-            name, reason = VerdictName.AMBIGUOUS, _modes(index, pieces, draws, axes)
+            name, reason = Verdict.AMBIGUOUS, _modes(index, pieces, draws, axes)
         elif ends and pieces:
             other_end = axes.value(index, pieces[-1][1] if ends == ["lower"] else pieces[0][0])
             reason = Reason(ReasonKind.AT_BOUND, {"side": ends[0], "value": float(other_end)})
-            name = VerdictName.AT_BOUND
+            name = Verdict.AT_BOUND
         else:
             sure = share <= IDENTIFIED and draws.agree
-            name = VerdictName.IDENTIFIED if sure else VerdictName.WEAKLY_IDENTIFIED
+            name = Verdict.IDENTIFIED if sure else Verdict.WEAKLY_IDENTIFIED
             others = _outlying_pieces(index, pieces, reported, draws, axes)
             reason = Reason(ReasonKind.WIDTH, {"share": float(share), **range_}, others)
-        result.append(Verdict(reported, name, reason, seen_reported))
+        result.append(JudgedSet(reported, name, reason, seen_reported))
     return result
 
 
@@ -345,11 +344,11 @@ def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, 
 
 def consistent(interval: Interval, value: float) -> Interval:
     """The interval; ambiguous if it was identified but does not contain the value with the lowest RMSE."""
-    identified = interval.verdict in (VerdictName.IDENTIFIED, VerdictName.WEAKLY_IDENTIFIED)
+    identified = interval.verdict in (Verdict.IDENTIFIED, Verdict.WEAKLY_IDENTIFIED)
     if not identified or interval.contains(value, 1e-9 * abs(value)):
         return interval
     reason = Reason(ReasonKind.OUTSIDE_INTERVAL, {"value": float(value)})
-    return replace(interval, verdict=VerdictName.AMBIGUOUS, reason=reason)
+    return replace(interval, verdict=Verdict.AMBIGUOUS, reason=reason)
 
 
 def credible_sets(
