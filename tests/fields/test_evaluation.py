@@ -34,6 +34,12 @@ def test_gains_equal_complex_arithmetic_whatever_the_padding() -> None:
     np.testing.assert_allclose(path_loss(paths), -10 * np.log10(np.bincount(paths.link, power)), rtol=1e-12)
 
 
+def test_a_path_of_more_than_sixteen_interactions_has_the_gain_that_it_has_alone() -> None:
+    sequences = [(Kind.DIFFUSE,), (Kind.DIFFUSE, Kind.DIFFUSE), (Kind.REFRACTION,) * 16 + (Kind.DIFFUSE,), ()]
+    paths = synthetic.program(sequences, seed=3, materials=synthetic.LAMBERTIAN)
+    np.testing.assert_allclose(path_gains(paths), reference_fields.gains(paths)[:, 0, 0], rtol=1e-11)
+
+
 def test_padding_is_not_evaluated_at_the_end_of_a_run() -> None:
     paths = synthetic.program([(Kind.SPECULAR,) * depth for depth in (1, 0, 3, 2, 3)], seed=3)
     program = layout(paths).program

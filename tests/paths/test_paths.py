@@ -287,6 +287,8 @@ def test_missing_misshapen_or_mistyped_dataset(paths: Paths, tmp_path: Path, nam
     ("paths/first", -1, 10**12), ("paths/first", 1, 5), ("paths/first", 3, -1), ("interactions/kind", 0, 3),
     ("interactions/kind", 0, 0), ("interactions/kind", 0, Kind.DIFFUSE), ("interactions/material", 0, 3),
     ("interactions/material", 0, -1), ("interactions/cos_incidence", 0, 1.1),
+    ("interactions/cos_incidence", 0, -0.5), ("diffuse/cos_scattered", 0, -0.5),
+    ("diffraction/cos_incidence_n", 0, -0.5),
     ("interactions/rotation", 0, 0.5), ("paths/delay", 0, -1e-9), ("paths/spreading", 0, -1.0),
     ("diffuse/solid_angle", 0, -1.0), ("diffraction/sin_edge", 0, 1.5), ("paths/departure", 0, 7.0),
     ("materials/relative_permittivity", 0, 0.5), ("materials/name", 0, "glass"), ("materials/name", 0, ""),

@@ -96,12 +96,16 @@ def cosine_and_sine(angle: ArrayLike) -> tuple[jax.Array, jax.Array]:
     """
     angle_as_given = jnp.asarray(angle)
     angle = angle_as_given.astype(jnp.float64)
+    # The angle is `quarters` quarter turns and a rest of at most pi / 4. Both parts of pi / 2 are subtracted in turn,
+    # so that the rest keeps its digits.
     quarters = jnp.round(angle * (2 / jnp.pi))
     rest = (angle - quarters * _QUARTER[0]) - quarters * _QUARTER[1]
     square = rest * rest
     sine, cosine = rest * _polynomial(_SINE, square), _polynomial(_COSINE, square)
     quadrant = quarters - 4 * jnp.floor(quarters / 4)  # 0, 1, 2 or 3
     odd = (quadrant == 1) | (quadrant == 3)
+    # An odd number of quarter turns exchanges cosine and sine; the cosine is negative in quadrants 1 and 2, the sine in
+    # 2 and 3.
     across, along = jnp.where(odd, sine, cosine), jnp.where(odd, cosine, sine)
     cosine = jnp.where((quadrant == 1) | (quadrant == 2), -across, across)
     sine = jnp.where(quadrant >= 2, -along, along)
@@ -152,6 +156,7 @@ def make_segments(segment: NDArray[np.integer], count: int) -> Segments:
         return Segments(None, jax.device_put(segment.astype(np.int32)), 0, count)
     order = np.argsort(segment, kind="stable")
     rank = np.arange(len(segment)) - np.repeat(np.cumsum(size) - size, size)  # within its segment
+    # The first numbers of each segment fill whole blocks; the remainder does not.
     in_block = rank < np.repeat(size // BLOCK * BLOCK, size)
     order = np.concatenate([order[in_block], order[~in_block]])
     blocks = int(in_block.sum()) // BLOCK

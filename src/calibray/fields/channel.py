@@ -96,6 +96,7 @@ def link_mean(weight: jax.Array, value: jax.Array, link: jax.Array, num_links: i
 def delay_spread(power: jax.Array, delay: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
     """Root mean square delay spread of every link [L], [s] (ITU-R P.1407-8 eq. 3); NaN without power."""
     mean = link_mean(power, delay, link, num_links)
+    # Relative to the mean: the difference of two second moments of absolute delays would lose its digits.
     excess_delay = delay - jnp.nan_to_num(mean)[link]
     variance = link_mean(power, excess_delay**2, link, num_links)
     return jnp.where(jnp.isfinite(mean), safe_sqrt(variance), jnp.nan)
@@ -106,6 +107,7 @@ def angular_spread(power: jax.Array, angle: jax.Array, link: jax.Array, num_link
     # sqrt(-2 ln |sum P e^{j phi} / sum P|)
     cosine, sine = (link_mean(power, part(angle), link, num_links) for part in (jnp.cos, jnp.sin))
     resultant = jnp.hypot(cosine, sine)
+    # Equal powers from opposite directions have the resultant 0, whose logarithm is infinite.
     spread = safe_sqrt(jnp.maximum(-2 * jnp.log(jnp.clip(resultant, 1e-300, 1.0)), 0.0))
     return jnp.where(jnp.isfinite(cosine), spread, jnp.nan)
 

@@ -137,11 +137,14 @@ def table_layout(
     row_of_node = np.repeat(np.arange(len(rows)), cells + _EXTRA_NODES)
     rank = np.arange(total) - first[row_of_node]  # of a node within its row
     position = cosine ** (1 / root[material]) * cells[row]
+    # Normal incidence is the end of the last interval, not the start of another one.
     below = np.minimum(position.astype(np.int64), cells[row] - 1)
     # A step without a coefficient takes the cell of the four nodes of 1 at the end.
     cell = np.append(first[row] + 1 + below, total + 1).astype(np.uint32)
     fraction = np.append(position - below, 0.0).astype(dtype)
     last, material_of_node = cells[row_of_node] + _EXTRA_NODES - 1, (rows // len(Mode))[row_of_node]
+    # The node before grazing incidence has the root -1 / cells, whose even power mirrors the node after it. The last
+    # node lies beyond normal incidence, where the formula continues smoothly.
     node_cosine = ((rank - 1) / cells[row_of_node]) ** root[material_of_node]
     return TableLayout(
         cell=tuple(jax.device_put(cell[step]) for step in steps),
@@ -261,6 +264,7 @@ def _errors_by_intervals(
         # Coefficients are even functions of the root of the cosine, so the node before the first mirrors the second.
         node = jnp.concatenate([node[1:2], node])
         interpolated = 9 / 16 * (node[1:-2] + node[2:-1]) - 1 / 16 * (node[:-3] + node[3:])
+        # Nodes end at normal incidence here, so the last interval lacks a neighbour and is left out.
         errors.append(jnp.abs(middle[:-1] - interpolated).max())
         step //= 2
     return jnp.stack(errors)

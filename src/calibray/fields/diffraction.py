@@ -32,6 +32,8 @@ def affine_form(table: Diffraction, row: NDArray[np.int64], frequency: float) ->
         a = 2 * np.cos(exterior * turns - beta / 2) ** 2
         return scale * _cotangent_times_transition((np.pi + sign * beta) / (2 * n), size * a, n, size)
 
+    # D_1 - D_4 and D_2 - D_3 as in Sionna RT, whose terms of the 0-face have the wrong sign
+    # (docs/explanation/fidelity.md).
     zero_face = term(1, difference) - term(-1, total)
     n_face = term(-1, difference) - term(1, total)
     in_0, out_0, in_n, out_n = (_matrix(table.rotations[row, k]) for k in range(4))
@@ -40,6 +42,7 @@ def affine_form(table: Diffraction, row: NDArray[np.int64], frequency: float) ->
     form = np.zeros((5, 2, 2, len(row)), dtype=complex)
     form[0] = np.where(unlit, -n_face, 0.0) * np.eye(2)[:, :, None]
     for component in range(2):
+        # One term of W_out diag(R_te, R_tm) W_in: a column of W_out times a row of W_in.
         form[1 + component] = zero_face * out_0[:, None, component] * in_0[None, component, :]
         form[3 + component] = lit_n_face * out_n[:, None, component] * in_n[None, component, :]
     return form

@@ -86,6 +86,7 @@ class ExtraLoss:
         """See `Effect.apply`."""
         specific = self.fixed if self.index is None else values[self.index]
         # A = A_m (1 - exp(-d gamma / A_m)), ITU-R P.833-10 equation 1
+        # For short paths it is d gamma; expm1 keeps the digits there.
         loss_db = self.maximum_db * -jnp.expm1(-jnp.asarray(self.length) * specific / self.maximum_db)
         return scaled(program, jnp.exp(-np.log(10) / 20 * loss_db))
 
@@ -172,6 +173,7 @@ class DisplacementLoss:
             knots = jnp.asarray(self.knots[axis])
             stated = (jnp.asarray(weights) @ (values - self.origin))[group]
             displacement = jnp.clip(stated, knots[0], knots[-1])
+            # Index of the lower knot: the number of inner knots that the displacement has passed.
             below = (displacement >= knots[1:-1]).sum(axis=0)[None]
             distance = displacement - jnp.take_along_axis(knots, below, axis=0)[0]
             cubic = jnp.take_along_axis(jnp.asarray(self.coefficients[axis]), below[None], axis=1)[:, 0]

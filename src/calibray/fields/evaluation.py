@@ -285,8 +285,12 @@ def _contract(
     num_materials: int,
 ) -> jax.Array:
     """Derivatives of path loss [L, M, columns] from those of the power with respect to the response."""
-    inverse = jnp.where(power > 0, 1 / jnp.where(power > 0, power, 1.0), 0.0)
-    return -10 / np.log(10) * inverse[:, None, None] * contract(program, slope, derivatives, num_materials)
+    return _loss_slope(power)[:, None, None] * contract(program, slope, derivatives, num_materials)
+
+
+def _loss_slope(power: jax.Array) -> jax.Array:
+    """Derivative of path loss [dB] by the power of a link [L]; 0 for a link without a path."""
+    return -10 / np.log(10) * jnp.where(power > 0, 1 / jnp.where(power > 0, power, 1.0), 0.0)
 
 
 def _by_path(by_field: list[AntennaFields], tangents: list[AntennaFields]) -> jax.Array:
@@ -389,6 +393,7 @@ def _slopes_with_effects(
     stored, values = partial(materialize, positive=program.wavelength), effects.values
 
     def evaluate(index: jax.Array, results: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        # Effects change the antenna fields alone: their tangents meet the reverse pass over the power there.
         fields, push = jax.linearize(
             lambda value: antenna_fields(apply_effects(program, effects.effects, value)), values[index]
         )
@@ -405,11 +410,10 @@ def _slopes_with_effects(
         by_step, by_field = stored(pull(jnp.ones_like(power)))
         tangents = jax.vmap(push, out_axes=-1)(jnp.eye(values.shape[1], dtype=values.dtype))
         by_effect = jax.vmap(partial(segment_sums, program.by_link), -1, -1)(_by_path(by_field, tangents))
-        inverse = jnp.where(power > 0, 1 / jnp.where(power > 0, power, 1.0), 0.0)
         slope = jnp.zeros((program.num_links, tables.shape[1], 0))
         if columns:
             slope = _contract(changed, power, by_step, derivatives, tables.shape[1])
-        answers = decibel(power), slope, -10 / np.log(10) * inverse[:, None] * by_effect
+        answers = decibel(power), slope, _loss_slope(power)[:, None] * by_effect
         return tuple(
             result.at[index].set(answer.astype(result.dtype))
             for result, answer in zip(results, answers, strict=True)

@@ -112,8 +112,9 @@ def _sequence_codes(paths: Paths, number: NDArray[np.int64]) -> NDArray[np.int64
         digit = number[paths.first[:-1][deep] + step]
         code[deep] = np.where(digit > 0, code[deep] * 4 + digit, code[deep])
         if step % 16 == 15:
-            # Two bits a step: renumber before a long path exceeds 64 bits.
-            code = np.unique(code, return_inverse=True)[1].reshape(-1)
+            # Two bits a step: renumber before a long path exceeds 64 bits. The last digit of the new codes is 0, so
+            # that a path that goes on gets the code of no path that ends here.
+            code = 4 * np.unique(code, return_inverse=True)[1].reshape(-1)
     return code
 
 

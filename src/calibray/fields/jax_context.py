@@ -93,6 +93,7 @@ def _cache_of_jax(programs: Any) -> Iterator[None]:
     try:
         with (
             config.compilation_cache_dir(str(programs._path)),
+            # Programs that compile faster than JAX's limit are kept too.
             config.persistent_cache_min_compile_time_secs(0.0),
         ):
             yield

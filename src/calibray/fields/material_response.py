@@ -189,6 +189,7 @@ def pattern_value(table: jax.Array, diffuse: DiffuseArguments) -> jax.Array:
     share, alpha_i = jnp.where(is_directive, 1.0, share), jnp.where(is_directive, 1.0, alpha_i)
     norm_r, norm_i = (_normalization(alpha, diffuse) for alpha in (alpha_r, alpha_i))
     alpha_r, alpha_i, share = alpha_r[material], alpha_i[material], share[material]
+    # ((1 + cos psi) / 2)^alpha, with psi from the specular direction, and from the direction back to the source.
     lobes = (
         share * (0.5 * (1 + diffuse.cos_specular)) ** alpha_r
         + (1 - share) * (0.5 * (1 + diffuse.cos_backward)) ** alpha_i

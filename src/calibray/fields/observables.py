@@ -60,6 +60,7 @@ class Taps:
         Taps are 1 / bandwidth apart. At this spacing they preserve the power, the mean and the mean square of the
         delays of the sampled profile, wherever a path lies between two taps.
         """
+        # The two taps at or before the path, and the two after it.
         number = np.floor(delay * bandwidth).astype(np.int64)[:, None] + np.arange(TAPS) - TAPS // 2 + 1
         share = hann_pulse(number - delay[:, None] * bandwidth)
         span = int(number.max(initial=0)) + TAPS
@@ -234,6 +235,7 @@ def _statistic(channel: Channel, power: jax.Array, wanted: Statistic) -> jax.Arr
     angle = jnp.asarray(_angles(channel, wanted.kind))
     if wanted.kind in kinds.SECTORS:
         start, _ = wanted.bin
+        # Counted from the start of the sector, which may contain the jump from pi to -pi.
         turned = (angle - start) % (2 * np.pi) + start
         return _share(path_weight, turned, link, num_links, wanted)
     return angular_spread(path_weight, angle, link, num_links)
@@ -244,6 +246,7 @@ def _seen(power: jax.Array, link: jax.Array, num_links: int, wanted: Statistic) 
     level_db, seen = -decibel(power), jnp.ones_like(power)
     if wanted.dynamic_range_db is not None:
         strongest = jax.ops.segment_max(power, link, num_links)
+        # Level relative to the link's strongest tap; `decibel` is a loss.
         below = level_db + decibel(strongest)[link]
         seen = seen * jax.nn.sigmoid((below + wanted.dynamic_range_db) / SOFT_DB)
     if wanted.floor_db is not None:
@@ -259,6 +262,7 @@ def _share(
     low, high = wanted.bin
     share = link_mean(weight, ((value >= low) & (value < high)).astype(weight.dtype), link, num_links)
     range_db = kinds.SHARE_RANGE_DB if wanted.dynamic_range_db is None else wanted.dynamic_range_db
+    # Power below the dynamic range is not seen; it also keeps the level of an empty bin finite.
     return 10 * jnp.log10(share + 10 ** (-range_db / 10))
 
 
@@ -275,6 +279,7 @@ def _flight(
     start = jax.ops.segment_min(jnp.where(chosen, delay, jnp.inf), link, num_links)
     if wanted.bandwidth is None:
         return jnp.where(jnp.isfinite(start), start, jnp.nan)
+    # A path within 1 / bandwidth of the chosen one is not resolved from it; its weight falls as a raised cosine.
     apart = (delay - start[link]) * wanted.bandwidth
     unresolved = jnp.where(jnp.abs(apart) < 1.0, 0.5 * (1 + jnp.cos(jnp.pi * apart)), 0.0)
     return link_mean(weight * unresolved, delay, link, num_links)

@@ -294,6 +294,7 @@ def _diffuse(
 ) -> DiffuseArguments:
     table = paths.diffuse
     patterns = tuple(material.scattering_pattern for material in paths.materials.values())
+    # A Lambertian pattern depends on none of these angles.
     lobes = slice(0 if all(pattern == "lambertian" for pattern in patterns) else None)
 
     def column(values: NDArray[np.float64]) -> jax.Array:
@@ -324,6 +325,7 @@ def _group(paths: Paths, group: PathGroup, table_row: NDArray[np.int64], dtype: 
     # (lambda / 4 pi) A of the gain of a path
     scale = paths.spreading[group.paths] * speed_of_light / paths.frequency / (4 * np.pi)
     if paths.correction is not None:
+        # The correction is a ratio of powers, the scale one of fields.
         scale = scale * np.sqrt(paths.correction[group.paths])
     tx, rx = paths.tx_field[group.paths], paths.rx_field[group.paths] * scale[:, None, None]
     return Group(

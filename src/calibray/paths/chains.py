@@ -94,6 +94,7 @@ def compile_chains(chains: Chains) -> Geometry:
     # the target follows the last interaction
     stop[np.arange(count), length] = chains.target
     ahead = np.concatenate([stop[:, :1] - chains.source[:, None], np.diff(stop, axis=1)], axis=1)
+    # Behind the target, `stop` is padding.
     segment = np.linalg.norm(ahead, axis=2) * (np.arange(depth + 1) <= length[:, None])
     total = segment.sum(axis=1)
     direction = ahead / np.where(segment > 0, segment, 1.0)[..., None]
@@ -103,6 +104,8 @@ def compile_chains(chains: Chains) -> Geometry:
     departure_rotation = np.tile([1.0, 0.0], (count, 1))
     rotation, cosine = np.zeros((count, depth, 2)), np.zeros((count, depth))
     tables: dict[int, list[tuple[NDArray[Any], ...]]] = {Kind.DIFFUSE: [], Kind.DIFFRACTION: []}
+    # Solid angle of the ray tube, as in Sionna RT: rays share the sphere equally, and every interaction divides by the
+    # probability with which it was chosen.
     solid_angle = np.full(count, 4 * np.pi / chains.samples)
     # A diffuse reflection starts a new ray tube; length travelled up to there.
     tube_start = np.zeros(count)
@@ -120,6 +123,7 @@ def compile_chains(chains: Chains) -> Geometry:
         kind = chains.kind[row, step]
         entering = transverse_electric(incident, normal)
         mirrored = incident - 2 * _dot(incident, normal)[:, None] * normal
+        # Direction in whose basis Sionna RT expresses the field after the interaction.
         onward = np.where((kind == Kind.SPECULAR)[:, None], mirrored, incident)
         exiting = entering.copy()
 
@@ -135,6 +139,7 @@ def compile_chains(chains: Chains) -> Geometry:
                 )
             )
             exiting[diffuse], onward[diffuse] = spherical_basis(k_out, pole_reference=False), k_out
+            # The tube of a diffuse reflection is the half space.
             solid_angle[rows] = 2 * np.pi
             tube_start[rows] = travelled[rows]
 
@@ -147,11 +152,13 @@ def compile_chains(chains: Chains) -> Geometry:
                 k_in, k_out, normal[wedge], chains.normal_n[rows], edge, before * after / (before + after)
             )
             tables[Kind.DIFFRACTION].append((rows, np.full(len(rows), step), *constants))
+            # Edge-fixed frames: the first axes are k_in x e and -(k_out x e).
             entering[wedge] = _unit(_cross(k_in, edge))
             exiting[wedge], onward[wedge] = -_unit(_cross(k_out, edge)), k_out
 
         into = rotate(incident, spherical_basis(incident), entering)
         if step == 0:
+            # The first rotation is applied to the transmit field.
             departure_rotation[row], rotation[row, 0] = into, [1.0, 0.0]
         else:
             rotation[row, step] = _compose(out_of[row], into)
@@ -259,6 +266,7 @@ def _wedge(
     With distances s and s' to the edge, `distance` is s s' / (s + s').
     The columns are those of `Diffraction` (Kouyoumjian and Pathak 1974; ITU-R P.526-15 section 4.5).
     """
+    # Both normals point out of the wedge, so its interior angle is arccos(-n_0 . n_n).
     exterior = 2 * np.pi - np.arccos(np.clip(-_dot(normal_0, normal_n), -1, 1))
     cos_edge = np.abs(_dot(incident, edge))
     tangent = _unit(_cross(normal_0, edge))
@@ -288,6 +296,7 @@ def _azimuth(
     away: NDArray[np.float64], tangent: NDArray[np.float64], normal: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Angle of a direction that points away from the edge, from the 0-face in [0, 2 pi)."""
+    # arccos alone gives the angle in front of the plane of the 0-face; behind it, the azimuth is 2 pi minus that.
     angle = np.pi - np.arccos(np.clip(_dot(away, tangent), -1, 1))
     return np.pi - angle * _sign(_dot(away, normal))
 
@@ -335,4 +344,5 @@ def _reject(vector: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[n
 
 
 def _inverse(probability: NDArray[np.float64]) -> NDArray[np.float64]:
+    # A choice of probability 0 contributes nothing, as in Sionna RT.
     return np.where(probability > 0, 1 / np.where(probability > 0, probability, 1.0), 0.0)

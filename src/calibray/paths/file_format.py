@@ -75,6 +75,7 @@ class Content:
 
 
 _COSINE = (-1 - _ROUNDING, 1 + _ROUNDING)
+_TO_NORMAL = (0.0, _COSINE[1])  # normals point to the side of the wave
 _ANGLE = (-2 * pi - _ROUNDING, 2 * pi + _ROUNDING)
 # Far beyond any antenna (120 dB), scene and path, and far below numbers whose sum of powers overflows.
 _FIELD = (-1e6, 1e6)
@@ -98,15 +99,15 @@ DATASETS: Final[Mapping[str, Dataset]] = MappingProxyType(
         **{f"paths/rx_field_{part}": Dataset(("P", "R", 2), "f", *_FIELD) for part in ("real", "imag")},
         "interactions/kind": Dataset(("I",), "i"),
         "interactions/material": Dataset(("I",), "i"),
-        "interactions/cos_incidence": Dataset(("I",), "f", *_COSINE),
+        "interactions/cos_incidence": Dataset(("I",), "f", *_TO_NORMAL),
         "interactions/rotation": Dataset(("I", 2), "f", *_COSINE),
         "interactions/vertex": Dataset(("I", 3)),
         "diffuse/rotation": Dataset(("D", 2), "f", *_COSINE),
         "diffuse/solid_angle": Dataset(("D",), "f", 0.0, 1e9),
-        "diffuse/cos_scattered": Dataset(("D",), "f", *_COSINE),
+        "diffuse/cos_scattered": Dataset(("D",), "f", *_TO_NORMAL),
         "diffuse/cos_specular": Dataset(("D",), "f", *_COSINE),
         "diffuse/cos_backward": Dataset(("D",), "f", *_COSINE),
-        "diffraction/cos_incidence_n": Dataset(("W",), "f", *_COSINE),
+        "diffraction/cos_incidence_n": Dataset(("W",), "f", *_TO_NORMAL),
         "diffraction/exterior_angle": Dataset(("W",), "f", 0.0, _ANGLE[1]),
         "diffraction/azimuth_in": Dataset(("W",), "f", *_ANGLE),
         "diffraction/azimuth_out": Dataset(("W",), "f", *_ANGLE),
@@ -184,6 +185,7 @@ def _array(file: h5py.File, name: str, dataset: Dataset) -> NDArray[Any]:
     link = file.get(name, getlink=True)
     if not isinstance(item, h5py.Dataset) or not isinstance(link, h5py.HardLink):
         raise _damaged(f"no dataset {name}")
+    # A chunked or external dataset may declare more than the file stores.
     if item.chunks is not None or item.is_virtual or item.external is not None or item.nbytes > length:
         raise _damaged(f"dataset {name} is not stored contiguously")
     if item.ndim != len(dataset.shape):
@@ -276,6 +278,7 @@ def seal(path: str | Path) -> None:
     try:
         with target.open("rb") as file:
             head = file.read(BLOCK)
+            # A user block, sealed or still empty, precedes the content; other programs write none.
             start = BLOCK if head.startswith(PATH_SEAL) or not any(head) else 0
             file.seek(start)
             if not file.read(len(_SIGNATURE)) == _SIGNATURE:

@@ -240,6 +240,7 @@ def take(paths: Paths, index: NDArray[np.int64]) -> Paths:
     index = np.asarray(index, dtype=np.int64)
     depth = np.diff(paths.first)[index]
     first = np.concatenate([[0], np.cumsum(depth)]).astype(np.int64)
+    # Consecutive numbers from the first interaction of each taken path on.
     interaction = np.arange(first[-1]) - np.repeat(first[:-1], depth) + np.repeat(paths.first[index], depth)
     return replace(
         paths,
@@ -258,6 +259,7 @@ def take_links(paths: Paths, links: NDArray[np.int64]) -> Paths:
     start = np.searchsorted(paths.link, np.arange(paths.num_links + 1))
     count = np.diff(start)[links]
     end = np.cumsum(count)
+    # The paths of the first taken link, then those of the second, and so on.
     index = np.arange(count.sum()) + np.repeat(start[links] - (end - count), count)
     return replace(
         take(paths, index),
@@ -307,6 +309,7 @@ def join_links(parts: Sequence[tuple[NDArray[np.int64], Paths]]) -> Paths:
 
 def _rows(table: Table, has_row: NDArray[np.bool_], interaction: NDArray[np.int64]) -> Table:
     """The rows of some interactions in the table of their kind; `has_row` marks the interactions of that kind [I]."""
+    # An interaction's row is the number of interactions of its kind before it.
     row = (np.cumsum(has_row) - 1)[interaction[has_row[interaction]]]
     return type(table)(*(getattr(table, field.name)[row] for field in fields(table)))
 
