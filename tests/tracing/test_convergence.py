@@ -63,6 +63,14 @@ def test_the_change_is_the_difference_to_a_trace_with_twice_the_rays(yard_file, 
     assert coarse.settings == TraceSettings(max_depth=2, samples=500, diffuse_reflection=True)
 
 
+def test_the_largest_seed_is_followed_by_the_smallest(yard_file, links):
+    last = tracer(yard_file, ROUGH, samples=500, seed=2**32 - 1, diffuse_reflection=True)
+    before = last.trace(links)
+    finer = tracer(yard_file, ROUGH, samples=1000, seed=0, diffuse_reflection=True).trace(links)
+    expected = compare(before, finer, 500, path_loss).change_db
+    np.testing.assert_array_equal(check(last, links, before, path_loss).change_db, expected)
+
+
 def test_links_reached_in_one_trace_only_change_infinitely(yard_file, links):
     few, many = (tracer(yard_file, samples=n, line_of_sight=False).trace(links) for n in (3, 20_000))
     gained, lost = compare(few, many, 3, path_loss), compare(many, few, 3, path_loss)

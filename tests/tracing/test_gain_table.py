@@ -144,6 +144,12 @@ def test_gain_is_interpolated_in_decibel_across_the_seam_and_to_the_poles() -> N
     np.testing.assert_allclose(table.gain([-180.0, 180.0, 540.0], 90.0), table.gain_dbi[12, 0])
 
 
+def test_an_azimuth_that_rounding_moves_below_the_first_one_has_its_gain() -> None:
+    table = GainTable(0.0, np.random.default_rng(3).uniform(-20, 3, (13, 24)))
+    for below in (1e-16, 1e-15, 1e-14, 1e-13):
+        np.testing.assert_allclose(table.gain(-below, 0.0), table.gain_dbi[6, 0], atol=1e-9)
+
+
 def test_sionnas_pattern_function_interpolates_like_the_table() -> None:
     """In random directions and at the edges of the grid, for a grid from 0 and one from -180 degrees."""
     rng = np.random.default_rng(4)

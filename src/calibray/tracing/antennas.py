@@ -79,6 +79,7 @@ class AntennaPattern:
         is relative to its centre and can be negative.
         """
         if not self.antenna.is_array:
+            # Zenith angles grow downwards: the shifted pattern has the gain that the stated one has `downtilt` above.
             return self.element(xp.clip(zenith - downtilt, 0.0, np.pi), azimuth, xp)
         return self.element(zenith, azimuth, xp) * array_factor(
             self.antenna, zenith, azimuth, downtilt, steering, xp
@@ -93,6 +94,7 @@ class AntennaPattern:
         local = direction @ to_world
         zenith, azimuth = np.moveaxis(zenith_azimuth(local), -1, 0)
         slant = np.array(SLANTS[self.antenna.polarization])
+        # Components along the antenna's own theta and phi (3GPP TR 38.901, eq. 7.3-4/5).
         polarization = np.stack([np.cos(slant), np.sin(slant)], axis=-1)
         field = self.amplitude(zenith, azimuth)[:, None, None] * polarization
         antenna_basis = spherical_basis(local, pole_reference=False) @ to_world.T
@@ -120,6 +122,7 @@ def hw_dipole(zenith: Any, azimuth: Any, xp: Any = np) -> Any:
 
 def tr38901(zenith: Any, azimuth: Any, xp: Any = np) -> Any:
     """Amplitude of a base station's antenna element (3GPP TR 38.901, Table 7.3-1); see `Amplitude`."""
+    # Both cuts lose 12 dB at a whole beamwidth from the main direction, at most 30 dB; the gain is 8 dBi.
     vertical_loss_db = xp.minimum(12 * ((zenith - np.pi / 2) / BEAMWIDTH) ** 2, 30)
     horizontal_loss_db = xp.minimum(12 * (azimuth / BEAMWIDTH) ** 2, 30)
     return xp.power(10.0, (8 - xp.minimum(vertical_loss_db + horizontal_loss_db, 30)) / 20)
@@ -134,6 +137,7 @@ def array_factor(
     cosine and sine. Coupling between the antennas is neglected, as in Sionna RT and 3GPP TR 38.901, section 7.3.
     """
     horizontal, vertical = (2 * np.pi * distance for distance in antenna.spacing)
+    # Phase between neighbours: 2 pi d / lambda times the direction cosine along y or z, from the main direction on.
     of_columns = horizontal * (xp.sin(zenith) * xp.sin(azimuth) - xp.cos(downtilt) * xp.sin(steering))
     of_rows = vertical * (xp.cos(zenith) + xp.sin(downtilt))
     factors = [
@@ -262,6 +266,7 @@ def mount(paths: Paths, mountings: Mapping[str, Mounting]) -> Paths:
     for end, mounting in mountings.items():
         angles = paths.departure if end == "tx" else paths.arrival
         jones = stated_jones(mounting.of_paths(paths.link), angles)
+        # The stored field of an isotropic vertical antenna is the theta vector of the path.
         axis = getattr(paths, f"{end}_field").real[:, 0]
         fields[f"{end}_field"] = in_frame(jones, axis, arriving=end == "rx").astype(complex)
     return replace(paths, **fields)
@@ -336,6 +341,7 @@ def antenna_response(
         [[sum(row[k] * mount[k][axis] for k in range(3)) for axis in range(3)] for row in to_mount]
     )
     rotation = [[of_paths(element) for element in row] for row in rotation]
+    # The wave's direction, theta and phi in the antenna's own frame.
     (x, y, z), theta, phi = stored(
         [[sum(row[axis] * vector[axis] for axis in range(3)) for row in rotation] for vector in basis]
     )
@@ -348,6 +354,7 @@ def antenna_response(
     zenith, azimuth = stored((xp.arctan2(sin_zenith, z), xp.arctan2(sin_own, cos_own)))
     amplitude = pattern.amplitude(zenith, azimuth, tilt, steering, xp)
     # The antenna's own theta vector is that of the path turned about the direction.
+    # It is (z cos_own, z sin_own, -sin_zenith) there.
     cosine, sine = (
         vector[0] * z * cos_own + vector[1] * z * sin_own - vector[2] * sin_zenith for vector in (theta, phi)
     )

@@ -16,6 +16,7 @@ from calibray.errors import InputError
 from calibray.paths import Paths
 from calibray.support.progress import Progress
 from calibray.tracing.protocol import Links, Tracer
+from calibray.tracing.settings import RANGES
 
 PathLoss = Callable[[Paths], NDArray[np.float64]]
 """Path loss of every link of a path program [L], [dB]; as `calibray.path_loss`."""
@@ -103,7 +104,9 @@ def check(
             "trace.samples = 'auto' needs no second trace: its last round of rays is the check; its change is "
             "settings['last_round_db'] of the paths"
         )
-    finer = tracer.with_settings(replace(settings, samples=2 * settings.samples, seed=settings.seed + 1))
+    # The largest seed is followed by 0.
+    next_seed = (settings.seed + 1) % (RANGES["seed"][1] + 1)
+    finer = tracer.with_settings(replace(settings, samples=2 * settings.samples, seed=next_seed))
     return compare(before, finer.trace(links, progress), settings.samples, path_loss)
 
 

@@ -57,6 +57,7 @@ class TwoCuts:
         azimuth = (np.asarray(azimuth_deg, dtype=float) + 180.0) % 360.0 - 180.0
         down = -np.asarray(elevation_deg, dtype=float)
         horizontal, back = self._at(self.horizontal_db, -azimuth), np.abs(azimuth) / 180.0
+        # Both cuts state the gain in front and at the back; differences from there do not count it twice.
         front_db = self._at(self.vertical_db, down) - self.horizontal_db[0]
         back_db = self._at(self.vertical_db, 180.0 - down) - self.horizontal_db[180]
         return self.gain_dbi - (horizontal + (1 - back) * front_db + back * back_db)
@@ -146,6 +147,7 @@ def _cut(path: str | Path, first: int, lines: list[str], count: int, key: str) -
             )
         angle, attenuation = (float(word.replace(",", ".")) for word in words[:2])
         pairs[index] = _cut_in_range(place, "angle", angle), _cut_in_range(place, "attenuation", attenuation)
+    # Angles of a full turn may be stated at both of its ends; the first one counts.
     angle, order = np.unique(np.round(pairs[:, 0] % 360.0, 6), return_index=True)
     largest = float(np.diff([*angle, angle[0] + 360.0]).max())
     if largest > LARGEST_STEP_DEG:
@@ -220,7 +222,8 @@ class GainTable:
         row = (xp.asarray(elevation_deg, dtype=float) + 90) / elevation_step
         column = ((xp.asarray(azimuth_deg, dtype=float) - self.first_azimuth_deg) / azimuth_step) % columns
         i = xp.clip(row.astype(int), 0, rows - 2)
-        j = column.astype(int) % columns
+        # The remainder of a tiny negative number rounds to `columns`, the end of the last interval.
+        j = xp.minimum(column.astype(int), columns - 1)
         next_j = (j + 1) % columns
         u, v = row - i, column - j
         low = (1 - v) * gain_dbi[i, j] + v * gain_dbi[i, next_j]

@@ -178,6 +178,7 @@ def compile_paths(
         # The wave travels along `arrival`; the receiver sees it come from the opposite direction.
         arrival=zenith_azimuth(-arrival),
         tx_field=rotate_jones(tx_pattern.jones_vectors(departure), geometry.departure_rotation),
+        # The receive pattern goes from the basis of arrival back into the last frame: the inverse rotation.
         rx_field=rotate_jones(
             rx_pattern.jones_vectors(-arrival, arriving=True), geometry.arrival_rotation * [1, -1]
         ),

@@ -89,6 +89,7 @@ class Launches(Sequence[Launch]):
             return [self[number] for number in range(*index.indices(len(self)))]
         receiver_set, share = divmod(range(len(self))[index], self._shares)
         source, links = self._receivers[receiver_set]
+        # Shares differ by one ray at most, and together are all rays.
         first, end = (self._settings.rays * k // self._shares for k in (share, share + 1))
         seed = launch_seed(self._settings.seed, share)
         return Launch(source, links, first, end - first, seed, last=share == self._shares - 1)

@@ -204,6 +204,7 @@ class _SourceSearch:
             self.rays, self.change_db = launches * RAYS_PER_ROUND, float(change_db.max())
             power += gained
             quiet = quiet + 1 if self.change_db <= CONVERGED_DB else 0
+        # The limit of launches may also be reached after one quiet round, in which nothing was missing.
         if quiet < QUIET_ROUNDS and self.change_db > CONVERGED_DB:
             _LOG.warning(
                 "%s rays from %s still changed path loss by up to %.2f dB: paths may be missing",
@@ -264,6 +265,7 @@ class _SourceSearch:
                 "trace.max_depth, or trace fewer links at once"
             )
         gained = np.zeros(len(self._targets))
+        # Paths name their link; powers are kept by the place of the link in this launch.
         order = np.argsort(self._launch.links)
         for part in new:
             gain = self._solver.compute_fields(part)

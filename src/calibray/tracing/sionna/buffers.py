@@ -145,6 +145,7 @@ def reverse(buffer: PathsBuffer, sources: mi.Point3f) -> PathsBuffer:
         kind = per_interaction(reversed_buffer, "interaction_types")
         wedges.swap_faces(mi.Bool(aligned(_zero_face_is_dark(reversed_buffer, kind, start), np.bool_)))
         at_edge = kind == Kind.DIFFRACTION
+        # Sionna counts interactions from 1; 0 is a path without an edge.
         depth = np.where(at_edge.any(axis=1), at_edge.argmax(axis=1) + 1, 0)
         edge_depth = mi.UInt(aligned(depth, np.uint32))
         reversed_buffer.set_primitive(edge_depth, wedges.prim0, edge_depth > 0)

@@ -53,6 +53,7 @@ class Surfaces:
         length = np.linalg.norm(cross, axis=1, keepdims=True)
         self.normal: NDArray[np.float64] = cross / np.where(length > 0, length, 1)
         self.offset: NDArray[np.float64] = np.einsum("ti,ti->t", self.normal, corner[:, 0])
+        # Offsets and normals on one scale, on which planes are equal within `SAME_PLANE`.
         feature = np.c_[50 * self.normal, self.offset]
         # Both sides of a surface are one plane: the first component of the normal that is not 0 is made positive.
         leading = np.argmax(np.abs(feature[:, :3]) > SAME_PLANE, axis=1)
@@ -64,6 +65,7 @@ class Surfaces:
         self._high = np.full((len(grid), 3), -np.inf)
         np.minimum.at(self._low, self.plane, corner.min(axis=1))
         np.maximum.at(self._high, self.plane, corner.max(axis=1))
+        # Planes that nearly coincide may have got normals of opposite signs.
         self._tree = KDTree(np.vstack([self._feature, -self._feature])) if len(grid) else None
 
     def bounding_boxes(self, plane: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -288,6 +290,7 @@ def possible_pairs(
             kind = dr.gather(mi.UInt, kinds, at)
             goal = dr.gather(mi.Point3f, aim, at) + dr.gather(mi.Point3f, slide, at) * mi.Point3f(along_edge)
             n, d = dr.gather(mi.Point3f, normal, at), dr.gather(mi.Float, offset, at)
+            # Signed distances of both points from the plane; their line crosses it between them if the signs differ.
             near, far = dr.dot(n, vertex) - d, dr.dot(n, goal) - d
             crossing = vertex + (goal - vertex) * mi.Point3f(near / (near - far))
             inside = dr.all(crossing >= dr.gather(mi.Point3f, low, at)) & dr.all(

@@ -130,6 +130,7 @@ def _objects(item: Any) -> Iterator[MeshObject]:
     values = mi.traverse(item.mi_mesh)
     vertex = np.array(values["vertex_positions"], dtype=float).reshape(-1, 3)
     face = np.array(values["faces"], dtype=np.int64).reshape(-1, 3)
+    # Surfaces are connected through positions: files may repeat a corner for each face.
     position, welded = np.unique(vertex, axis=0, return_inverse=True)
     face = welded.reshape(-1)[face]
     ends = face[:, [0, 1, 1, 2]].reshape(-1, 2).T
@@ -188,6 +189,7 @@ def _antenna(end: str, array: Any, devices: Mapping[str, Any]) -> Antenna:
             f"the devices at the end {end} have different orientations; a study has one antenna per end: calibrate "
             "devices of one orientation at a time"
         )
+    # Uniform over the sphere except for its poles, where azimuths are undefined.
     azimuth, cosine = np.random.default_rng(0).uniform(
         [[-np.pi], [-0.999]], [[np.pi], [0.999]], (2, DIRECTIONS)
     )
@@ -246,10 +248,7 @@ def verify_export(tracer: Tracer, materials: Mapping[str, Material], target: Pat
         if held is None:
             raise InputError(_failed(target, f"Sionna RT has no material {shortened(repr(names[name]))}"))
         for constant in SCALAR_CONSTANTS:
-            expected, value = (
-                getattr(materials[name], constant),
-                float(np.array(getattr(held, constant)).item()),
-            )
+            expected, value = getattr(materials[name], constant), _number(getattr(held, constant))
             if not np.isclose(value, expected, rtol=1e-5, atol=1e-12):
                 fault = f"{constant} of {shortened(repr(names[name]))} is {value:g} in Sionna RT, not {expected:g}"
                 raise InputError(_failed(target, fault))

@@ -169,6 +169,7 @@ class Solver:
                     f"more paths than fit into memory, with {num_receivers} receivers at once; "
                     "lower trace.samples or trace.max_depth, or trace fewer links at once"
                 )
+            # The counter ends at the size of the buffer, so a full one may have lost candidates.
             if num_candidates < size - 1:
                 break
             size = min(4 * size, most)

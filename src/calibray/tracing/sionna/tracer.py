@@ -226,6 +226,7 @@ class Tracer:
         if backwards:
             buffer, source, target = reverse(buffer, target), target, source
         self.solver.compute_geometry(buffer, source, target, len(targets))
+        # After reversal, the receivers of the launch are the sources of the paths.
         end = buffer.source_indices if backwards else buffer.target_indices
         return TracedBuffer(buffer, source, target, launch.links[np.array(end, dtype=np.int64)])
 
@@ -245,6 +246,7 @@ class Tracer:
         origin = np.repeat(local, directions.shape[1], axis=0)
         ray = mi.Ray3f(mi.Point3f(*origin.T), mi.Vector3f(*np.tile(directions, len(points))))
         odd, active = np.zeros(len(origin), dtype=bool), np.ones(len(origin), dtype=bool)
+        # Every surface that a ray meets changes its side.
         for _ in range(64):
             hit = self.solver.mitsuba_scene.ray_intersect(ray, mi.Bool(active))
             active &= np.array(hit.is_valid(), dtype=bool)
