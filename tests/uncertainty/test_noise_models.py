@@ -16,6 +16,7 @@ from calibray.engines import Replay
 from calibray.fitting.problem import Problem
 from calibray.study import Setup, Study
 from calibray.uncertainty import laplace as tails
+from calibray.uncertainty.joint_model import joint_model
 from calibray.uncertainty.noise_models import (
     IMPROBABLE,
     OFFSET_DB,
@@ -274,3 +275,23 @@ def test_models_far_less_probable_are_left_out():
     best = density.densities(gap).max()
     assert fewer.densities(gap).min() > best - IMPROBABLE
     assert fewer.densities(gap).max() == best
+
+
+@pytest.mark.parametrize("stated_db", [0.5, 5.0])
+def test_priors_of_nuisances_have_their_declared_deviation_whatever_error_is_stated(stated_db):
+    """The level is that of the residuals, with all unknowns; the prior is in units of it."""
+    sections = {"offset": {"per": "half", "prior_db": 3.0}, "nuisance": {"slope": {"by": "log_distance"}}}
+    noise = {"std_db": stated_db, "heterogeneity": 0, "constants_spread": 0}
+    study = Study.from_content(planted.content("links.csv", noise=noise, **sections))
+    setup = Setup.open(study, links=links_from_frame(planted.links(), group="half"))
+    problem = Problem.of(setup, planted.engine())
+    measured = planted.campaign(noise_db=2.0).path_loss_db.to_numpy()
+    problem = replace(problem, objective=replace(problem.objective, measured=measured))
+    best = problem.parameters.to_search(np.array(list(planted.TRUTH.values())))
+    optimum = problem.squares(best[None])
+    freedom = optimum.num_rows - problem.unknowns
+    model = joint_model(problem, best, float(optimum.value[0] ** 2), freedom)
+    squares = float(np.sum(optimum.residuals**2))
+    assert model.marginal.noise_db == pytest.approx(np.sqrt(squares / freedom))
+    deviation_db = model.marginal.noise_db / model.marginal.ridge[:2]
+    assert deviation_db == pytest.approx([3.0, 3.0])

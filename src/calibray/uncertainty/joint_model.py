@@ -164,6 +164,7 @@ class JointModel:
         links, further = gaps[:, :last], np.zeros(len(gaps))
         for count, freedom, stated in self.observed:
             square = np.sum(gaps[:, last : last + count] ** 2, axis=1)
+            # A stated error is the unit of the rows. Otherwise the integral over it is square^(-freedom / 2).
             further += -0.5 * square if stated else -0.5 * freedom * np.log(np.maximum(square, 1e-300))
             last += count
         return links, further
@@ -196,6 +197,7 @@ class JointModel:
         """Draw points from the prior [count, d + k]."""
         grid = np.linspace(0.0, 1.0, GRID)
         line = np.tile(grid[:, None], (1, len(self.parameters)))
+        # Inverse transform sampling, one parameter at a time.
         density = np.ones_like(line)
         if len(self.priors):
             residual = self.priors.residuals(self.parameters.from_unit(line))
@@ -221,19 +223,22 @@ class JointModel:
 def joint_model(problem: Problem, best: NDArray[np.float64], square: float, freedom: int) -> JointModel:
     """Set up the unknowns that a study does not fix, from the optimum in the search space [d].
 
-    `square` is the mean square of its residuals [dB^2], and `freedom` the number of links minus unknowns.
+    `square` is the mean square of its residuals [dB^2], and `freedom` their number minus that of unknowns.
     """
     objective, links, section = problem.objective, problem.setup.links, problem.setup.study.noise
     weight, censored = _weights_and_censoring(problem)
     counted = np.flatnonzero(weight > 0)
     weight, censored = weight[counted], censored[counted]
+    # Of mean square one, as in the objective: the noise level is that of a link of mean weight.
     scale = np.sqrt(weight * len(weight) / weight.sum())
-    noise_db = float(np.sqrt(square * (freedom + len(problem.parameters)) / freedom))
+    noise_db = float(np.sqrt(square * (freedom + problem.unknowns) / freedom))
     nuisance, position = objective.nuisance, np.hstack([links.rx, links.tx])[counted]
     coefficients = objective.coefficients(problem.modelled(best[None]))[0]
+    # A coefficient at its bound stays there; the others are integrated over all numbers.
     at_bound = (coefficients <= nuisance.lower) | (coefficients >= nuisance.upper)
     design = nuisance.design[counted].toarray() if nuisance.terms else np.zeros((len(counted), 0))
     used = objective.determined & ~at_bound
+    # Few links distinguish neither noise models nor buildings.
     few = len(counted) < FEW
     # With correlated errors, the probability of censoring is an integral over all censored links.
     uncorrelated = few or bool(censored.any())
@@ -247,7 +252,7 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
         out_of_sight=out_of_sight,
     )
     excess = excess_db(problem)[counted] if out_of_sight else None
-    ridge = objective.noise_db / nuisance.prior[used] if nuisance.terms else np.zeros(0)
+    ridge = noise_db / nuisance.prior[used] if nuisance.terms else np.zeros(0)
     marginal = Marginal.of(design[:, used], ridge, scale, position, noise_db, models, censored, excess)
     measured = objective.measured[counted] - design[:, at_bound] @ coefficients[at_bound]
 
@@ -304,6 +309,7 @@ def _with_constants(
 
     if fixed:
         values = np.append(study.from_search(best), [item.start for item in fixed])
+        # One row per fixed constant, in which it is larger by one standard deviation.
         steps = np.exp(known_to * np.eye(len(values))[len(study) :])
         alike = np.ones((len(values) - len(study) + 1, len(replay.parameter_of)))
         gaps = gap(loss_at(np.vstack([values, values * steps]), alike))
@@ -321,6 +327,7 @@ def _with_constants(
         all_values[:, index] = values
         return all_values
 
+    # Constants that the scene fixes have one value for all buildings.
     of_building = np.flatnonzero((replay.building_of >= 0) & (replay.parameter_of < len(study)))
     parameter_of = replay.parameter_of[of_building]
     constants = np.bincount(replay.parameter_of, minlength=len(every))[: len(study)]
