@@ -113,6 +113,7 @@ class ReplayedModel:
 
     def __post_init__(self) -> None:
         start = self.engine.parameters.start
+        # The paths are stored, so a link without any gets none for other candidates.
         self._reached = np.isfinite(self.engine.path_loss(start[None])[0])
 
     @property

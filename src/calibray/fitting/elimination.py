@@ -122,6 +122,7 @@ class Elimination:
         side = side[:, self.order]
         best = np.empty_like(side)
         if self.separable:
+            # One column per link: the normal equations are diagonal, so each clipped mean is the minimum.
             best[:, self.order] = side / np.where(self.normal.held, np.inf, self.normal.scale**2)
             return np.clip(best, self.lower, self.upper)
         best[:, self.order] = self.normal.minimum(side, self.lower[self.order], self.upper[self.order])
@@ -145,6 +146,7 @@ class Elimination:
         self, side: NDArray[np.float64], coefficients: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """`projection` [n, q, d] from sums over the links, Z' W times the derivatives [n, q, d]."""
+        # A coefficient at its bound does not follow the parameters.
         free = ((coefficients > self.lower) & (coefficients < self.upper))[:, self.order]
         projection = np.empty_like(side)
         projection[:, self.order] = self.normal.solve(free & ~self.normal.held, side[:, self.order])
@@ -273,6 +275,7 @@ class Arrowhead:
         inner = side[:, :split].reshape(len(side), groups, width, -1)
         solved = np.linalg.solve(blocks, np.concatenate([border, inner], axis=-1))
         across, within = solved[..., :edge], solved[..., edge:]
+        # Schur complement: the border with the blocks eliminated.
         schur = corner - np.einsum("mgbp,mgbr->mpr", border, across, optimize=True)
         outer = np.linalg.solve(schur, side[:, split:] - np.einsum("mgbp,mgbk->mpk", border, within))
         within = within - across @ outer[:, None]
@@ -305,6 +308,7 @@ def _dependent(matrix: NDArray[np.float64]) -> NDArray[np.bool_]:
     for k in range(matrix.shape[-1]):
         pivot = remainder[..., k, k].copy()
         dependent[..., k] = pivot <= DEPENDENT
+        # A dependent column eliminates nothing.
         root = np.where(dependent[..., k], np.inf, np.sqrt(np.maximum(pivot, DEPENDENT)))
         column = remainder[..., :, k] / root[..., None]
         remainder -= column[..., :, None] * column[..., None, :]

@@ -71,6 +71,7 @@ def retrace(
         if displaced and paths is not None:
             setup = setup.placed_at(parameters.named(best), AROUND)
             engine, before = replay(setup, paths), best
+            # From the stated weights, because errors of earlier positions no longer apply.
             weight, error_db = np.where(objective.weight > 0, stated.weight, 0.0), gap
             for effect in getattr(engine, "effects", ()):
                 if isinstance(effect, DisplacementLoss):

@@ -86,6 +86,7 @@ class Term:
         if labels is None:
             return replace(self, value=value, group=np.zeros(len(links), dtype=np.int64))
         link_labels = _labels(self.name, links, labels)
+        # The labels are sorted. An unknown one finds a neighbour, which it does not equal.
         index = np.minimum(np.searchsorted(self.labels, link_labels), len(self.labels) - 1)
         matches = np.array(self.labels)[index] == link_labels
         return replace(self, value=value, group=np.where(matches, index, -1))
@@ -285,6 +286,7 @@ class Nuisance:
         """
         variance = np.zeros(self.num_links)
         for term in self.terms:
+            # A group of a single block has no other link that determines its coefficient.
             pairs = np.unique(np.stack([term.group, block])[:, block >= 0], axis=1)
             alone = np.bincount(pairs[0], minlength=len(term.labels)) == 1
             variance += (
@@ -300,6 +302,7 @@ class Nuisance:
         first = 0
         for term in self.terms:
             last = first + len(term.labels)
+            # The mean of a random effect is the term before its deviations.
             shared = coefficient.get(term.around, {}).get("", 0.0)
             values = zip(term.labels, coefficients[first:last].tolist(), determined[first:last], strict=True)
             coefficient[term.around or term.name] = {

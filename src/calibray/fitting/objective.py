@@ -78,6 +78,7 @@ class Share:
         at_ceiling = loss >= (np.inf if self.ceiling_db is None else self.ceiling_db)
         gap = self.measured - (loss if self.ceiling_db is None else np.minimum(loss, self.ceiling_db))
         lost = np.asarray(~np.isfinite(gap).all(axis=1))
+        # A candidate that loses a path is marked below; its sums must stay finite.
         columns = np.where(lost[:, None], 0.0, gap)[..., None]
         if derivative is not None:
             slope = np.where((at_ceiling | lost[:, None])[..., None], 0.0, derivative[:, self.links])
@@ -182,6 +183,7 @@ class Objective:
             self._elimination.remove(slope, projection)
             has_prior = self._ridge > 0
             if has_prior.any():
+                # The best coefficients change by minus the projection.
                 prior_rows = -(projection * self._ridge[:, None])[:, has_prior]
         slope *= self._scale[:, None]
         return slope if prior_rows is None else np.concatenate([slope, prior_rows], axis=1)

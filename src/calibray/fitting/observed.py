@@ -84,6 +84,7 @@ class Observed:
     def slopes(self, derivative: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
         """Derivatives of the residuals [n, m, k], from those of the modelled values [n, L, k]."""
         used = self.used(weight)
+        # A link without a statistic has the residual 0 for any parameters.
         slope = np.nan_to_num(derivative[:, used] / self.scale)
         if self.labels:
             slope = (

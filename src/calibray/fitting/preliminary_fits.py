@@ -77,8 +77,10 @@ def leave_out_near_floor(problem: Problem, progress: Progress | None = None) -> 
         fit = least_squares(problem, SEARCHES if turn == 0 else 1, starts)
         starts = fit.minima[:SEARCHES]
         rmse_db = float(problem.squares(fit.best.x[None]).rmse_db[0])
+        # The fit absorbs the errors of as many links as there are unknowns.
         error_db = rmse_db * np.sqrt(objective.num_counted / max(problem.freedom, 1))
         predicted = objective.model(problem.modelled(fit.best.x[None]))[0]
+        # Negated, so that a link without a predicted path counts as faint.
         before, faint = faint, (all_weights > 0) & ~(predicted <= limit - MARGIN * error_db)
         if progress is not None:
             progress("choosing links", turn + 1, SELECTIONS)
@@ -183,6 +185,7 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
     for index, term in enumerate(terms):
         if not term.around:
             continue
+        # Without the deviations, their scatter is in the residuals.
         others = Nuisance(len(objective.weight), (*terms[:index], *terms[index + 1 :]))
         without = replace(problem, objective=replace(objective, nuisance=others))
         evaluation = without.evaluate(point[None], derivatives=problem.differentiable)
@@ -272,6 +275,7 @@ def group_spread(
         inner, side = weighted[:-1, :-1], weighted[:-1, -1]
         variance = float(weighted[-1, -1] - side @ np.linalg.solve(inner, side)) / freedom
         variance = max(variance, 1e-12)
+        # Minus twice the restricted log likelihood; |V| is the product of 1 + ratio x square over the groups.
         deviance = freedom * np.log(variance) + np.log1p(ratio * square).sum() + np.linalg.slogdet(inner)[1]
         if deviance < best:
             best, spread = deviance, GroupSpread(float(np.sqrt(ratio * variance)), float(np.sqrt(variance)))
@@ -314,6 +318,7 @@ def estimate_spreads(problem: Problem, progress: Progress | None = None) -> Prob
         spreads = {}
         for field, numbers in members.items():
             width = parameters.upper[numbers[0]] - parameters.lower[numbers[0]]
+            # Fitted values are drawn towards 0 by their prior; their variances make up for it.
             square = np.mean(fit.best.x[numbers] ** 2 + variance[numbers])
             spreads[field] = float(max(np.sqrt(square), LEAST * width))
         stated = problem.setup.study

@@ -174,6 +174,7 @@ class Problem:
         answer = self.respond(candidates, with_slopes)
         modelled, observed = answer.path_loss, answer.observed
         if with_slopes and answer.loss_slope is not None:
+            # Chain rule: from the fields' units to the search coordinates.
             unit = parameters.search_slope(candidates)
             further = (
                 None if answer.observed_slope is None else answer.observed_slope * unit[:, None, None, :]

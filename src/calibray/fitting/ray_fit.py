@@ -82,7 +82,7 @@ class Ratio(NamedTuple):
     Attributes:
         call: The earlier call.
         here: Their indices in the last call, ascending [n].
-        weight: Their weights, 1 over all ratios [n].
+        weight: Their weights, of sum 1 over all ratios [n].
         level_db: Power in the last call [n], [dB].
         observed: Power in the last call over that in the earlier one [n], [dB].
     """
@@ -292,6 +292,7 @@ def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: in
     lower, upper = fit.model.bounds
     start, tables = np.clip(fit.values, lower, upper), _tables(fit.model, ratios, last)
     size = np.linalg.norm(_errors(replace(fit, values=start), ratios, tables)[1], axis=0)
+    # A value that changes no ratio would make the normal equations singular.
     free = np.flatnonzero(size > 1e-9 * size.max(initial=1e-9))
     lower, upper, values = lower[free] - 1e-9, upper[free] + 1e-9, start[free]
     kept: dict[bytes, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}

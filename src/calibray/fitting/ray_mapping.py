@@ -242,6 +242,7 @@ def _most_informative(problem: Problem, call: Call, random: np.random.Generator)
         _, (first, *slopes) = model.levels_and_slopes(tables, values, (False, False))
         for number, slope in enumerate(slopes):
             part = ((slope - first) * weight)[:, :count]
+            # The identity is a prior: each constant is known to a factor of e.
             information[number] += np.linalg.slogdet(np.eye(count) + part.T @ part)[1]
     return probes[int(np.argmax(information))]
 

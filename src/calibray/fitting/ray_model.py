@@ -149,6 +149,7 @@ class RayModel:
         levels, slopes = [], []
         for start in range(0, len(tables), BATCH):
             part = tables[start : start + BATCH]
+            # Padded to the compiled number of candidates.
             batch = np.concatenate([part, np.repeat(part[:1], BATCH - len(part), axis=0)])
             if self.known:
                 loss, by_material, _ = path_losses_and_slopes(program, batch, _COLUMNS, count=len(part))
@@ -158,6 +159,7 @@ class RayModel:
                 loss, by_material, by_angle = path_losses_and_slopes_with_effects(
                     program, batch, effects, _COLUMNS, count=len(part)
                 )
+            # By the logarithms of the constants.
             by_constant = by_material[:, :, rows, columns] * np.exp(values[:count])
             level, slope = -loss, -np.concatenate([by_constant, by_angle], axis=-1)
             levels.append(np.maximum(level, LEAST_DB))
@@ -224,6 +226,7 @@ class RayModel:
     def _by_path(self) -> tuple[GroupedProgram, Polarized]:
         """The program with each path as a link of its own, and the polarization of its antennas."""
         count = self.paths.num_paths
+        # Path loss of such a link is minus the power of its path, whatever the phase.
         nowhere = np.zeros((count, 3))
         plan = layout(
             replace(self.paths, link=np.arange(count), tx_position=nowhere, rx_position=nowhere), phases=False

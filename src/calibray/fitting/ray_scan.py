@@ -175,8 +175,10 @@ def _minima(
     )
     for pair in range(pairs):
         order = np.lexsort((square[:, pair], group))
+        # The best conductivity of every thickness.
         first = order[np.flatnonzero(np.diff(group[order], prepend=-1))]
         lowest = square[first, pair]
+        # Both ends of the range can be minima.
         around = np.minimum(np.append(np.inf, lowest[:-1]), np.append(lowest[1:], np.inf))
         found = first[lowest <= around]
         found = found[np.argsort(square[found, pair], kind="stable")[:KEPT]]
@@ -342,6 +344,7 @@ def antennas(parts: list[Gains], angles: NDArray[np.float64]) -> list[NDArray[np
     _, distinct = np.unique(np.round([cost for cost, _ in found], 6), return_index=True)
     lowest = [found[index][1] for index in distinct[:KEPT]]
     for each in lowest:
+        # A linear polarization has the period pi.
         each[[0, ANGLES]] = np.remainder(each[[0, ANGLES]] + np.pi / 2, np.pi) - np.pi / 2
     return lowest
 
@@ -372,6 +375,7 @@ def _scan_angles(parts: list[Gains], end: int, other: NDArray[np.float64]) -> li
             along = np.einsum("prt,pr->pt" if end == 0 else "prt,pt->pr", gain, weight)
             first = (theta * along).sum(axis=2)[:, None]
             second = (theta[..., 0] * along[:, 1] - theta[..., 1] * along[:, 0])[:, None]
+            # |cos x first + sin x second|^2, from three products for all slants.
             cross = (first * second.conj()).real
             levels.append(
                 _level(cos**2 * np.abs(first) ** 2 + sin**2 * np.abs(second) ** 2 + 2 * cos * sin * cross)

@@ -248,6 +248,7 @@ def find_minima(problem: Problem, trail: Trail) -> tuple[NDArray[np.float64], ND
     They are points of the search space, the calibrated one first [k, d], and their mean squares [k].
     """
     points = np.concatenate([problem.parameters.to_search(trail.best)[None], trail.minima])
+    # The calibrated point and the optimizer's best one are the same minimum.
     if len(points) <= 2:
         points = np.concatenate([points, least_squares(problem, SEARCHES, points).minima])
     return points, problem.squares(points).value ** 2

@@ -387,6 +387,7 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     parameters = problem.parameters
     candidates = np.stack([parameters.to_search(best), parameters.to_search(parameters.start)])
     terms = objective.nuisance.terms
+    # In units of the largest difference between repeats; two groups differ by 2 or more.
     columns = np.array([
         *np.nan_to_num(problem.modelled(candidates)[:, counted] / REPEAT_DB),  # inf without a path
         *(term.value[counted] / 1e-3 for term in terms),
@@ -396,6 +397,7 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     first = np.full(len(counted), -1)
     for row in range(len(counted)):
         if first[row] < 0:
+            # A first row takes all later rows that agree with it.
             near = np.array(tree.query_ball_point(position[row], REPEAT_M))
             equal = (np.abs(columns[:, near] - columns[:, [row]]) <= 1.0).all(axis=0) & (first[near] < 0)
             first[near[equal]] = row

@@ -91,6 +91,7 @@ class Split(ABC):
     @property
     def keys(self) -> NDArray[np.int64]:
         """A number for the parameter and building of every constant, ascending [c]."""
+        # Building -1 comes just before building 0 of the same parameter.
         return (self.parameter_of << 32) + self.building_of
 
     def path_loss(self, values: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -258,6 +259,7 @@ def _split_paths(
     items, keys = [], []
     at_carrier, constant_of = parameters.at_carrier(paths.frequency)
     for constant_index, constant in enumerate(at_carrier):
+        # Both coefficients of a law set one constant.
         setting = np.flatnonzero(constant_of == constant_index).tolist()
         # Buildings differ by factors of a constant or of its law's scale, but not if only the exponent is a parameter.
         scaling = [index for index in setting if parameters.items[index].field not in EXPONENTS]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.protocol import Responses
-from calibray.fitting.cheap_replay import ReplayedModel
+from calibray.fitting.cheap_replay import ProblemRows, ReplayedModel
 from calibray.fitting.observed import Observed
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
@@ -102,10 +102,8 @@ class ResponseRows:
 
     @property
     def filling(self) -> NDArray[np.float64]:
-        """The ceiling, or without one the measured path loss [L], [dB]."""
-        objective = self.problem.objective
-        ceiling = objective.ceiling_db
-        return objective.measured if ceiling is None else np.full(len(objective.measured), ceiling)
+        """See `Rows.filling`."""
+        return ProblemRows(self.problem).filling
 
     def known(self, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """See `Rows.known`."""
@@ -208,6 +206,7 @@ class EmulatedEngine:
             return Responses(*self._for_all_links(base + self.function.values(inputs), wanted))
         base, slope, inputs, change = self.mean.base_and_slope(unit)
         box, scale = self._box, self.parameters.search_slope(candidates)
+        # From derivatives by the unit cube's coordinates to those by the fields' values.
         slope = (slope + self.function.slopes(inputs, change)) / (box.width * scale[:, None, :])
         links, last = self.rows.links, len(self.rows.links)
         loss_slope = np.zeros((count, len(self.initial_loss), box.dimension))
@@ -321,6 +320,7 @@ def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Call
     parameters = problem.parameters
     candidates, modelled = np.array(trail.candidates), np.array(trail.modelled)
     observed = np.array(trail.observed)
+    # The problem keeps path loss at the initial values, but no observables.
     if not problem.observed:
         candidates = np.vstack([candidates, parameters.start])
         modelled = np.vstack([modelled, problem.before])
@@ -352,4 +352,5 @@ def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Call
 
 def _steepness(unit: NDArray[np.float64]) -> float:
     """Factor that scales the responses to a total mean square of one over the cube."""
+    # A coordinate that is uniform in the unit cube has variance 1 / 12.
     return float(np.sqrt(12.0 / unit.shape[1]))

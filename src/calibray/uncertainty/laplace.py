@@ -81,6 +81,7 @@ def log_evidence(
             break
         trial = np.asarray(point + np.clip(step, -_longest(point), _longest(point)), dtype=np.float64)
         trial_value, trial_slope, trial_curvature = joint(trial, gap, censored, design, ridge, freedom)
+        # Damping as in Levenberg's method: less after a step that raises the density, more after others.
         better = trial_value > value
         point = np.where(better[:, None], trial, point)
         value = np.where(better, trial_value, value)
@@ -89,6 +90,7 @@ def log_evidence(
         damping = np.clip(np.where(better, damping / 10, damping * 10), 1e-12, 1e12)
     has_prior = ridge > 0
     value = value + np.log(ridge[has_prior]).sum() - 0.5 * has_prior.sum() * np.log(2 * np.pi)
+    # Laplace: the density at the mode times (2 pi)^(k/2) |minus the Hessian|^(-1/2), for k = q + 1.
     eigenvalues = np.maximum(np.linalg.eigvalsh(curvature), 1e-12)
     return value + 0.5 * point.shape[1] * np.log(2 * np.pi) - 0.5 * np.log(eigenvalues).sum(axis=1)
 
@@ -311,11 +313,13 @@ def _mode(
     links, columns = design.shape
     outer = (design[:, :, None] * design[:, None, :]).reshape(links, -1)
     errors, coefficients, change = gap, np.zeros((len(gap), columns)), np.float64(0.0)
+    # Gaps leave the iteration when they have converged; `rows` are those that remain.
     mode, rows = (gap.copy(), coefficients.copy(), size.copy()), np.arange(len(gap))
     for step in range(MAX_STEPS):
         variance = size**2
         weight = tail.weight(errors**2 / variance[:, None])
         if columns:
+            # Weighted normal equations, times the variance.
             matrix = (weight @ outer).reshape(-1, columns, columns) + variance[:, None, None] * prior
             side = (weight * gap) @ design
             coefficients = np.linalg.solve(regular(matrix), side[..., None])[..., 0]

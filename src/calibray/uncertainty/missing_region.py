@@ -96,28 +96,31 @@ def missing_region(
     Returns:
         The rectangle; None if there are too few links, or no extra loss explains anything.
     """
+    if len(excess_db) < FEWEST_LINKS:
+        return None
     step = -(-len(excess_db) // MOST)
     tx, rx, excess_db = tx[::step], rx[::step], excess_db[::step]
     distance = np.log10(np.maximum(np.linalg.norm(rx - tx, axis=1), 1.0))
     design = np.column_stack([np.ones(len(distance)), distance, *(column[::step] for column in known)])
     basis, sizes, _ = np.linalg.svd(design, full_matrices=False)
     basis = basis[:, sizes > 1e-9 * sizes[0]]
-    if len(excess_db) < FEWEST_LINKS:
-        return None
     residual = excess_db - basis @ (basis.T @ excess_db)
     square = float(residual @ residual)
     if square <= 0:
         return None
     random = np.random.default_rng(0)
     orders = np.stack([residual, *(random.permutation(residual) for _ in range(SHUFFLES))])
+    # In another order, residuals are no longer orthogonal to the fitted columns.
     orders -= (orders @ basis) @ basis.T
     corner, cell = _grid(tx, rx)
     lowest = float(min(tx[:, 2].min(), rx[:, 2].min()))
     best, chance = None, np.zeros(SHUFFLES)
     for height in HEIGHTS:
         length = _lengths(tx, rx, corner, cell, lowest + height)
+        # The part of the lengths that the fitted columns do not explain already.
         inside = length - basis @ (basis.T @ length)
         rectangles = list(_rectangles(inside.T @ orders.T, inside.T @ inside))
+        # Residuals in random order have the same choice of heights and rectangles.
         chance = np.maximum(chance, np.max([rectangle.chance for rectangle in rectangles], axis=0))
         top = max(rectangles, key=lambda rectangle: rectangle.explained)
         if top.explained / square > (0.0 if best is None else best.share):
@@ -157,6 +160,7 @@ def _lengths(
     point = tx[:, None] + share[:, None] * (rx - tx)[:, None]
     index = np.clip(((point[..., :2] - corner) / cell).astype(np.int64), 0, GRID - 1)
     number = np.arange(len(tx))[:, None] * GRID**2 + index[..., 0] * GRID + index[..., 1]
+    # Each point stands for a piece of its line; pieces above the top have no length inside.
     piece = np.linalg.norm(rx - tx, axis=1)[:, None] / SAMPLES * (point[..., 2] < top)
     counts = np.bincount(number.reshape(-1), piece.reshape(-1), len(tx) * GRID**2)
     return counts.reshape(len(tx), GRID**2).astype(np.float64)
@@ -175,6 +179,7 @@ def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> 
     for columns in range(1, GRID + 1):
         west = np.arange(GRID + 1 - columns)
         east = west + columns
+        # Products of the rectangles' columns with themselves: differences along x, then along y, in both indices.
         strip = total[east, :, east] - total[east, :, west] - total[west, :, east] + total[west, :, west]
         square = (
             strip[:, north, north] - strip[:, north, south] - strip[:, south, north] + strip[:, south, south]
@@ -183,6 +188,7 @@ def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> 
         # Below this, rounding dominates.
         used = square > 1e-6 * largest
         root = np.where(used, 1.0 / np.sqrt(np.where(used, square, 1.0)), 0.0)
+        # Signed root of the sum of squares that a rectangle explains: only extra loss counts.
         loss = band[:, north]
         loss -= band[:, south]
         loss *= root[..., None]

@@ -57,6 +57,7 @@ def excess_db(problem: Problem) -> NDArray[np.float64]:
 
     links, (lower, upper) = problem.setup.with_obstruction().links, problem.parameters.search_bounds
     points = qmc.scale(qmc.Sobol(len(lower), rng=0).random(CANDIDATES), lower, upper)
+    # Free-space loss is 20 log10(distance x frequency) plus a constant that cancels below.
     electrical = np.maximum(links.distance, 1e-3) * (1.0 if links.frequency is None else links.frequency)
     excess = np.median(problem.modelled(points), axis=0) - 20.0 * np.log10(electrical)
     strongest = np.quantile(excess[problem.objective.weight > 0], STRONGEST)
@@ -66,6 +67,7 @@ def excess_db(problem: Problem) -> NDArray[np.float64]:
 
 def missing_db(excess: NDArray[np.float64], level: float) -> NDArray[np.float64]:
     """Change of path loss by missing power at a level below the line of sight, for links of this excess [dB]."""
+    # 10 log10(1 + 10^((excess - level) / 10)), without overflow.
     return 10.0 * np.logaddexp(0.0, (excess - level) * (0.1 * np.log(10.0))) / np.log(10.0)
 
 
@@ -156,6 +158,7 @@ def noise_models(
     Returns:
         The models; their weights sum to one.
     """
+    # A declared range rules out independent errors, and a range of 0 correlated ones.
     kinds = [[NoiseModel(GAUSSIAN, 1.0)]] if kind != HEAVY and not range_m else []
     ranges = _ranges(position) if range_m is None else (range_m,) * (range_m > 0)
     if kind != HEAVY and ranges:
@@ -164,6 +167,7 @@ def noise_models(
         kinds.append([NoiseModel(OUT_OF_SIGHT, 1.0, range=level) for level in LEVELS])
     if kind != GAUSSIAN and not range_m:
         tails = [NoiseModel(HEAVY, 1.0, freedom=freedom) for freedom in FREEDOMS]
+        # A declared Student's t excludes gross errors.
         if kind != HEAVY and not censored:
             tails.append(NoiseModel(HEAVY, 1.0, gross=True))
         kinds.append(tails)
@@ -192,6 +196,7 @@ def _ranges(position: NDArray[np.float64]) -> tuple[float, ...]:
         return ()
     high = float(distance.max()) / 3
     np.fill_diagonal(distance, np.inf)
+    # Typical distance to the nearest other position.
     low = float(np.median(distance.min(axis=1)))
     repeated = (SAME_PLACE * low,) if len(places) < len(position) else ()
     return (*repeated, *np.geomspace(low, max(high, 2 * low), RANGES).tolist())
@@ -246,6 +251,7 @@ class Marginal:
         censored = np.zeros(len(scale), dtype=bool) if censored is None else censored
         whiteners = {}
         keys = sorted({(model.kind, model.range, model.share) for model in models})
+        # One search for neighbours serves all ranges.
         many = len(position) > EXACT and any(kind == CORRELATED for kind, _, _ in keys)
         near = nearest_earlier(position) if many else None
         for kind, range_, share in keys:
@@ -299,6 +305,7 @@ class Marginal:
             white, shift = filter_.apply(white), 0.5 * filter_.log_determinant
         square, freedom = white.T @ white, len(design) - int((ridge == 0).sum())
         if len(ridge):
+            # The form is S of the module; the shift contains |C| and |A|.
             columns = white @ design
             matrix, side = regular(columns.T @ columns + np.diag(ridge**2)), columns.T @ white
             square -= side.T @ np.linalg.solve(matrix, side)
@@ -314,6 +321,7 @@ class Marginal:
         design, ridge = self._with_offset(bool(offset.any()))
         by_gap = np.tile(ridge / self.noise_db, (len(gap), 1))
         if offset.any():
+            # So large a ridge fixes the offset at 0. Its normalisation cancels its integral.
             by_gap[~offset, -1] = NO_OFFSET
         freedom = np.array([model.freedom for model in models])
         return evidence(gap, design, by_gap, gross() if models[0].gross else student(freedom))
@@ -338,6 +346,7 @@ def _plain(
     freedom = gap.shape[1] - int((ridge == 0).sum())
     square, log_root = np.sum(gap**2, axis=1), 0.0
     if design.shape[1]:
+        # With A = F F', y'Z A^-1 Z'y is the square of F^-1 Z'y, and |A|^(1/2) the product of F's diagonal.
         factor = np.linalg.cholesky(regular(design.T @ design + np.diag(ridge**2)))
         square = square - np.sum(np.linalg.solve(factor, design.T @ gap.T) ** 2, axis=0)
         log_root = float(np.log(np.diag(factor)).sum())

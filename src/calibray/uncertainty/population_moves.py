@@ -150,6 +150,7 @@ class Moves:
         # 2.38 / sqrt(2 k) is the optimal length for k moving coordinates of a normal density (ter Braak).
         length = lengths.points * 2.38 / np.sqrt(2.0 * moving.sum(axis=1, keepdims=True))
         length = length * np.exp(0.4 * random.standard_normal((count, 1)))
+        # The full difference of two modes carries a member from one to the other.
         full = random.random((count, 1)) < 1 / 3
         step = np.where(full, 1.0, length) * (population.point[first] - population.point[second])
         point = population.point + moving * (step + JITTER * random.standard_normal((count, width)))
@@ -169,6 +170,7 @@ class Moves:
             size = (centre[np.minimum(high, count - 1)] - centre[np.maximum(low, 0)]) / 2 + JITTER
             kernel = random.integers(0, count, len(rows))
             value = centre[kernel] + size[kernel] * random.standard_normal(len(rows))
+            # The rule needs the proposal's density at the present value and at the new one.
             both = np.concatenate([population.point[rows, index], value])
             density = np.mean(np.exp(-0.5 * ((both[:, None] - centre) / size) ** 2) / size, axis=1)
             with np.errstate(divide="ignore"):
@@ -199,6 +201,7 @@ class Moves:
         normal = random.standard_normal((count, width))
         deviation = np.sqrt(1.0 - length**2) * population.deviation + length * normal
         moved = replace(population, deviation=deviation)
+        # Without a spread, deviations have no effect: no replay is needed, and every move is accepted.
         proposal = self._evaluated_where(population.spread > 0, population, moved)
         accepted = self._accepts(population, proposal)
         buildings = _adapted(lengths.buildings, accepted[all_buildings & (population.spread > 0)], 1.0)
@@ -212,6 +215,7 @@ class Moves:
             spread=self.model.draw_spread(count, self.random),
             deviation=self.random.standard_normal(population.deviation.shape),
         )
+        # The proposal is the prior, so the likelihood alone decides.
         either = (population.spread > 0) | (proposal.spread > 0)
         proposal = self._evaluated_where(either, population, proposal)
         return population.updated(self._accepts(population, proposal), proposal)
@@ -230,6 +234,7 @@ class Moves:
         values, spread = parameters.from_unit(population.point), population.spread
         differing = spread > 0
         before = np.log(np.maximum(values[:, index], TINY))
+        # Logarithms of the buildings' constants, which stay.
         constants = before[:, None] + spread[:, None] * population.deviation[:, columns]
         normal = self.random.standard_normal(len(spread))
         after = constants.mean(axis=1) + spread / np.sqrt(columns.sum()) * normal

@@ -70,6 +70,7 @@ def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...
     increase = (
         _squares(own, both) - np.array([_squares(own, links)[0], _squares(own, further)[1]])
     ) / noise_db**2
+    # The common fit has one set of parameters, and the separate fits have two: `width` degrees of freedom.
     statistic = float(increase.sum()) / width
     probability = float(fdtrc(width, freedom + of_further, max(statistic, 0.0)))
     first, second = (problem.parameters.from_search(point) for point in (links, further))
@@ -179,6 +180,7 @@ def departures(noise: Mapping[str, float], study: StudyModel) -> tuple[Remark, .
     gaussian, remarks = float(noise.get(GAUSSIAN, 0.0)), []
     for kind, remark in DEPARTURES.items():
         weight = float(noise.get(kind, 0.0))
+        # Buildings are equal or differ; noise models compete with Gaussian noise.
         rival = 1.0 - weight if kind == DIFFERING else gaussian
         if weight > max(NOTABLE, LIKELY * (weight + rival)):
             values: dict[str, Value] = {"weight": weight, "gaussian_weight": gaussian}

@@ -100,6 +100,7 @@ def fit_correlation(
         raise InputError("noise: all receivers have the same position; set range_m = 0")
     if not errors.any():
         raise EngineError("noise: all errors are zero, which no noise explains; check the measured values")
+    # Beyond these ranges errors are independent, or common to all links.
     log_ranges = np.log([pairs[pairs > 0].min() / 3, 3 * pairs.max()])
 
     def trial(share: float, log_range: float) -> tuple[float, float]:
@@ -110,6 +111,7 @@ def fit_correlation(
     def cost(point: NDArray[np.float64]) -> float:
         return -trial(*point)[0]
 
+    # The search is local, so it starts from the best of a few trials.
     start_ranges = np.quantile(log_ranges, (0.4, 0.6, 0.8))
     starts = [np.array([share, log_range]) for share in (0.3, 0.8) for log_range in start_ranges]
     # BLAS threads cost more than they save on matrices of this size.
@@ -140,6 +142,7 @@ def _restricted(
     square = errors @ solved[:, 0] - (side @ np.linalg.solve(gram, side) if len(gram) else 0.0)
     variance = square / freedom
     determinant = 2.0 * np.log(np.diag(factor[0])).sum() + np.linalg.slogdet(gram)[1]
+    # f (log 2 pi v + 1) + log |V| + log |X'V^-1 X|, with the best variance v = S / f.
     return float(-0.5 * (freedom * (np.log(2 * np.pi * variance) + 1.0) + determinant)), float(variance)
 
 
@@ -273,6 +276,7 @@ def _vecchia(
         # Conditional mean and variance of the last member given its neighbours.
         weight = np.linalg.solve(matrix[:, :-1, :-1], matrix[:, :-1, -1:])[..., 0]
         variance = matrix[:, -1, -1] - np.sum(matrix[:, -1, :-1] * weight, axis=1)
+        # A row: the member minus its conditional mean, over its conditional standard deviation.
         entries[rows] = np.column_stack([-weight, np.ones(len(rows))]) / np.sqrt(variance)[:, None]
         log_determinant += float(np.log(variance).sum())
     row, column = np.nonzero(members >= 0)

@@ -161,6 +161,7 @@ def draw_posterior(
                 if progress is not None:
                     progress((number % 2 + share) / 2)
 
+            # A population does not depend on how many others there are.
             random = np.random.default_rng([seed, number])
             population, evidence = _anneal(model, size, sweeps, random, stepped)
             populations.append(population)
@@ -184,6 +185,7 @@ def _distance(model: JointModel, populations: list[Population]) -> float:
     first, second = (each.point[:, : len(model.study)] for each in populations)
     distance = 0.0
     for one, other in zip(first.T, second.T, strict=True):
+        # The statistic of Kolmogorov and Smirnov.
         every = np.sort(np.concatenate([one, other]))
         shares = (np.searchsorted(np.sort(each), every, side="right") / len(each) for each in (one, other))
         distance = max(distance, float(np.abs(np.subtract(*shares)).max()))
@@ -195,6 +197,7 @@ def _posterior(model: JointModel, members: Population, weight: NDArray[np.float6
     values = model.parameters.from_unit(members.point)[:, :width]
     density = members.log_likelihood + members.log_prior
     seen = np.log(np.maximum(values, TINY))
+    # The geometric mean over buildings is the mean of all buildings times exp(mean of s z).
     factors = members.spread[:, None] * members.deviation
     for index in range(width):
         mine = model.parameter_of == index
@@ -220,6 +223,7 @@ def _anneal(
     """
     point = model.draw_prior(size, random)
     deviation = random.standard_normal((size, len(model.parameter_of)))
+    # Uniform, because the likelihood contains the weights of the models and is raised to a power with them.
     models = random.integers(0, len(model.marginal.models), size)
     empty = np.zeros(size)
     population = Population(
@@ -238,7 +242,9 @@ def _anneal(
         if step == MAX_STEPS - 1:
             power = 1.0
         rise = (power - before) * population.log_likelihood
+        # Logarithm of the mean of likelihood^rise: the ratio of successive normalising constants.
         evidence += float(np.logaddexp.reduce(rise)) - np.log(size)
+        # Moves take differences to members at a fixed distance, so copies must not be neighbours.
         population = population.selected(
             random.permutation(systematic_resampling(_weights(rise), size, random))
         )

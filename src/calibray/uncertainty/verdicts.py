@@ -81,8 +81,10 @@ def linear_intervals(
     freedom = max(freedom, 1)
     quantile = float(stdtrit(freedom, (1 + CONFIDENCE) / 2))  # of Student's t
     variance = float(residuals @ residuals) / freedom
+    # In units of the ranges, which makes the eigenvalues comparable.
     scaled = jacobian * (upper - lower)
     values, vectors = np.linalg.eigh(scaled.T @ scaled)
+    # A direction without effect gets a large variance instead of an infinite one.
     values = np.maximum(values, values.max(initial=0.0) * 1e-12 + 1e-300)
     errors = np.sqrt(variance * ((vectors**2) @ (1 / values))) * (upper - lower)
     result = []
@@ -327,6 +329,7 @@ def _effect(index: int, modelled: Modelled, best: NDArray[np.float64], axes: Axe
 def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, noise_db: float) -> Reason:
     """Why most of the range fits although links depend on the parameter: a trade-off, or large errors."""
     drawn = draws.point[systematic_resampling(draws.weight, RANKED, np.random.default_rng(0))]
+    # Spearman's correlation is that of the ranks.
     rank = np.argsort(np.argsort(drawn, axis=0), axis=0)
     varied = np.ptp(rank, axis=0) > 0
     correlation = np.zeros(len(names))
