@@ -11,6 +11,7 @@ from calibray.engines import Engine, Replay, Retrace
 from calibray.engines.replay import Computation
 from calibray.errors import InputError
 from calibray.fields import path_loss
+from calibray.measurements.observables import Statistic
 from calibray.scenarios import demo_study_path
 from calibray.study import Setup, Study
 
@@ -80,6 +81,15 @@ def test_a_batch_is_its_candidates_one_by_one_and_each_is_one_call(count):
         np.vstack([replay.path_loss(batch[k : k + 1]) for k in range(count)]), abs=1e-9
     )
     assert replay.calls - calls == 2 * count
+
+
+@pytest.mark.parametrize("derivatives", [False, True])
+@pytest.mark.parametrize("combining", ["power", "coherent"])
+def test_a_candidate_with_further_observables_is_one_call(combining, derivatives):
+    replay = planted.engine()
+    replay = Replay(replay.paths, replay.parameters, combining)
+    replay.respond(candidates(3), (Statistic("rms_delay_spread"),), derivatives)
+    assert replay.calls == 3
 
 
 def test_derivatives_are_the_central_differences():

@@ -107,12 +107,14 @@ def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERAN
             in_batch = slice(ends[link] - start, ends[link + 1] - start)
             fit = _fit_link(powers, in_batch, [total[:, link] for total in totals], tolerance_db)
             if fit is not None:
+                # Paths of the link outside the pool are left out.
                 weight[slice(*np.searchsorted(paths.link, [link, link + 1]))] = 0.0
                 weight[pool[ends[link] : ends[link + 1]]], error[link] = fit
     kept = np.flatnonzero(weight > 0)
     compressed = take(paths, kept)
     compressed = replace(
         compressed,
+        # Weights are factors of powers, spreading is one of amplitudes.
         spreading=compressed.spreading * np.sqrt(weight[kept]),
         settings={**compressed.settings, "compressed_db": tolerance_db},
     )
@@ -131,6 +133,7 @@ def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
     _, strength, _ = _evaluate_all(paths, parameters, [candidates], FIRST_INTERVALS)
     order = np.lexsort((strength, paths.link))
     total = np.concatenate([[0.0], np.cumsum(strength[order])])
+    # Share of a path together with all weaker ones of its link.
     weaker = total[1:] - total[np.searchsorted(paths.link, paths.link[order])]
     return take(paths, np.sort(order[weaker > share]))
 
@@ -222,12 +225,14 @@ def _fit_link(
 
     Candidates without power, for instance without scattering, are left out, because no weight changes a zero.
     """
+    # Largest relative error of a power, from one in decibels.
     bound = FIT_SHARE * tolerance_db * np.log(10) / 10
     shares, first = [], None
     for index, total in enumerate(totals):
         positive = total > 0
         share = powers.at(index, paths)[positive] / total[positive, None]
         if index:
+            # The first set only trains; each further one checks the fit to all before it.
             weight = sparse_weights(np.vstack(shares), bound, first)
             first = np.flatnonzero(weight)
             error = float(np.abs(10 * np.log10(share @ weight)).max(initial=0.0))

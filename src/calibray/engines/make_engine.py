@@ -78,6 +78,7 @@ def fingerprint(study: OpenedStudy) -> str:
     its command line is included instead.
     """
     links, parameters, radio = study.links, study.parameters, study.radio
+    # Calibrated constants are part of the candidate.
     free = {f"{parameter.material}.{parameter.constant}" for parameter in parameters}
     record = {
         "engine": study.engine.name,

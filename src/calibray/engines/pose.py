@@ -72,6 +72,7 @@ class PoseError:
 
     def ordered(self, order: NDArray[np.int64]) -> PoseError:
         """See `Effect.ordered`."""
+        # Place of every path in the new order.
         place = np.argsort(order)
         return replace(
             self,
@@ -124,6 +125,7 @@ def pose_error(
     """
     names, transmitter = np.unique(labels, return_inverse=True)
     degree = np.pi / 180
+    # Compass bearings grow clockwise, yaw counter-clockwise.
     unit = {"azimuth": -degree if from_north else degree, "downtilt": degree, "gain": 1.0}
     weights = np.zeros((len(FIELDS), len(names), len(effect_parameters)))
     for number, parameter in enumerate(effect_parameters):

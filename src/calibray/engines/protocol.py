@@ -102,6 +102,7 @@ def joined(parts: Sequence[Responses]) -> Responses:
 def of_links(parts: Sequence[Responses], links: Sequence[NDArray[np.intp]]) -> Responses:
     """Combines the responses of parts of the links [l]; each part gives the indices of its links among all links."""
     count, arrays = sum(map(len, links)), []
+    # Axis of the links in path loss, in observables, and in the derivatives of both.
     for column, axis in zip(zip(*(part.arrays() for part in parts), strict=True), (1, 2, 1, 2), strict=False):
         shape = list(column[0].shape)
         shape[axis] = count

@@ -123,6 +123,7 @@ class Replay:
         if not self.effects and not walls:
             return self.path_loss(candidates)
         names = list(self.paths.materials)
+        # Facades get the material of the wall that they are part of.
         whole = np.array([names.index(walls.get(name, name)) for name in names], self.paths.material.dtype)
         paths = replace(self.paths, material=whole[self.paths.material])
         return Replay(paths, self.parameters, *self._options).path_loss(candidates)
@@ -150,11 +151,11 @@ class Replay:
             batch = values[start : start + OBSERVED_SIZE]
             padded = np.concatenate([batch, np.repeat(batch[:1], OBSERVED_SIZE - len(batch), axis=0)])
             batches.append(Responses(*function(channel, padded, len(batch))))
-        self.calls += len(values)
         responses = joined(batches)
         if self._combining.kind == "power":
+            self.calls += len(values)
             return responses
-        # Only sums of powers follow from the powers of paths.
+        # Only sums of powers follow from the powers of paths; the functions below count the candidates.
         if not derivatives:
             return replace(responses, path_loss=self.path_loss(candidates))
         loss, slope = self.path_loss_and_jacobian(candidates)
@@ -227,6 +228,7 @@ class Replay:
             *answers, table_error = function(*self._arguments(self._base, batch, size), len(batch))
             too_coarse = table_error > TABLE_TOLERANCE
             refused = np.flatnonzero(too_coarse.any(axis=(1, 2)))
+            # Candidates before the first refused one are accurate; it is evaluated again with finer tables.
             done = refused[0] if len(refused) else len(batch)
             batches.append([np.asarray(answer[:done], dtype=float) for answer in answers])
             start += done
@@ -244,6 +246,7 @@ class Replay:
         """
         tables = np.repeat(base[None], size, axis=0)
         tables[: len(batch), self._rows, self._columns] = batch[:, self.parameters.of_materials]
+        # Rows beyond the batch repeat its values; their answers are dropped.
         of_effects = np.resize(batch[:, self.parameters.of_effects], (size, len(self.parameters.of_effects)))
         return tables, of_effects
 

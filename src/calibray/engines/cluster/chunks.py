@@ -191,6 +191,7 @@ def trace_in_chunks(
         EngineError: The paths do not fit into memory, or workers die repeatedly.
     """
     links, size = study.links, chunk_size(stated_chunk_size(study), len(study.links))
+    # Chunks bring their own links: the study that they share is sent with one.
     one_link = study.at(select_links(links, np.array([0])))
     answers = for_each_chunk(workers, partial(_trace_chunk, check), one_link, links, size, progress)
     paths = join_links([(chunk, chunk_paths) for chunk, (chunk_paths, _) in answers])
@@ -313,19 +314,20 @@ class ChunkedReplay:
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of every link for candidates; see `Engine.path_loss`."""
-        values = check_candidates(candidates, len(self.parameters))
-        loss = np.empty((len(values), len(self._study.links)))
-        for chunk, chunk_loss in self._answers("path_loss", values):
-            loss[:, chunk] = chunk_loss
-        return loss
+        return self._path_loss(candidates, "path_loss")
 
     def scene_path_loss(
         self, candidates: NDArray[np.float64], walls: Mapping[str, str]
     ) -> NDArray[np.float64]:
         """Path loss of the scene alone for candidates; see `ReplaysScene.scene_path_loss`."""
+        return self._path_loss(candidates, "scene_path_loss", dict(walls))
+
+    def _path_loss(
+        self, candidates: NDArray[np.float64], method: str, *arguments: Any
+    ) -> NDArray[np.float64]:
         values = check_candidates(candidates, len(self.parameters))
         loss = np.empty((len(values), len(self._study.links)))
-        for chunk, chunk_loss in self._answers("scene_path_loss", values, dict(walls)):
+        for chunk, chunk_loss in self._answers(method, values, *arguments):
             loss[:, chunk] = chunk_loss
         return loss
 

@@ -143,6 +143,7 @@ class DaskWorkers:
                 future = self._client.submit(handle.make, handle.sources[index], workers=[home], pure=False)
                 handle.objects[index] = home, future
         objects = (handle.objects[index][1] for handle in handles)
+        # With pure=True, Dask would answer an equal question with the result of an earlier one.
         return self._client.submit(function, *objects, *arguments, workers=[home], pure=False)
 
     def _wait_for_any(self, futures: list[Future]) -> None:

@@ -309,6 +309,7 @@ class LocalWorkers:
             for key, handle in zip(keys, handles, strict=True)
             if key not in worker.objects
         }
+        # What the worker has after this question: it drops objects of handles that are not in use.
         worker.objects = {key for key in worker.objects if key[0] in alive} | set(keys)
         return _Question(function, arguments, keys, recipes, alive)
 

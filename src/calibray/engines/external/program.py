@@ -160,6 +160,7 @@ class ExternalProgram:
                     return read_rays(response_file, num_links)
                 wanted = request.radio.observables
                 loss, observed = read_answer(response_file, self.file_format, num_links, len(wanted))
+                # Programs answer in the units of the study.
                 scale = np.array([each.scale for each in wanted])[:, None]
                 return loss, observed * scale if wanted else observed
             except Unusable as error:

@@ -156,6 +156,7 @@ class Command:
                 self._progress("running", done, len(requests))
             failure = self._describe(requests[index], outcome.failure) if outcome.failure else ""
             yield Answer(index, outcome.path_loss_db, outcome.seconds, failure, outcome.rays)
+            # Counted after the answer was given: whoever takes it may store it before the run ends.
             self._successive_failures = self._successive_failures + 1 if failure else 0
             if self._successive_failures >= self._give_up_after:
                 raise EngineError(

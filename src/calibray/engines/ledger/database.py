@@ -73,6 +73,7 @@ def _is_valid(claimed: tuple[str, bytes, str], owner: object, expires: object, n
     A claim is invalid if its process has ended, or has not renewed it for `EXPIRY`. `expires` and `now` are times [s
     since 1970], by the clock of the claim's machine and of this machine.
     """
+    # A clock may be wrong by `SKEW`; a claim further away from now is damaged or was left behind.
     if not isinstance(expires, float) or not abs(expires - now) <= SKEW + EXPIRY:
         return False
     try:

@@ -155,6 +155,7 @@ class Recorded:
                         raise
                     rescued = self._ledger.rescue(self._problem, self._name, self.parameters.names, unsaved)
                     raise EngineError(f"{error}. {rescued}") from None
+                # The candidate itself is an RT call, its repeats in the batch are not.
                 self.hits += len(indices[candidate]) - 1
                 yield from (_answer(index, entry) for index in indices[candidate])
 

@@ -81,11 +81,11 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
                 f"{table.source}: no path has a power above 0; export the rays of at least one link"
             )
     ends, link, chosen = _assign_links(table, setting.links)
+    # Paths of no link, numbered -1, come first and are left out.
     order = np.argsort(link, kind="stable")[(link < 0).sum() :]
     table, link = table.take(order), link[order]
     _check_repeats(table, link)
     chains, distance = _chains(table, scene)
-    _check_delays(table, chains)
     antennas = setting.antennas or (UNKNOWN, UNKNOWN)
     paths = compile_paths(
         chains, link, ends, frequency=setting.frequency, materials=scene.materials,
@@ -146,6 +146,7 @@ def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
     ahead = np.diff(stops, axis=1)
     length = np.linalg.norm(ahead, axis=2)
     used = np.hstack([np.ones((len(stops), 1), bool), present])
+    segment = length * used  # 0 beyond the receiver
     if (used & (length == 0)).any():
         number = int(np.argmax((used & (length == 0)).any(axis=1)))
         raise InputError(f"{table.source}: path {table.path[number]} has the same point twice; correct it")
@@ -177,7 +178,8 @@ def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
         found = find_edge(surfaces, hits, number)
         face[number], normal[path, at] = found.face, found.normal_0
         edge[path], normal_n[path] = found.direction, found.normal_n
-        lengths[path] = length[path, : at + 1].sum(), (length * used)[path, at + 1 :].sum()
+        lengths[path] = segment[path, : at + 1].sum(), segment[path, at + 1 :].sum()
+    _check_delays(table, segment)
     material = np.zeros(table.kind.shape, dtype=np.int64)
     material[present] = surfaces.material[face]
     return Chains(
@@ -214,6 +216,7 @@ def _stated_materials(table: RayTable, scene: Scene) -> NDArray[np.int64]:
 
 
 def _check_straight(hits: Hits, transmits: NDArray[np.bool_]) -> None:
+    # The angle of the bend times the shorter segment: by how much its end is off.
     bend = np.linalg.norm(hits.leaving - hits.incident, axis=1) * hits.length
     if (transmits & (bend > 4 * TOLERANCE)).any():
         number = int(np.argmax(np.where(transmits, bend, 0)))
@@ -223,16 +226,14 @@ def _check_straight(hits: Hits, transmits: NDArray[np.bool_]) -> None:
         )
 
 
-def _check_delays(table: RayTable, chains: Chains) -> None:
+def _check_delays(table: RayTable, segment: NDArray[np.float64]) -> None:
+    """Refuse delays that do not agree with the lengths of the paths' segments [P, D + 1], [m]."""
     if table.delay is None:
         return
-    present = chains.kind != 0
-    stops = np.concatenate([chains.source[:, None], chains.vertex, chains.target[:, None]], axis=1)
-    stops[np.arange(len(stops)), present.sum(axis=1) + 1] = chains.target
-    used = np.hstack([np.ones((len(stops), 1), bool), present])
-    length = (np.linalg.norm(np.diff(stops, axis=1), axis=2) * used).sum(axis=1)
+    length = segment.sum(axis=1)
     off = np.abs(table.delay * speed_of_light - length)
-    if (wrong := off > 2 * TOLERANCE * used.sum(axis=1) + 1e-4 * length).any():
+    # Both ends of every segment may be off by the tolerance.
+    if (wrong := off > 2 * TOLERANCE * (segment > 0).sum(axis=1) + 1e-4 * length).any():
         worst = int(np.argmax(np.where(wrong, off / length, 0)))
         raise InputError(
             f"{table.source}: path {table.path[worst]} has the delay {table.delay[worst]:.6g} s, but a length of "

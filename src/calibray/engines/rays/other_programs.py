@@ -145,6 +145,7 @@ def _insite_paths(file: Path, rest: Iterator[tuple[int, str]], tx_power_dbm: flo
     (receivers,) = _insite_numbers(file, next(rest), 1)
     for _ in range(int(receivers)):
         _, count = _insite_numbers(file, next(rest), 2)
+        # The line of sums.
         if count:
             next(rest)
         for _ in range(int(count)):

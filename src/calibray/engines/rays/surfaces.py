@@ -132,6 +132,7 @@ def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.
     error = hits.mirror_error(index, surfaces.normal[face])
     # A point that is off by the tolerance turns both segments.
     bent = hits.reflects[index] & (error > 4 * TOLERANCE)
+    # For each point, faces that obey the mirror law come first, the nearest of them foremost.
     order = np.lexsort((distance, bent, index))
     index, face, distance, bent = index[order], face[order], distance[order], bent[order]
     matched, first = np.unique(index, return_index=True)
@@ -205,8 +206,7 @@ def find_edge(surfaces: Surfaces, hits: Hits, number: int) -> Edge:
     Raises:
         InputError: No two faces form an edge there that diffracts into the direction of the path.
     """
-    point, incident, leaving = hits.point[number], hits.incident[number], hits.leaving[number]
-    _, faces, _ = surfaces.near(point[None], TOLERANCE)
+    _, faces, _ = surfaces.near(hits.point[[number]], TOLERANCE)
     edges = [_edge(surfaces, hits, number, (a, b)) for a in faces.tolist() for b in faces.tolist() if a != b]
     usable = [edge for edge in edges if edge is not None and edge.error <= 4 * TOLERANCE]
     if not usable:
@@ -214,7 +214,8 @@ def find_edge(surfaces: Surfaces, hits: Hits, number: int) -> Edge:
             f"{hits.label[number]}: no edge of the scene diffracts the wave into the direction of the path there; "
             "check the vertex, or remove the path"
         )
-    return min(usable, key=lambda edge: (round(edge.error, 6), np.dot(incident, edge.normal_0), leaving[0]))
+    # Of pairs with the same error, the 0-face is the one that the wave meets most directly.
+    return min(usable, key=lambda edge: (round(edge.error, 6), np.dot(hits.incident[number], edge.normal_0)))
 
 
 def _edge(surfaces: Surfaces, hits: Hits, number: int, faces: tuple[int, int]) -> Edge | None:
@@ -222,6 +223,7 @@ def _edge(surfaces: Surfaces, hits: Hits, number: int, faces: tuple[int, int]) -
     point, incident, leaving = hits.point[number], hits.incident[number], hits.leaving[number]
     normal_0, normal_n = surfaces.normal[list(faces)]
     direction = np.cross(normal_0, normal_n)
+    # The sine between the normals: nearly coplanar faces form no edge.
     if hits.material[number] not in (-1, surfaces.material[faces[0]]) or np.linalg.norm(direction) < 0.05:
         return None
     into_0, into_n = surfaces.corners[list(faces)].mean(axis=1) - point
@@ -229,10 +231,13 @@ def _edge(surfaces: Surfaces, hits: Hits, number: int, faces: tuple[int, int]) -
     normal_0 = -normal_0 * np.sign(np.dot(into_n, normal_0))
     normal_n = -normal_n * np.sign(np.dot(into_0, normal_n))
     direction /= np.linalg.norm(direction)
+    # The tangent n_0 x e of Sionna RT's azimuths points into the 0-face.
     direction *= np.sign(np.dot(np.cross(normal_0, direction), into_0))
+    # A ray behind both faces runs within the wedge; the wave must meet the 0-face from outside.
     inside = [np.dot(end, normal_0) < 0 and np.dot(end, normal_n) < 0 for end in (-incident, leaving)]
     if any(inside) or np.dot(incident, normal_0) > 0 or not direction.any():
         return None
+    # Keller's law: both rays make the same angle with the edge.
     error = abs(np.dot(incident - leaving, direction)) * hits.length[number]
     return Edge(faces[0], normal_0, normal_n, direction, float(error))
 
