@@ -397,6 +397,43 @@ def test_positions_in_centimetres_are_read_as_such(scene, tmp_path):
     assert links.tx[0].tolist() == [-30, 0, 15]
 
 
+def test_the_origin_of_a_scene_without_a_frame_places_degrees(scene, tmp_path):
+    """The radii of curvature of WGS 84 give the metres of a degree; without `--origin`, degrees have no place."""
+    file = Path(scene)
+    file.write_text("\n".join(line for line in file.read_text().splitlines() if "calibray frame" not in line))
+    longitude, latitude, squared = 9.99, 50.01, 0.00669437999014
+    curvature = 1 - squared * np.sin(np.radians(latitude)) ** 2
+    north = np.radians(1e-4) * 6378137.0 * (1 - squared) / curvature**1.5 * np.array([1, -2, 3])
+    east = (
+        np.radians(1e-4) * 6378137.0 * np.cos(np.radians(latitude)) / curvature**0.5 * np.array([-1, -2, -3])
+    )
+    degrees = {
+        "longitude": longitude - 1e-4 * np.array([1, 2, 3]),
+        "latitude": latitude + 1e-4 * np.array([1, -2, 3]),
+    }
+    links = table(
+        tmp_path, **degrees, tx_longitude=longitude, tx_latitude=latitude, rssi=[-50.0, -60.0, -70.0]
+    )
+    target = tmp_path / "study.toml"
+    with pytest.raises(InputError, match="--origin LON,LAT"):
+        draft(scene, links, target, frequency=3.5e9)
+    # A file of this name next to a scene of another program need not be one that `calibray scene` wrote.
+    (file.parent / "trees.geojson").write_text("{}")
+    code, shown, errors = typed(
+        *("init", scene, links, "--frequency", 3.5e9, "--origin", f"{longitude},{latitude}", "--out", target)
+    )
+    assert code == 0, errors
+    assert "--origin states the scene's position" in " ".join(shown.split())
+    placed = Study.load(target).measurements()
+    np.testing.assert_allclose(placed.rx[:, :2], np.stack([east, north], axis=1), atol=0.02)
+    np.testing.assert_allclose(placed.tx[:, :2], 0.0, atol=0.02)
+    code, _, errors = typed(
+        "init", scene, links, "--frequency", 3.5e9, "--origin", "9.99", "--out", "other.toml"
+    )
+    assert code == 2
+    assert "--origin 9.99: must be longitude and latitude in degrees" in " ".join(errors.split())
+
+
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:3857", "EPSG:31467"])
 def test_metres_of_a_map_projection_are_placed_on_the_scene(scene, tmp_path, crs):
     """UTM, Web Mercator, and Gauss-Krueger of another datum, some 100 m off if taken for a UTM zone's."""

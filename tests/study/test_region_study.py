@@ -142,6 +142,14 @@ def test_files_and_columns_that_cannot_be_used_are_named(tmp_path):
     opened = Setup.open(study(tmp_path, regions={"trees": section}), links=links_from_frame(planted.links()))
     with pytest.raises(InputError, match="none of its 1 features is a polygon"):
         opened.effects(planted.engine().paths)
+    metres = {"type": "Polygon", "coordinates": [[[200, 0], [210, 0], [210, 5], [200, 0]]]}
+    feature = {"type": "Feature", "properties": {"h": 8.0}, "geometry": metres}
+    file = tmp_path / "trees.geojson"
+    file.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    with pytest.raises(
+        InputError, match=r"trees\.geojson: longitude of position 0 is 200.*position = 'scene'"
+    ):
+        RegionSection.model_validate(section).region(file, Place(FRAME, lambda: None))
 
 
 def test_trees_are_written_next_to_a_scene_and_read_as_a_region(tmp_path):

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
 
 import typer
 
+from calibray.errors import InputError
 from calibray.support import interruption
 from calibray.support.progress import Progress
 
@@ -104,6 +105,21 @@ class Permissions:
         ),
     ] = False
     overwrite: Overwrite = False
+
+
+def read_origin(text: str) -> tuple[float, float]:
+    """Read the longitude and latitude [deg] of ``--origin``.
+
+    Raises:
+        InputError: The text is not two numbers.
+    """
+    try:
+        longitude, latitude = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(
+            f"--origin {text}: must be longitude and latitude in degrees, such as 11.5755,48.1374"
+        ) from None
+    return longitude, latitude
 
 
 def with_groups(command: Callable[..., None]) -> Callable[..., None]:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import echo, log, option, progress_bars, warn, with_groups
+from calibray.cli.console import echo, log, option, progress_bars, read_origin, warn, with_groups
 from calibray.errors import InputError
 
 
@@ -21,6 +21,9 @@ class Known:
     antennas: Annotated[Path | None, option("DIR", "Folder of MSI files named after the antennas.")] = None
     tx: Annotated[str | None, option("X,Y,Z", "Transmitter position in the scene frame [m].")] = None
     frequency: Annotated[float | None, option("HZ", "Carrier frequency [Hz].")] = None
+    origin: Annotated[
+        str | None, option("LON,LAT", "Origin of the scene frame [deg], if the scene file does not state it.")
+    ] = None
 
 
 @with_groups
@@ -64,7 +67,8 @@ def init(
 
         progress("reading scene and links", 0, None)
         tx = None if known.tx is None else _position(known.tx)
-        given = Given(known.transmitters, known.track, known.antennas, tx, known.frequency)
+        origin = None if known.origin is None else read_origin(known.origin)
+        given = Given(known.transmitters, known.track, known.antennas, tx, known.frequency, origin)
         draft = draft_study(scene, links, out, given)
         measured = draft.study.measurements()
     echo(render(assumptions(draft)))

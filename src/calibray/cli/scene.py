@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from calibray.cli.console import Overwrite, echo, log, option, progress_bars, with_groups
+from calibray.cli.console import Overwrite, echo, log, option, progress_bars, read_origin, with_groups
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -95,12 +95,7 @@ class MapOptions:
             if self.utm:
                 raise InputError("--utm needs --origin LON,LAT")
             return None
-        try:
-            longitude, latitude = (float(part) for part in self.origin.split(","))
-        except ValueError:
-            raise InputError(
-                f"--origin {self.origin}: must be longitude and latitude in degrees, such as 11.5755,48.1374"
-            ) from None
+        longitude, latitude = read_origin(self.origin)
         return Frame.utm(longitude, latitude) if self.utm else Frame.local(longitude, latitude)
 
 

@@ -249,7 +249,7 @@ def _content(links: LinksDraft) -> dict[str, Any]:
     regions, attenuation = _trees(links)
     return {
         "version": VERSION,
-        "scene": {"file": links.scene_file, "frequency": links.frequency},
+        "scene": links.scene_section | {"frequency": links.frequency},
         **({"materials": constants} if constants else {}),
         "links": section,
         "antennas": antenna_section,
@@ -320,14 +320,14 @@ def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
 def _trees(links: LinksDraft) -> tuple[dict[str, Any], dict[str, Any]]:
     """The region of the trees next to the scene, and its parameter if they are on the straight line of a link."""
     file = Path(links.scene).parent / TREES_FILE
-    frame = None if links.scene.startswith(BUNDLED) else read_frame(links.scene)
-    if frame is None or not exists(file):
+    # A file of this name next to another scene need not have the columns of `calibray scene`.
+    if links.scene.startswith(BUNDLED) or read_frame(links.scene) is None or not exists(file):
         return {}, {}
     specific = round(dense_trees(links.frequency), 2)
     heights = {"heights": "ground", "bottom": "bottom", "top": "top"}
     content = {"file": links.relative(file), **heights, "specific_attenuation": specific}
     section = RegionSection.model_validate_json(json.dumps(content))
-    region, measured = section.region(file, Place(frame, lambda: links.overhead)), links.measurements()
+    region, measured = section.region(file, Place(links.frame, lambda: links.overhead)), links.measurements()
     crossing = int((region.length_inside(measured.tx, measured.rx) > 0).sum())
     reason = f"trees are on the straight line of {crossing} of {len(measured)} links; typical of dense trees in leaf"
     links.assume("regions", f"trees, {specific:g} dB/m", reason)

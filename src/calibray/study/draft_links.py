@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from calibray.coordinates import find_projection
+from calibray.coordinates import Frame, find_projection
 from calibray.errors import InputError
 from calibray.measurements import (
     TRACK_COLUMNS,
@@ -68,6 +68,7 @@ class Given:
         antennas: Folder of MSI files named after the transmitters' antennas.
         tx: Transmitter position (x, y, z) [m] in the scene's frame, unless a table contains it.
         frequency: Carrier frequency [Hz], unless the links have it.
+        origin: Longitude and latitude of the scene's origin [deg], unless the scene file states its frame.
     """
 
     transmitters: Path | None = None
@@ -75,6 +76,7 @@ class Given:
     antennas: Path | None = None
     tx: Sequence[float] | None = None
     frequency: float | None = None
+    origin: tuple[float, float] | None = None
 
 
 @dataclass
@@ -122,10 +124,16 @@ class LinksDraft:
         """The ground below and the roofs above positions in the scene."""
         return SceneSurfaces.read(self.scene)
 
+    @cached_property
+    def frame(self) -> Frame | None:
+        """The position of the scene on the globe; None if neither the user nor the scene file states it."""
+        return read_frame(self.scene) if self.given.origin is None else Frame.local(*self.given.origin)
+
     @property
-    def scene_file(self) -> str:
-        """The scene, relative to the study file's folder."""
-        return self.scene if self.scene.startswith(BUNDLED) else self.relative(Path(self.scene))
+    def scene_section(self) -> dict[str, Any]:
+        """The keys of ``[scene]`` other than the carrier; the file is relative to the study file's folder."""
+        file = self.scene if self.scene.startswith(BUNDLED) else self.relative(Path(self.scene))
+        return {"file": file} | ({} if self.given.origin is None else {"origin": list(self.given.origin)})
 
     @property
     def transmitter_rows(self) -> pd.DataFrame:
@@ -142,7 +150,7 @@ class LinksDraft:
         """The links by the keys drafted so far."""
         content = {
             "version": VERSION,
-            "scene": {"file": self.scene_file, "frequency": 1e9},
+            "scene": self.scene_section | {"frequency": 1e9},
             "links": self.section,
             "parameters": {"any.relative_permittivity": {"bounds": [1.5, 12.0]}},
             "offset": {},
@@ -311,7 +319,7 @@ class LinksDraft:
         self, rx: PositionColumns, tx: PositionColumns | None
     ) -> tuple[PositionColumns, PositionColumns | None]:
         """The columns; their numbers are on the globe if they are far from the scene, but on it in a projection."""
-        frame = read_frame(self.scene) if rx.position == "scene" else None
+        frame = self.frame if rx.position == "scene" else None
         if frame is None or (tx is not None and tx.position != "scene"):
             return rx, tx
         x, y = (pd.to_numeric(self.table.frame[name], errors="coerce").dropna() for name in (rx.x, rx.y))
@@ -345,12 +353,13 @@ class LinksDraft:
         if rx.position != "geographic":
             return
         self.section["position"] = "geographic"
-        if read_frame(self.scene) is None:
+        if self.frame is None:
             raise InputError(
-                f"{self.links}: positions are in degrees, but {self.scene} has no position on the globe; make the "
-                f"scene with `calibray scene`, or write a study yourself with scene.origin"
+                f"{self.links}: positions are in degrees, but {self.scene} has no position on the globe; state the "
+                f"longitude and latitude of its origin, --origin LON,LAT, or make the scene with `calibray scene`"
             )
-        reason = f"{unit}; {Path(self.scene).name} has the scene's position on the globe"
+        known = f"{Path(self.scene).name} has" if self.given.origin is None else "--origin states"
+        reason = f"{unit}; {known} the scene's position on the globe"
         self.assume("links.position", "geographic", reason)
 
     def _add_position_unit(self, tx: PositionColumns | None, rx: PositionColumns) -> None:

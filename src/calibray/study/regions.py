@@ -163,7 +163,13 @@ def read_polygons(path: Path, position: str, frame: Frame | None) -> tuple[NDArr
         raise InputError(f"{path}: none of its {len(polygon)} features is a polygon; give outlines")
     outline = shapely.make_valid(features.outline[polygon])
     if position == "geographic":
-        outline = project(outline, _known(frame, path), features.crs or WGS84)
+        known = _known(frame, path)
+        try:
+            outline = project(outline, known, features.crs or WGS84)
+        except InputError as error:
+            raise InputError(
+                f"{path}: {error}, or set position = 'scene' if they are in its metres"
+            ) from None
     return outline, {name: values[polygon] for name, values in features.columns.items()}
 
 
