@@ -5,7 +5,7 @@ import optuna
 import pytest
 
 from calibray.errors import InputError
-from calibray.optimizers import SGWOIM
+from calibray.optimizers import SGWOIM, optuna_sampler
 from calibray.optimizers.optuna_sampler import SGWOIMSampler
 
 FLOAT, INT = optuna.distributions.FloatDistribution, optuna.distributions.IntDistribution
@@ -151,6 +151,15 @@ def test_scales_and_whole_numbers_keep_to_their_grid():
     assert {trial.params["steps"] for trial in study.trials} == {2, 4, 6, 8}
     assert {trial.params["width"] for trial in study.trials} == {0.0, 0.25, 0.5, 0.75, 1.0}
     assert study.best_value < 0.3
+
+
+@pytest.mark.parametrize("grid", [FLOAT(0.0, 1.0, step=0.25), INT(0, 40, step=10), INT(3, 7)])
+def test_every_value_of_a_grid_covers_the_same_share_of_the_search_space(grid):
+    low, high = optuna_sampler._bounds(grid)
+    coordinates = low + (high - low) * (np.arange(500) + 0.5) / 500
+    values, counts = np.unique([optuna_sampler._value(grid, x) for x in coordinates], return_counts=True)
+    assert values.tolist() == np.linspace(grid.low, grid.high, 5).tolist()
+    assert counts.tolist() == [100] * 5
 
 
 def test_without_a_space_it_is_inferred_and_categories_are_drawn():

@@ -118,18 +118,21 @@ def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: 
         both = [new] if points is None else [points, new]
         return _Points(*(np.concatenate(part) for part in zip(*both, strict=True)))
 
+    # Towards the farther face.
     side = np.where(start <= 0.5, radius, -radius)
     points = yield from evaluated(None, np.vstack([start, start + np.diag(side)]))
     while radius > last:
         best = int(np.argmin(points.value))
         centre = points.unit[best]
         chosen, missing = _spanning(points, best, radius)
+        # A model needs d points besides the best one; far ones serve if near ones are missing.
         if missing is None or len(chosen) == d:
             step, predicted = _step(points, best, _enriched(points, best, chosen, radius), radius)
             if predicted > 0 and np.abs(step).max() > 1e-3 * last:
                 before = points.value[best]
                 points = yield from evaluated(points, np.clip(centre + step, 0.0, 1.0)[None])
                 ratio = (before - points.value[-1]) / predicted
+                # A good step that ends near the edge suggests a larger region.
                 if ratio >= ACCEPTED:
                     radius = min(2 * radius, LARGEST) if np.abs(step).max() > 0.75 * radius else radius
                     continue
@@ -153,6 +156,7 @@ def _spanning(points: _Points, best: int, radius: float) -> tuple[list[int], NDA
         for index in range(len(offset) - 1, -1, -1):
             if index == best or index in chosen or distance[index] > reach * np.sqrt(offset.shape[1]):
                 continue
+            # Gram and Schmidt: the part along directions that the chosen points lack.
             rest = offset[index] - basis.T @ (basis @ offset[index])
             if np.linalg.norm(rest) >= NEW_DIRECTION * max(distance[index], 1.0):
                 chosen.append(index)
@@ -160,6 +164,7 @@ def _spanning(points: _Points, best: int, radius: float) -> tuple[list[int], NDA
             if len(chosen) == offset.shape[1]:
                 return chosen, missing
         if missing is None:
+            # The null space of the directions that near points span.
             missing = np.linalg.svd(basis)[2][len(basis) :] if len(basis) else np.eye(offset.shape[1])
     return chosen, missing
 
@@ -183,6 +188,7 @@ def _enriched(points: _Points, best: int, chosen: list[int], radius: float) -> N
 def _pivot(offset: NDArray[np.float64]) -> float:
     """Smallest singular value of the quadratic terms of points, without the part that a plane can represent."""
     plane = np.hstack([np.ones((len(offset), 1)), offset])
+    # Combinations of the points on which every plane vanishes.
     q = np.linalg.qr(plane, mode="complete")[0][:, plane.shape[1] :]
     return float(np.linalg.svd(q.T @ _quadratic(offset) @ q, compute_uv=False)[-1])
 
@@ -199,6 +205,7 @@ def _step(
     offset = (points.unit[kept] - points.unit[best]) / radius
     count, d = offset.shape
     plane = np.hstack([np.ones((count, 1)), offset])
+    # Interpolation with the least curvature: one multiplier per point, then the constant and the slopes.
     system = np.block([[_quadratic(offset), plane], [plane.T, np.zeros((d + 1, d + 1))]])
     side = np.vstack([points.residuals[kept], np.zeros((d + 1, points.residuals.shape[1]))])
     solved = np.linalg.lstsq(system, side, rcond=1e-12)[0]
@@ -214,6 +221,7 @@ def _step(
         return float(gradient @ step + 0.5 * step @ product), gradient + product
 
     newton = np.linalg.lstsq(curvature, -gradient, rcond=None)[0]
+    # The curvature may be indefinite, so there may be several minima in the region.
     starts = (np.zeros(d), np.clip(newton, low, high), np.where(gradient > 0, low, high))
     bounds = np.stack([low, high], axis=1)
     ended = [minimize(model, start, jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]

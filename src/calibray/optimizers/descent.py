@@ -62,6 +62,7 @@ def begin(unit: NDArray[np.float64], evaluated: Residuals) -> Starts:
     failed = np.asarray(~np.isfinite(r).all(axis=1))
     r, j = np.where(failed[:, None], 0.0, r), np.where(failed[:, None, None], 0.0, j)
     links = r.shape[1]
+    # The cost is half of a mean, so its derivatives are means over the residuals too.
     curvature = np.einsum("smi,smj->sij", j, j) / links
     largest = np.diagonal(curvature, axis1=1, axis2=2).max(axis=1)
     return Starts(
@@ -97,6 +98,7 @@ def damped_steps(starts: Starts) -> tuple[NDArray[np.float64], NDArray[np.float6
             break
         free &= ~outside
     # Fixing groups of components is a heuristic; the projected gradient step is a floor that always descends.
+    # The trace is at least the largest curvature in any direction.
     bound = np.trace(damped, axis1=1, axis2=2)[:, None]
     gradient_step = np.clip(-starts.gradient / bound, low, high)
     better = _decrease(starts, gradient_step) > _decrease(starts, step)
@@ -111,6 +113,7 @@ def _decrease(starts: Starts, step: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> Starts:
     """Accept or reject trial points by the decrease of cost that was predicted [s], and update the damping."""
+    # A failed trial has an infinite cost, hence a ratio of minus infinity.
     ratio = (starts.cost - trial.cost) / predicted
     better = ratio > 1e-4
     gain = np.where(better, ratio, 0.0)
@@ -133,6 +136,7 @@ def merge(starts: Starts, settled: Starts) -> tuple[Starts, Starts, NDArray[np.b
     True for each moving search that can be dropped [s].
     """
     number, cost = len(settled.cost), np.concatenate([settled.cost, starts.cost])
+    # Ties are broken by position, so that of two close searches exactly one is better.
     rank = np.lexsort((np.arange(len(cost)), cost)).argsort()
     distance = cdist(starts.unit, np.concatenate([settled.unit, starts.unit]))
     near = (distance < MERGE_DISTANCE) & (rank[None] < rank[number:, None])

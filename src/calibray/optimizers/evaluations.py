@@ -230,6 +230,7 @@ def check_order(evaluations: Evaluations, archive: Archive) -> None:
     size = root_mean_square(evaluations.errors)
     order = np.argsort(size, kind="stable")
     value, size = evaluations.y[order], size[order]
+    # In the order of the mean squares, no value may be below an earlier one.
     highest = np.maximum.accumulate(value)
     slack = OBJECTIVE_TOLERANCE * np.abs(value) + 1e-9
     for row in np.flatnonzero(highest > value + slack):
@@ -251,6 +252,7 @@ def merge_repeated(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Merge repeated points [n, d] of the unit cube: distinct points [k, d], means of their values [k, ...]."""
     points, group = np.unique(np.round(unit, DECIMALS), axis=0, return_inverse=True)
+    # Each row averages the repeats of one point.
     share = (np.arange(len(points))[:, None] == group) / np.bincount(group)[:, None]
     return points, share @ values
 

@@ -82,6 +82,7 @@ class GaussianProcess(Optimizer):
         around = draw_around(taken[:5], CANDIDATES, -3.0, self._rng)
         candidates = np.vstack([self._rng.random((CANDIDATES, d)), around])
         promise = log_improvement(model, candidates, best)
+        # Ever closer around the best candidate so far.
         for reach in (0.1, 0.01, 0.001):
             closer = reach * self._rng.standard_normal((CANDIDATES // 3, d))
             closer = np.clip(candidates[np.argmax(promise)] + closer, 0.0, 1.0)

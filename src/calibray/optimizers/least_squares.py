@@ -147,6 +147,7 @@ class LeastSquares(Optimizer):
             ended = yield from self._descended(unit, ended, self.catch_up)
             if returns(ended) >= RETURNS:
                 break
+            # Given starting points and the best earlier one belong to the first round.
             unit = unit[:0]
         if ended is not None and len(ended.cost):
             if returns(ended) < RETURNS:
@@ -158,6 +159,7 @@ class LeastSquares(Optimizer):
         number, before = min(COMBINATIONS, self.starts), np.inf
         followed = round(FOLLOWED * number)
         while followed and ended.cost.min() < before:
+            # Only a cost below this counts as a lower minimum.
             before = ended.cost.min() - _slack(ended)
             unit = recombine(distinct(ended, SPACE).unit, number)
             if not len(unit):
@@ -183,6 +185,7 @@ class LeastSquares(Optimizer):
             while True:
                 answers = yield self.box.from_unit(unit)
                 failed = ~np.isfinite(answers.y)[:, None]
+                # `descend` recognises a failure by infinite residuals.
                 residuals = np.where(failed, np.inf, answers.errors)
                 unit = descent.send((residuals, answers.slopes * self.box.width))
         except StopIteration as end:
@@ -208,8 +211,10 @@ def recombine(minima: NDArray[np.float64], number: int) -> NDArray[np.float64]:
     """
     best, low, dimension = minima[0], minima[:PARENTS], minima.shape[1]
     target, source = np.nonzero(~np.eye(len(low), dtype=bool))
+    # Pairs of the lowest minima first.
     order = np.lexsort((target + source, np.maximum(target, source)))
     shifted = best + (low[target] - low[source])[order]
+    # Every coordinate of every other minimum in turn.
     exchanged = np.where(np.eye(dimension, dtype=bool), low[1:, None], best).reshape(-1, dimension)
     new = [_new(points, minima) for points in (shifted, exchanged)]
     turn = np.argsort(np.concatenate([np.arange(len(points)) for points in new]), kind="stable")

@@ -178,8 +178,8 @@ class SGWOIMSampler(BaseSampler):
 
 
 def _bounds(distribution: Numeric) -> tuple[float, float]:
-    """Bounds of the search coordinate; each integer covers an interval of width 1."""
-    margin = 0.5 if isinstance(distribution, IntDistribution) else 0.0
+    """Bounds of the search coordinate; each value of a grid covers an interval as wide as its step."""
+    margin = 0.5 * (distribution.step or 0.0)
     return _coordinate(distribution, distribution.low - margin), _coordinate(
         distribution, distribution.high + margin
     )

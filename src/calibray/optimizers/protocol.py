@@ -99,10 +99,12 @@ class Session:
         self.archive.add(evaluations)
         if self._asked is None:
             return
+        # The whole batch in its order needs no search for each point.
         if np.array_equal(evaluations.x, self._asked) and len(self._open) == len(self._asked):
             self._answers, self._open = {0: evaluations}, self._open[:0]
             return
         for row, point in enumerate(evaluations.x):
+            # Equal candidates of a batch are answered one after the other.
             same = np.flatnonzero((self._asked[self._open] == point).all(axis=1))
             if same.size:
                 self._answers[int(self._open[same[0]])] = evaluations.rows(np.array([row]))

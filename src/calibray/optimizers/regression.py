@@ -118,6 +118,7 @@ class Trend(NamedTuple):
             return Trend(np.eye(len(unit)), np.zeros((0, len(unit))))
         basis = trend_basis(unit)
         size = basis.shape[1]
+        # The first columns of Q span the trend, and the others are the contrasts.
         q, r = np.linalg.qr(basis, mode="complete")
         return Trend(q[:, size:], solve_triangular(r[:size], q[:, :size].T))
 
@@ -257,14 +258,19 @@ class Likelihood:
         weights = inverse @ self.values
         square = np.maximum(np.sum(self.values * weights, axis=0), 1e-300)
         free = len(lower)
+        # Of Student's t; without degrees of freedom, of a Gaussian with the best variance of each residual.
         value = residuals * np.log(np.diag(lower)).sum()
         value += 0.5 * (self.freedom + free) * np.log((self.freedom + square) / (self.freedom + free)).sum()
         # Derivative by K (eq. 5.9), each residual weighted by its precision.
-        gap = residuals * inverse - (weights * _precision(free, square, self.freedom)) @ weights.T
-        gap *= 0.5
-        by_variance = kernel.variances * [gap.sum(), np.sum(gap * self.response), np.sum(gap * smooth)]
-        by_rate = v_2 * ((gap * matern_slope(distance)).ravel() @ self.squares) * rates_squared
-        return float(value), np.concatenate([by_variance, by_rate, [kernel.nugget * np.trace(gap)]])
+        by_matrix = residuals * inverse - (weights * _precision(free, square, self.freedom)) @ weights.T
+        by_matrix *= 0.5
+        by_variance = kernel.variances * [
+            by_matrix.sum(),
+            np.sum(by_matrix * self.response),
+            np.sum(by_matrix * smooth),
+        ]
+        by_rate = v_2 * ((by_matrix * matern_slope(distance)).ravel() @ self.squares) * rates_squared
+        return float(value), np.concatenate([by_variance, by_rate, [kernel.nugget * np.trace(by_matrix)]])
 
 
 class Prior(NamedTuple):

@@ -129,6 +129,7 @@ class VectorSurrogate(Optimizer):
             else:
                 self._model = self._fitted(points, residuals)
                 best_first = unit[np.argsort(evaluated.y, kind="stable")]
+                # The improvement refers to residuals; the value may have another scale.
                 best = float(root_mean_square(archive.leading.errors)[0])
                 chosen = self._choose(self._model, best_first, best, turn, count)
             yield box.from_unit(chosen)
@@ -139,6 +140,7 @@ class VectorSurrogate(Optimizer):
         points = maximin_design(self.initial, self.box.dimension, self._rng)
         spacing, counted = 0.5 * float(pdist(points).min()), earlier[:0]
         for point in earlier:
+            # Every earlier point that counts replaces the nearest one of the design.
             clumped = len(counted) and distance_to_nearest(point[None], counted)[0] < spacing
             if len(points) and not clumped:
                 counted = np.vstack([counted, point])
@@ -166,6 +168,7 @@ class VectorSurrogate(Optimizer):
         chosen = []
         for step in range(turn, turn + count):
             fresh = minima[distance_to_nearest(minima, taken) > SEPARATION]
+            # In turns: exploration, the lowest minimum, another basin.
             if step % 3 and len(fresh):
                 _, share = model.predict(fresh)
                 # argmax of flags is the first uncertain minimum, or the lowest one if none is uncertain
@@ -216,6 +219,7 @@ def improvement(
     It follows from predictions [k, m], their variance relative to the prior's [k], and draws with the prior covariance
     [draws, m]; it is 0 if no draw improves. `best` is the root mean square of the best residuals so far.
     """
+    # |r + s v|^2 = r.r + 2 s r.v + s^2 v.v for prediction r and draw v.
     along, across = 2.0 * np.sqrt(share)[:, None] * (mean @ draws.T), np.sum(draws**2, axis=1)
     square = np.sum(mean**2, axis=1)[:, None] + along + share[:, None] * across
     return np.maximum(best**2 - square / mean.shape[1], 0.0).mean(axis=1)

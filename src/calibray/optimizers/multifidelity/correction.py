@@ -258,6 +258,7 @@ def constants_fit(
     model, process, prior = corrected.cheap.model, corrected.discrepancy, corrected.cheap.constants
     points, width = corrected.cheap.box.from_unit(corrected.unit), prior.width
     (count, links), size = corrected.residuals.shape, len(prior.centre)
+    # Whitened over the points; the weights are inverse standard deviations of the residuals.
     whiten = np.linalg.inv(process.lower)
     weight = np.sqrt(process.precision)
     prior_slope = np.diag(width / prior.spread)

@@ -110,6 +110,7 @@ def scaled_density(whitened: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
     count, links = whitened.shape[-2:]
     square, scale = np.sum(whitened**2, axis=-2), np.ones(len(whitened))
     for _ in range(30):
+        # Reweighting converges to the scale at which a t distribution is most probable.
         weight = (FREEDOM + count) / (FREEDOM + square / scale[:, None])
         scale = np.maximum(np.mean(weight * square, axis=1) / count, NUGGET)
     density = 0.5 * (FREEDOM + count) * np.log1p(square / scale[:, None] / FREEDOM).sum(axis=1)
@@ -196,6 +197,7 @@ def sample_function(process: Process, random: np.random.Generator, stretch: floa
         random.uniform(0.0, 2.0 * np.pi, COSINES),
         size[2] * np.sqrt(2.0 / COSINES) * correlated(COSINES),
     )
+    # The answers are a function plus errors, so a draw of the errors belongs to what they miss.
     scatter = stretch * np.sqrt(kernel.nugget) * correlated(count)
     missed = process.values - prior.values(inputs) - scatter
     return SampledFunction(prior, solve(inputs, missed, kernel))

@@ -45,7 +45,7 @@ from calibray.optimizers.multifidelity.correction import (
     average,
     correct,
 )
-from calibray.optimizers.protocol import AS_GIVEN, CheapModel, Optimizer, Schedule, Search, Session
+from calibray.optimizers.protocol import CheapModel, Optimizer, Search, Session
 from calibray.optimizers.regression import Inputs
 from calibray.optimizers.sampling import design, distance_to_nearest, draw_around
 from calibray.optimizers.vector_surrogate import VectorSurrogate, improvement
@@ -121,8 +121,6 @@ class SpaceMapping(Optimizer):
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value", "residuals"})
-    schedule: ClassVar[Schedule | None] = AS_GIVEN
-    takes_starts: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -289,6 +287,7 @@ def error_ratio(corrected: Corrected) -> float:
     """
     residuals = corrected.residuals
     scale = max(float(residuals.std(axis=0).max()), 1e-12)
+    # The same process on the answers themselves.
     alone = discrepancy.fit(Inputs.plain(corrected.unit), residuals, scale)
     with_it, without = (
         np.sum(process.left_out_errors() ** 2, axis=0) for process in (corrected.discrepancy, alone)
