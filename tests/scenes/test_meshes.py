@@ -12,6 +12,7 @@ import calibray as cb
 from calibray.errors import InputError
 from calibray.scenes import Mesh, read_mesh, read_scene, read_triangles
 from calibray.scenes.meshes import ply_bytes
+from calibray.scenes.obstruction import obstruction
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
 from small_scenes import write_scene
@@ -264,3 +265,21 @@ def test_objects_that_became_unreadable_are_left_out_and_named(tmp_path: Path) -
     triangles = read_triangles(scene)
     assert triangles.left_out == ("wall",)
     assert triangles.ground.tolist() == [True, True]
+
+
+def test_triangles_are_those_of_the_placed_shapes(tmp_path: Path) -> None:
+    """A wall that its shape moves, scales from millimetres or gives as a rectangle obstructs like a plain mesh."""
+    wall = [[(0.0, -9.0, 0.0), (0.0, 9.0, 0.0), (0.0, 9.0, 9.0), (0.0, -9.0, 9.0)]]
+    file = write_scene(tmp_path, {**FLOOR, "wall": wall})
+    text = file.read_text()
+    moved = '<transform name="to_world"><translate x="3"/></transform></shape></scene>'
+    rectangle = (
+        '<shape type="rectangle" id="mesh-screen"><transform name="to_world"><rotate y="1" angle="90"/>'
+        '<translate x="-5" z="2"/></transform><ref id="mat-stone" name="bsdf"/></shape></scene>'
+    )
+    file.write_text(text.replace("</shape></scene>", moved).replace("</scene>", rectangle))
+    triangles = read_triangles(read_scene(file, 2e9))
+    assert triangles.left_out == ()
+    tx = np.array([[-8.0, 0.0, 2.0], [2.0, 0.0, 2.0], [-2.0, 0.0, 2.0]])
+    rx = np.array([[-2.0, 0.0, 2.0], [4.0, 0.0, 2.0], [2.0, 0.0, 2.0]])
+    assert obstruction(triangles, tx, rx).walls.tolist() == [1, 1, 0]

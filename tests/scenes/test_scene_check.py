@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibray.errors import InputError
-from calibray.scenes import Mesh, MeshObject, join_meshes, write_scene
+from calibray.scenes import Mesh, MeshObject, join_meshes, read_scene, write_scene
 from calibray.scenes.authoring import Windows, make_scene
 from calibray.scenes.checks import SceneCheck, check_scene
 from calibray.scenes.checks.scene_check import count_faults, find_covers
@@ -102,6 +102,18 @@ def test_a_wrong_unit_is_named(tmp_path, factor, offset, problem):
     result = check(tmp_path, Mesh(mesh.vertices * factor + offset, mesh.faces))
     assert any(problem in text for text in problems(result))
     assert result.findings[0].severity == "error"
+
+
+def test_a_mesh_in_millimetres_that_its_shape_scales_is_sound(tmp_path):
+    """At 300 m, single precision stores millimetres in steps of 0.03 mm: fine, though 0.03 m would not be."""
+    meshes = [MeshObject("body", "stone", cube(300_000.0))]
+    file = write_scene(tmp_path, meshes, STONE)
+    scale = '<transform name="to_world"><scale value="0.001"/></transform></shape>'
+    file.write_text(file.read_text().replace("</shape>", scale))
+    result = check_scene(file)
+    assert result.findings == ()
+    assert result.bounds == pytest.approx([0.0] * 3 + [300.0] * 3)
+    assert read_scene(file, 2e9).sizes[0].high == pytest.approx([300.0] * 3)
 
 
 def test_names_that_sionna_refuses_are_found(tmp_path):

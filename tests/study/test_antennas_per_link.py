@@ -19,7 +19,8 @@ from calibray.reporting.trust_figures import residuals_by_direction
 from calibray.result.verdict import RemarkKind
 from calibray.result.wording import remark_text
 from calibray.study import Setup, Study
-from calibray.tracing.antennas import stated_jones
+from calibray.study.mounting import largest_gain_dbi
+from calibray.tracing.antennas import AntennaPattern, stated_jones
 from calibray.tracing.settings import Antenna
 from link_tables import links_from_frame
 from two_ray import COLUMNS, TRUTH, TwoRay
@@ -89,6 +90,19 @@ def mounted(plain: Study, tx: dict[str, Any] = TX, **links: Any) -> Study:
     return Study.from_content(
         {name: value for name, value in content.items() if value is not None}, plain.path
     )
+
+
+def test_the_largest_gain_of_an_array_may_lie_in_a_side_lobe(tmp_path: Path) -> None:
+    """Elements that look 40 degrees down, in four rows: the first side lobe, of opposite phase, is the strongest."""
+    azimuth, elevation = (x.ravel() for x in np.meshgrid(np.arange(-180, 180, 5), np.arange(-90, 91, 5)))
+    gain = np.maximum(15 - 12 * ((elevation + 40) / 20) ** 2 - 12 * (azimuth / 60) ** 2, -20)
+    columns = {"azimuth_deg": azimuth, "elevation_deg": elevation, "gain_dbi": gain}
+    pd.DataFrame(columns).to_csv(tmp_path / "element.csv", index=False)
+    antenna = Antenna(pattern=str(tmp_path / "element.csv"), rows=4)
+    down = np.radians(np.arange(-90.0, 91.0))
+    direction = np.stack([np.cos(down), 0 * down, np.sin(down)], axis=-1)
+    power = (np.abs(AntennaPattern.of(antenna).jones_vectors(direction)[:, 0]) ** 2).sum(axis=-1)
+    assert largest_gain_dbi(antenna) == pytest.approx(10 * np.log10(power.max()), abs=1e-9)
 
 
 def test_three_transmitters_with_their_own_antennas_and_powers_are_calibrated(planted: Study) -> None:

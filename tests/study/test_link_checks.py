@@ -93,6 +93,18 @@ def test_a_planted_mistake_of_links_is_named(town, mistake, named):
     assert named in suspicions(town, mistake(links()))
 
 
+def test_the_gain_of_an_array_is_no_mistake(town):
+    """64 antennas have 18 dB more than one of 8 dBi: path losses as much below free space are no suspicion."""
+    array = {"rows": 8, "columns": 8}
+    frame = links()
+    distance = np.linalg.norm(frame[["x", "y", "z"]] - MAST, axis=1)
+    best = frame.assign(loss=20 * np.log10(4 * np.pi * distance * 3.5e9 / 299792458) - 26)
+    named = "path losses are below free space"
+    assert named in suspicions(town, best)
+    assert named not in suspicions(town, best, antenna=array)
+    assert named in suspicions(town, best.assign(loss=best.loss - 10), antenna=array)
+
+
 @pytest.mark.parametrize(
     ("changes", "named"),
     [

@@ -251,7 +251,9 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     level = sign * table.numbers(columns.value)
     rx = [str(name) for name in columns.rx]
     transmitter = [steps.transmitter] if steps.transmitter in table.frame else []
-    keys = dict.fromkeys([*steps.keep, *transmitter, *map(str, columns.tx)])
+    # The average gets one transmitted power, so that samples of different ones stay apart.
+    power = [columns.tx_power_dbm] if isinstance(columns.tx_power_dbm, str) else []
+    keys = dict.fromkeys([*steps.keep, *transmitter, *power, *map(str, columns.tx)])
     labels = pd.DataFrame({name: table.column(name) for name in keys})
     labels[_AREA] = _areas(table, averaging, rx)
     labels[_PART] = 0 if steps.held_out is None else steps.held_out(table)

@@ -39,12 +39,14 @@ def building_numbers(triangles: Triangles, position: NDArray[np.float64]) -> NDA
         return np.full(len(position), -1)
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     cell = max(CELL, float(np.sqrt(np.prod(np.maximum(high - low, CELL)) / MAX_CELLS)))
+    # One cell more, for the corners at the upper bounds.
     built = np.zeros(tuple(((high - low) / cell).astype(np.int64) + 1), dtype=bool)
     for point in _edge_cells((corners - low) / cell):
         built[point[:, 0], point[:, 1]] = True
     label = np.zeros(built.shape, dtype=np.int32)
     ndimage.label(built, structure=np.ones((3, 3)), output=label)
     tree = KDTree(np.argwhere(built), compact_nodes=False, balanced_tree=False)
+    # Cell k extends from k to k + 1; its centre is nearest, not its lower corner.
     _, nearest = tree.query((position[:, :2] - low) / cell - 0.5)
     return np.asarray(label[built][nearest] - 1, dtype=np.int64)
 
@@ -53,6 +55,7 @@ def _edge_cells(corners: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
     """Raster cells along the edges of triangles [F, 3, 2], in batches; successive cells of an edge are neighbours."""
     start = corners.reshape(-1, 2)
     step = np.roll(corners, -1, axis=1).reshape(-1, 2) - start
+    # Steps of at most one cell along either axis, so that an edge has no gap.
     count = np.ceil(np.abs(step).max(axis=1)).astype(np.int64) + 1
     ends = np.cumsum(count)
     first = 0
@@ -83,6 +86,7 @@ def footprints(
     inside = (high > least - around).all(axis=1) & (low < most + around).all(axis=1)
     lying = (np.abs(normal[:, 2]) > LEVEL * area) & (area > 0)
     chosen = np.flatnonzero(lying & inside & ~triangles.ground)
+    # All faces counter-clockwise from above, so that a shared edge occurs once in each direction.
     turned = normal[chosen, 2] < 0
     face = np.where(turned[:, None, None], corners[chosen][:, ::-1], corners[chosen])
     points = face.reshape(-1, 3)

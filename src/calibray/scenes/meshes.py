@@ -237,6 +237,7 @@ def _read_obj(content: bytes) -> Mesh:
                 for index, (_, _, attributes) in zip(indices, parts, strict=True)
                 if index is not None
             )
+            # A polygon as a fan of triangles around its first corner.
             faces += [(first, second, third) for second, third in pairwise(rest)]
     if not faces:
         raise InputError("has no faces")
@@ -264,6 +265,7 @@ def ply_bytes(mesh: Mesh) -> bytes:
     Vertices are rounded to 32-bit floats, or stored as 64-bit ones where that would lose more than a tenth of a
     millimetre.
     """
+    # Single precision halves the file; beyond 4 km, its steps are 0.5 mm or more.
     is_coarse = np.spacing(np.float32(np.abs(mesh.vertices).max(initial=0.0))) > 3e-4
     name, stored = ("double", "<f8") if is_coarse else ("float", "<f4")
     header = (

@@ -56,6 +56,7 @@ class Region:
         lines = shapely.linestrings(np.stack([start[:, :2], end[:, :2]], axis=1))
         line, prism = shapely.STRtree(self.outline).query(lines, predicate="intersects")
         low, high = _between(start[line, 2], end[line, 2], self.bottom[prism], self.top[prism])
+        # Lines beside the heights of a prism are dropped before the costly intersection in plan.
         near = high > low
         line, prism, low, high = line[near], prism[near], low[near], high[near]
         step = (end - start)[line]
@@ -69,6 +70,7 @@ class Region:
         piece = shapely.get_type_id(parts) == 1  # a touched corner is a point
         parts, of = parts[piece], sloping[of[piece]]
         ends = np.stack([shapely.get_coordinates(shapely.get_point(parts, k)) for k in (0, -1)], axis=1)
+        # Shares of the line at which the pieces begin and end, by projection in plan.
         away = ((ends - start[line[of], None, :2]) * step[of, None, :2]).sum(axis=2) / plan[of, None] ** 2
         away = np.clip(np.sort(away, axis=1), low[of, None], high[of, None])
         spans.append(np.column_stack([line[of], away])[away[:, 1] > away[:, 0]])
@@ -86,6 +88,7 @@ def united(
         return
     event = np.concatenate([spans[:, [0, 1]], spans[:, [0, 2]]])
     change = np.repeat([1, -1], count)
+    # Where one span ends as the next begins, the begin comes first, so that they are one piece.
     order = np.lexsort((-change, event[:, 1], event[:, 0]))
     depth = np.cumsum(change[order])
     begins = (depth == 1) & (change[order] == 1)
@@ -102,6 +105,7 @@ def _between(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The part of lines between two heights, as shares of the line [k] each; empty if low exceeds high."""
     rise = last - first
+    # A level line is between the heights all along or nowhere.
     level = np.abs(rise) < 1e-9
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = np.sort([(bottom - first) / rise, (top - first) / rise], axis=0)
@@ -157,6 +161,7 @@ class Obstruction:
         The wavelength [m] is that of all links or of each [n].
         """
         parameter = self.clearance / np.sqrt(wavelength)
+        # The bound also keeps lines without a roof, whose clearance is -inf, out of the root.
         above = np.maximum(parameter, CLEAR) - 0.1
         loss_db = 6.9 + 20 * np.log10(np.sqrt(above**2 + 1) + above)
         return np.where(parameter > CLEAR, loss_db, 0.0)
@@ -189,8 +194,10 @@ def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[n
     for line, face in _pairs(first, last, roofs):
         below, parameter = _under(first[line], last[line], roofs[face])
         np.maximum.at(clearance, line, parameter)
+        # Roofs that the line passes above give the edge's clearance but no span.
         inside = below[:, 1] > below[:, 0]
         spans.append(np.column_stack([line.astype(np.float64), below])[inside])
+    # Below several roofs at once, such as floors of one building, a length counts once.
     for line, lower, upper in united(np.concatenate([np.zeros((0, 3)), *spans])):
         np.add.at(length, line, upper - lower)
     length *= np.linalg.norm(end - start, axis=1)
@@ -200,6 +207,7 @@ def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[n
         for distance in (crossing(first[line], last[line], sides[face]),)
     ]
     crossed = np.concatenate([np.zeros((0, 2)), *crossings])
+    # By line, then by distance.
     crossed = crossed[np.lexsort(crossed.T[::-1])]
     separate = np.ones(len(crossed), dtype=bool)
     separate[1:] = (np.diff(crossed[:, 0]) > 0) | (np.diff(crossed[:, 1]) > SAME_CROSSING)
@@ -245,10 +253,12 @@ def _pairs(
         twice = np.concatenate([sorted_azimuth, sorted_azimuth + 2 * np.pi])
         relative = corners[:, :, :2] - origin
         direction = np.arctan2(relative[..., 1], relative[..., 0])
+        # The corners' azimuths relative to the first corner's, in (-pi, pi]: a range across 180 degrees stays whole.
         turn = np.angle(np.exp(1j * (direction - direction[:, :1])))
         low, high = direction[:, 0] + turn.min(axis=1), direction[:, 0] + turn.max(axis=1)
         around = high - low > np.pi * (1 - 1e-9)  # the origin is inside the triangle or on its side
         low, high = np.where(around, -np.pi, low) - 1e-12, np.where(around, np.pi, high) + 1e-12
+        # `twice` covers -pi to 3 pi; ranges that begin below are found one turn on.
         shift = np.where(low < -np.pi, 2 * np.pi, 0.0)
         begin = np.searchsorted(twice, low + shift, "left")
         count = np.searchsorted(twice, high + shift, "right") - begin
@@ -277,6 +287,7 @@ def _under(
     low, high = np.zeros(len(first)), np.ones(len(first))
     orientation = _cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
+        # Clip the line at the three sides of the triangle in plan (Cyrus and Beck); `sign` makes the inside positive.
         for k in range(3):
             side = corners[:, (k + 1) % 3] - corners[:, k]
             sign = np.sign(orientation)
@@ -285,6 +296,7 @@ def _under(
             share = -distance / slope
             low = np.where(slope > 0, np.maximum(low, share), low)
             high = np.where(slope < 0, np.minimum(high, share), high)
+            # A line parallel to a side and outside of it misses the triangle.
             high = np.where((slope == 0) & (distance < 0), -1.0, high)
         over = high > low
         # Height of the triangle's plane above the line, linear along it.
@@ -294,11 +306,13 @@ def _under(
         offset = point[..., :2] - corners[:, 0, :2]
         roof = corners[:, 0, 2] - (normal[:, :2] * offset).sum(axis=-1) / normal[:, 2]
         above = np.where(over, roof - point[..., 2], -1.0)
+        # Share at which the line passes through the plane; used only where the signs at both ends differ.
         zero = low + (high - low) * above[0] / (above[0] - above[1])
         lower = np.where(above[0] > 0, low, zero)
         upper = np.where(above[1] > 0, high, zero)
         # Fresnel parameter h sqrt(2 / lambda (1 / d1 + 1 / d2)), ITU-R P.526-15 equation 26, for a wavelength of 1 m
         length = np.linalg.norm(step, axis=1)
+        # Roofs above an antenna itself would give an infinite parameter.
         away = np.clip(ends, 1e-6, 1 - 1e-6)
         parameter = above * np.sqrt(2 / length * (1 / away + 1 / (1 - away)))
     below = over & ((above[0] > 0) | (above[1] > 0))
@@ -320,6 +334,7 @@ def crossing(
     """
     step = last - first
     one, other = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
+    # Intersection of Moller and Trumbore: barycentric u, v and the share of the line from one triple product.
     across = np.cross(step, other)
     offset = first - corners[..., 0, :]
     normal = np.cross(offset, one)

@@ -295,6 +295,7 @@ def _material(
     law = itu_law(str(itu), frequency, str(revision))
     # A constant given as a number does not depend on frequency.
     if "relative_permittivity" in constants:
+        # P.2040: permittivity a f^b, conductivity c f^d.
         law = law._replace(a=steady.a, b=0.0)
     if "conductivity" in constants:
         law = law._replace(c=steady.c, d=0.0)

@@ -83,18 +83,27 @@ def read_surface(shape: ElementTree.Element, path: Path) -> Mesh:
     """Read the surface of a shape in the scene frame.
 
     Raises:
-        InputError: As for `shape_mesh`, the transform has an element that Calibray does not know, or the
-            file stores coordinates in steps of more than `TOO_COARSE`.
+        InputError: As for `place_mesh`, or the file stores coordinates in steps of more than `TOO_COARSE`.
     """
-    mesh = shape_mesh(shape, path)
-    if mesh is None:
-        mesh = replace(_SQUARE, misread=True) if shape.get("type") == "rectangle" else _cube()
+    mesh = place_mesh(shape, path)
     if mesh.step > TOO_COARSE:
         raise InputError(
             f"{path}: the mesh of shape {shape.get('id')!r} lies so far from the origin that its file stores "
             f"coordinates in steps of {mesh.step:g} m; export it with coordinates of type double, or move the origin "
             "into the scene"
         )
+    return mesh
+
+
+def place_mesh(shape: ElementTree.Element, path: Path) -> Mesh:
+    """Read the mesh of a shape, also of a rectangle or cube, and apply its transform.
+
+    Raises:
+        InputError: As for `shape_mesh`, or the transform has an element that Calibray does not know.
+    """
+    mesh = shape_mesh(shape, path)
+    if mesh is None:
+        mesh = replace(_SQUARE, misread=True) if shape.get("type") == "rectangle" else _cube()
     matrix = transform_matrix(shape, path)
     if (matrix == np.eye(4)).all():
         return mesh
@@ -108,7 +117,9 @@ def read_surface(shape: ElementTree.Element, path: Path) -> Mesh:
     sheared = any(
         abs(np.linalg.norm(_axes(turn, 0.0)) - 1) > 1e-6 for turn in shape.findall("transform/rotate")
     )
-    return replace(mesh, vertices=vertices, misread=mesh.misread or sheared)
+    # The file's numbers are in its own unit, such as millimetres, which the transform scales to metres.
+    step = mesh.step * float(np.linalg.norm(matrix[:3, :3], 2))
+    return replace(mesh, vertices=vertices, step=step, misread=mesh.misread or sheared)
 
 
 def transform_matrix(shape: ElementTree.Element, path: Path) -> NDArray[np.float64]:
@@ -189,6 +200,7 @@ def local_origin(sizes: tuple[SurfaceSize, ...]) -> NDArray[np.float64]:
     low = np.min([size.low for size in sizes], axis=0)
     high = np.max([size.high for size in sizes], axis=0)
     furthest = max(float(np.abs(low).max()), float(np.abs(high).max()))
+    # A local origin at most halves the coordinates of a scene that is as large as it is far away.
     if furthest <= max(FAR, float((high - low).max())):
         return np.zeros(3)
     return np.rint((low + high) / 2)

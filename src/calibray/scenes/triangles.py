@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.scenes.meshes import Mesh, MeshObject
 from calibray.scenes.scene import Scene
-from calibray.scenes.scene_file import find_scene, shape_mesh
+from calibray.scenes.scene_file import find_scene
+from calibray.scenes.shapes import place_mesh, read_surface
 
 LEVEL: Final = 0.5
 """A face is level, like a roof or the ground, if the vertical part of its unit normal is above this [1]."""
@@ -33,10 +34,7 @@ _EDGE: Final = 1e-9
 
 
 def read_meshes(source: str | Path) -> Iterator[MeshObject]:
-    """Read the PLY and OBJ meshes of a scene, one after the other.
-
-    Faces are reversed if the file flips normals. Transforms of shapes are not applied, and shapes without a file
-    (rectangles, cubes) are skipped.
+    """Read the meshes of a scene in the scene frame, one after the other; faces are reversed if the file flips normals.
 
     Raises:
         InputError: The scene or a mesh cannot be read, or the scene has no mesh.
@@ -45,9 +43,7 @@ def read_meshes(source: str | Path) -> Iterator[MeshObject]:
     count = 0
     for shape in root.findall("shape"):
         name = (shape.get("id") or "?").removeprefix("mesh-")
-        mesh = shape_mesh(shape, path)
-        if mesh is None:
-            continue
+        mesh = place_mesh(shape, path)
         flip = shape.find("boolean[@name='flip_normals']")
         if flip is not None and flip.get("value") == "true":
             mesh = replace(mesh, faces=mesh.faces[:, ::-1])
@@ -92,7 +88,7 @@ class Triangles:
 def read_triangles(scene: Scene) -> Triangles:
     """Read the triangles of a scene.
 
-    Objects without a mesh file, with a transform, or whose file can no longer be read are left out and named.
+    Objects whose file can no longer be read are left out and named.
     """
     materials = list(scene.materials)
     meshes: list[Mesh] = []
@@ -101,13 +97,10 @@ def read_triangles(scene: Scene) -> Triangles:
     shapes = ElementTree.fromstring(scene.xml).findall("shape")
     for shape, item in zip(shapes, scene.objects, strict=True):
         try:
-            mesh = shape_mesh(shape, scene.path) if shape.find("transform") is None else None
+            meshes.append(read_surface(shape, scene.path))
         except InputError:
-            mesh = None
-        if mesh is None:
             left_out.append(item.name or "?")
         else:
-            meshes.append(mesh)
             material.append(materials.index(item.material))
     count = [len(mesh.faces) for mesh in meshes]
     offset = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
@@ -138,12 +131,14 @@ def _ground(triangles: Triangles, owner: NDArray[np.int64]) -> NDArray[np.bool_]
     area, height = np.linalg.norm(normal, axis=1), corners[:, :, 2].mean(axis=1)
     level = np.abs(normal[:, 2]) > LEVEL * area
     steep = area * ~level
+    # Mean height of the walls: a roof over most of the scene is above it, the ground below.
     walls = float(np.average(height, weights=steep)) if steep.any() else np.inf
     extent = np.ptp(triangles.vertex[:, :2], axis=0)
     for number in np.unique(owner):
         mask = owner == number
         own_extent = np.ptp(corners[mask][:, :, :2].reshape(-1, 2), axis=0)
         if (own_extent > LEVEL * extent).all() and area[mask & level].sum() > 0.95 * area[mask].sum():
+            # Area in plan over the area of the bounding box.
             covered = np.abs(normal[mask, 2]).sum() / own_extent.prod()
             below = np.average(height[mask], weights=area[mask]) < walls
             ground |= mask & bool(covered > WITHOUT_GAPS or (covered > LEVEL and below))
@@ -204,6 +199,7 @@ def vertical_crossings(
     # The lines are moved by a fraction of a micrometre: through an edge shared by two triangles they would cross both.
     x, y = points[:, 0] + 3.1e-7, points[:, 1] + 1.7e-7
     low, high = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
+    # Sorted by x, the points over the width of a triangle are one range.
     first = np.searchsorted(x, low[:, 0], "left")
     count = np.searchsorted(x, high[:, 0], "right") - first
     batch = np.cumsum(count) // BATCH

@@ -18,12 +18,9 @@ from calibray.measurements import FEW, Measurements
 from calibray.measurements.column_names import words
 from calibray.scenes.checks import Finding, SceneSurfaces, scale_findings
 from calibray.study.model import StudyModel
-from calibray.study.mounting import link_antennas
+from calibray.study.mounting import largest_gain_dbi, link_antennas
 from calibray.tracing.gain_table import read_gain_table
 from calibray.tracing.settings import Antenna
-
-PATTERN_GAIN_DB: Final = {"iso": 0.0, "dipole": 1.8, "hw_dipole": 2.2, "tr38901": 8.0}
-"""Largest gain of Sionna's antenna patterns [dB]."""
 
 BELOW_FREE_SPACE_DB: Final = 6.0
 """Path loss more than this below free space is suspicious [dB]; a ground reflection alone gains up to 6 dB."""
@@ -257,10 +254,7 @@ def _levels(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str]]
     frequency = study.scene.frequency if links.frequency is None else links.frequency
     free_space = 20 * np.log10(4 * np.pi * links.distance * frequency / speed_of_light)
     gain = sum(
-        max(
-            PATTERN_GAIN_DB.get(antenna.pattern, 20.0)
-            for antenna in link_antennas(study, end, links.table)[0]
-        )
+        max(largest_gain_dbi(antenna) for antenna in link_antennas(study, end, links.table)[0])
         for end in ("tx", "rx")
     )
     excess = free_space - gain - links.path_loss_db

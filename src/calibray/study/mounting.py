@@ -199,7 +199,8 @@ def port_power(study: StudyModel, table: SourceTable, optional: bool = False) ->
 def largest_gain_dbi(antenna: Antenna) -> float:
     """Largest gain of an antenna over all directions on a grid of one degree [dBi]."""
     zenith, azimuth = np.meshgrid(np.radians(np.arange(181.0)), np.radians(np.arange(-180.0, 180.0)))
-    return float(20 * np.log10(AntennaPattern.of(antenna).amplitude(zenith, azimuth).max()))
+    # In side lobes, the amplitude of an array can be negative.
+    return float(20 * np.log10(np.abs(AntennaPattern.of(antenna).amplitude(zenith, azimuth)).max()))
 
 
 FIRST_SPREAD: Final = 0.25

@@ -88,6 +88,7 @@ def _overlay(polygons: NDArray[Any]) -> tuple[list[Any], NDArray[np.bool_]]:
     inside = shapely.point_on_surface(pieces)
     covers = np.zeros((len(polygons), len(pieces)), dtype=bool)
     point, polygon = shapely.STRtree(polygons).query(inside, predicate="within")
+    # A piece lies wholly inside or outside each polygon, so one point of it decides.
     covers[polygon, point] = True
     built = covers.any(axis=0)
     return list(pieces[built]), covers[:, built]
@@ -258,6 +259,7 @@ def _strips(walls: dict[Edge, list[Stand]], windows: Windows | None) -> Strips:
     strips: Strips = {}
     for edge, stands in walls.items():
         if stands:
+            # Divided in one direction only: rounding from the other end could differ by a millimetre.
             start, end = min(edge), max(edge)
             forward = windows.divide((start, end))
             ends = [*(point for point, _ in forward[1:]), end]

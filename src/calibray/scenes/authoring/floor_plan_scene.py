@@ -191,6 +191,7 @@ def _extend(
         offset = end - other.start
         sine = outward[0] * along[1] - outward[1] * along[0]  # times the other's length
         reach = (other.thickness or WALL_THICKNESS) / 2 + _REACH
+        # The crossing of nearly parallel walls is not where they meet.
         if abs(sine) < 0.1 * np.hypot(*along):
             continue
         step = (along[0] * offset[1] - along[1] * offset[0]) / sine

@@ -48,6 +48,7 @@ class Terrain:
         northwest, northeast = self.z[row + 1, column], self.z[row + 1, column + 1]
         lower = southwest + u * (southeast - southwest) + v * (northeast - southeast)
         upper = southwest + v * (northwest - southwest) + u * (northeast - northwest)
+        # South-east of the diagonal, where u exceeds v, the cell is the lower triangle of `mesh`.
         return np.where(u >= v, lower, upper)
 
     def mesh(self) -> Mesh:
@@ -139,6 +140,7 @@ def pixels(
     inverse = ~affine  # type: ignore[operator]
     column = inverse.a * east + inverse.b * north + inverse.c
     row = inverse.d * east + inverse.e * north + inverse.f
+    # The affine transform counts from the corner of the first cell, not from its centre.
     return column - 0.5, row - 0.5
 
 

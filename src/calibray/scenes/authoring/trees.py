@@ -142,6 +142,7 @@ def read_trees(path: str | Path, frame: Frame) -> Trees:
         [height or HEIGHTS[kind] for height, kind in zip(heights, kinds, strict=True)], dtype=float
     )
     kind, narrow = np.array(kinds, dtype=str), np.isin(kinds, ("tree", "tree row"))
+    # Points and lines become discs and strips of a crown's width; areas keep their outline.
     radius = np.where(narrow, [0.5 * (crown or CROWN) for crown in crowns], 0.0)
     outline = np.array(shapes, dtype=object)
     if len(outline):
@@ -197,6 +198,7 @@ def read_canopy(
     classes = np.round(heights / STEP).astype(np.int32)
     a, b, c, d, e, f = (float(value) for value in tuple(affine)[:6])
     row, column = (int(value) for value in first)
+    # The transform of the part that was read, with its origin at its own first cell.
     window = type(affine)(a, b, c + a * column + b * row, d, e, f + d * column + e * row)
     polygons = [
         (shapely.from_geojson(json.dumps(shape)), value * STEP)

@@ -89,9 +89,11 @@ def _move_onto_lines(
         step = along * ((points[point] - middle[first]) @ along)
         crossing = next((other for other in others if abs(_cross(along, direction[other])) > CROSSING), None)
         if crossing is not None:
+            # Crossing of both lines, by Cramer's rule.
             reach = _cross(middle[crossing] - middle[first], direction[crossing])
             step = along * reach / _cross(along, direction[crossing])
         target = middle[first] + step
+        # At a small angle, a crossing can be far from the corner.
         if np.hypot(*(target - points[point])) <= 2 * tolerance:
             moved[point] = target
     return moved
@@ -110,6 +112,7 @@ def _lines(segments: NDArray[np.float64], edges: NDArray[np.int64], tolerance: f
         return np.zeros(0, dtype=np.int64)
     run = _group(segments, _parallel(segments, _touching(edges)), tolerance)
     single = run < 0
+    # Each edge that continues no other is a run of its own.
     run[single] = run.max() + 1 + np.arange(single.sum())
     middle, direction, _ = _fit_lines(segments, run)
     ends = ((segments - middle[run][:, None]) @ direction[run][..., None])[..., 0]

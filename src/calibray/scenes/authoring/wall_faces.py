@@ -118,6 +118,7 @@ def _types_drawn_as_faces(segments: Sequence[Segment], pairs: Sequence[tuple[int
     for segment in segments:
         length[segment.kind] += segment.length
     for one, other in pairs:
+        # Each pair covers this length of both of its lines.
         low, high = _span(segments[one], segments[other])
         faced[segments[one].kind] += 2 * (high - low)
     # A plan of faces pairs nearly all its length, a plan of single lines only the odd two walls.
@@ -169,6 +170,8 @@ def _part(segment: Segment, start: float, end: float, offset: float) -> Segment:
 def _merge_pair(one: Segment, other: Segment) -> Segment:
     """The sheet between two faces: over their overlap, with its ends midway where both faces end near each other."""
     low, high = sorted(_relative(one, other)[0].tolist())
+    # At a corner, one face ends a wall's thickness before the other: midway is the centre line of the wall that
+    # crosses.
     start = low / 2 if abs(low) <= THICKEST else max(low, 0.0)
     end = (high + one.length) / 2 if abs(high - one.length) <= THICKEST else min(high, one.length)
     sheet = _part(one, start, end, _offset(one, other) / 2)

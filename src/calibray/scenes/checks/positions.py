@@ -158,6 +158,7 @@ class SceneSurfaces:
     def _surfaces(self, position: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """All surfaces at some positions: index of the position, and height of the surface [m]."""
         shapely = library("shapely", "scenes")
+        # On an edge of two faces, a point has both; callers compare counts with zero or each other, not with one.
         index, face = self._tree.query(shapely.points(position[:, :2]), predicate="intersects")
         a, b, c = np.moveaxis(self.level[face], 1, 0)
         normal = np.cross(b - a, c - a)
@@ -268,5 +269,6 @@ def locate(triangles: Triangles, points: NDArray[np.float64]) -> NDArray[np.str_
         np.add.at(ground_below, point, is_ground & ~above)
     beyond = ((unique[:, :2] < scene_low[:2]) | (unique[:, :2] > scene_high[:2])).any(axis=1)
     under = ((ground > 0) & (ground_below == 0)) | (unique[:, 2] < scene_low[2] - CLEARANCE)
+    # Upwards from inside a closed body, a line crosses its surface an odd number of times.
     location = np.select([beyond, under, over_building % 2 == 1], [BEYOND, UNDER, INSIDE], "")
     return location[inverse.reshape(-1)]

@@ -245,6 +245,7 @@ def find_covers(corners: NDArray[np.float64]) -> NDArray[np.int64]:
     normal = normal / np.where(length > 2 * _FLAT, length, np.inf)
     steepest = np.abs(normal).argmax(axis=1)
     for axis in range(3):
+        # Faces are projected along the axis nearest to their normal, where they are widest.
         turn = [(axis + 1) % 3, (axis + 2) % 3, axis]
         members = np.flatnonzero(steepest == axis)
         centroid = corners[members].mean(axis=1)[:, turn]
@@ -256,10 +257,12 @@ def find_covers(corners: NDArray[np.float64]) -> NDArray[np.int64]:
             gap = height - centroid[point, 2]
             own = members[point]
             cosine = np.abs((normal[face] * normal[own]).sum(axis=1))
+            # The gap along the axis times the normal's part along it is the distance across the faces.
             near = (cosine > _PARALLEL) & (np.abs(gap * normal[own, axis]) < CLOSE) & (face != own)
             found[point[near]] = face[near]
             np.add.at(above, point, gap > CLOSE)
             np.add.at(below, point, gap < -CLOSE)
+        # A side with an even number of surfaces beyond it is outside of all closed bodies.
         # Nothing is in the open below the ground.
         is_open = (above % 2 == 0) | ((below % 2 == 0) & (axis != 2))
         cover[members[is_open]] = found[is_open]
@@ -316,8 +319,11 @@ def _count_flipped(
     base = np.full((piece.max() + 1, 3), np.inf)
     np.minimum.at(base, piece, np.minimum(np.minimum(a, b), c))
     normal = np.cross(b - a, c - a) * orientation[:, None]
+    # Divergence theorem: positive if the normals of a closed body point outwards. From a corner of the piece, so that
+    # large coordinates do not cancel.
     volume = np.bincount(piece, (normal * (a - base[piece])).sum(axis=1) / 6)
     area = np.bincount(piece, np.linalg.norm(normal, axis=1) / 2)
+    # Twice the signed area in plan; a level sheet has more than half of its area there.
     upward = np.bincount(piece, normal[:, 2])
     is_sheet = np.abs(volume) < 1e-3 * area**1.5
     is_level = np.abs(upward) > area
@@ -326,6 +332,7 @@ def _count_flipped(
         is_sheet & is_level, np.sign(upward), np.where(is_closed & ~is_sheet, np.sign(volume), 0.0)
     )
     wrong = orientation * right[piece] < 0
+    # Without a right side, the fewer faces count as flipped against their neighbours.
     minority = np.minimum(np.bincount(piece, orientation > 0), np.bincount(piece, orientation < 0))
     return int(wrong.sum() + minority[np.unique(piece[right[piece] == 0])].sum())
 
