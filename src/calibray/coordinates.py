@@ -37,8 +37,8 @@ class Frame:
         height: Height of z = 0 [m], above the same datum as other heights.
 
     Raises:
-        InputError: PROJ does not know the projection, it is not in metres with x to the east, or a number is not
-            finite.
+        InputError: PROJ does not know the projection, it is not in metres with x to the east and y to the north, or a
+            number is not finite.
     """
 
     crs: str
@@ -50,11 +50,12 @@ class Frame:
         if not np.isfinite([self.easting, self.northing, self.height]).all():
             raise InputError(f"frame {self.record()}: the origin must be finite numbers of metres")
         projection = parse_crs(self.crs)
-        units = {axis.unit_name for axis in projection.axis_info[:2]}
-        if not projection.is_projected or units != {"metre"}:
+        axes = {(axis.direction, axis.unit_name) for axis in projection.axis_info[:2]}
+        # Some projections count to the west and the south (EPSG:2048); a scene in them would be turned by 180 degrees.
+        if not projection.is_projected or axes != {("east", "metre"), ("north", "metre")}:
             raise InputError(
-                f"crs = {self.crs!r}: {projection.name} is not a projection in metres; name one, such as the UTM zone "
-                f"EPSG:326xx, or omit it for a local one"
+                f"crs = {self.crs!r}: {projection.name} is not a projection in metres with x to the east and y to the "
+                "north; name one, such as the UTM zone EPSG:326xx, or omit it for a local one"
             )
 
     @classmethod
@@ -81,6 +82,7 @@ class Frame:
         _check_degrees(np.array([longitude]), np.array([latitude]))
         if not -80 <= latitude <= 84:
             raise InputError(f"latitude = {latitude:g}: must be -80 to 84 degrees for UTM; use a local frame")
+        # 180 degrees east would be zone 61. The wider zones of Norway and Svalbard are ignored: their neighbours serve.
         zone = min(int((longitude + 180) // 6) + 1, 60)
         crs = f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
         easting, northing, _ = cls(crs).to_scene([longitude], [latitude])[0]
@@ -199,6 +201,7 @@ def find_projection(
     here = pyproj.aoi.AreaOfInterest(longitude, latitude, longitude, latitude)
     known = pyproj.database.query_crs_info("EPSG", pyproj.enums.PJType.PROJECTED_CRS, here, contains=True)
     utm = [Frame.utm(longitude, latitude).crs] if -80 <= latitude <= 84 else []
+    # At least half of the positions must lie on the scene; of equal shares the first candidate wins.
     best, most = None, 0.5
     # Points of equal coordinates in two geodetic datums are less than 3 km apart, most less than 1 km.
     reach = 3000.0 + 2 * float(np.max(np.subtract(high, low)))
@@ -209,11 +212,8 @@ def find_projection(
             if not np.hypot(np.median(x) - east, np.median(y) - north) < reach:
                 continue
             placed = frame.to_scene(x, y, 0.0, crs)[:, :2]
-        except (
-            InputError,
-            pyproj.exceptions.ProjError,
-        ):  # outside the projection, or it is none of the globe
-            continue
+        except (InputError, pyproj.exceptions.ProjError):
+            continue  # the scene is outside the projection, or it is none of the globe
         share = float(((placed >= np.asarray(low)) & (placed <= np.asarray(high))).all(axis=1).mean())
         if share > most or (best is None and share == most):
             best, most = crs, share

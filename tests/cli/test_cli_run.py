@@ -16,6 +16,7 @@ import planted
 import programs
 from calibray.calibration.result import Result
 from calibray.cli.console import progress_bars
+from calibray.cli.predict import _columns
 from calibray.paths import Paths
 from calibray.reporting import result_tables
 from calibray.result.files import FILES
@@ -337,3 +338,10 @@ def test_the_cache_is_listed_and_cleared(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["mine.h5"]
     monkeypatch.setenv("CALIBRAY_CACHE", "")
     assert "CALIBRAY_CACHE is empty" in run("cache").stdout
+
+
+def test_names_with_underscores_are_not_numbers():
+    """Python reads 1_2 as 12; a map would take the offset of another sector."""
+    assert _columns(["sector=1_2", "carrier=3.5e9", "side=east"]) == {
+        "sector": "1_2", "carrier": 3.5e9, "side": "east",
+    }  # fmt: skip

@@ -101,6 +101,17 @@ def test_the_reported_path_loss_is_that_of_paths_sampled_with_the_calibrated_mat
     computed = np.array([float(row["computed_db"]) for row in rows])
     assert computed == pytest.approx(links.scene_db.to_numpy(), abs=LIMIT_DB)
     assert np.isfinite(computed).sum() > len(links) / 2
+    script = str(tmp_path / "exported" / "load_scene.py")
+    monkeypatch.setattr(sys, "argv", ["load_scene.py", rows[0]["row"], "9999"])
+    with pytest.raises(SystemExit, match=r"links\.csv has no row 9999"):
+        runpy.run_path(script, run_name="__main__")
+    record = tmp_path / "exported" / "calibration.json"
+    calibration = json.loads(record.read_text())
+    calibration["antennas"]["tx"]["pattern"] = "sector.msi"
+    record.write_text(json.dumps(calibration))
+    monkeypatch.setattr(sys, "argv", ["load_scene.py", rows[0]["row"]])
+    with pytest.raises(SystemExit, match=r"The gain of the tx antenna is a table \(sector\.msi\)"):
+        runpy.run_path(script, run_name="__main__")
     assert sampling_text(result) == ""
     unchecked = replace(result, fit=replace(result.fit, retrace_gap_db=None))
     assert "depends on the materials" in sampling_text(unchecked)

@@ -10,7 +10,7 @@ def test_a_plan_shows_the_antennas_and_the_footprints(tmp_path):
     figure = draw_positions(made.path, [[0, 0, 10]], [[5, 5, 1.5], [40, 5, 1.5]])
     (axes,) = figure.axes
     labels = {text.get_text() for text in axes.get_legend().get_texts()}
-    assert labels == {"2 receivers", "1 transmitters"}
+    assert labels == {"2 receivers", "1 transmitter"}
     # Two collections of antennas, one of roofs and one of walls; the ground is left out.
     assert len(axes.collections) == 4
     figure.savefig(tmp_path / "map.svg")

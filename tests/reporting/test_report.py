@@ -9,12 +9,20 @@ from dataclasses import replace
 import numpy as np
 
 import shown
+from calibray.calibration.result import Result
 from calibray.comparison import comparison
 from calibray.reporting import result_tables
 from calibray.reporting import scene_tables as trace
-from calibray.reporting.page import _laws
+from calibray.reporting.page import _laws, _tiles
 from calibray.reporting.summary import summary
-from calibray.reporting.wording import carriers_text, method_text, scene_alone_text
+from calibray.reporting.wording import (
+    carriers_text,
+    diagnostics_table,
+    method_text,
+    prediction_text,
+    scene_alone_text,
+)
+from calibray.result.held_out import Model
 from calibray.study import Study
 from calibray.tables import render
 from calibray.tracing.protocol import EnclosedAntennas
@@ -67,6 +75,58 @@ def test_the_result_of_an_external_program_names_its_method_its_failures_and_its
     ).rows
     assert "Predictions at new links and maps call the program" in scene_alone_text(result)
     assert "differs from the predictions" in scene_alone_text(shown.result())
+
+
+def predicted_by(name: str, **values: object) -> Result:
+    """The stored result with another prediction model."""
+    result = shown.result()
+    model = replace(result.prediction.model, name=name, **values)
+    return replace(result, prediction=replace(result.prediction, model=model))
+
+
+def test_an_average_without_nuisances_is_a_whole_sentence():
+    values = dict(shown.result().parameters)
+    average = predicted_by(Model.AVERAGE_CALIBRATED, averaged=values)
+    text = "with the calibrated materials, averaged with those of a fit with a prior"
+    assert prediction_text(average).startswith(
+        f"Predictions and maps use the model '{Model.AVERAGE_CALIBRATED}', {text}, and the fitted offset."
+    )
+    assert f"{text}." in prediction_text(predicted_by(Model.AVERAGE_CALIBRATED, averaged=values, terms=()))
+
+
+def test_the_model_with_obstruction_uses_the_scene_but_no_materials():
+    assert "which uses no scene" in scene_alone_text(predicted_by(Model.LOG_DISTANCE, parameters=None))
+    assert "which uses no materials" in scene_alone_text(predicted_by(Model.OBSTRUCTION, parameters=None))
+
+
+def test_the_mean_of_each_group_is_mentioned_only_with_groups():
+    result = shown.result()
+    grouped = replace(result, links=result.links.assign(group=["east", "west"] * 6))
+    alone = replace(result, links=result.links.drop(columns="group", errors="ignore"))
+    assert "dB without the mean of each group)" in scene_alone_text(grouped)
+    assert "dB without their mean)" in scene_alone_text(alone)
+    single = replace(alone, links=alone.links.iloc[:1].assign(scene_db=80.0, predicted_db=90.0))
+    assert "by 10.00 dB (RMS over 1 link; 0.00 dB without their mean)" in scene_alone_text(single)
+
+
+def test_one_interaction_is_singular():
+    result = shown.result()
+    depth = np.where(np.arange(12) < 6, 1.0, 2.0)
+    shift = np.where(depth == 1, 9.0, -1.0) + result.links.measured_db
+    deep = replace(
+        result, links=result.links.assign(depth=depth, predicted_db=shift, has_path=True, held_out=False)
+    )
+    assert ", paths of 1 interaction, 6 links" in dict(diagnostics_table(deep).rows)["by depth"]
+
+
+def test_the_rival_with_further_nuisances_is_not_called_an_offset_alone():
+    result = shown.result()
+    slope = changed(result, coefficients={**result.nuisance.coefficients, "slope": {"": 1.0}})
+    names = [[text.partition(":")[0] for text in _tiles(found)[0][2]] for found in (result, slope)]
+    assert [found[1] for found in names] == [
+        "initial materials, offset only",
+        "initial materials, nuisances only",
+    ]
 
 
 def test_a_trace_and_its_check_are_printed_as_stored():

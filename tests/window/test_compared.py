@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from calibray.errors import InputError
 from calibray.result.held_out import HeldOutErrors
 from calibray.window.result_steps import better, changes, predicted_text
 
@@ -67,6 +68,13 @@ def test_results_without_links_in_common_are_not_compared(results):
     planted["old"] = replace(other, block=np.where(other.block < 2, other.block, -1))
     planted["new"] = replace(other, block=np.where(other.block < 2, -1, other.block))
     assert "no held-out link in common" in better("old", "new", folder)
+
+
+def test_a_result_is_not_compared_with_itself(results):
+    planted, folder = results
+    planted.update(old=held_out(3.0, 1))
+    with pytest.raises(InputError, match="old: chosen twice; choose two results"):
+        better("old", "old", folder)
 
 
 def test_the_changes_of_a_study_are_its_settings_that_differ():

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from calibray.errors import InputError
 from calibray.study import Study
-from calibray.window.desk import StudyFolder, sites
+from calibray.window.desk import Desk, StudyFolder, sites
+from calibray.window.result_steps import write_links
 from calibray.window.study_steps import likely_tables
+from small_scenes import block, write_scene
 
 STUDY = """version = 1
 
@@ -163,3 +166,19 @@ def test_sectors_of_one_mast_are_separate_transmitters(tmp_path):
     found = sites(study, study.measurements())
     assert [site["name"] for site in found] == ["east at 0, 0, 25", "south at 0, 0, 25"]
     assert [site["columns"] for site in found] == [east, south]
+
+
+def test_places_are_at_their_height_above_the_ground(tmp_path):
+    """On a slope of 20 %, where z = 1.5 m would be under the ground."""
+    slope = [[(0.0, 0.0, 0.0), (200.0, 0.0, 40.0), (200.0, 100.0, 40.0), (0.0, 100.0, 0.0)]]
+    write_scene(tmp_path, {"ground": slope, "house": block((20.0, 20.0, 0.0), (40.0, 40.0, 15.0))})
+    desk = Desk(StudyFolder(tmp_path), scene="scene.xml")
+    site = {"tx": [0.0, 0.0, 30.0], "columns": {"sector": "north"}}
+    write_links(desk, "candidates.csv", site, np.array([50.0, 100.0]), np.array([60.0]), 1.5)
+    table = pd.read_csv(tmp_path / "candidates.csv")
+    assert table[["rx_x", "rx_y"]].to_numpy().tolist() == [[50.0, 60.0], [100.0, 60.0]]
+    assert table["rx_z"].to_numpy() == pytest.approx([11.5, 21.5])
+    assert (table["tx_z"] == 30.0).all()
+    assert (table["sector"] == "north").all()
+    with pytest.raises(InputError, match="heights above the ground need a scene"):
+        write_links(Desk(StudyFolder(tmp_path)), "place.csv", site, np.array([1.0]), np.array([1.0]), 1.5)

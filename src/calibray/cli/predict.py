@@ -384,7 +384,8 @@ def _columns(entries: list[str]) -> dict[str, object]:
         if not equals or not name:
             raise InputError(f"--column {entry}: must be NAME=VALUE, such as sector=north")
         try:
-            columns[name] = float(value)
+            # Python reads 1_2 as 12, but tables keep it as text.
+            columns[name] = value if "_" in value else float(value)
         except ValueError:
             columns[name] = value
     return columns

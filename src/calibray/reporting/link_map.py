@@ -18,6 +18,7 @@ from calibray.scenes import Triangles, read_meshes
 from calibray.scenes.buildings import footprints
 from calibray.scenes.triangles import LEVEL, STEEP, is_ground
 from calibray.support.figure_style import BLUE, FAINT, LINE, ORANGE, dress, styled
+from calibray.support.messages import counted
 from calibray.support.output_files import check_file, replacing
 
 WIDTH: Final = 1000
@@ -240,11 +241,11 @@ def draw_positions(source: str | Path, tx: ArrayLike, rx: ArrayLike) -> Figure:
             axes.add_collection(
                 PolyCollection(list(corners[:, :, :2]), facecolor=LINE, edgecolor=edges, linewidth=0.6)
             )
-    marks = {"receivers": (rx, "o", BLUE, 12), "transmitters": (tx, "^", ORANGE, 60)}
+    marks = {"receiver": (rx, "o", BLUE, 12), "transmitter": (tx, "^", ORANGE, 60)}
     for name, (positions, marker, color, size) in marks.items():
         points = np.asarray(positions, dtype=float).reshape(-1, 3)
         if len(points):
-            label = f"{len(points)} {name}"
+            label = counted(len(points), name)
             axes.scatter(*points[:, :2].T, s=size, c=color, marker=marker, label=label, zorder=3)
     axes.autoscale_view()
     axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=len(marks))

@@ -238,8 +238,11 @@ def _tiles(result: Record) -> list[tuple[str, str, tuple[str, ...]]]:
         if judged
         else (fit.rmse_db, fit.nuisance_only_rmse_db, fit.log_distance_rmse_db)
     )
-    rmse_db, offset_only_db, log_distance_db = errors
-    rivals = {"initial materials, offset only": offset_only_db, "log-distance model": log_distance_db}
+    rmse_db, nuisances_only_db, log_distance_db = errors
+    rivals = {
+        f"initial materials, {tables.nuisances_only(result)}": nuisances_only_db,
+        "log-distance model": log_distance_db,
+    }
     identified = sum(interval.verdict == Verdict.IDENTIFIED for interval in result.intervals.values())
     tiles = [
         (
@@ -259,7 +262,7 @@ def _tiles(result: Record) -> list[tuple[str, str, tuple[str, ...]]]:
 
 
 def _held_out_errors(result: Record) -> tuple[float | None, float | None, float | None]:
-    """Held-out RMSE of the prediction model, of the initial materials with an offset, and of the log-distance model."""
+    """Held-out RMSE of the prediction model, of the initial materials with nuisances, and of the log-distance model."""
     model, accuracy = result.prediction.model, result.accuracy
     own_db = accuracy.holdout_rmse_db if model.name == Model.CALIBRATED else model.residual_db
     return own_db, accuracy.nuisance_only_holdout_rmse_db, accuracy.log_distance_holdout_rmse_db

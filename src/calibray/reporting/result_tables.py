@@ -162,10 +162,9 @@ def nuisances(result: Record) -> Table:
 def accuracy(result: Record) -> Table:
     """RMSE before and after calibration, and that of the baselines."""
     fit, held_out = result.fit, result.accuracy
-    nuisances_only = "nuisances only" if _nuisances_besides_offset(result) else "offset only"
     rows = (
         ("before", fit.initial_rmse_db, held_out.initial_holdout_rmse_db),
-        (nuisances_only, fit.nuisance_only_rmse_db, held_out.nuisance_only_holdout_rmse_db),
+        (nuisances_only(result), fit.nuisance_only_rmse_db, held_out.nuisance_only_holdout_rmse_db),
         ("after", fit.rmse_db, held_out.holdout_rmse_db),
         ("log-distance model", fit.log_distance_rmse_db, held_out.log_distance_holdout_rmse_db),
     )
@@ -260,6 +259,11 @@ def values(result: Record) -> list[Value]:
             )
         )
     return entries
+
+
+def nuisances_only(result: Record) -> str:
+    """The name of the model with the initial materials and fitted nuisances."""
+    return "nuisances only" if _nuisances_besides_offset(result) else "offset only"
 
 
 def _nuisances_besides_offset(result: Record) -> dict[str, dict[str, float]]:

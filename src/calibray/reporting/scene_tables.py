@@ -13,6 +13,7 @@ from calibray.reporting.result_tables import suspicious_rows
 from calibray.scenes.authoring import MadeScene
 from calibray.scenes.checks import Finding, SceneCheck
 from calibray.study.draft import Draft
+from calibray.support.messages import counted
 from calibray.tables import LISTED, Column, Table, numbers, rows_text
 from calibray.tracing.convergence import Convergence
 from calibray.tracing.protocol import EnclosedAntennas
@@ -43,7 +44,7 @@ def contents(scene: MadeScene) -> Table:
 
 def _listed(names: Sequence[str]) -> str:
     first = ", ".join(names[:LISTED]) + (", ..." if len(names) > LISTED else "")
-    return f"{len(names)} buildings: {first}"
+    return f"{counted(len(names), 'building')}: {first}"
 
 
 def findings(check: SceneCheck) -> list[Table]:

@@ -10,6 +10,7 @@ from calibray.parameters.parameter import PARAMETER_BOUNDS
 from calibray.reporting.wording import (
     block_sentence,
     carriers_text,
+    group_text,
     method_text,
     prediction_text,
     scene_alone_text,
@@ -17,6 +18,7 @@ from calibray.reporting.wording import (
 from calibray.result.record import Record
 from calibray.result.verdict import RemarkKind, Verdict
 from calibray.result.wording import NOT_JUDGED, judgement_text
+from calibray.support.messages import counted
 from calibray.tables import named, rows_text
 from calibray.validation.validation import Validation
 
@@ -68,14 +70,13 @@ def summary(result: Record, links_by_material: Mapping[str, int] | None = None) 
 
 
 def _scope(result: Record) -> Sentence:
-    study, count = result.study, len(result.parameters)
+    study = result.study
     materials = list(dict.fromkeys(name.rpartition(".")[0] for name in result.parameters))
-    constants = "1 constant" if count == 1 else f"{count} constants"
     return Sentence(
         "What was calibrated?",
-        f"{constants} of {_list(materials)} at {carriers_text(result)}, on "
-        f"{result.counts['calibrated_on']:,} links, by {method_text(result, study.method.name)} with the engine "
-        f"{study.engine.name}: {result.rt_calls:,} RT calls in {_seconds(result.cost.seconds)}, after "
+        f"{counted(len(result.parameters), 'constant')} of {_list(materials)} at {carriers_text(result)}, on "
+        f"{counted(result.counts['calibrated_on'], 'link')}, by {method_text(result, study.method.name)} with the "
+        f"engine {study.engine.name}: {counted(result.rt_calls, 'RT call')} in {_seconds(result.cost.seconds)}, after "
         f"{_seconds(result.cost.trace_seconds)} of tracing and loading.",
     )
 
@@ -185,9 +186,8 @@ def _cautions(result: Record) -> Iterator[Sentence]:
     sentences = []
     without_path = result.counts["rows_without_path"]
     if without_path:
-        sentences.append(
-            f"{len(without_path):,} of {len(result.links):,} links have no path ({rows_text(without_path)})."
-        )
+        verb, count = "has" if len(without_path) == 1 else "have", counted(len(result.links), "link")
+        sentences.append(f"{len(without_path):,} of {count} {verb} no path ({rows_text(without_path)}).")
     enclosed = result.provenance.enclosed
     if enclosed is not None and not enclosed.indoors:
         for end, rows in (("transmitter", enclosed.tx), ("receiver", enclosed.rx)):
@@ -202,10 +202,8 @@ def _cautions(result: Record) -> Iterator[Sentence]:
             f"than the tolerance of {tolerance:g} dB (fidelity.tolerance_db)."
         )
     if result.nuisance.groups_without_path:
-        sentences.append(
-            f"No calibration link of {named(result.nuisance.groups_without_path)} has a path, so their offset is "
-            "unknown."
-        )
+        groups = named(group_text(result, group) for group in result.nuisance.groups_without_path)
+        sentences.append(f"No calibration link of {groups} has a path, so the offset there is unknown.")
     yield from _headed("What calls for caution?", sentences, "caution")
 
 

@@ -39,7 +39,7 @@ class Rays:
     Attributes:
         paths: The strongest paths of every link, strongest first.
         vertex: Their points of interaction [I, 3], [m].
-        gain_db: Their power gain with the calibrated materials, without nuisances [P], [dB].
+        gain_db: Their power gain with the materials that exports write, without nuisances [P], [dB].
         per_link: Most paths per link.
         traced: Number of traced paths.
         links_by_material: Number of links with at least one traced path that interacts with the material, by material.
@@ -67,7 +67,7 @@ def rays(result: Record, progress: Progress | None = None) -> Rays:
 
 
 def strongest(paths: Paths, result: Record) -> Rays:
-    """Select the strongest paths of every link, with a result's materials."""
+    """Select the strongest paths of every link, with the materials that exports write."""
     gain = path_gains(paths, result.scene_materials).reshape(paths.num_paths, -1)
     # Summed over receive ports and averaged over transmit ports, as in path loss.
     power = (np.abs(gain) ** 2).sum(axis=1) / paths.tx_field.shape[1]

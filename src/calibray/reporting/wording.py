@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
@@ -17,7 +17,7 @@ from calibray.reporting.diagnostics import calibration_links, diagnostics, link_
 from calibray.result.held_out import HeldOutErrors, Model
 from calibray.result.record import Record
 from calibray.study.displacement import RECEIVER
-from calibray.support.messages import percent
+from calibray.support.messages import counted, percent
 from calibray.tables import Column, Table, hertz, named, rows_text
 from calibray.tracing.antennas import POSE
 from calibray.uncertainty.verdicts import TRADE_OFF
@@ -27,17 +27,17 @@ def prediction_text(record: Record) -> str:
     """What predictions use."""
     model = record.prediction.model
     if model.parameters is None:
-        source = "no materials" if model.name == Model.OBSTRUCTION else "no scene"
+        source = _unused(record)
     elif model.parameters == record.parameters:
         source = "the calibrated materials"
     else:
         source = (
             "materials calibrated with a prior" if model.name != Model.INITIAL else "the initial materials"
         )
-    if model.averaged is not None:
-        source += f", averaged with {_AVERAGED[Model(model.name)]},"
     terms = [term.name for term in model.terms]
     added = f" and the fitted {' and '.join(terms)}" if terms else ""
+    if model.averaged is not None:
+        added = f", averaged with {_AVERAGED[Model(model.name)]}{',' if terms else ''}{added}"
     fallback = record.prediction.fallback
     text = f"Predictions and maps use the model {str(model.name)!r}, with {source}{added}."
     if fallback is None:
@@ -51,6 +51,11 @@ _AVERAGED: Final = {
     Model.AVERAGE_CALIBRATED: "those of a fit with a prior",
     Model.AVERAGE_OFFSETS: "those of a fit with a prior and offsets",
 }
+
+
+def _unused(record: Record) -> str:
+    """What a prediction model without materials does not use; the one with obstruction uses walls and roofs."""
+    return "no materials" if record.prediction.model.name == Model.OBSTRUCTION else "no scene"
 
 
 def carriers_text(record: Record) -> str:
@@ -106,18 +111,20 @@ def scene_alone_text(record: Record) -> str:
         *([] if model.averaged is None else ["the average with other materials"]),
     ]
     cause = " or ".join(filter(None, (", ".join(missing[:-1]), *missing[-1:]))) or "its ceiling"
+    rms = f"{rms_db:.2f} dB (RMS over {counted(len(difference), 'link')}"
     if model.parameters is None:
         return (
-            f"Predictions use the model {str(model.name)!r}, which uses no scene. The exported scene has the "
-            f"calibrated materials; its path loss differs from the predictions by {rms_db:.2f} dB (RMS over "
-            f"{len(difference)} links).{near}"
+            f"Predictions use the model {str(model.name)!r}, which uses {_unused(record)}. The exported scene has the "
+            f"calibrated materials; its path loss differs from the predictions by {rms}).{near}"
         )
-    group = links["group"].to_numpy()[both] if "group" in links else np.zeros(len(difference))
+    group, mean = np.zeros(len(difference)), "their mean"
+    if "group" in links:
+        group, mean = links["group"].to_numpy()[both], "the mean of each group"
     means = pd.Series(difference).groupby(group, dropna=False).transform("mean").to_numpy()
     spread_db = float(np.sqrt(np.mean((difference - means) ** 2)))
     return (
-        f"The exported scene alone differs from the predictions by {rms_db:.2f} dB (RMS over {len(difference)} links; "
-        f"{spread_db:.2f} dB without the mean of each group): a scene cannot contain {cause}.{near}"
+        f"The exported scene alone differs from the predictions by {rms}; {spread_db:.2f} dB without {mean}): a scene "
+        f"cannot contain {cause}.{near}"
     )
 
 
@@ -180,10 +187,12 @@ def diagnostics_table(result: Record) -> Table:
     findings = {
         "power": text("power", _power_text),
         "over distance": _distance_text(result),
-        "by depth": _class_text(tables, "depth", "paths of {} interactions"),
-        "by group": _class_text(tables, "group", "group {}", lambda label: group_text(result, label)),
+        "by depth": _class_text(
+            tables, "depth", lambda depth: f"paths of {counted(int(depth), 'interaction')}"
+        ),
+        "by group": _class_text(tables, "group", lambda label: f"group {group_text(result, str(label))}"),
         "by obstruction": text("obstruction", _obstruction_text),
-        "by street": _class_text(tables, "streets", "{}"),
+        "by street": _class_text(tables, "streets", str),
         "missing region": text("missing_region", _missing_region_text),
         "neighbours": text("neighbours", _neighbours_text),
         "leverage": text("leverage", _leverage_text),
@@ -216,9 +225,7 @@ def _distance_text(result: Record) -> str:
     return f"{verdict}: the residuals change by {slope:+z.1f} dB per decade, standard error {error:.1f} dB"
 
 
-def _class_text(
-    tables: dict[str, pd.DataFrame], column: str, wording: str, shown: Callable[[str], str] = str
-) -> str:
+def _class_text(tables: dict[str, pd.DataFrame], column: str, described: Callable[[Any], str]) -> str:
     """The class of links with the largest mean residual."""
     if column not in tables or len(tables[column]) < 2:
         return ""
@@ -228,10 +235,9 @@ def _class_text(
     worst = table.iloc[int(np.argmax(table["mean_db"].abs()))]
     if abs(worst["mean_db"]) < 0.1:
         return ""
-    name = f"{worst[column]:g}" if isinstance(worst[column], float) else shown(str(worst[column]))
     clear = abs(worst["mean_db"]) > CLEAR * worst["standard_deviation_db"] / np.sqrt(worst["links"])
     return (
-        f"largest mean residual: {worst['mean_db']:+z.1f} dB, {wording.format(name)}, {worst['links']:.0f} links"
+        f"largest mean residual: {worst['mean_db']:+z.1f} dB, {described(worst[column])}, {worst['links']:.0f} links"
         + ("" if clear else " (not significant)")
     )
 
@@ -242,7 +248,7 @@ def _obstruction_text(table: pd.DataFrame) -> str:
     for row in table.to_dict("records"):
         below = f"with {row['from_m']:.0f} to {row['to_m']:.0f} m below roofs"
         where = "in sight" if not row["out_of_sight"] else below if row["to_m"] >= 1.0 else "out of sight"
-        parts.append(f"{row['mean_db']:+z.1f} dB {where} ({row['links']} links)")
+        parts.append(f"{row['mean_db']:+z.1f} dB {where} ({counted(row['links'], 'link')})")
     return f"mean residual: {', '.join(parts)}"
 
 

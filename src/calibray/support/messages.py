@@ -87,6 +87,16 @@ def type_name(value: object) -> str:
     return type(value).__name__ if package == "builtins" else f"{package}.{type(value).__name__}"
 
 
+def counted(number: int, noun: str) -> str:
+    """A number with its noun, whose plural ends in s.
+
+    Example:
+        >>> counted(1, "link"), counted(1200, "link")
+        ('1 link', '1,200 links')
+    """
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
 def percent(share: float) -> str:
     """Write a share as a whole number of per cent.
 
@@ -107,4 +117,4 @@ def duration(seconds: float) -> str:
     for unit, length in (("days", 86_400.0), ("hours", 3_600.0), ("minutes", 60.0)):
         if seconds >= 2 * length:
             return f"{seconds / length:,.0f} {unit}"
-    return f"{seconds:.0f} seconds"
+    return counted(round(seconds), "second")

@@ -28,8 +28,9 @@ from calibray.errors import InputError
 from calibray.measurements import Measurements
 from calibray.measurements.delimited_text import SUFFIXES
 from calibray.reporting.link_map import lay_out
-from calibray.scenes import read_scene, read_triangles
+from calibray.scenes import Scene, Triangles, read_scene, read_triangles
 from calibray.scenes.checks import SceneSurfaces
+from calibray.scenes.triangles import ground_heights
 from calibray.study import Study
 from calibray.study.link_checks import count_unknowns, examine
 from calibray.study.mounting import mounting_columns
@@ -219,9 +220,7 @@ def solid(folder: StudyFolder, scene: str | None) -> Solid | None:
     source, study = opened(folder, scene)
     if source is None:
         return None
-    frequency = 1e9 if study is None else study.scene.frequency
-    read = read_scene(source, frequency)
-    triangles = read_triangles(read)
+    read, triangles = _geometry(source, study)
     low, high = triangles.vertex.min(axis=0), triangles.vertex.max(axis=0)
     centre, scale = (low + high) / 2, 2 * RADIUS / max(float(np.linalg.norm(high - low)), 1e-6)
     names, corners = list(read.materials), (triangles.corners - centre) * scale
@@ -332,7 +331,7 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
     if source is None:
         return {"links": [], "transmitters": [], "sites": []}
     links = None if study is None else study.measurements()
-    triangles = read_triangles(read_scene(source, 1e9 if study is None else study.scene.frequency))
+    _, triangles = _geometry(source, study)
     corners = triangles.corners.reshape(-1, 3)
     measured = [] if links is None else [links.tx, links.rx]
     layout = lay_out(np.concatenate([corners, *measured]), triangles)
@@ -387,6 +386,29 @@ def opened(folder: StudyFolder, scene: str | None) -> tuple[str | None, Study | 
     if scene is None or scene not in folder.scenes():
         return None, None
     return str(folder.path / scene), None
+
+
+def _geometry(source: str, study: Study | None) -> tuple[Scene, Triangles]:
+    """A scene and its faces; without a study, the carrier only has to be one that the materials allow."""
+    scene = read_scene(source, 1e9 if study is None else study.scene.frequency)
+    return scene, read_triangles(scene)
+
+
+def grid_above_ground(
+    folder: StudyFolder, scene: str | None, x: NDArray[np.float64], y: NDArray[np.float64], height: float
+) -> NDArray[np.float64]:
+    """Places of a grid of ascending, equally spaced x and y [m], at a height above the ground [n, 3], [m].
+
+    Raises:
+        InputError: There is no scene, or it cannot be read.
+    """
+    source, study = opened(folder, scene)
+    if source is None:
+        raise InputError("heights above the ground need a scene: make or add one first")
+    _, triangles = _geometry(source, study)
+    # As in a coverage map, so that a place has the same height in both.
+    z = ground_heights(triangles, x, y) + height
+    return np.stack([*np.meshgrid(x, y), z], axis=-1).reshape(-1, 3)
 
 
 def findings(folder: StudyFolder) -> list[str]:

@@ -15,6 +15,7 @@ from urllib.parse import quote
 import numpy as np
 import pandas as pd
 from nicegui import run, ui
+from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.reporting.link_survey import QUANTITIES
@@ -22,7 +23,16 @@ from calibray.result.files import read
 from calibray.result.held_out import HeldOutErrors, Model
 from calibray.support.output_files import write_table
 from calibray.validation.held_out_statistics import compare
-from calibray.window.desk import CANDIDATES, PLACE, PREDICTED, STUDY, SUGGESTED, Desk, filled
+from calibray.window.desk import (
+    CANDIDATES,
+    PLACE,
+    PREDICTED,
+    STUDY,
+    SUGGESTED,
+    Desk,
+    filled,
+    grid_above_ground,
+)
 from calibray.window.jobs import Job
 from calibray.window.study_steps import safe
 
@@ -236,8 +246,10 @@ def better(first: str, second: str, folder: Path) -> str:
     """Which of two results of a folder predicts held-out blocks better, with what certainty, as a sentence.
 
     Raises:
-        InputError: A result or its validation cannot be read.
+        InputError: Both are the same result, or a result or its validation cannot be read.
     """
+    if first == second:
+        raise InputError(f"{first}: chosen twice; choose two results")
     results = {name: predictive_errors(folder / name) for name in (first, second)}
     if missing := [name for name, errors in results.items() if errors is None]:
         return f"{' and '.join(missing)}: not validated, so nothing shows which result predicts better. Validate both."
@@ -280,7 +292,7 @@ def show_prediction(desk: Desk) -> None:
     with ui.row():
         chosen = desk.keep(ui.select(names, label="Result", value=names[-1]))
         tx = desk.keep(ui.select(sites, label="Transmitter at x, y, z [m]", value=next(iter(sites), None)))
-        height = desk.keep(ui.number("Height of the receiver [m]", value=1.5, step=0.1))
+        height = desk.keep(ui.number("Receiver above the ground [m]", value=1.5, step=0.1))
         cell = desk.keep(ui.number("Width of a cell [m]", value=5.0, min=0.1, step=1))
     x, y = desk.point or (None, None)
     with ui.row():
@@ -300,12 +312,14 @@ def show_prediction(desk: Desk) -> None:
             raise InputError("choose a transmitter")
         return json.loads(tx.value)
 
-    def predict() -> None:
+    async def write(file: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+        await run.io_bound(write_links, desk, file, site(), x, y, filled(height))
+
+    async def predict() -> None:
         with desk.messages():
             if east.value is None or north.value is None:
                 raise InputError("choose a place: click on the map, or give x and y")
-            places = np.array([[east.value, north.value, filled(height)]])
-            write_table(desk.folder.path / PLACE, _links(site(), places))
+            await write(PLACE, np.array([east.value]), np.array([north.value]))
             predict_table(PLACE)
 
     def predict_table(name: str) -> None:
@@ -319,10 +333,9 @@ def show_prediction(desk: Desk) -> None:
             words += [f"--column={name}={value}" for name, value in site()["columns"].items()]
             desk.start(words)
 
-    def suggest() -> None:
+    async def suggest() -> None:
         with desk.messages():
-            places = _grid(desk, filled(cell), filled(height))
-            write_table(desk.folder.path / CANDIDATES, _links(site(), places))
+            await write(CANDIDATES, *_grid(desk, filled(cell)))
             desk.start(["suggest", chosen.value, CANDIDATES, "--count", 5, "--out", SUGGESTED])
 
     def export() -> None:
@@ -353,16 +366,25 @@ def show_prediction(desk: Desk) -> None:
             ).classes("coverage")
 
 
-def _links(site: dict[str, Any], rx: Any) -> pd.DataFrame:
-    """Links from a transmitter to places, with its groups, its carrier and the direction of its antenna."""
+def write_links(
+    desk: Desk, file: str, site: dict[str, Any], x: NDArray[np.float64], y: NDArray[np.float64], height: float
+) -> None:
+    """Write a table of links to the folder: from a transmitter to a grid of places x, y at a height above the ground.
+
+    The links have the transmitter's groups, its carrier and the direction of its antenna; lengths are in [m].
+
+    Raises:
+        InputError: The scene cannot be read, or the table cannot be written.
+    """
+    rx = grid_above_ground(desk.folder, desk.scene, x, y, height)
     table = pd.DataFrame({f"rx_{axis}": rx[:, k] for k, axis in enumerate("xyz")})
     for k, axis in enumerate("xyz"):
         table[f"tx_{axis}"] = site["tx"][k]
-    return table.assign(**site["columns"])
+    write_table(desk.folder.path / file, table.assign(**site["columns"]))
 
 
-def _grid(desk: Desk, cell: float, height: float) -> Any:
-    """Places of a regular grid in the chosen area [n, 3], [m]."""
+def _grid(desk: Desk, cell: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Eastings and northings of a regular grid in the chosen area [m]."""
     if desk.area is None:
         raise InputError("draw an area on the map first; its places are the candidates")
     west, south, east, north = desk.area
@@ -370,8 +392,7 @@ def _grid(desk: Desk, cell: float, height: float) -> Any:
         raise InputError(
             f"the area has more than {MOST_CANDIDATES} cells; draw a smaller one, or widen the cells"
         )
-    x, y = np.meshgrid(np.arange(west, east, cell), np.arange(south, north, cell))
-    return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, height)])
+    return np.arange(west, east, cell), np.arange(south, north, cell)
 
 
 def _read(desk: Desk, name: str) -> pd.DataFrame | None:

@@ -40,7 +40,7 @@ def load() -> rt.Scene:
         )
     for end in ("tx", "rx"):
         antenna = CALIBRATION["antennas"][end]
-        if antenna["pattern"].lower().endswith(".csv"):
+        if "." in antenna["pattern"]:  # a file; Sionna RT's own names have no dot
             sys.exit(
                 f"The gain of the {end} antenna is a table ({antenna['pattern']}): register it as a pattern first."
             )
@@ -104,6 +104,8 @@ def main() -> None:
     with (FOLDER / "links.csv").open(encoding="utf-8", newline="") as file:
         links = list(csv.DictReader(file))
     wanted = set(sys.argv[1:])
+    if absent := wanted - {link["row"] for link in links}:
+        sys.exit(f"links.csv has no row {', '.join(sorted(absent))}: give rows of its column row")
     links = [link for link in links if not wanted or link["row"] in wanted]
     carrier = CALIBRATION["frequency_hz"]
     for link in [link for link in links if float(link.get("frequency") or carrier) != carrier]:
