@@ -17,7 +17,12 @@ from calibray.calibration.result import Result
 from calibray.cli.app import app
 from calibray.coordinates import Frame
 from calibray.errors import InputError
-from calibray.prediction.corrections import calibration_residuals, krige_residuals
+from calibray.prediction.corrections import (
+    TermAtLinks,
+    calibration_residuals,
+    krige_residuals,
+    nuisance_shift,
+)
 from calibray.prediction.suggestion import suggest
 from calibray.result.held_out import BlockErrors, ResidualField
 from calibray.scenes import Triangles
@@ -25,6 +30,7 @@ from calibray.scenes.checks.positions import locate
 from calibray.uncertainty.residual_correlation import shared_errors
 from calibray.validation.held_out_statistics import FEWEST_FOR_RANKS, interval_half_width, two_levels
 from changed import changed
+from link_tables import links_from_frame
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -276,3 +282,26 @@ def test_links_out_of_sight_get_wider_intervals_where_their_errors_are_larger(re
     # The draws' part of the variance does not change.
     added = np.where(blocked > 0, (1.5**2 - 1) * half_width(levels, 60) ** 2, 0.0)
     assert half[1] ** 2 - half[0] ** 2 == pytest.approx(added, rel=1e-6, abs=1e-9)
+
+
+def test_the_draws_of_a_random_effect_are_its_mean_plus_the_deviations():
+    links = links_from_frame(planted.links().iloc[:2])
+    term = TermAtLinks("street", np.ones(2), np.array(["a", "b"]), {"a": 5.0, "b": 1.0}, spread_db=2.0)
+    draws = {"street": [3.0, 4.0], "street, deviation[a]": [2.5, 1.0], "street, deviation[b]": [-1.0, -2.0]}
+    shift = nuisance_shift(iter([term]), links, draws)
+    assert shift.value_db.tolist() == [[5.0, 1.0], [5.5, 2.0], [5.0, 2.0]]
+
+
+@pytest.mark.parametrize("prior", [None, "auto"])
+def test_offsets_that_compensate_the_parameters_do_not_widen_intervals(tmp_path, prior):
+    """Without links held out: Student's t has the degrees of freedom that all unknowns leave."""
+    table = planted.campaign(noise_db=1.0).assign(street=list("aabbccddaabb"))
+    table["path_loss_db"] += 8 + table.street.map({"a": -4, "b": 1, "c": 5, "d": -2})
+    shift = {"by": "constant", "per": "street"} | ({} if prior is None else {"prior": prior})
+    result = calibrate(planted.study(tmp_path, table, nuisance={"shift": shift}), engine=planted.engine())
+    coefficients = 4 if prior is None else 5
+    freedom = planted.LINKS - len(planted.TRUTH) - coefficients
+    ends = result.predict_interval(table)
+    half_width = (ends.upper_db - ends.lower_db) / 2
+    assert half_width.min() > stdtrit(freedom, 0.95) * result.prediction.model.residual_db
+    assert half_width.max() < 1.2 * stdtrit(freedom, 0.95) * result.prediction.model.residual_db

@@ -131,6 +131,7 @@ def _choice(
         rms_db, basis = float(np.sqrt(np.mean(errors[name] ** 2))), f"errors of {count} links held out"
         basis = basis if name == Model.CALIBRATED else f"{name}, {basis}"
         position = np.hstack([setup.links.tx, setup.links.rx])[judged][finite]
+        # These links were held out together; blocks only separate the two levels of their errors.
         block = place_blocks(moving_end(setup.links)[judged][finite], DEFAULT_BLOCKS)
         levels = two_levels(errors[name], block, position)
         if levels is not None:
@@ -141,8 +142,7 @@ def _choice(
     if problem.freedom >= 1:
         rms_db = float(trail.best_rmse_db * np.sqrt(objective.num_counted / problem.freedom))
     basis = f"errors of {objective.num_counted} calibration links"
-    freedom = max(objective.num_counted - len(problem.parameters), 1)
-    return Model.CALIBRATED, HeldOutResiduals(rms_db, basis, freedom, np.zeros(0))
+    return Model.CALIBRATED, HeldOutResiduals(rms_db, basis, max(problem.freedom, 1), np.zeros(0))
 
 
 def log_distance_errors(

@@ -127,6 +127,7 @@ def leverage(jacobian: NDArray[np.float64], design: NDArray[np.float64]) -> NDAr
         size = np.linalg.norm(columns, axis=0)
         used = columns[:, size > 0] / size[size > 0]
         basis, values, _ = np.linalg.svd(used, full_matrices=False)
+        # Columns that depend on others add nothing to the projection.
         total += np.sum(basis[:, values > 1e-6] ** 2, axis=1)
     return np.minimum(total, 1.0)
 
@@ -237,9 +238,11 @@ def differing_groups(
             mixed = int(np.count_nonzero(square))
             if mixed < FEWEST_CLUSTERS or square.sum() < MIXED * variance * len(member):
                 continue
+            # Regression of residuals on membership, both relative to their clusters.
             difference = float(inside @ residual / square.sum())
             score = np.bincount(cluster, inside * residual) - square * difference
             error = float(np.sqrt(np.sum(score**2) * mixed / (mixed - 1)) / square.sum())
+            # An offset of the group removes this part of the mean square.
             improved = np.sqrt(mean_square) - np.sqrt(max(mean_square - variance * difference**2, 0.0))
             chance = 1.0
             if improved >= SMALLEST_DB:
@@ -479,6 +482,7 @@ def _direction(
     step, _, full_rank, _ = np.linalg.lstsq(turned, -residuals, rcond=None)
     before = float(np.sum((residuals + stated @ without) ** 2))
     after = float(np.sum((residuals + turned @ step) ** 2))
+    # An angle that the other columns can replace adds no rank.
     further, left = int(full_rank - rank), freedom - 1 - int(full_rank - rank)
     improvement = (np.sqrt(before) - np.sqrt(after)) / np.sqrt(len(residuals))
     if further < 1 or left < 1 or improvement < SMALLEST_DB:

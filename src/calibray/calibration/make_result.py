@@ -324,6 +324,7 @@ def observable_fits(
             f"{observable.name}_after_{unit}": after[index] / observable.scale,
         }
         if observable.labels:
+            # The last element belongs to index -1, a link without a bias.
             known = np.append(np.isin(np.arange(len(observable.labels)), groups), False)
             of_links = np.append(biases[0], np.nan)[observable.group]
             columns[f"{observable.name}_bias_{unit}"] = np.where(known[observable.group], of_links, np.nan)

@@ -148,8 +148,13 @@ def random_effect(links: Measurements, name: str, by: str, labels: ArrayLike) ->
     They are a coefficient that all links share, and the deviation of each group from it, whose prior `estimate_noise`
     replaces by the estimated spread.
     """
-    deviations = make_term(links, f"{name}, deviation", by, labels=labels, prior=START_SPREAD)
+    deviations = make_term(links, deviations_of(name), by, labels=labels, prior=START_SPREAD)
     return make_term(links, name, by), replace(deviations, around=name)
+
+
+def deviations_of(name: str) -> str:
+    """Name of the term with the deviations of a random effect's groups from their mean."""
+    return f"{name}, deviation"
 
 
 def transmitters(links: Measurements) -> NDArray[np.str_]:

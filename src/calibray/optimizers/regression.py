@@ -262,15 +262,11 @@ class Likelihood:
         value = residuals * np.log(np.diag(lower)).sum()
         value += 0.5 * (self.freedom + free) * np.log((self.freedom + square) / (self.freedom + free)).sum()
         # Derivative by K (eq. 5.9), each residual weighted by its precision.
-        by_matrix = residuals * inverse - (weights * _precision(free, square, self.freedom)) @ weights.T
-        by_matrix *= 0.5
-        by_variance = kernel.variances * [
-            by_matrix.sum(),
-            np.sum(by_matrix * self.response),
-            np.sum(by_matrix * smooth),
-        ]
-        by_rate = v_2 * ((by_matrix * matern_slope(distance)).ravel() @ self.squares) * rates_squared
-        return float(value), np.concatenate([by_variance, by_rate, [kernel.nugget * np.trace(by_matrix)]])
+        by_k = residuals * inverse - (weights * _precision(free, square, self.freedom)) @ weights.T
+        by_k *= 0.5
+        by_variance = kernel.variances * [by_k.sum(), np.sum(by_k * self.response), np.sum(by_k * smooth)]
+        by_rate = v_2 * ((by_k * matern_slope(distance)).ravel() @ self.squares) * rates_squared
+        return float(value), np.concatenate([by_variance, by_rate, [kernel.nugget * np.trace(by_k)]])
 
 
 class Prior(NamedTuple):

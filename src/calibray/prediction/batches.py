@@ -82,6 +82,7 @@ def predict_links(
     light = replace(result, history=result.history.iloc[:0], paths=None, scene=None)
     task = _Task(light, setup.at(select_links(links, np.array([0]))), level, with_remarks)
     chunks = for_each_chunk(workers, _predict_chunk, task, links, _chunk_size(setup), progress)
+    # Back to the order of the links.
     order = np.argsort(np.concatenate([link_indices for link_indices, _ in chunks]))
     table = pd.concat([predictions for _, predictions in chunks], ignore_index=True)
     return table.iloc[order].reset_index(drop=True)

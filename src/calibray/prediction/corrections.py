@@ -24,7 +24,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from calibray.errors import InputError
-from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, column, transmitters
+from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, column, deviations_of, transmitters
 from calibray.measurements import Measurements
 from calibray.result.held_out import NO_PATH, PredictionModel, ResidualField
 from calibray.result.record import Prediction
@@ -120,8 +120,13 @@ def nuisance_shift(
         best = np.array(list(term.coefficients.values()))
         columns = []
         for label, coefficient in term.coefficients.items():
-            drawn = draws.get(f"{term.name}[{label}]" if label else term.name, [coefficient] * num_draws)
-            columns.append(np.array([coefficient, *drawn]))
+            # A random effect is drawn as a mean and the deviations of the groups from it.
+            effect = (term.name, f"{deviations_of(term.name)}[{label}]")
+            names = (f"{term.name}[{label}]" if label else term.name,) if term.spread_db is None else effect
+            drawn = np.full(num_draws, coefficient)
+            if draws.keys() >= set(names):
+                drawn = np.sum([draws[name] for name in names], axis=0)
+            columns.append(np.append(coefficient, drawn))
         coefficients = np.stack(columns, axis=1)
         labels = np.full(len(links), "") if term.labels is None else term.labels
         position = {label: index for index, label in enumerate(term.coefficients)}
@@ -171,6 +176,7 @@ def fill_missing(
         return filled
     half_width = np.broadcast_to(least_db, len(links))[missing]
     if model.residual_db:
+        # A group without a coefficient adds its spread to the errors of the fallback.
         errors_db = interval_half_width(np.array(model.sizes_db), level)
         half_width = np.maximum(half_width, errors_db * np.hypot(1.0, shift.spread_db / model.residual_db))
     filled.loc[missing, "lower_db"] = path_loss_db - half_width
@@ -193,6 +199,7 @@ def krige_residuals(
     if len(measured) <= MOST_EXACT:
         return _krige(field, measured, residuals, position)
     correction, share = np.zeros(len(position)), np.zeros(len(position))
+    # One small system of equations for each new link.
     neighbours = np.asarray(KDTree(measured).query(position, k=NEAREST)[1])
     variance = field.shared_db**2
     for first in range(0, len(position), TOGETHER):

@@ -103,6 +103,7 @@ def coverage_map(
     z = ground_heights(triangles, x, y) + height
     east, north = np.meshgrid(x, y)
     rx = np.stack([east, north, z], axis=-1).reshape(-1, 3)
+    # Cells at the transmitter itself have no path loss.
     cells = np.flatnonzero(np.linalg.norm(rx - transmitter, axis=1) > MIN_DISTANCE)
     names = ("path_loss_db",) if level is None else ("path_loss_db", "lower_db", "upper_db")
     layers, no_path = np.full((3, len(rx)), np.nan), np.zeros(len(rx), dtype=bool)

@@ -213,6 +213,7 @@ def separation_probability(
 def _others_ruled_out(total: NDArray[np.float64], piece: NDArray[np.int64]) -> NDArray[np.float64]:
     """Probability that all ranges but the true draw's are ruled out [n, c], from sums of squares [n, m, c]."""
     ranges, value_range = np.unique(piece, return_inverse=True)
+    # The sum of squares of the best fit in each range.
     least = np.stack([total[:, value_range == k].min(axis=1) for k in range(len(ranges))])
     is_true = value_range[: len(total)] == np.arange(len(ranges))[:, None]
     best_rival = np.where(is_true[:, :, None], np.inf, least).min(axis=0)
@@ -229,6 +230,7 @@ def _rank_by_scatter(
     for start in range(0, candidates, size):
         batch = predicted[:, start : start + size].T
         weight = _weights(squares + (batch[:, :, None] - batch[:, None, :]) ** 2)
+        # Moments of the draws if the draw of a row is the truth.
         mean = weight @ point
         variance = np.maximum(weight @ point**2 - mean**2, 0.0)
         rank[start : start + size] = 0.5 * np.log(variance + LEAST_VARIANCE).mean(axis=(1, 2))

@@ -132,6 +132,7 @@ def worth_measuring(
             name, section = own[kind]
             error = result.fit.observables[name].error * section.scale
         slope = np.nan_to_num(jacobian[:, column]) * unit_slope[:, None, :] / max(error, 1e-300)
+        # Each suggestion is measured in addition to those above it.
         added = np.cumsum(np.einsum("nli,nlj->lnij", slope, slope), axis=0)
         narrowed = np.mean(_deviation(information + added) / before, axis=1)
         for number, ratio in enumerate(narrowed):

@@ -217,8 +217,10 @@ def interval(
     replayed = _replay(result, setup, draws, progress)
     modelled = _modelled(result, links, replayed) + shift.value_db
     best, reached = modelled[0], np.isfinite(modelled).all(axis=0)
+    # About the best value instead of the draws' mean, so that their difference counts as an error.
     deviation = np.where(reached, modelled[1:] - np.where(reached, best, 0.0), 0.0)
     factor, between = _quantiles(model, level)
+    # `factor` multiplies everything below; the spread of groups needs the quantile of blocks instead.
     variance = (between * shift.spread_db) ** 2 + (np.mean(deviation**2, axis=0) if draws else 0.0)
     best = np.where(reached, best, np.inf)
     basis = model.basis
@@ -313,6 +315,7 @@ def _replay(
     if draws:
         setup = with_constants(result, setup)
         names = setup.parameters.names
+        # Only the calibrated model has draws, and it is not averaged: `values` has one row.
         scene_values = setup.parameters.start[None, values.shape[1] :]
         drawn = np.stack([draws[name] for name in names], axis=1)
         values = np.vstack([np.hstack([values, scene_values]), drawn])
@@ -356,7 +359,7 @@ def _path_loss(replayed: Replayed) -> NDArray[np.float64]:
         return replayed.engine.path_loss(replayed.values)
     if len(replayed.values) == len(answers):
         return answers
-    path_loss_db = replayed.engine.path_loss(np.delete(replayed.values, np.s_[1 : len(answers)], axis=0))
+    path_loss_db = replayed.engine.path_loss(replayed.values)
     present = np.isfinite(path_loss_db).all(axis=0)
     change_db = np.where(present, path_loss_db[1:] - np.where(present, path_loss_db[0], 0.0), 0.0)
     return np.vstack([answers, answers[0] + change_db])

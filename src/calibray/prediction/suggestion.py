@@ -306,6 +306,7 @@ class _ReplayedDraws:
         wide_prior = np.where(objective.determined, np.inf, UNKNOWN_DB)
         gram = measured.T @ (weight[:, None] * measured)
         gram += np.diag((self.noise_db / nuisance.prior) ** 2 + (self.noise_db / wide_prior) ** 2)
+        # The coefficients' covariance is root root'.
         root = self.noise_db * np.linalg.cholesky(np.linalg.inv(gram))
         parts = [self._term(term, links) for term in nuisance.terms]
         design = np.concatenate([columns for columns, _ in parts], axis=1)
@@ -424,6 +425,7 @@ def _width(result: Record, name: str, narrowed: float) -> float:
         (np.log(ends) if log else ends).mean(),
         *(np.ptp(np.log(bounds) if log else bounds) / 2 for bounds in (ends, seen)),
     )
+    # Squares add: what other buildings differ by, and the rest, which the measurement narrows.
     half = min(float(np.hypot(np.sqrt(max(half**2 - seen_half**2, 0.0)), narrowed * seen_half)), half)
     after = np.array([middle - half, middle + half])
     return float(np.ptp(np.exp(after) if log else after))
