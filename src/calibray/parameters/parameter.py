@@ -169,6 +169,7 @@ def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:
         0.298364939528...
     """
     bound, factor = PARAMETER_BOUNDS[split_name(name)[1]], exp(4.0 * spread)
+    # The range ends at a physical bound, such as 1 for a scattering coefficient.
     lower, upper = value / factor, min(value * factor, bound.upper)
     if value <= 0.0 or spread <= 0.0 or lower not in bound or upper not in bound or lower >= upper:
         return None

@@ -80,6 +80,7 @@ class LogNormal:
         total = np.zeros(len(candidates))
         for row, reference in self._pairs:
             middle, low, high, tilt = self._interval(row, candidates[:, reference], parameters)
+            # Integral over x of exp(-(log x - m)^2 / 2 s^2): exp(m + s^2 / 2) times a probability about m + s^2.
             total += tilt * (middle - tilt * self.spread[row] ** 2 / 2)
             total += np.log(np.maximum(ndtr(high) - ndtr(low), 1e-300))
         return total

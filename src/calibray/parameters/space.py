@@ -297,6 +297,7 @@ class Parameters:
         rows, columns = parameters.matrix_indices(list(base))
         matrix = constants_matrix(base)
         batch = np.broadcast_to(matrix, (*values.shape[:-1], *matrix.shape)).copy()
+        # `rows` and `columns` have no entries for effects.
         cell = np.searchsorted(parameters.of_materials, indices[self.of_materials])
         batch[..., rows[cell], columns[cell]] = values[..., self.of_materials]
         return batch

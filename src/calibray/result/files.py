@@ -398,4 +398,5 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
     numeric = [column for column in table if str(column)[:3] in ("tx_", "rx_") or column in OPTIONAL]
     if invalid := [column for column in numeric if table[column].dtype.kind not in "if"]:
         raise InputError(f"{file}: column {invalid[0]!r} has values of the wrong type; run the study again")
+    # Whole metres are read as integers.
     return table.astype(dict.fromkeys(numeric, float))

@@ -316,6 +316,7 @@ class Record:
         """
         has_path = self.links["has_path"].to_numpy(bool)
         held_out = self.links["held_out"].to_numpy(bool)
+        # As in the objective, where a ceiling replaces a missing path.
         usable = has_path | (self.study.objective.no_path == "censor")
         if "faint" in self.links:
             usable &= ~self.links["faint"].to_numpy(bool)

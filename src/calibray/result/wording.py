@@ -153,6 +153,7 @@ _CAUSES: Final = {
 
 
 def _ranges(ends: list[float]) -> str:
+    # Lower and upper ends in turn.
     return ", ".join(f"{low:.4g} to {high:.4g}" for low, high in zip(ends[::2], ends[1::2], strict=True))
 
 

@@ -178,6 +178,7 @@ def averaged_terms(few: tuple[FittedTerm, ...], more: tuple[FittedTerm, ...]) ->
             others = known[term.name].coefficients
         elif spread_db is not None:
             spread_db = spread_db / 2
+        # The coefficients of each model, completed by those of the other.
         pairs = ({**others, **term.coefficients}, {**term.coefficients, **others})
         means = {label: (pairs[0][label] + pairs[1][label]) / 2 for label in pairs[0]}
         averaged.append(replace(term, coefficients=means, spread_db=spread_db))
@@ -230,6 +231,7 @@ def fitted_terms(
     coefficients = objective.coefficients(path_loss_db[None])[0]
     by_term, terms = objective.nuisance.by_term(coefficients, objective.determined), []
     spreads = {term.around: term.prior for term in objective.nuisance.terms if term.around}
+    # A random effect is one term, with the groups of its deviations.
     grouped = {term.around or term.name: term for term in objective.nuisance.terms}
     for name, term in grouped.items():
         if term.labels == ("",):

@@ -123,6 +123,7 @@ def compare(
     size = np.bincount(cluster)
     total = np.stack([np.bincount(cluster, weights=square[row]) for row in (0, best)])
     resampled = np.random.default_rng(seed).integers(len(size), size=(RESAMPLES, len(size)))
+    # Clusters differ in size: sums of squares over sums of links.
     model_rmse, baseline_rmse = np.sqrt(total[:, resampled].sum(axis=2) / size[resampled].sum(axis=1))
     # Resampling k clusters underestimates the variance over new clusters by (k - 1) / k.
     error = None
@@ -182,6 +183,7 @@ def two_levels(
     count, links = len(size), len(errors)
     if count < 2 or links <= count:
         return None
+    # The mean over a block's links scatters by within / size about the error that they share.
     mean = np.bincount(index, errors) / size
     within = float(np.sum((errors - mean[index]) ** 2)) / (links - count)
     # A block's mean error is not corrected in predictions, so it counts from zero.
@@ -224,6 +226,7 @@ def interval_half_width(absolute_errors: NDArray[np.float64], level: float) -> f
     student_t = float(stdtrit(count, (1 + level) / 2)) * rms
     if count < FEWEST_FOR_RANKS:
         return student_t
+    # No observed error is an upper limit at this level.
     if rank > count:
         return max(student_t, float(absolute_errors[-1]))
     return float(np.interp(rank, np.arange(1, count + 1), absolute_errors))

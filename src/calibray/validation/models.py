@@ -109,6 +109,7 @@ def log_distance(links: Measurements, objective: Objective, known_db: NDArray[np
         if (by, ("",)) not in present:
             terms.append(make_term(links, _free_name(by, terms), by))
     nuisance = Nuisance(len(links), tuple(terms))
+    # A model without paths reaches every link, so the ceiling does not apply.
     return Baseline(replace(objective, nuisance=nuisance, ceiling_db=None), known_db)
 
 
@@ -163,10 +164,12 @@ def kriging(links: Measurements, objective: Objective, trend_db: NDArray[np.floa
         raise InputError(f"kriging: {count} links, at most {MOST_KRIGED}")
     position = np.hstack([links.rx, links.tx])
     measured, residual = position[counted], (objective.measured - trend_db)[counted]
+    # The fit removed an intercept and, unless all distances are equal, a slope.
     design = np.stack([np.ones(count), np.log10(links.distance[counted])], axis=1)
     if np.ptp(design[:, 1]) == 0:
         design = design[:, :1]
     field = fit_correlation(residual, measured, design=design)
+    # Simple kriging: far from all links, the expected residual is 0.
     weights = np.linalg.solve(field.covariance(measured), residual)
     return trend_db + field.shared_db**2 * np.exp(-cdist(position, measured) / field.range_m) @ weights
 
@@ -279,6 +282,7 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
 
 def find_minima(problem: Problem, starts: NDArray[np.float64], new_starts: int) -> NDArray[np.float64]:
     """Find minima of a problem [m, d] by local searches from starting points [k, d] and new ones, the best first."""
+    # If minima are known, other searches only have to show whether they lead to a lower one.
     catch_up = NEARER if len(starts) else CATCH_UP
     return least_squares(
         problem, new_starts, starts[:MOST_STARTS], tolerance=TOLERANCE, catch_up=catch_up

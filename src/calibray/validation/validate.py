@@ -143,6 +143,7 @@ def validate_problem(
         if progress is not None:
             progress("validating", number + 1, len(labels))
     judged = (block >= 0) & np.isfinite(errors[Model.INITIAL]) & np.isfinite(errors[Model.CALIBRATED])
+    # A model that is missing in a block, such as kriging, is not compared.
     complete = {name: residual for name, residual in errors.items() if np.isfinite(residual[judged]).all()}
     return Validation(
         labels, np.where(judged, block, -1), complete, moving_end(links), objective.measured,
@@ -186,6 +187,7 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
             link_labels = links.table.labels(by)
         names, block[counted] = np.unique(link_labels[counted], return_inverse=True)
         labels = tuple(map(str, names))
+    # What is left when the largest block is held out.
     fewest = int(counted.sum()) - int(np.bincount(block[counted]).max())
     if len(labels) < 2 or counted.sum() < len(labels) or fewest <= problem.unknowns:
         raise InputError(

@@ -192,6 +192,7 @@ class Validation(HeldOutErrors):
     def _figures(self, name: str) -> dict[str, float]:
         errors, log_density, inside = self.errors[name], [], []
         for block in self._blocks():
+            # The other blocks give the error that is expected in this one.
             others = errors[self.judged & ~block]
             rms = float(np.sqrt(np.mean(others**2)))
             log_density.append(-0.5 * (errors[block] / rms) ** 2 - np.log(rms * np.sqrt(2 * np.pi)))
