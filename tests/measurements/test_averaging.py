@@ -57,13 +57,17 @@ def test_averages_do_not_cross_transmitters_and_kept_columns():
         average(rows, keep=("phon",))
 
 
-def test_averages_do_not_cross_transmitted_powers():
+def test_averages_do_not_cross_transmitted_powers_carriers_and_groups():
     """Two samples of 100 dB path loss in one cell, sent with 20 and 10 dBm."""
     rows = pd.DataFrame({"rx_x": [0.0, 1.0], "rx_z": 30.0, "power": [-80.0, -90.0], "sent": [20.0, 10.0]})
     rows[["tx_x", "tx_y", "tx_z", "rx_y"]] = 0.0
+    rows["carrier_ghz"], rows["phone"] = [0.8, 3.5], ["A", "B"]
+    steps = Preparation(averaging=Averaging("cell", 5.0))
     columns = LinkColumns(TX, RX, "power", "received_power", tx_power_dbm="sent")
-    links = measured_links(SourceTable(rows), columns, Preparation(averaging=Averaging("cell", 5.0)))
-    np.testing.assert_allclose(links.path_loss_db, 100.0)
+    np.testing.assert_allclose(measured_links(SourceTable(rows), columns, steps).path_loss_db, 100.0)
+    for stated in ({"frequency": "carrier_ghz"}, {"group": "phone"}):
+        columns = LinkColumns(TX, RX, "power", "rsrp", **stated)
+        assert measured_links(SourceTable(rows), columns, steps).path_loss_db.tolist() == [80.0, 90.0]
 
 
 @pytest.mark.parametrize(

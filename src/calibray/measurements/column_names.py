@@ -168,6 +168,7 @@ def find_flight_time(frame: pd.DataFrame) -> tuple[str, str, str] | None:
             continue
         unit = next((unit for unit in ("ps", "ns", "us", "ms", "s", "m") if unit in words(name)), None)
         if unit is not None and (without_codes(frame[name]).dropna() > 0).mean() > 0.5:
+            # A round trip in metres is stated as the distance, one way.
             returned = matches(name, "round-trip time") and unit != "m"
             return name, "round_trip_time" if returned else "time_of_flight", unit
     return None
@@ -288,6 +289,7 @@ def find_value(table: SourceTable) -> ValueColumn:
             f"({', '.join(map(str, table.frame))}); name it path_loss_db, path_gain_db or rsrp_dbm"
             f"{unlikely or text_instead(table.frame, *(row for row, _ in kinds))}"
         )
+    # Powers without a unit come last; otherwise losses before gains before reference signals before other powers.
     candidates.sort(key=lambda candidate: candidate[:3])
     *_, name, quantity = candidates[0]
     median = float(np.nanmedian(without_codes(table.frame[name])))
@@ -346,6 +348,7 @@ def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
             continue
         values = frame[name].to_numpy(dtype=float)
         median = float(np.nanmedian(values))
+        # Carriers are below 300 GHz: a larger number is in a smaller unit.
         likely_unit = "ghz" if median < 300 else "mhz" if median < 3e5 else "hz"
         carriers = values * find_frequency_unit(name, likely_unit)
         if FREQUENCIES[0] <= np.nanmin(carriers) and np.nanmax(carriers) <= FREQUENCIES[1]:
@@ -380,4 +383,5 @@ def _first(names: Iterable[str], row: str) -> str | None:
 def _is_plausible(values: pd.Series, quantity: Quantity) -> bool:
     """Whether values can belong to a quantity; the sign of a loss or gain is not decided."""
     median = float(np.nanmedian(values)) if values.notna().any() else 0.0
+    # The median, because single values may be errors of the logger.
     return -200 < median < -10 if quantity == "rsrp" else 20 < abs(median) < 250

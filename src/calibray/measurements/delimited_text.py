@@ -148,6 +148,7 @@ def _layout(text: str, separator: str | None) -> _Layout:
             records = _records(head, mark)
             widths = {len(cells) for cells, _, _ in records[1:]}
             width = len(records[0][0]) if records else 0
+            # Rows may end with a separator where the header does not.
             if width < 2 or not widths <= {width, width + 1} or len(widths) > 1:
                 continue
             # Spreadsheets pad lines above the header with empty cells.

@@ -374,6 +374,8 @@ class _Interpreter:
         if isinstance(node.op, ast.Pow):
             # In floating point, a power of whole numbers neither takes long nor wraps around.
             left, right = _as_floats(left), _as_floats(right)
+        # Whole numbers wrap around without a message in columns, and division by zero gives infinity; `_overflows`
+        # finds both.
         result = operation(left, right)
         if _overflows(operation, left, right, result):
             raise self._refusal(node, "the result is too large a number; correct it")

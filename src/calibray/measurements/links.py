@@ -144,6 +144,7 @@ class Measurements:
         """The index [links] of each link's group in `group_names`."""
         if self.group is None:
             return np.zeros(len(self), dtype=np.int64)
+        # Every group is in the sorted names, so that the insertion point is its index.
         return np.searchsorted(self.group_names, self.group)
 
     @property

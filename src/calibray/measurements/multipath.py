@@ -98,6 +98,7 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
 
     azimuth = angle(AZIMUTH)
     if azimuth is not None and compass:
+        # A compass counts from north clockwise, the scene from east counter-clockwise.
         azimuth = np.pi / 2 - azimuth
     return Multipath(
         labels,
@@ -167,13 +168,17 @@ def _value(
         return of_path[statistic.path] * (2 if kind == kinds.ROUND_TRIP else 1)
     if kind == kinds.K_FACTOR:
         strongest = float(weight.max())
+        # Strongest component over the sum of all others; with a single component it is infinite.
         return 10 * float(np.log10(strongest / (1 - strongest))) if strongest < 1 else np.nan
     if statistic.edges is not None:
         low, high = statistic.edges
+        # Angles are turned into the full turn that begins at the sector's lower edge.
         values = delay - first if angle is None else (angle - low) % (2 * np.pi) + low
         range_db = kinds.SHARE_RANGE_DB if statistic.dynamic_range_db is None else statistic.dynamic_range_db
         share = float(weight[(values >= low) & (values < high)].sum())
+        # The range as a floor: an empty bin has a finite value, which the model's bins have too.
         return 10 * float(np.log10(share + 10 ** (-range_db / 10)))
+    # Circular angular spread of 3GPP TR 38.901, Annex A.1; the bounds keep the logarithm finite and the root real.
     resultant = float(np.clip(abs(np.sum(weight * np.exp(1j * np.asarray(angle)))), 1e-300, 1.0))
     return float(np.sqrt(-2 * np.log(resultant)))
 
@@ -239,6 +244,7 @@ def _above_noise(
 ) -> tuple[NDArray[Any], ...]:
     """Link, snapshot, delay and level of the samples of a link's responses [snapshots, samples] above the noise."""
     power = np.abs(response) ** 2
+    # The median of exponentially distributed power is ln 2 times its mean, and few samples of signal hardly move it.
     noise = np.median(power, axis=1, keepdims=True) / np.log(2)
     snapshot, sample = np.nonzero(power > noise * 10 ** (margin_db / 10))
     level_db = 10 * np.log10(power[snapshot, sample])
@@ -254,6 +260,7 @@ def _read(file: Path, sample_rate: float | None) -> tuple[NDArray[Any], NDArray[
     if not numeric:
         raise InputError(f"{file}: contains no array of numbers")
     name, response = max(numeric.items(), key=lambda item: item[1].size)
+    # Axes of a single transmitting or receiving antenna.
     response = np.squeeze(response) if response.ndim > 3 else response
     if not np.isfinite(response).all():
         raise InputError(f"{file}: {shortened(name)!r} contains values that are not finite")

@@ -34,6 +34,7 @@ def join_track(table: SourceTable, track: Track) -> SourceTable:
     seconds = _row_times(table, track) - track.clock
     times = _seconds(points["time"])
     after = np.clip(np.searchsorted(times, seconds, side="left"), 0, len(times) - 1)
+    # At the time of a point itself, gaps next to it do not matter.
     before = np.where(times[after] == seconds, after, np.maximum(after - 1, 0))
     # Before and after the track, and at missing times (NaN), one of the comparisons is false.
     covered = (
@@ -178,6 +179,7 @@ def _positions(
             ground = steps.ground(positions[:, 0], positions[:, 1])
         except InputError as error:
             raise InputError(f"{table.source}: {end}: {error}") from None
+        # Heights are then above the ground, not above the origin or the sea.
         positions[:, 2] = ground + height
     return positions
 

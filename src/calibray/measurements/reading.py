@@ -140,6 +140,7 @@ def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> 
     limit_db = censored = None
     if steps.noise_floor_dbm is not None:
         sent_dbm = 0.0 if columns.tx_power_dbm is None else table.numbers(columns.tx_power_dbm)
+        # The path loss at which the received power is the noise floor.
         limit_db = np.full(len(table), sent_dbm - steps.noise_floor_dbm)
         censored = table.numbers(columns.value) <= steps.noise_floor_dbm if steps.censored else None
     return Measurements(
@@ -212,6 +213,7 @@ def _weights(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
         raise InputError(
             f"{table.cell(first, source)}: {values[first]:g} must be greater than 0; remove the row with a where filter"
         )
+    # Inverse variances: the best weights of independent normal errors.
     return values if columns.std is None else 1 / values**2
 
 
@@ -223,7 +225,7 @@ _PART: Final = "calibray part"
 
 
 def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
-    """Average the samples of one area, transmitter and group; without averaging, return the table itself.
+    """Average the samples of one area, transmitter, carrier and group; without averaging, return the table itself.
 
     A sample below the noise floor has a power between zero and the floor, and counts as half of the floor. Averages
     whose uncertainty then exceeds `MAX_UNCERTAINTY_DB` are left out, because the samples above the floor are only the
@@ -250,10 +252,7 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     sign = -1.0 if columns.quantity == "path_loss" else 1.0
     level = sign * table.numbers(columns.value)
     rx = [str(name) for name in columns.rx]
-    transmitter = [steps.transmitter] if steps.transmitter in table.frame else []
-    # The average gets one transmitted power, so that samples of different ones stay apart.
-    power = [columns.tx_power_dbm] if isinstance(columns.tx_power_dbm, str) else []
-    keys = dict.fromkeys([*steps.keep, *transmitter, *power, *map(str, columns.tx)])
+    keys = [*_separating_columns(table, steps, columns), *map(str, columns.tx)]
     labels = pd.DataFrame({name: table.column(name) for name in keys})
     labels[_AREA] = _areas(table, averaging, rx)
     labels[_PART] = 0 if steps.held_out is None else steps.held_out(table)
@@ -278,9 +277,11 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
         highest = 10 ** (mean_level / 10)  # The samples below the floor count as the whole floor.
         from_below = mean["below"].to_numpy() * 10 ** (steps.noise_floor_dbm / 10)
         lowest = np.maximum(highest - from_below, 0.0)
+        # The true mean lies between both.
         uncertain = highest > lowest * 10 ** (MAX_UNCERTAINTY_DB / 10)
         mean_level = 10 * np.log10(highest - from_below / 2)
     if averaging.unbiased:
+        # Delta method: E[ln m] is below ln E[m] by var / (2 n mean^2), here in decibels.
         bias_db = 5 / np.log(10) * groups["power"].var() / (count * mean["power"] ** 2)
         mean_level = mean_level + bias_db.fillna(0.0).to_numpy()
 
@@ -308,6 +309,7 @@ def _areas(table: SourceTable, averaging: Averaging, rx: Sequence[str]) -> NDArr
     positions = np.stack([table.numbers(name) for name in rx[:2]], axis=1)
     if averaging.by == "distance":
         steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        # Stretches of the distance along the track, in the order of the rows.
         return np.floor(np.cumsum([0.0, *steps]) / averaging.size).astype(np.int64)
     cells = np.floor(positions / averaging.size).astype(np.int64)
     return np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
@@ -357,7 +359,9 @@ def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) 
         return table
     value = table.numbers(columns.value)
     positions = np.hstack([table.positions("tx", columns.tx), table.positions("rx", columns.rx)])
-    keys = pd.DataFrame({name: table.column(name) for name in _separating_columns(table, steps, columns)})
+    times = [str(name) for name in table.frame if column_names.matches(name, "time")]
+    names = [*_separating_columns(table, steps, columns), *times]
+    keys = pd.DataFrame({name: table.column(name) for name in names})
     floor = -np.inf if steps.noise_floor_dbm is None else steps.noise_floor_dbm
     keys["censored"] = value <= floor
     keys[_PART] = 0 if steps.held_out is None else steps.held_out(table)
@@ -382,14 +386,13 @@ def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) 
 
 
 def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkColumns) -> list[str]:
-    """Columns whose values differ between different links at the same positions."""
+    """Columns whose values differ between different links at the same positions; their samples are not averaged."""
     groups: Sequence[str] = [columns.group] if isinstance(columns.group, str) else columns.group or ()
     names = [*groups, *steps.keep]
     names += [name for name in (columns.frequency, columns.tx_power_dbm) if isinstance(name, str)]
     if steps.transmitter in table.frame:
         names.append(steps.transmitter)
-    names += [str(name) for name in table.frame if column_names.matches(str(name), "time")]
-    return list(dict.fromkeys(names))
+    return names
 
 
 def join_positions(

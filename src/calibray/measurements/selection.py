@@ -53,6 +53,7 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
         table = table.select(mask)
     if value in table.frame:
         table, coded = mask_codes(table, [value], steps.missing)
+        # With a noise floor, a missing power was too weak to measure; without one, it says nothing.
         if steps.noise_floor_dbm is None and coded.any():
             if coded.all():
                 raise InputError(
@@ -212,6 +213,7 @@ def find_codes(values: ArrayLike) -> tuple[float, ...]:
     measured = distinct[~is_candidate]
     if not len(measured):
         return ()
+    # Losses are positive, powers and gains negative.
     sign = np.sign(np.median(measured))
     return tuple(
         float(code)

@@ -223,6 +223,7 @@ def read_table(path: str | Path) -> SourceTable:
             numbers, text = sheet_text(path)
             table = parse_text(path, text, ",")
             # Lines of the text count line breaks within cells, and rows of the sheet blank rows.
+            # The last rows are those of the table: the header, units and lines above it come first.
             table = replace(table, row=np.array(numbers[len(numbers) - len(table) :], dtype=np.int64))
         case suffix:
             raise InputError(
