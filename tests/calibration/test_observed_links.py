@@ -177,6 +177,9 @@ def test_columns_and_engines_that_cannot_be_used_are_refused(tmp_path, table):
         )
     with pytest.raises(InputError, match="at least two links"):
         run(tmp_path, table.assign(spread_ns=np.nan), observables={"spread": SPREAD})
+    held_out = table.assign(spread_ns=table.spread_ns.where(table.rx_x > 15))
+    with pytest.raises(InputError, match="has 0 values at calibration links"):
+        run(tmp_path, held_out, observables={"spread": SPREAD}, holdout={"where": "rx_x > 15"})
 
 
 def test_blocks_held_out_in_turn_judge_every_observable(tmp_path, table, engine):

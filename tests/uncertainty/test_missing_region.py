@@ -5,6 +5,7 @@ import pytest
 import shapely
 
 from calibray.scenes.obstruction import Region
+from calibray.uncertainty import missing_region as room
 from calibray.uncertainty.missing_region import missing_region
 
 BELT = shapely.box(-42, -90, -30, -10)
@@ -52,3 +53,15 @@ def test_few_links_or_no_residuals_are_not_searched():
     assert missing_region(tx, rx, noise) is None
     tx, rx, noise = links(4)
     assert missing_region(tx, rx, 0 * noise) is None
+
+
+def test_the_number_of_crossing_links_refers_to_all_links(monkeypatch):
+    """Repeated links, of which every fourth one is searched: four times as many cross the same rectangle."""
+    tx, rx, noise = links(0)
+    length = Region(np.array([BELT]), np.zeros(1), np.full(1, 10.0)).length_inside(tx, rx)
+    excess_db = noise + 0.8 * length
+    once = missing_region(tx, rx, excess_db)
+    monkeypatch.setattr(room, "MOST", len(tx))
+    repeated = missing_region(*(np.repeat(part, 4, axis=0) for part in (tx, rx, excess_db)))
+    assert repeated.box == once.box
+    assert repeated.links == 4 * once.links

@@ -133,10 +133,11 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
             measured = np.array([values.get(label, np.nan) for label in labels]) / section.scale
         if section.where is not None:
             measured = np.where(links.where(section.where), measured, np.nan)
-        if np.isfinite(measured).sum() < 2:
+        count = int(np.isfinite(measured[~setup.held_out]).sum())
+        if count < 2:
             raise InputError(
-                f"{links.source}: {place} of [observables.{name}] has {int(np.isfinite(measured).sum())} values; at "
-                "least two links need one"
+                f"{links.source}: {place} of [observables.{name}] has {count} values at calibration links; at least "
+                "two links need one: measure more, or change [holdout]"
             )
         group, labels = _groups(links, section.bias)
         # Equal values have no deviation; the error is estimated from the residuals later.

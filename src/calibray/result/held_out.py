@@ -209,7 +209,7 @@ class PredictionModel:
 
 @dataclass(frozen=True)
 class ResidualField:
-    """The spatially correlated part of the residuals; see `prediction.residual_field`.
+    """The spatially correlated part of the residuals; see `prediction.corrections`.
 
     Attributes:
         range_m: Distance at which the correlation has fallen to 1/e [m].

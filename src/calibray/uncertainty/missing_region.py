@@ -59,7 +59,7 @@ class MissingRegion:
         box: West, south, east and north in the scene's frame [m].
         height: Height at which it ends [m].
         attenuation: Loss per length inside [dB/m].
-        links: Number of links whose straight line crosses it.
+        links: Number of links whose straight line crosses it; an estimate if not all links are searched.
         share: Share of the mean square of the residuals that it explains.
         chance: Median share that the best rectangle explains if residuals are in random order.
         significant: Whether it explains more than in any random order.
@@ -130,7 +130,7 @@ def missing_region(
                 (west, south, east, north),
                 lowest + height,
                 top.attenuation,
-                int((crossing.sum(axis=(1, 2)) > 0).sum()),
+                step * int((crossing.sum(axis=(1, 2)) > 0).sum()),
                 top.explained / square,
                 0.0,
                 False,
