@@ -122,6 +122,27 @@ def test_levels_of_the_signal_are_no_groups(problem: Problem) -> None:
     assert remark.values["column"] == "bars"
 
 
+def test_carriers_that_share_an_offset_are_named_though_they_are_no_whole_numbers(problem: Problem) -> None:
+    truth, links, study = np.array([two_ray.TRUTH]), problem.setup.links, problem.setup.study
+    modelled = problem.modelled(problem.parameters.to_search(truth[None]))[0]
+    carrier = np.random.default_rng(5).choice([763.0, 1842.5], 200)
+    loss = modelled + np.random.default_rng(6).normal(0, 3, 200) + 5.0 * (carrier > 1000)
+    frame = links.frame.drop(columns=["phone", "serial"]).assign(**{"f [MHz]": carrier})
+    own = replace(links, table=replace(links.table, frame=frame), path_loss_db=loss)
+    measured = replace(problem.objective, measured=loss)
+
+    def remarks(frequency: str | None) -> tuple:
+        section = study.links.model_copy(update={"frequency": frequency})
+        setup = replace(problem.setup, links=own, study=study.model_copy(update={"links": section}))
+        changed = replace(problem, setup=setup, objective=measured)
+        return groups_remark(changed, Trail(best=truth, best_modelled=modelled))
+
+    assert remarks(None) == ()
+    (remark,) = remarks("f [MHz]")
+    assert remark.values["column"] == "f [MHz]"
+    assert "antennas, carriers or days" in remark_text(remark)
+
+
 def field_and_noise(position: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Errors with a part that neighbours within 40 m share, and a slope [dB]."""
     distance = np.linalg.norm(position[:, None] - position, axis=2)

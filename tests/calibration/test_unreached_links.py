@@ -153,6 +153,21 @@ def test_the_fallback_is_fitted_although_every_link_has_a_path(seen: tuple[Resul
     assert predictions.lower_db[0] < expected < predictions.upper_db[0]
 
 
+def test_links_out_of_sight_show_what_obstacles_cost_if_each_has_a_path(tmp_path: Path) -> None:
+    """A link without a path is out of sight; a fit to mostly unobstructed links predicts too little path loss."""
+    result = calibrated(tmp_path, behind=10, diffraction=True)
+    assert result.links.has_path.all()
+    hidden = result.links.out_of_sight.to_numpy(bool)
+    assert hidden.tolist() == [False] * 8 + [True] * 10
+    lost = pd.DataFrame({"path_loss_db": [np.inf], "basis": [""]})
+    links = links_from_frame(places(HIDDEN))
+    filled = fill_missing(result.prediction, result.study, links, lost, level=0.9)
+    assert filled.basis[0] == "no path: log-distance, errors of 10 links out of sight"
+    expected = 46.0 + 22.0 * np.log10(np.linalg.norm([34.0, -54.0, -4.5])) + SHADOW_DB
+    assert filled.path_loss_db[0] == pytest.approx(expected, abs=1.5)
+    assert filled.lower_db[0] < expected < filled.upper_db[0]
+
+
 def test_the_map_marks_cells_without_a_path_and_leaves_buildings_blank(
     shadowed: Result, tmp_path: Path
 ) -> None:

@@ -51,9 +51,9 @@ class Ramp:
         return self.path_loss(candidates), slope
 
 
-def measured(seed: int) -> Problem:
+def measured(seed: int, spread_db: float = SPREAD_DB) -> Problem:
     """A problem over the links above the noise floor."""
-    loss = 80.0 + SLOPE * WAY + SPREAD_DB * np.random.default_rng(seed).standard_normal(len(WAY))
+    loss = 80.0 + SLOPE * WAY + spread_db * np.random.default_rng(seed).standard_normal(len(WAY))
     way, loss = WAY[loss < LIMIT_DB], loss[loss < LIMIT_DB]
     place = np.column_stack([way, np.zeros((len(way), 2))])
     links = Measurements(tx=place + 1.0, rx=place, path_loss_db=loss, limit_db=np.full(len(way), LIMIT_DB))
@@ -83,6 +83,17 @@ def test_selection_by_measurement_is_biased_and_by_prediction_is_not():
     # Those left out are expected beyond the limit less the margin, by the fit to those left.
     model = 80.0 + SLOPE * one.setup.links.rx[:, 0]
     assert model[one.faint].min() == pytest.approx(LIMIT_DB - MARGIN * SPREAD_DB, abs=2.0)
+
+
+def test_large_errors_leave_half_the_margin_instead_of_all_links(caplog):
+    """No link is eight standard deviations of 5.5 dB above the floor, a third of them four: the slope is unbiased."""
+    every = [measured(seed, 5.5) for seed in range(40)]
+    chosen = [leave_out_near_floor(problem) for problem in every]
+    received, expected = (np.array([slope(each) for each in problems]) for problems in (every, chosen))
+    errors = [slopes.std(ddof=1) / np.sqrt(len(every)) for slopes in (received, expected)]
+    assert received.mean() < SLOPE - 4 * errors[0]
+    assert abs(expected.mean() - SLOPE) < 3 * errors[1]
+    assert not caplog.messages
 
 
 def test_without_a_floor_or_far_above_it_all_links_are_used():

@@ -525,6 +525,26 @@ def test_carriers_of_the_table_of_transmitters_are_read(scene, tmp_path):
         drafted(freq=[3500.0, 800.0, 2100.0])
 
 
+def test_every_transmitter_has_a_gain_at_each_of_its_carriers(scene, tmp_path):
+    """A unit of frequency names carriers, unless the column is a bandwidth; they are never averaged together."""
+    sites = tmp_path / "cells.csv"
+    sites.write_text("cell,x,y,height\na,-30,0,9\nb,-60,0,9\n")
+    rows = {"x": np.repeat(np.arange(10.0), 2), "y": 20.0, "rsrp_dbm": np.arange(-90, -70)}
+    several = {**rows, "cell": np.repeat(["a", "b"], 10), "BW [MHz]": [5.0, 10.0] * 10}
+    found = draft(
+        scene,
+        table(tmp_path, **several, **{"Frq [MHz]": [763.0, 1842.5] * 10}),
+        tmp_path / "study.toml",
+        sites,
+    )
+    assert found.study.links.frequency == "Frq [MHz]"
+    assert [carrier for carrier, _ in found.study.measurements().carriers] == [763e6, 1842.5e6]
+    assert assumed(found)["offset.per"] == "cell, Frq [MHz]"
+    one_each = {**several, "Frq [MHz]": np.repeat([763.0, 1842.5], 10)}
+    found = draft(scene, table(tmp_path, **one_each), tmp_path / "study.toml", sites)
+    assert assumed(found)["offset.per"] == "cell"
+
+
 @pytest.mark.parametrize(("places", "held_out"), [(24, True), (18, False), (24, False)])
 def test_blocks_are_held_out_if_links_suffice(scene, tmp_path, places, held_out):
     columns = {

@@ -1,8 +1,8 @@
 """Accuracy on held-out links, chosen by a filter or in blocks, and the prediction model that they choose.
 
 It has the study's nuisances and is fitted to the calibration links, like the baseline in the validation. Links without
-a path are mostly behind obstacles, so their path loss exceeds the prediction of this fit. If the study has enough of
-these links, their mean residual is added, and their errors are the errors of the fallback.
+a path are behind obstacles, so their path loss exceeds the prediction of this fit. If the study has enough of these
+links, otherwise of links out of sight, their mean residual is added, and their errors are the errors of the fallback.
 """
 
 from __future__ import annotations
@@ -206,23 +206,27 @@ def fit_fallback(
 ) -> PredictionModel:
     """Fit the fallback, the log-distance model, to the calibration links.
 
-    Its errors come from links without a path; if these are too few, from its residuals on held-out links [n], [dB],
-    which `basis` describes; and if these are too few as well, from the calibration links.
+    Its errors come from links without a path; if these are too few, from links out of sight, of which some are near the
+    noise floor, as links without a path are; if these are too few as well, from its residuals on held-out links [n],
+    [dB], which `basis` describes; and otherwise from the calibration links.
     """
     setup, links = problem.setup, problem.setup.links
     objective, known_db = log_distance(links, problem.objective, without_scene(setup.study, links))
     terms = fitted_terms(objective, known_db, setup.study)
     residuals = objective.measured - objective.with_nuisance(known_db)
-    usable = without_path & ~setup.held_out
-    for excluded in (links.censored, problem.faint):
-        usable = usable if excluded is None else usable & ~excluded
+    measured = ~setup.held_out if links.censored is None else ~setup.held_out & ~links.censored
+    usable, name = without_path & measured, WITHOUT_PATH
+    usable = usable if problem.faint is None else usable & ~problem.faint
+    table = setup.with_obstruction().links.table
+    if usable.sum() < FEW and OUT_OF_SIGHT in table.frame:
+        usable, name = (table.numbers(OUT_OF_SIGHT) > 0) & measured, OUT_OF_SIGHT.replace("_", " ")
     count = int(usable.sum())
     if count >= FEW:
         mean_db = float(residuals[usable].mean())
-        terms += (FittedTerm(WITHOUT_PATH, CONSTANT, "", {"": mean_db}),)
+        terms += (FittedTerm(name, CONSTANT, "", {"": mean_db}),)
         # The error of each link if the mean is that of the others.
         errors = (residuals[usable] - mean_db) * count / (count - 1)
-        basis = f"errors of {count} links without a path"
+        basis = f"errors of {count} links {name}"
     elif len(held_out_db) >= FEW:
         errors = held_out_db
     else:

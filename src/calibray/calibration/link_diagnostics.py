@@ -349,7 +349,8 @@ def region_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
 def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
     """Name the column that no nuisance uses and whose groups, such as devices, explain the residuals of a calibration.
 
-    Labels are texts, or a few whole numbers that do not follow the measured value, as the levels of a signal do.
+    Labels are texts, carriers, or a few whole numbers that do not follow the measured value, as the levels of a signal
+    do.
     """
     setup, links, count = problem.setup, problem.setup.links, problem.objective.num_counted
     if not isinstance(links, Measurements):
@@ -363,7 +364,9 @@ def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
     for name in frame.columns.difference(list(used)):
         cells = frame[name]
         if cells.notna().all() and (
-            not is_numeric_dtype(cells) or _are_labels(cells, links.path_loss_db[counted])
+            name == section.frequency
+            or not is_numeric_dtype(cells)
+            or _are_labels(cells, links.path_loss_db[counted])
         ):
             columns[str(name)] = cells.astype(str).to_numpy(dtype=np.str_)
     residual_db = problem.residuals(trail.best[None], trail.best_modelled[None])[0, :count]

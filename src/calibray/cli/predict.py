@@ -115,7 +115,14 @@ def predict(
     for warning in sorted(warnings, key=lambda text: (text != UNREACHED, text)):
         _warn(warning, warnings[warning], table.rows)
     if UNREACHED in warnings and result.prediction.fallback is not None:
-        echo("The log-distance model predicts the links without a path; see the column basis", err=True)
+        received = study.links.noise_floor_dbm is not None
+        reason = (
+            "; it is fitted to powers above the noise floor, so theirs may be much lower" if received else ""
+        )
+        echo(
+            f"The log-distance model predicts the links without a path; see the column basis{reason}",
+            err=True,
+        )
     if out is not None:
         echo(f"Written to {out}", err=True)
 

@@ -62,6 +62,7 @@ PATTERNS: Final = {
     "additional": r"add.*|extra",
     "sum of both tilts": r"total|tot|sum|combined|effective",
     "frequency": r"freq|frequency|carrier|fc|frequenz|frecuencia|frequence|frequenza",
+    "bandwidth or shift": r"[rv]?bw|bandwidth|bandbreite|span|step|spacing|scs|rate|doppler|shift|offset|cfo|error|std",
     "time": r"time|timestamp|date|datetime|utc|epoch|zeit(stempel)?|uhrzeit|datum|fecha|hora|heure",
     "distance": r"dist.*|separation|abstand|entfernung",
 }
@@ -341,11 +342,18 @@ def find_frequency_unit(name: str, default: str = "hz") -> float:
 def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
     """Find the column of carriers, and the carrier of every row [Hz], if there is one.
 
-    The unit is that of the column's name, or otherwise follows from the size of its values.
+    The name contains a word for frequency, or otherwise a unit of it. The unit is that of the name, or otherwise
+    follows from the size of the values.
+
+    Example:
+        >>> find_frequency(pd.DataFrame({"BW [MHz]": [20.0], "Frq [MHz]": [763.0]}))
+        ('Frq [MHz]', array([7.63e+08]))
     """
-    for name in numeric_columns(frame):
-        if not matches(name, "frequency"):
-            continue
+    names = numeric_columns(frame)
+    in_hertz = [
+        name for name in names if words(name) & {*FREQUENCY_UNITS} and not matches(name, "bandwidth or shift")
+    ]
+    for name in dict.fromkeys([*(name for name in names if matches(name, "frequency")), *in_hertz]):
         values = frame[name].to_numpy(dtype=float)
         median = float(np.nanmedian(values))
         # Carriers are below 300 GHz: a larger number is in a smaller unit.

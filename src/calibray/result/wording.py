@@ -288,7 +288,7 @@ def _differing_groups(values: dict[str, Any]) -> str:
     return (
         f"Residuals of links in the same place depend on the column {values['column']!r}, more than by chance. "
         f"Measured minus modelled path loss, compared with neighbouring links: {groups}{more}.{others} If the column "
-        f"names devices, antennas or days, give each an offset: [offset] per = "
+        f"names devices, antennas, carriers or days, give each an offset: [offset] per = "
         f"{f'[{per}]' if len(values['per']) > 1 else per}."
     )
 

@@ -103,14 +103,31 @@ def _offset_groups(draft: LinksDraft, value: ValueColumn) -> list[str]:
         return []
     name = draft.section.get("transmitter")
     devices = transmitter_columns.find_devices(draft.table.frame)
-    ends = [*(["each transmitter"] if name else []), *(["each receiver"] if devices else [])]
+    carriers = _carriers_of_transmitters(draft)
+    ends = [
+        *(["each transmitter"] if name else []),
+        *(["each receiver"] if devices else []),
+        *(["each carrier"] if carriers else []),
+    ]
     reasons = [] if devices else ["no column of devices was found"]
     if ends:
         reasons.append(f"{' and '.join(ends)} has its own gain")
-    groups = [*([name] if name else []), *devices]
+    groups = [*([name] if name else []), *devices, *carriers]
     groups = list(dict.fromkeys(groups))
     draft.assume("offset.per", ", ".join(groups) or "one", "; ".join(reasons))
     return groups
+
+
+def _carriers_of_transmitters(draft: LinksDraft) -> list[str]:
+    """The column of carriers, if transmitters do not have one carrier each."""
+    frame, name, carrier = draft.table.frame, draft.section.get("transmitter"), draft.section.get("frequency")
+    if (
+        carrier is None
+        or carrier not in frame
+        or (name and frame.groupby(name)[carrier].nunique().max() == 1)
+    ):
+        return []
+    return [carrier]
 
 
 def _add_noise_floor(draft: LinksDraft, value: ValueColumn) -> None:
