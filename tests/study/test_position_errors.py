@@ -67,6 +67,22 @@ def test_a_region_attenuates_the_paths_to_the_displaced_receivers(exact: Study) 
     assert np.std(losses, axis=0).max() > 3.0
 
 
+def test_position_noise_is_that_of_the_facades(exact: Study) -> None:
+    """A wet strip of the ground, whose material is calibrated, reflects to some of the displaced receivers."""
+    content = exact.content()
+    content["facades"] = {"wet": {"of": "ground", "boxes": [[5.0, -9.0, 9.0, 9.0]]}}
+    content["materials"]["wet"] = {"relative_permittivity": 80.0, "conductivity": 5.0}
+    content["parameters"]["wet.relative_permittivity"] = {"bounds": [60.0, 90.0]}
+    setup = Setup.open(with_error(Study.from_content(content, exact.path)), tracer=TwoRay)
+    losses = []
+    for angle in np.radians([0.0, 90.0, 180.0, 270.0]):
+        rx = setup.links.rx + np.sqrt(2) * ERROR_M * np.array([np.cos(angle), np.sin(angle), 0.0])
+        moved = Measurements(tx=setup.links.tx, rx=rx, path_loss_db=np.full(len(rx), np.nan))
+        losses.append(path_loss(setup.at(moved).trace()))
+    weight = setup.with_position_noise().links.weight
+    np.testing.assert_allclose(1 / weight, 2.0**2 + np.std(losses, axis=0) ** 2, rtol=1e-9)
+
+
 def test_a_column_of_errors_and_exact_predictions(exact: Study) -> None:
     table = exact.measurements().frame.assign(error=0.0)
     table.to_csv(exact.path.parent / "errors.csv", index=False, float_format="%.17g")

@@ -83,6 +83,7 @@ class Displacement:
         """
         shares = np.array(neighbours)
         equidistant = np.arange(1, len(shares) + 1) / max(len(shares), 1)
+        # Links are displaced by sums of parameters; the room to the bounds is what the present values leave.
         present, knots = self.weights @ values, [np.zeros((1, len(self.reach)))]
         for side in (1, -1):
             room = np.maximum(self.reach - side * present, LEAST)
@@ -178,6 +179,7 @@ def displacement_loss(
 
     knots = np.array([each.knots(values, neighbours) for each in displacements])  # [K, 2n + 1, L]
     change_db = np.zeros(knots.shape)
+    # At its own position a link is not traced again: its change is zero.
     moved = (knots != 0) & np.array([each.reach[each.group] > 0 for each in displacements])[:, None]
     if moved.any():
         axis, _, link = np.nonzero(moved)
@@ -275,4 +277,5 @@ def spread_db(path_loss_db: NDArray[np.float64]) -> NDArray[np.float64]:
     reached = np.isfinite(loss)
     number = np.maximum(reached.sum(axis=0), 1)
     mean = np.where(reached, loss, 0.0).sum(axis=0) / number
+    # The directions are the whole distribution of the error, not a sample of it: no n - 1.
     return np.sqrt((np.where(reached, loss - mean, 0.0) ** 2).sum(axis=0) / number)

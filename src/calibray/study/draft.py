@@ -325,6 +325,7 @@ def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
         covered = read_scene(links.scene, float(np.clip(links.frequency, 1e9, 10e9)))
     constants = {}
     for name, law in covered.laws.items():
+        # Laws of P.2040: a f^b and c f^d, with f in GHz.
         nearest = float(np.clip(links.frequency / 1e9, law.lower, law.upper))
         if nearest != links.frequency / 1e9:
             permittivity, conductivity = law.a * nearest**law.b, law.c * nearest**law.d
@@ -357,6 +358,7 @@ def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dic
     materials = {
         name: material
         for name, material in scene.materials.items()
+        # Neither metal, which reflects nearly everything, nor air.
         if material.conductivity < 1e6 and material.relative_permittivity > 1.5
     }
     # Links seldom identify more materials.

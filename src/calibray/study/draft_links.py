@@ -152,6 +152,7 @@ class LinksDraft:
             "version": VERSION,
             "scene": self.scene_section | {"frequency": 1e9},
             "links": self.section,
+            # Neither the carrier nor the parameters change positions, but a study has both.
             "parameters": {"any.relative_permittivity": {"bounds": [1.5, 12.0]}},
             "offset": {},
         }
@@ -278,6 +279,7 @@ class LinksDraft:
         if carriers[-1] - carriers[0] < SAME_CARRIER * carriers[0]:
             return float(np.nanmedian(values)), f"median of column {name}"
         read = rows[name].to_numpy(dtype=float) * column_names.find_frequency_unit(name)
+        # `links.frequency` is in the unit of the column's name; a guessed unit cannot be stated.
         if np.array_equal(read, values, equal_nan=True) and len(carriers) <= MAX_CARRIERS:
             self.section["frequency"] = name
             self.assume("links.frequency", name, f"{len(carriers)} carriers in {file.name}")

@@ -163,15 +163,18 @@ def _applies(
     applies = np.ones(len(point), dtype=bool)
     if section.storeys is not None:
         height = point[:, 2] - surfaces.ground_height(point[:, 0], point[:, 1])
+        # Storeys count from 1, the ground floor.
         storey = np.floor(height / section.storey_height) + 1
         applies &= (storey >= section.storeys[0]) & (storey <= section.storeys[1])
     if section.facing is not None or section.share is not None:
         bearing, along, length = _walls(surfaces, point)
         if section.facing is not None:
             start, end = section.facing
+            # Clockwise from start to end, also across north; equal ends are the full turn.
             applies &= (bearing - start) % 360 <= ((end - start) % 360 or 360)
         if section.share is not None:
             strips = np.maximum(np.round(length / section.module), 1)
+            # A strip in the middle of each module.
             applies &= np.abs((along * strips) % 1 - 0.5) < section.share / 2
     outlines = [shapely.box(*box) for box in section.boxes]
     if file is not None:
@@ -183,6 +186,7 @@ def _applies(
             outline = outline[columns[section.column].astype(str) == name]
             if not len(outline):
                 raise InputError(f"{file}: no polygon has {name!r} in its column {section.column!r}")
+        # Walls are on the outline itself, where a point may lie just outside.
         outlines += shapely.buffer(outline, NEAR).tolist()
     if outlines:
         area = shapely.union_all(outlines)
@@ -199,6 +203,7 @@ def _walls(
     Each is [n]; the compass bearing is that of its outward normal.
     """
     shapely, walls = library("shapely", "scenes"), surfaces.walls
+    # In plan, an upright triangle is a line: from its first to its last corner in order of x and y.
     plan = np.round(walls[:, :, :2], 6)
     order = np.lexsort((plan[..., 1], plan[..., 0]), axis=-1)
     ends = np.stack([plan[np.arange(len(plan)), order[:, k]] for k in (0, 2)], axis=1)
@@ -214,6 +219,7 @@ def _walls(
     outward = normal[nearest] / np.linalg.norm(normal[nearest], axis=1, keepdims=True)
     front, back = (surfaces.under_roof(point + side * BESIDE * outward) for side in (1, -1))
     outward = np.where((front & ~back)[:, None], -outward, outward)
+    # East over north: clockwise from north.
     bearing = np.degrees(np.arctan2(outward[:, 0], outward[:, 1])) % 360
     return bearing, along, length
 
@@ -244,6 +250,7 @@ def roughness_effects(stated: Mapping[str, float], parameters: Parameters, paths
         )
         for name in rough
     ]
+    # The factor 8 (pi / lambda)^2 of `RoughSurfaces`, for heights in millimetres.
     per_mm = 8 * (np.pi * 1e-3 * paths.frequency / speed_of_light) ** 2
     heights = np.array([stated.get(name, 0.0) for name in rough])
     exponent = np.asarray(per_mm * np.stack(square, axis=1), dtype=np.float64)

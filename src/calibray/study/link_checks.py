@@ -124,6 +124,7 @@ def _dominant_positions(links: Measurements, is_geographic: bool) -> Iterator[tu
     cell = SPREAD if is_geographic else 0.01
     ends = np.round(np.hstack([links.tx, links.rx]) / cell)
     count = np.unique(ends, axis=0, return_counts=True)[1]
+    # The number of positions if all are equally frequent, and nearly 1 if one has nearly all rows.
     effective = len(links) ** 2 / float(np.sum(count.astype(float) ** 2))
     if effective < DOMINATED * len(count):
         within = f" within {cell:g} m" if is_geographic else ""
@@ -257,6 +258,7 @@ def _levels(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str]]
         max(largest_gain_dbi(antenna) for antenna in link_antennas(study, end, links.table)[0])
         for end in ("tx", "rx")
     )
+    # The least loss in free space: in the main directions of the best antennas of both ends.
     excess = free_space - gain - links.path_loss_db
     below = excess > BELOW_FREE_SPACE_DB
     if below.mean() > 0.1:
@@ -309,6 +311,7 @@ def _spread(
     """Spread of path loss without the antenna's gain around a line over the logarithm of distance [dB]."""
     away = other - own
     azimuth = (np.arctan2(away[:, 1], away[:, 0]) - yaw + np.pi) % (2 * np.pi) - np.pi
+    # Measured losses contain the antenna's gain; adding it leaves what does not depend on the azimuth.
     level = links.path_loss_db + gain(azimuth)
     design = np.column_stack([np.ones(len(links)), np.log10(links.distance)])
     residual = level - design @ np.linalg.lstsq(design, level)[0]

@@ -226,6 +226,8 @@ class StudyModel(StudyContent, ABC):
         priors, linear = [], []
         for index, (name, entry) in enumerate(self.parameters.items()):
             if entry.prior is not None and entry.prior.std is not None:
+                # Of antennas: additive errors around the stated pose; constants of materials are positive, with priors
+                # of the logarithm.
                 priors.append((index, float(entry.start or 0.0), entry.prior.std))
                 linear.append(index)
             elif entry.prior is not None:
@@ -280,6 +282,7 @@ class StudyModel(StudyContent, ABC):
                 name, *entry.bounds, stated if entry.start is None else float(entry.start), entry.scale
             )
         region = self.regions.get(name.removeprefix(PREFIX).rpartition(".")[0]) if PREFIX in name else None
+        # Antennas start at their stated pose, the error 0.
         start = 0.0 if region is None else region.specific_attenuation
         return Parameter(
             name, *entry.bounds, start if entry.start is None else float(entry.start), entry.scale
@@ -357,6 +360,7 @@ class StudyModel(StudyContent, ABC):
             InputError: The filter is malformed, lacks a column, or selects all links or none; or the links have no
                 column of labels by which they are held out in turn.
         """
+        # A missing column is refused here, before anything is traced.
         if self.holdout is not None and self.holdout.by not in (None, "tx", *OBSTRUCTION):
             links.table.labels(self.holdout.by)
         if self.holdout is None or self.holdout.where is None:

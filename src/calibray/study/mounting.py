@@ -60,7 +60,9 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
     yaw, downtilt, electrical, steering = degrees
     if section.aim is not None:
         yaw = np.arctan2(away[:, 1], away[:, 0])
+        # Positive downwards.
         downtilt = -np.arctan2(away[:, 2], np.hypot(away[:, 0], away[:, 1]))
+    # A bearing counts from north clockwise, yaw from east counter-clockwise; steering turns the same way.
     elif section.azimuth_deg is not None and section.azimuth_from == "north":
         yaw = np.pi / 2 - yaw
     if section.azimuth_from == "north":
@@ -233,6 +235,7 @@ def with_population(study: StudyModel, links: Measurements) -> dict[str, Any]:
         std = FIRST_SPREAD * (upper - lower) if entry.spread == "auto" else entry.spread
         for label in (*labels, NEW):
             own = {"bounds": [lower, upper], "prior": {"std": std, "shared": True}}
+            # A transmitter with an entry of its own keeps it.
             content["parameters"].setdefault(f"{POSE}{label}.{name.rpartition('.')[2]}", own)
     return content
 

@@ -159,6 +159,7 @@ def by_column(sections: Mapping[str, ObservableSection]) -> dict[str, Observable
             parts = {
                 f"{name}_{number}": section.model_copy(update={
                     "column": column, "columns": (),
+                    # Both ends of this bin; of the two keys, the unused one stays empty.
                     "edges": section.edges[number - 1 : number + 1],
                     "edges_deg": section.edges_deg[number - 1 : number + 1],
                 })

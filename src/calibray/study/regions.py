@@ -137,9 +137,11 @@ class RegionSection(Section):
             )
         if self.heights == "ground" or self.canopy is not None:
             surfaces = place.surfaces()
+            # Outside of the scene, no height of the ground is known.
             outline = shapely.intersection(outline, shapely.box(*surfaces.bounds[[0, 1, 3, 4]]))
             inside = ~shapely.is_empty(outline)
             outline, bottom, top = outline[inside], bottom[inside], top[inside]
+            # The ground at one point inside each polygon; the centroid of a bent one can be outside of it.
             ground = surfaces.ground_height(*shapely.get_coordinates(shapely.point_on_surface(outline)).T)
             bottom, top = bottom + ground, top + ground
         return Region(outline, bottom, top)
@@ -237,6 +239,7 @@ def region_effects(
         np.add.at(length, path, regions[name].length_inside(start, end))
         effects.append(
             ExtraLoss(
+                # Attenuations are stated at the study's carrier; links may have others.
                 length * (paths.frequency / frequency) ** section.frequency_exponent,
                 section.largest_loss_db(paths.frequency),
                 names.index(parameter) if parameter in names else None,
@@ -252,6 +255,7 @@ def _segments(
     """The straight pieces of all paths: number of the path [k], and both ends [k, 3], [m]."""
     number = np.arange(paths.num_paths)
     path = np.repeat(number, np.diff(paths.first) + 1)
+    # A path of n interactions has n + 1 pieces: the pieces of path p begin p places later than its interactions.
     begins, ends = paths.first[:-1] + number, paths.first[1:] + number
     start = np.empty((len(path), 3))
     end = np.empty((len(path), 3))
@@ -265,5 +269,6 @@ def _segments(
         # The last piece follows from its direction and from the length that the others leave.
         before = np.bincount(path[inner], np.linalg.norm(end - start, axis=1)[inner], paths.num_paths)
         last = paths.delay * speed_of_light - before
+        # The arrival direction points from the receiver back along the ray.
         end[ends] = start[ends] - last[:, None] * wave_basis(paths.arrival)[0].T
     return path, start, end

@@ -68,6 +68,7 @@ def row_steps(study: StudyModel) -> Preparation:
     inside = None if links.inside == "keep" else links.inside
     groups = [label for term in study.nuisance_terms.values() for label in term.per]
     groups += [item.bias for item in study.observables.values() if item.bias not in (None, "all")]
+    # Columns that follow from the scene are added later, to the links.
     keep = [label for label in groups if label not in (*OBSTRUCTION, CLUSTER)]
     keep += [links.frequency] if links.frequency else []
     return replace(
@@ -166,6 +167,7 @@ def known_frame(study: StudyModel) -> Frame | None:
     if crs is not None:
         if origin is None:
             return Frame(crs)
+        # In a frame without an origin, positions are the coordinates of the reference system.
         easting, northing, _ = Frame(crs).to_scene([origin[0]], [origin[1]])[0]
         return Frame(crs, float(easting), float(northing))
     if origin is not None:

@@ -333,6 +333,7 @@ class Setup:
         scene = replace(self.scene, materials={**self.scene.materials, **(materials or {})})
         if self.links.frequency is None:
             return self._mounted(self._trace_links(self._links_in_place, scene, progress), scene)
+        # Paths do not depend on the carrier: ends that several carriers share are traced once.
         ends = np.hstack([self.links.tx, self.links.rx])
         _, first, pair = np.unique(ends, axis=0, return_index=True, return_inverse=True)
         distinct = replace(self.links.select(np.isin(np.arange(len(ends)), first)), frequency=None)
@@ -374,20 +375,20 @@ class Setup:
             return self
         from calibray.engines.replay import Computation, Replay
 
-        paths = mount(
-            self._trace(displaced(links, errors), self.scene, None),
-            mounted_at_displaced(self.mountings, len(links)),
-        )
+        mountings = mounted_at_displaced(self.mountings, len(links))
+        paths = self._mounted(self._trace(displaced(links, errors), self.scene, None), self.scene, mountings)
         effects = self._path_effects(paths)
         replay = Replay(paths, self.parameters, effects=effects, computation=Computation(batch=1))
         loss = replay.path_loss(self.parameters.start[None])[0]
+        # With stated standard deviations, weights are inverse variances.
         variance = 1 / links.weight if study.links.std is not None else (study.noise.std_db or 0.0) ** 2
         weight = 1 / (variance + spread_db(loss) ** 2)
         return self._with_tracer(replace(self, links=replace(links, weight=weight)))
 
-    def _mounted(self, paths: Paths, scene: Scene) -> Paths:
+    def _mounted(self, paths: Paths, scene: Scene, mountings: Mapping[str, Mounting] | None = None) -> Paths:
         """The paths with the fields of the antennas that differ between links, and the materials of facades."""
-        paths, study = mount(paths, self.mountings) if self.mountings else paths, self.study
+        study, mountings = self.study, self.mountings if mountings is None else mountings
+        paths = mount(paths, mountings) if mountings else paths
         if not study.facades:
             return paths
         return with_facades(paths, study.facades, study.facade_paths, scene_place(study), scene.materials)
@@ -453,6 +454,7 @@ def _paths_of_program(setup: Setup, materials: Mapping[str, Material], progress:
     from calibray.engines.rays.export import Exporting
 
     scene = replace(setup.scene, materials={**setup.scene.materials, **materials})
+    # The program gets the constants of the materials in the order of a candidate.
     candidate = [getattr(scene.materials[item.material], item.constant) for item in setup.parameters]
     program = cast(Answering, setup.study.engine.open(setup, None, progress, None))
     return Exporting(program, replace(setup, scene=scene)).export(np.array(candidate)).paths
