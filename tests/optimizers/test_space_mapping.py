@@ -22,7 +22,7 @@ from calibray.optimizers.multifidelity.correction import (
     misfit,
 )
 from calibray.optimizers.multifidelity.discrepancy import FREEDOM, VARIANCE_SPREAD, expected, scaled_density
-from calibray.optimizers.multifidelity.space_mapping import HELPFUL, error_ratio
+from calibray.optimizers.multifidelity.space_mapping import HELPFUL, MISLED, error_ratio
 from calibray.optimizers.protocol import CheapAnswer, Constants
 from calibray.optimizers.sampling import design
 
@@ -296,6 +296,16 @@ def test_a_cheap_model_is_judged_by_the_median_link():
     assert ratio(cheap(1.1), residuals) < HELPFUL
     assert ratio(useless(), residuals) > HELPFUL
     assert ratio(cheap(1.1), wild) < HELPFUL
+
+
+def test_a_useless_cheap_model_is_recognised_on_a_noisy_engine():
+    """Both processes smooth: one that interpolates noise would make the cheap model look better."""
+    unit = design("sobol", 16, 2, np.random.default_rng(16))
+    answers = engine(BOX.from_unit(unit)) + 0.5 * np.random.default_rng(116).standard_normal((16, 25))
+    corrected = correct(
+        UnitModel(useless(), BOX), (unit, answers), CLOUD, np.random.default_rng(1), noisy=True
+    )
+    assert error_ratio(corrected) < MISLED < 3.0 < error_ratio(corrected, noisy=True)
 
 
 def test_a_useless_cheap_model_costs_three_calls_at_most():

@@ -277,7 +277,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
     if replayed is not None and len(calls.unit) > 1:
         cloud = design("sobol", CLOUD, box.dimension, random)
         corrected = correct(UnitModel(replayed, box), (calls.unit, calls.rows), cloud, random, noisy=noisy)
-        if len(calls.unit) >= JUDGED and error_ratio(corrected) > MISLED:
+        if len(calls.unit) >= JUDGED and error_ratio(corrected, noisy=noisy) > MISLED:
             corrected = None
     if corrected is not None:
         mean: MeanFunction = corrected

@@ -175,7 +175,8 @@ class SpaceMapping(Optimizer):
                 if len(unit) >= JUDGED:
                     verdicts += 1
                     bound = HELPFUL if verdicts <= DOUBTS else MISLED
-                    doubts = doubts + 1 if error_ratio(self._corrected) > bound else 0
+                    ratio = error_ratio(self._corrected, noisy=self.noisy)
+                    doubts = doubts + 1 if ratio > bound else 0
                 if doubts == DOUBTS:
                     self._corrected = None
                     yield from self._without(archive, left)
@@ -234,6 +235,7 @@ class SpaceMapping(Optimizer):
         evaluated, d = archive.all(), self.box.dimension
         taken = self.box.to_unit(evaluated.x)[np.argsort(evaluated.y, kind="stable")]
         best = float(root_mean_square(archive.leading.errors)[0])
+        # The best evaluated point is the first one.
         near = np.clip(taken[0] + self._reach * self._rng.uniform(-1.0, 1.0, (KEPT, d)), 0.0, 1.0)
         starts = np.vstack([taken[:KEPT], near, self._minima[:KEPT], design("sobol", SEARCHES, d, self._rng)])
         ends = descend_all(starts, model.members[0].mean_and_slope, SEARCH_STEPS, CONVERGED)
@@ -266,6 +268,7 @@ class SpaceMapping(Optimizer):
         prediction, gain = model.predict(candidates), np.zeros(len(candidates))
         draws = max(1, DRAWS // len(model.members))
         for member, (residuals, share) in zip(model.members, prediction.members, strict=True):
+            # Earlier errors exceeded their predicted variances by this factor, so members deviate by its root.
             mean = prediction.mean + np.sqrt(stretch) * (residuals - prediction.mean)
             normal = self._rng.standard_normal((draws, len(member.root)))
             gain += improvement(mean, stretch * share, normal @ member.root, best)
@@ -273,6 +276,7 @@ class SpaceMapping(Optimizer):
 
     def _resize(self, best: float, before: float) -> None:
         """Resize the trust region after an exploitation, and explore once if it gained too little."""
+        # The step was an exploration, or nothing succeeded before it.
         if self._stalled or not np.isfinite(before):
             self._stalled = False
             return
@@ -280,15 +284,16 @@ class SpaceMapping(Optimizer):
         self._stalled = best > (1.0 - GAINED) * before
 
 
-def error_ratio(corrected: Corrected) -> float:
+def error_ratio(corrected: Corrected, *, noisy: bool = False) -> float:
     """Squared error with the cheap model over that without it, for the median link.
 
-    Each of at least three points is predicted from all others. The cheap model helps if the ratio is below 1.
+    Each of at least three points is predicted from all others. The cheap model helps if the ratio is below 1. `noisy`
+    states whether the answers scatter, which the process without the cheap model must know as well.
     """
     residuals = corrected.residuals
     scale = max(float(residuals.std(axis=0).max()), 1e-12)
     # The same process on the answers themselves.
-    alone = discrepancy.fit(Inputs.plain(corrected.unit), residuals, scale)
+    alone = discrepancy.fit(Inputs.plain(corrected.unit), residuals, scale, noisy=noisy)
     with_it, without = (
         np.sum(process.left_out_errors() ** 2, axis=0) for process in (corrected.discrepancy, alone)
     )
