@@ -126,6 +126,7 @@ class ReplayedModel:
         """The constants on a logarithmic scale."""
         parameters = self.engine.parameters
         lower, upper = (bound[self.count :] for bound in parameters.search_bounds)
+        # The bounds are `BOUND` standard deviations from the centre, in logarithms.
         centre = parameters.to_search(parameters.start)[self.count :]
         return Constants(centre, (upper - lower) / (2.0 * BOUND), lower, upper)
 

@@ -99,6 +99,7 @@ class Elimination:
             lower=nuisance.lower,
             upper=nuisance.upper,
             separable=len(nuisance.terms) == 1,
+            # A prior makes even a column without links regular.
             determined=determined & (data.diagonal() > 0),
         )
 
@@ -245,6 +246,7 @@ class Arrowhead:
             slack = ROUNDING * (1.0 + np.abs(side[pending]).max(axis=1, initial=0.0))[:, None]
             outside = active & ((trial < lower - slack) | (trial > upper + slack))
             inwards = ((trial <= lower) & (descent > slack)) | ((trial >= upper) & (descent < -slack))
+            # Free components beyond a bound, and fixed ones that would descend into the box.
             infeasible = outside | (~active & ~self.held & inwards)
             value[pending] = np.clip(trial, lower, upper)
             unfinished = infeasible.any(axis=1)
@@ -329,6 +331,7 @@ def _to_exchange(
     parts = infeasible.reshape(len(infeasible), fewest.shape[1], -1)
     count = parts.sum(axis=2)
     fewer, remaining = count < fewest[pending], patience[pending]
+    # Murty's rule exchanges a single component.
     last = parts.shape[2] - 1 - np.argmax(parts[..., ::-1], axis=2)
     last_only = parts & (np.arange(parts.shape[2]) == last[..., None])
     fewest[pending] = np.minimum(count, fewest[pending])

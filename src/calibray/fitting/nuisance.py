@@ -232,6 +232,7 @@ class Nuisance:
         """The design [L, q]: a row has one entry for each term with a group of the link."""
         parts = [sparse.csr_array((self.num_links, 0))]
         for term in self.terms:
+            # A link of another group has no entry.
             row = np.flatnonzero(term.group >= 0)
             entries = (term.value[row], (row, term.group[row]))
             parts.append(sparse.csr_array(entries, shape=(self.num_links, len(term.labels))))
@@ -253,6 +254,7 @@ class Nuisance:
             by_grouping.setdefault(term.group.tobytes(), []).append(index)
         finest = max(by_grouping.values(), key=lambda terms: (len(self.terms[terms[0]].labels), len(terms)))
         groups = len(self.terms[finest[0]].labels)
+        # Group by group, the columns of all terms with these groups.
         inner = (first[finest][None] + np.arange(groups)[:, None]).ravel()
         order = np.concatenate([inner, np.setdiff1d(np.arange(first[-1]), inner)])
         return order.astype(np.int64), groups, len(finest)

@@ -332,6 +332,7 @@ class Problem:
 
 def _noise(study: StudyModel, links: Measurements) -> float:
     """Declared standard deviation of a link's error at the mean weight [dB]; 1 until it is estimated."""
+    # Weights are inverse variances [1/dB^2] if errors of single links are known.
     if study.links.position_error_m is not None:
         return float(1.0 / np.sqrt(links.weight.mean()))
     if study.noise.std_db is not None:

@@ -72,6 +72,7 @@ class Understanding:
     def replay(self, parameters: Parameters, last: Call) -> Replay:
         """The replay of a call's paths, corrected so that it agrees with the call."""
         paths = self.model.replay_paths(last.candidate, self.values, self.linear)
+        # Power of every path in the engine over that of its replay.
         correction = 10 ** (last.export.level_db / 10) / np.maximum(powers(paths), 1e-300)
         return Replay(replace(paths, correction=correction), parameters)
 

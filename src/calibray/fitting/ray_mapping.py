@@ -175,6 +175,7 @@ def map_rays(
         mapped = _finish(problem, calls, known, understanding, gap)
         if mapped.moved_db <= UNDERSTOOD_DB or len(calls) >= most_calls:
             return mapped
+        # The rays of the last call in this order are the ones that are modelled.
         ordered, understanding = _best_last(problem, calls), mapped.understanding
 
 

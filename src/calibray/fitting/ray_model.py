@@ -189,6 +189,7 @@ class RayModel:
         fields = [self.paths.tx_field, self.paths.rx_field]
         angles = values[len(self.assumed) :].reshape(-1, ANGLES)
         for end in np.flatnonzero(linear).tolist() if not self.known else []:
+            # The antenna receives along its polarization only; the second row is orthogonal to it.
             weights = ports(self.bases[end], angles[end])[:, 0]
             fields[end] = np.einsum("pt,ptc->pc", weights, fields[end])[:, None]
         materials = self.materials(candidate, values)

@@ -262,5 +262,6 @@ def relevant_minima(
     They have mean squares [k]; the freedom is the number of residuals minus unknowns.
     """
     order = np.argsort(square, kind="stable")
+    # (square - lowest) / lowest x freedom is the excess in noise variances.
     order = order[square[order] <= square.min() * (1.0 + RELEVANT / freedom)]
     return minima[order]

@@ -166,6 +166,7 @@ def descend(
     behind.
     """
     starts = begin(unit, (yield unit))
+    # No search starts at a failed evaluation.
     starts = starts.rows(np.isfinite(starts.cost))
     if followed is not None:
         starts = starts.rows(starts.cost.argsort(kind="stable").argsort() < followed)

@@ -193,6 +193,7 @@ def checked_evaluations(
             f"x[{row}, {column}] = {points[row, column]:g} lies outside its bounds "
             f"[{box.lower[column]:g}, {box.upper[column]:g}]; remove the point or widen the bounds"
         )
+    # Negated, so that NaN is refused as well.
     for (row,) in np.argwhere(~((values > -np.inf) & (values <= np.inf))):
         raise InputError(f"y[{row}] = {values[row]}; it must be a number, +inf for a failed evaluation")
     residuals, jacobian = parts["residuals"], parts["jacobian"]

@@ -192,6 +192,7 @@ class Process:
     def slope(self, at: Inputs, response_slope: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
         """Derivatives of the mean by the unit cube's coordinates [k, m, d], given those of the responses [k, r, d]."""
         rates, variances = self.kernel.rates, self.kernel.variances
+        # dM / dx_j = M'(r) / r x rate_j^2 x (difference along j).
         toward = (at.unit[:, :, None] - self.inputs.unit.T) * rates[:, None] ** 2
         by_coordinate = variances[2] * matern_slope(self.kernel.distance(at, self.inputs))[:, None] * toward
         if response_slope is not None:

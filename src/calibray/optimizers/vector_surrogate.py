@@ -188,6 +188,7 @@ class VectorSurrogate(Optimizer):
         around = draw_around(taken[:5], CANDIDATES, -3.0, self._rng)
         candidates = np.vstack([self._rng.random((CANDIDATES, self.box.dimension)), around, fresh])
         candidates = candidates[distance_to_nearest(candidates, taken) > SEPARATION]
+        # Times the root: draws with the covariance of the residuals.
         normal = self._rng.standard_normal((DRAWS, len(model.root)))
         mean, share = model.predict(candidates)
         gain = improvement(mean, share, normal @ model.root, best)

@@ -57,6 +57,7 @@ class LogNormal:
         values, centre, linear = candidates[:, self._columns], np.array(self.centre), self._linear
         logarithm = np.log(np.where(linear, 1.0, values)) - np.log(np.where(linear, 1.0, centre))
         for row, reference in self._pairs:
+            # The centre is relative to the common value of the population.
             logarithm[:, row] -= np.log(candidates[:, reference])
         return np.where(linear, values - centre, logarithm) / self.spread
 
@@ -92,6 +93,7 @@ class LogNormal:
         drawn = candidates.copy()
         for row, reference in self._pairs:
             middle, low, high, _ = self._interval(row, candidates[:, reference], parameters)
+            # Inverse transform sampling between the bounds.
             level = ndtr(low) + random.random(len(drawn)) * (ndtr(high) - ndtr(low))
             logarithm = middle + self.spread[row] * ndtri(np.clip(level, 1e-300, 1 - 1e-16))
             item = parameters.items[self.index[row]]

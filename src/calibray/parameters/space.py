@@ -158,6 +158,7 @@ class Parameters:
                 np.asarray(law.fixed_exponent) if law.exponent is None else given[..., law.exponent],
                 self.frequency if frequency is None else frequency,
             )
+            # Both coefficients of a law stand for the constant that they set together.
             if law.scale is not None:
                 constants[..., law.scale], slopes[..., law.scale] = values.value, values.by_scale
             if law.exponent is not None:
@@ -177,6 +178,7 @@ class Parameters:
         for parameter, start in zip(self.items, starts.tolist(), strict=True):
             name = _constant_name(parameter)
             if name != parameter.name:
+                # Bounds of a coefficient say nothing about the constant.
                 parameter = Parameter(name, PARAMETER_BOUNDS[parameter.constant].lower, _UNBOUNDED, start)
             constants.setdefault(name, parameter)
         number = {name: index for index, name in enumerate(constants)}

@@ -126,6 +126,7 @@ class Judgement:
         """Whether the gain exceeds its standard error significantly (Student's t, one degree less than clusters)."""
         if self.error_db is None:
             return False
+        # The standard error comes from resampling the clusters.
         return self.gain_db > float(stdtrit(max(self.clusters - 1, 1), (1 + CONFIDENCE) / 2)) * self.error_db
 
 

@@ -282,6 +282,7 @@ class Record:
     @property
     def scene_laws(self) -> dict[str, dict[str, float]]:
         """Coefficients of ITU-R P.2040 by material, as in `Fit.laws`, that give the constants of `scene_materials`."""
+        # The prediction model may have other values than the calibrated ones.
         values = self.prediction.model.parameters or {}
         return {
             material: {name: values.get(f"{material}.{name}", value) for name, value in law.items()}

@@ -328,6 +328,7 @@ def _trials(corrected: Corrected, random: np.random.Generator) -> NDArray[np.flo
     size, count = len(corrected.constants), max(FOLLOWED, min(TRIALS, COMPARED // len(corrected.unit)))
     drawn = corrected.cheap.constants.draw(random.standard_normal((count, size)))
     one, another = np.eye(size, dtype=bool)[random.integers(0, size, (2, count))]
+    # In turns: one constant, two, all.
     number = np.arange(count)[:, None] % 3
     return np.where(one | (another & (number > 0)) | (number > 1), drawn, corrected.constants)
 
