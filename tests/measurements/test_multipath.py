@@ -112,6 +112,13 @@ def test_impulse_responses_of_every_format(tmp_path, responses, ending):
     assert values(multipath, "rms_delay_spread") == pytest.approx({"a": 150e-9, "b": 0.0}, rel=0.02)
 
 
+@pytest.mark.parametrize("ending", [".npz", ".mat", "v7.3.mat"])
+def test_impulse_responses_of_one_link(tmp_path, responses, ending):
+    file = write(tmp_path, ending, responses[:1])
+    multipath = read_impulse_responses(file, ["a"], margin_db=15.0)
+    assert values(multipath, "rms_delay_spread") == pytest.approx({"a": 150e-9}, rel=0.02)
+
+
 def test_a_folder_with_a_file_per_link(tmp_path, responses):
     for name, response in zip("ab", responses, strict=True):
         np.savez(

@@ -230,6 +230,8 @@ def read_impulse_responses(
             parts.append(_above_noise(label, np.atleast_2d(response), delay, margin_db))
     else:
         response, delay = _read(source, sample_rate)
+        # MATLAB's arrays of one row are read without it.
+        response = response[None] if response.ndim == 1 and len(labels) == 1 else response
         if len(response) != len(labels) or response.ndim not in (2, 3):
             raise InputError(
                 f"{source}: an array of shape {response.shape}, must have one row for each of {len(labels)} links"
@@ -244,7 +246,6 @@ def _above_noise(
 ) -> tuple[NDArray[Any], ...]:
     """Link, snapshot, delay and level of the samples of a link's responses [snapshots, samples] above the noise."""
     power = np.abs(response) ** 2
-    # The median of exponentially distributed power is ln 2 times its mean, and few samples of signal hardly move it.
     noise = np.median(power, axis=1, keepdims=True) / np.log(2)
     snapshot, sample = np.nonzero(power > noise * 10 ** (margin_db / 10))
     level_db = 10 * np.log10(power[snapshot, sample])

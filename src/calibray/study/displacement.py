@@ -184,6 +184,7 @@ def displacement_loss(
     if moved.any():
         axis, _, link = np.nonzero(moved)
         there, offset = at_index(links, link), knots[moved]
+        # Each copy of a link is displaced along one axis.
         for number, each in enumerate(displacements):
             there = each.moved(there, np.where(axis == number, offset, 0.0))
         with np.errstate(invalid="ignore"):  # inf - inf where no path reaches

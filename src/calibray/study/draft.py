@@ -28,7 +28,7 @@ from calibray.study.content import BUNDLED, VERSION
 from calibray.study.draft_links import Assumption, Given, LinksDraft
 from calibray.study.link_checks import CELL_SHARE, LINKS_PER_UNKNOWN, count_unknowns
 from calibray.study.regions import Place, RegionSection, dense_trees
-from calibray.study.study import Study
+from calibray.study.study import LARGEST_PERMITTIVITY, Study
 from calibray.study.toml_file import study_text
 from calibray.support.output_files import exists
 from calibray.tracing.gain_table import TWO_CUT_SUFFIXES, read_gain_table
@@ -91,6 +91,7 @@ def _powers(draft: LinksDraft, value: ValueColumn) -> dict[str, str]:
     power = column_names.find_transmit_power(draft.table.frame)
     if power is not None:
         return {"eirp_dbm" if column_names.matches(power, "EIRP") else "tx_power_dbm": power}
+    # A reference signal has the power of one subcarrier; tables of transmitters state that of the whole carrier.
     if draft.sites is None or column_names.matches(value.column, "reference signal"):
         return {}
     return find_powers(draft.transmitter_rows)
@@ -368,7 +369,7 @@ def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dic
     entries: dict[str, dict[str, Any]] = {}
     for name in names:
         permittivity, conductivity = materials[name].relative_permittivity, materials[name].conductivity
-        bounds = [1.5, max(15.0, round(2 * permittivity))]
+        bounds = [1.5, max(LARGEST_PERMITTIVITY, round(2 * permittivity))]
         entries[f"{name}.relative_permittivity"] = {"bounds": bounds}
         if indoors and conductivity > 0:
             bounds = [min(1e-3, float(f"{conductivity / 10:.0e}")), 3.0]

@@ -242,6 +242,7 @@ class LinksDraft:
     def add_filter(self, condition: str) -> None:
         """Add a condition to the row filter."""
         where = self.section.get("where")
+        # In parentheses, because the first condition may contain `or`.
         self.section["where"] = condition if where is None else f"({where}) and {condition}"
 
     def assume_codes(self, codes: Sequence[float], columns: str) -> None:

@@ -206,6 +206,7 @@ def refuse_far_receivers(
         InputError: All receivers are that far.
     """
     low, high = bounds[:2], bounds[3:5]
+    # At least a kilometre: the scene may be a room.
     furthest = FAR * max(float(np.max(high - low)), 100.0)
     if ((rx[:, :2] < low - furthest) | (rx[:, :2] > high + furthest)).any(axis=1).all():
         centre = rx.mean(axis=0)

@@ -78,6 +78,7 @@ class StudyModel(StudyContent, ABC):
         return study
 
     def __reduce__(self) -> tuple[Any, ...]:
+        # Files are relative to the study file, and another process may have another working folder.
         return type(self).from_content, (self.content(), self._path.absolute())
 
     @property
@@ -291,6 +292,7 @@ class StudyModel(StudyContent, ABC):
     def content(self) -> dict[str, Any]:
         """The study as a dictionary with all defaults; `Study.from_content` reads it."""
         content = self.model_dump(mode="json", exclude_none=True)
+        # `replace` may choose another engine, to which these keys then belong.
         content["engine"] |= self._other_engines
         return content
 

@@ -160,6 +160,7 @@ def read_polygons(path: Path, position: str, frame: Frame | None) -> tuple[NDArr
     from calibray.scenes.authoring.geodata import read_features
 
     features = read_features(path, None)
+    # Polygons, of one or several parts.
     polygon = np.isin(shapely.get_type_id(features.outline), (3, 6))
     if not polygon.any():
         raise InputError(f"{path}: none of its {len(polygon)} features is a polygon; give outlines")

@@ -108,6 +108,7 @@ class Setup:
         if links is None:
             links = study_links(study)
             if any(entry.spread is not None for entry in study.parameters.values()):
+                # Which transmitters there are is known only from the links.
                 study = type(study).from_content(with_population(study, links), study.path)
             held_out = study.held_out(links)
             columns = {POSE: study.links.transmitter, RECEIVER: study.links.device}
@@ -116,6 +117,7 @@ class Setup:
         scene = _scene_of(study, study.scene.frequency)
         parameters = study.parameter_set(scene.materials, scene.laws)
         parameters.check_carriers([frequency for frequency, _ in links.carriers])
+        # The tracer samples reflection and refraction by the constants of the scene: by the start values.
         scene = replace(scene, materials=parameters.materials(parameters.start, scene.materials))
         if held_out is None:
             held_out = np.zeros(len(links), dtype=bool)

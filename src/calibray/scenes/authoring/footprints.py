@@ -364,6 +364,7 @@ def _read(path: Path, layer: str | None) -> tuple[NDArray[Any], dict[str, NDArra
         raise InputError(
             f"footprints {path}: has no reference system; add its .prj file, or convert it to GeoJSON"
         )
+    # Polygons, of one or several parts.
     is_polygon = np.isin(shapely.get_type_id(outlines), (3, 6))
     if not is_polygon.any():
         raise InputError(
