@@ -179,7 +179,7 @@ def _with_columns(result: Record, setup: Setup) -> Setup:
 
 
 def interval(
-    result: Record, setup: Setup, level: float | None = 0.9, progress: Progress | None = None
+    result: Record, setup: Setup, level: float | None, progress: Progress | None = None
 ) -> pd.DataFrame:
     """Predict path loss and its interval at links for which the study was opened.
 
@@ -189,22 +189,20 @@ def interval(
         InputError: The level is not between 0 and 1, or the calibration had too few links to estimate the size of
             residuals.
     """
-    if level is None:
-        setup = _with_columns(result, setup)
-        links = setup.links
-        # A group without a coefficient is refused before anything is traced.
-        shift = nuisance_shift(model_terms(result.prediction.model, links), links)
-        replayed = _replay(result, setup, {}, progress)
-        field_db, _ = _residual_field(result, links)
-        path_loss_db = _modelled(result, links, replayed)[0] + shift.value_db[0] + field_db
-        basis = np.full(len(path_loss_db), str(result.prediction.model.name), dtype=object)
-        table = pd.DataFrame({"path_loss_db": path_loss_db, "basis": basis})
-        table = table.assign(**further_observables(result, replayed))
-        return fill_missing(result.prediction, result.study, setup.links, table)
-    if not (isinstance(level, Real) and 0 < level < 1):
+    if level is not None and not (isinstance(level, Real) and 0 < level < 1):
         raise InputError(f"level = {level!r}: must be between 0 and 1, such as 0.9")
     setup = _with_columns(result, setup)
     links, field, model = setup.links, result.prediction.residual_field, result.prediction.model
+    if level is None:
+        # A group without a coefficient is refused before anything is traced.
+        shift = nuisance_shift(model_terms(model, links), links)
+        replayed = _replay(result, setup, {}, progress)
+        field_db, _ = _residual_field(result, links)
+        path_loss_db = _modelled(result, links, replayed)[0] + shift.value_db[0] + field_db
+        basis = np.full(len(path_loss_db), str(model.name), dtype=object)
+        table = pd.DataFrame({"path_loss_db": path_loss_db, "basis": basis})
+        table = table.assign(**further_observables(result, replayed))
+        return fill_missing(result.prediction, result.study, links, table)
     if model.residual_db is None:
         raise InputError(
             f"{result.study.path}: {result.counts['calibrated_on']} links are too few to estimate the size of "

@@ -201,8 +201,10 @@ class _ReplayedDraws:
         """The state of the calibration before any candidate is measured."""
         evaluation, draws = self.evaluation, slice(self.num_draws)
         square = evaluation.value**2 * evaluation.num_rows / self.noise_db**2
-        unit = (self.problem.parameters.to_search(self.values[draws]) - self.lower) / self.width
-        information = self._information(evaluation)[draws]
+        unit, information = (
+            self.problem.parameters.to_unit(self.values[draws]),
+            self._information(evaluation)[draws],
+        )
         return Beliefs(unit, information, self._pieces(self.values), square - square.min())
 
     def at(self, setup: Setup) -> tuple[NDArray[np.float64], NDArray[np.float64], Errors]:
@@ -347,8 +349,8 @@ def _as_calibrated(result: Record, problem: Problem) -> Problem:
 
     Links near the noise floor are not among its links.
     """
-    constants, priors = problem.parameters.items[len(result.study.parameters) :], problem.priors
     first = len(result.study.parameters)
+    constants, priors = problem.parameters.items[first:], problem.priors
     numbers, centres = range(first, first + len(constants)), [item.start for item in constants]
     spread, objective = result.study.noise.constants_spread, problem.objective
     if "faint" in result.links:

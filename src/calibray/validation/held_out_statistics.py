@@ -102,9 +102,7 @@ def place_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]
     return block[place.reshape(-1)]
 
 
-def compare(
-    errors: NDArray[np.float64], baselines: Errors, position: NDArray[np.float64], seed: int = 0
-) -> Judgement:
+def compare(errors: NDArray[np.float64], baselines: Errors, position: NDArray[np.float64]) -> Judgement:
     """Compare a model with its best baseline, by residuals on the same held-out links [n], [dB].
 
     The error of the difference comes from resampling clusters of links whose receivers [n, 3], [m], are neighbours, the
@@ -122,7 +120,7 @@ def compare(
     cluster = spatial_blocks(position[finite], clusters)
     size = np.bincount(cluster)
     total = np.stack([np.bincount(cluster, weights=square[row]) for row in (0, best)])
-    resampled = np.random.default_rng(seed).integers(len(size), size=(RESAMPLES, len(size)))
+    resampled = np.random.default_rng(0).integers(len(size), size=(RESAMPLES, len(size)))
     # Clusters differ in size: sums of squares over sums of links.
     model_rmse, baseline_rmse = np.sqrt(total[:, resampled].sum(axis=2) / size[resampled].sum(axis=1))
     # Resampling k clusters underestimates the variance over new clusters by (k - 1) / k.
