@@ -133,3 +133,39 @@ def test_scans_of_one_place_are_averaged_and_small_averages_left_out():
     enough = average_samples(SourceTable(frame), steps, LinkColumns(TX, RX, "power", "rsrp"))
     assert enough.frame["rx_x"].tolist() == [1.0]
     assert enough.changes["averages of fewer than 2 samples, left out"] == 2
+
+
+def noted(table):
+    return [change for change in table.changes if "over several values" in change]
+
+
+def test_a_step_between_days_within_averages_is_noted_only_if_planted():
+    """Forty places on two days; the second day is 3 dB stronger, or not. A street follows the place."""
+    random, place = np.random.default_rng(3), np.repeat(np.arange(40), 2)
+    rows = {
+        "rx_x": 10.0 * place,
+        "day": np.tile(["Monday", "Tuesday"], 40),
+        "street": np.repeat(["A", "B"], 40),
+    }
+    power = -70.0 - place / 2 + random.normal(0, 1.5, 80)
+    assert noted(average({**rows, "power": power})) == []
+    power = power + 3.0 * (rows["day"] == "Tuesday")
+    (change,) = noted(average({**rows, "power": power}))
+    assert "several values of day" in change
+    step_db = float(np.mean(power[1::2] - power[::2]))
+    assert f"differs by {step_db:+.1f} dB" in change or f"differs by {-step_db:+.1f} dB" in change
+    # Repeats of a link are averaged, too.
+    frame = pd.DataFrame({**rows, "power": power, "rx_y": 0.0, "rx_z": 1.5})
+    links = measured_links(
+        SourceTable(frame), LinkColumns((5.0, 5.0, 9.0), RX, "power", "rsrp"), Preparation()
+    )
+    assert len(links) == 40
+    assert any("several values of day" in change for change in links.prepared)
+    # A group of the offset is kept apart, so that nothing is averaged.
+    assert noted(average({**rows, "power": power}, keep=("day",))) == []
+
+
+def test_further_observables_of_an_average_are_means_of_the_values_that_exist():
+    rows = {"rx_x": [0.0, 1.0, 2.0, 9.0], "power": -80.0, "spread": [np.nan, 10.0, 30.0, 7.0]}
+    mean = average(rows | {"power": [-80.0] * 4}, observables=("spread",)).frame
+    assert mean["spread"].tolist() == [20.0, 7.0]

@@ -118,6 +118,17 @@ def test_values_that_the_receiver_clips_become_its_noise_floor(scene, tmp_path):
         assert reasons.get("links.noise_floor_dbm") == stated
 
 
+def test_the_noise_floor_is_that_of_the_least_sensitive_receiver(scene, tmp_path):
+    """Receiver B states nothing below -80 dBm, A nothing below -100 dBm; C states everything, but was near."""
+    power = np.linspace(-105.0, -60.0, 60)
+    received = [np.where(power > -100, power, np.nan), np.where(power > -80, power, np.nan), power / 2]
+    rows = {"x": np.tile(np.linspace(-40, 10, 60), 3), "y": 20.0, "rsrp_dbm": np.concatenate(received)}
+    file = table(tmp_path, **rows, receiver=np.repeat(["A", "B", "C"], 60))
+    found = draft(scene, file, tmp_path / "study.toml", frequency=3.5e9, tx=[-30.0, 0.0, 9.0])
+    assert found.study.links.noise_floor_dbm == np.floor(power[power > -80].min())
+    assert any("none of receiver B is lower" in each.reason for each in found.assumptions)
+
+
 def test_values_at_the_ends_of_what_a_receiver_states_are_no_measurements(tmp_path, scene):
     """Each access point of a wide table has a third of its values at either end."""
     power = np.random.default_rng(7).normal(-75.0, 15.0, (200, 2)).round(1).clip(-82.0, -68.0)

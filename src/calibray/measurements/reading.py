@@ -23,12 +23,13 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.measurements import column_names
-from calibray.measurements.links import Measurements
+from calibray.measurements.links import FEW, Measurements
 from calibray.measurements.placement import RX_COLUMNS, TX_COLUMNS, clear_buildings, place_rows
 from calibray.measurements.preparation import Averaging, LinkColumns, Preparation, Quantity
 from calibray.measurements.selection import select_rows
 from calibray.measurements.source_table import Coordinates, SourceTable
 from calibray.measurements.table_files import read_table
+from calibray.support.messages import shortened
 
 
 def read_measurements(
@@ -231,7 +232,7 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     whose uncertainty then exceeds `MAX_UNCERTAINTY_DB` are left out, because the samples above the floor are only the
     strong ones. The steps `averaging`, `keep`, `held_out`, `transmitter` and `noise_floor_dbm` are used. Returns for
     each average the row of its first sample, with the mean receiver position, the mean value, and the columns `std_db`
-    (standard deviation of the samples [dB], NaN for one sample) and `count`.
+    (standard deviation of the samples [dB], NaN for one sample) and `count`; further observables are means.
 
     Raises:
         InputError: A column is missing or not numeric, a time cannot be read, or no average remains.
@@ -256,7 +257,7 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     labels = pd.DataFrame({name: table.column(name) for name in keys})
     labels[_AREA] = _areas(table, averaging, rx)
     labels[_PART] = 0 if steps.held_out is None else steps.held_out(table)
-    group = labels.groupby(list(labels), sort=False, dropna=False).ngroup().to_numpy()
+    group = np.asarray(labels.groupby(list(labels), sort=False, dropna=False).ngroup(), dtype=np.int64)
 
     samples = pd.DataFrame({name: table.numbers(name) for name in rx})
     # Relative to the strongest sample, so that weak powers do not underflow.
@@ -284,10 +285,12 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
         # Delta method: E[ln m] is below ln E[m] by var / (2 n mean^2), here in decibels.
         bias_db = 5 / np.log(10) * groups["power"].var() / (count * mean["power"] ** 2)
         mean_level = mean_level + bias_db.fillna(0.0).to_numpy()
+    table = _note_steps(table, group, level, samples["below"].to_numpy() == 0, keys)
 
     averages = table.select(~pd.Series(group).duplicated().to_numpy()).assign(
         **{columns.value: sign * mean_level},
         **{name: mean[name].to_numpy() for name in rx},
+        **{name: _means(table, name, group) for name in steps.observables},
         std_db=groups["level"].std().to_numpy(),
         count=count.to_numpy(),
     )
@@ -381,8 +384,71 @@ def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) 
         if isinstance(name, str):
             merged[name] = pd.Series(table.numbers(name)).groupby(link).mean().to_numpy()
     for name in steps.observables:
-        merged[name] = pd.Series(table.numbers(name, gaps=True)).groupby(link).mean().to_numpy()
-    return table.note("rows that repeat a link, merged", int((~first).sum())).select(first).assign(**merged)
+        merged[name] = _means(table, name, link)
+    table = table.note("rows that repeat a link, merged", int((~first).sum()))
+    return _note_steps(table, link, level, value > floor, list(map(str, keys))).select(first).assign(**merged)
+
+
+def _means(table: SourceTable, name: str, group: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Means of a column's values, without missing ones, over groups of rows [rows]."""
+    return np.asarray(pd.Series(table.numbers(name, gaps=True)).groupby(group).mean(), dtype=np.float64)
+
+
+LEAST_STEP_DB: Final = 1.0
+"""Smallest difference between labels of a column that is noted if rows of different labels become one link."""
+
+LEAST_RATIO: Final = 5.0
+"""The same as a multiple of its standard error: by chance, one of two million labels differs by more."""
+
+MOST_LABELS: Final = 50
+"""Largest number of labels; more would be names of links or of positions."""
+
+
+def _note_steps(
+    table: SourceTable,
+    link: NDArray[np.int64],
+    level: NDArray[np.float64],
+    usable: NDArray[np.bool_],
+    apart: Sequence[str],
+) -> SourceTable:
+    """Note columns of texts, such as days, between whose labels the power of a link differs although they are averaged.
+
+    Every link is one observation of the difference, because its rows can share errors.
+
+    Args:
+        table: The rows.
+        link: The link or average to which each row belongs [rows].
+        level: Power or gain [rows], [dB].
+        usable: Rows whose level is above the noise floor [rows].
+        apart: Columns whose labels are kept apart.
+    """
+    rows = pd.DataFrame({"link": link, "level": level})[usable]
+    for name in [str(name) for name in table.frame if name not in apart]:
+        labels = table.frame[name][usable]
+        few = 2 <= labels.nunique() <= MOST_LABELS
+        if pd.api.types.is_numeric_dtype(labels) or labels.isna().any() or not few:
+            continue
+        largest_db, at = 0.0, ""
+        for label in labels.unique():
+            own = rows.assign(member=(labels == label).astype(float))
+            centred = own - own.groupby("link").transform("mean").assign(link=0)
+            products = centred[["level"]].assign(square=centred["member"]).mul(centred["member"], axis=0)
+            sums = products.groupby(rows["link"]).sum()
+            sums = sums[sums["square"] > 0]
+            if len(sums) < FEW:
+                continue
+            step_db = float(sums["level"].sum() / sums["square"].sum())
+            score = sums["level"] - step_db * sums["square"]
+            error_db = float(np.sqrt(np.sum(score**2)) / sums["square"].sum())
+            if abs(step_db) > max(LEAST_STEP_DB, LEAST_RATIO * error_db, abs(largest_db)):
+                largest_db, at = step_db, str(label)
+        if at:
+            cause = (
+                f"of one link over several values of {shortened(name)}: the power at {shortened(at)} differs by "
+                f"{largest_db:+.1f} dB; name the column in offset.per"
+            )
+            table = table.note(cause, int(usable.sum()))
+    return table
 
 
 def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkColumns) -> list[str]:

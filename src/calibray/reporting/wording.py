@@ -246,7 +246,8 @@ def _obstruction_text(table: pd.DataFrame) -> str:
     """Mean residual of links in sight, and of those out of sight by the length of the line below roofs."""
     parts = []
     for row in table.to_dict("records"):
-        below = f"with {row['from_m']:.0f} to {row['to_m']:.0f} m below roofs"
+        digits = 0 if row["to_m"] - row["from_m"] >= 1.0 else 1
+        below = f"with {row['from_m']:.{digits}f} to {row['to_m']:.{digits}f} m below roofs"
         where = "in sight" if not row["out_of_sight"] else below if row["to_m"] >= 1.0 else "out of sight"
         parts.append(f"{row['mean_db']:+z.1f} dB {where} ({counted(row['links'], 'link')})")
     return f"mean residual: {', '.join(parts)}"

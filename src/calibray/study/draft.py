@@ -30,6 +30,7 @@ from calibray.study.link_checks import CELL_SHARE, LINKS_PER_UNKNOWN, count_unkn
 from calibray.study.regions import Place, RegionSection, dense_trees
 from calibray.study.study import LARGEST_PERMITTIVITY, Study
 from calibray.study.toml_file import study_text
+from calibray.support.messages import shortened
 from calibray.support.output_files import exists
 from calibray.tracing.gain_table import TWO_CUT_SUFFIXES, read_gain_table
 
@@ -45,6 +46,12 @@ CLIPPED_SHARE: Final = 0.03
 
 CLIPPED_RATIO: Final = 10
 """Smallest ratio of their number to the median number of values that equal another one."""
+
+MISSING_SHARE: Final = 0.1
+"""Share of a device's powers that are missing above which its lowest power is taken for its noise floor."""
+
+FEWEST_OF_DEVICE: Final = 20
+"""Smallest number of its powers: the lowest of 20 is in the lowest tenth of the received ones in 88 % of the cases."""
 
 
 def draft_links(scene: str, links: Path, target: Path, given: Given) -> LinksDraft:
@@ -146,6 +153,15 @@ def _add_noise_floor(draft: LinksDraft, value: ValueColumn) -> None:
         floor, reason = lowest, f"{share:.0%} of the values equal the lowest one"
     elif column.isna().any() and "wide" not in draft.section:
         floor, reason = float(np.floor(lowest)), f"{missing}, and none is lower"
+        # A floor below that of the least sensitive device would count its missing powers as weaker than they are.
+        for name in transmitter_columns.find_devices(draft.table.frame):
+            for device, values in column.groupby(draft.table.frame[name]):
+                lacks = values.isna().mean() > MISSING_SHARE and values.notna().sum() >= FEWEST_OF_DEVICE
+                if lacks and np.floor(values.min()) > floor:
+                    floor = float(np.floor(values.min()))
+                    reason = (
+                        f"{missing}, and none of {name} {shortened(device)} is lower, the least sensitive"
+                    )
     else:
         return
     draft.section["noise_floor_dbm"] = floor
