@@ -334,7 +334,7 @@ def test_the_cache_is_listed_and_cleared(tmp_path, monkeypatch):
     (tmp_path / "mine.h5").write_bytes(b"0")
     listed = run("cache")
     assert re.search(rf"folder +{tmp_path}\ntraces +1, 2.0 MB", listed.stdout)
-    assert "Removed 1 traces, 0 compiled programs" in run("cache", "--clear").stderr
+    assert "Removed 1 trace, 0 compiled programs" in run("cache", "--clear").stderr
     assert [path.name for path in tmp_path.iterdir()] == ["mine.h5"]
     monkeypatch.setenv("CALIBRAY_CACHE", "")
     assert "CALIBRAY_CACHE is empty" in run("cache").stdout

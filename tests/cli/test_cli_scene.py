@@ -47,7 +47,7 @@ def test_an_extract_becomes_a_scene(tmp_path):
         "--origin", "11.5755,48.1374", "--utm", "--default-height", 7,
     )  # fmt: skip
     assert (status, err.strip()) == (0, "Making a scene with 2 buildings")
-    assert "1 buildings: way-2" in out
+    assert "1 building: way-2" in out
     assert "EPSG:32632" in out
     materials = read_scene(folder / "scene.xml", 3.5e9).materials
     assert list(materials) == ["walls", "windows", "ground"]

@@ -7,12 +7,14 @@ import sys
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 
 import shown
 from calibray.calibration.result import Result
 from calibray.comparison import comparison
 from calibray.reporting import result_tables
 from calibray.reporting import scene_tables as trace
+from calibray.reporting.figures import cumulative_cost
 from calibray.reporting.page import _laws, _tiles
 from calibray.reporting.summary import summary
 from calibray.reporting.wording import (
@@ -154,3 +156,23 @@ print([name for name in heavy if name in sys.modules])
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (run.stdout, run.stderr) == ("[]\n", "")
+
+
+def test_the_line_of_the_surrogate_is_after_the_last_full_iteration():
+    """With one iteration there is none; with one full iteration it is after the first."""
+
+    def lines(calls: list[int]) -> list[float]:
+        iteration = np.repeat(np.arange(1, len(calls) + 1), calls)
+        number = np.arange(1, len(iteration) + 1)
+        history = pd.DataFrame({"iteration": iteration, "call": number, "seconds": 0.1 * number})
+        panels = cumulative_cost({"sgwo-im": replace(shown.result(), history=history)}).axes
+        return [line.get_xdata()[0] for line in panels[0].lines if line.get_linestyle() == "--"]
+
+    assert lines([30, 30, 5, 5]) == [2]
+    assert lines([30, 5, 5]) == [1]
+    assert lines([30]) == []
+
+
+def test_times_are_written_without_an_exponent():
+    for seconds, text in ((0.034, "0.034 s"), (98.4, "98 s"), (99.7, "2 min"), (1500.0, "25 min")):
+        assert f"RT calls in {text}, after" in summary(changed(shown.result(), seconds=seconds))[1].text

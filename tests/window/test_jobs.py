@@ -87,3 +87,17 @@ def test_a_command_that_is_stopped_before_it_starts_does_not_run(tmp_path, monke
     monkeypatch.setattr(signal, "signal", lambda number, handler: handler(number, None))
     main()
     assert ended.read_text() == "-2\n"
+
+
+def test_a_command_that_ends_at_once_is_recorded(tmp_path, monkeypatch):
+    """Its process leaves the system's table before the next step of the server."""
+
+    class AtOnce:
+        def __init__(self, target, daemon):
+            self.start = target
+
+    monkeypatch.setattr("calibray.window.jobs.Thread", AtOnce)
+    monkeypatch.setattr(sys, "executable", "/bin/true")
+    jobs = Jobs(tmp_path)
+    jobs.start(["--version"])
+    assert [(job.state, job.words) for job in jobs.list()] == [("died", ("--version",))]

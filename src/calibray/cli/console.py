@@ -141,6 +141,7 @@ def with_groups(command: Callable[..., None]) -> Callable[..., None]:
         }
         command(**values, **grouped)
 
+    # Typer reads the options from the signature and from the annotations.
     flat.__annotations__ = {option.name: option.annotation for option in options}
     flat.__signature__ = Signature(options)  # type: ignore[attr-defined]
     return flat

@@ -9,6 +9,7 @@ import typer
 
 from calibray.cli.console import Overwrite, echo, log, option, progress_bars
 from calibray.errors import InputError
+from calibray.support.messages import counted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -92,17 +93,17 @@ def cache(clear: Annotated[bool, typer.Option("--clear", help="Remove all cached
     from calibray.tracing.cache import stored_traces
 
     folder, programs = cache_folder(), compiled_programs()
-    kept = {"traces": stored_traces(), "compiled programs": [] if programs is None else programs.entries()}
+    kept = {"trace": stored_traces(), "compiled program": [] if programs is None else programs.entries()}
     size = {name: sum(path.stat().st_size for path in paths) / 1e6 for name, paths in kept.items()}
     if clear:
         for path in (path for paths in kept.values() for path in paths):
             path.unlink(missing_ok=True)
-        removed = ", ".join(f"{len(paths)} {name}" for name, paths in kept.items())
+        removed = ", ".join(counted(len(paths), name) for name, paths in kept.items())
         echo(f"Removed {removed}, {sum(size.values()):.1f} MB", err=True)
         return
     rows = [
         ("folder", "none: CALIBRAY_CACHE is empty" if folder is None else str(folder)),
-        *((name, f"{len(paths)}, {size[name]:.1f} MB") for name, paths in kept.items()),
+        *((f"{name}s", f"{len(paths)}, {size[name]:.1f} MB") for name, paths in kept.items()),
     ]
     echo(render(Table("", (Column(), numbers()), tuple(rows))))
 
@@ -131,11 +132,11 @@ def ledger(
         check_table(out, (), overwrite)
     with closing(open_ledger(folder)) as store:
         if forget_failed:
-            echo(f"Removed {store.forget_failures()} failed calls", err=True)
+            echo(f"Removed {counted(store.forget_failures(), 'failed call')}", err=True)
         table = store.table(path_loss=out is not None)
     if out is not None:
         write_table(out, table)
-        echo(f"Written to {out}: {len(table)} calls", err=True)
+        echo(f"Written to {out}: {counted(len(table), 'call')}", err=True)
     else:
         echo(render(calls_table(table)))
 

@@ -10,6 +10,7 @@ import typer
 
 from calibray.cli.console import echo, log, option, progress_bars, read_origin, warn, with_groups
 from calibray.errors import InputError
+from calibray.support.messages import command, counted
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ def init(
         measured = draft.study.measurements()
     echo(render(assumptions(draft)))
     counts = [f"{number} {cause}" for cause, number in measured.prepared.items()]
-    echo("\n" + ", ".join([f"{len(measured)} links", *counts]))
+    echo("\n" + ", ".join([counted(len(measured), "link"), *counts]))
     with progress_bars(log()) as progress:
         progress("checking positions", 0, None)
         warn(draft.study, measured)
@@ -87,7 +88,7 @@ def init(
     if not schema.exists():
         write_text(schema, schema_text())
     write_text(out, draft.text)
-    echo(f"Written to {out}; next: calibray run {out} --out result", err=True)
+    echo(f"Written to {out}; next: {command('run', out, '--out', 'result')}", err=True)
 
 
 def _position(text: str) -> list[float]:

@@ -22,6 +22,7 @@ from calibray.cli.console import (
     with_groups,
 )
 from calibray.errors import InputError
+from calibray.support.messages import command, counted
 
 if TYPE_CHECKING:
     from calibray.calibration.result import Result
@@ -116,8 +117,8 @@ def run(
         echo(render(tables.heading(result), *tables.tables(result)))
     names = [*FILES, *_write_report(result, out, output)]
     judged = result.accuracy.judgement is not None
-    following = f"predict {out} LINKS" if judged else f"validate {study_file} --out {out}"
-    echo(f"Written to {out}: {', '.join(names)}; next: calibray {following}", err=True)
+    following = command("predict", out, "LINKS") if judged else command("validate", study_file, "--out", out)
+    echo(f"Written to {out}: {', '.join(names)}; next: {following}", err=True)
 
 
 def _kept_text(out: Path) -> str:
@@ -126,14 +127,13 @@ def _kept_text(out: Path) -> str:
 
     from calibray.engines import open_ledger
     from calibray.engines.ledger.ledger import LEDGER_FILE
-    from calibray.errors import InputError
     from calibray.support.cache_folder import cache_folder
     from calibray.tracing.cache import stored_traces
 
     parts = []
     if (out / LEDGER_FILE).is_file():
         with suppress(InputError), closing(open_ledger(out)) as ledger:  # it may be another program's
-            parts.append(f"{len(ledger.table())} RT calls in {out / LEDGER_FILE}")
+            parts.append(f"{counted(len(ledger.table()), 'RT call')} in {out / LEDGER_FILE}")
     if stored_traces():
         parts.append(f"finished traces in {cache_folder()}")
     kept = f"Kept: {' and '.join(parts)}." if parts else "Nothing was finished, so nothing is kept."
@@ -152,7 +152,8 @@ def _write_report(result: Result, out: Path, output: Output) -> list[str]:
             )
     except Exception as error:
         echo(
-            f"Warning: the report was not written ({error}); try again with: calibray report {out}", err=True
+            f"Warning: the report was not written ({error}); try again with: {command('report', out)}",
+            err=True,
         )
         return []
     return [page.FILE, *([f"{page.FIGURES}/"] if output.figures else [])]

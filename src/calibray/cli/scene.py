@@ -11,6 +11,7 @@ import typer
 
 from calibray.cli.console import Overwrite, echo, log, option, progress_bars, read_origin, with_groups
 from calibray.errors import InputError
+from calibray.support.messages import counted
 
 if TYPE_CHECKING:
     from calibray.coordinates import Frame
@@ -235,7 +236,7 @@ def _make(read: Callable[[], tuple[Footprints, Frame, Trees | None]], out: Path,
             surface, frame = lower_origin(
                 read_terrain(options.terrain, frame, bounds, options.spacing), frame
             )
-        echo(f"Making a scene with {len(buildings)} buildings", err=True)
+        echo(f"Making a scene with {counted(len(buildings), 'building')}", err=True)
         progress("making", 0, None)
         made = make_scene(
             buildings, out, frame, surface, palette, windows, options.margin,

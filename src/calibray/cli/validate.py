@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from calibray.cli.console import Overwrite, Pool, StudyFile, echo, log, option, progress_bars, with_groups
+from calibray.support.messages import command
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def validate(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         write_validation(validation, study, out, validation.content())
-        following = f"; next: calibray report {out}" if (out / RESULT_FILE).is_file() else ""
+        following = f"; next: {command('report', out)}" if (out / RESULT_FILE).is_file() else ""
         echo(f"Written to {out / VALIDATION_FILE}{following}", err=True)
 
 

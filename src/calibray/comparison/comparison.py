@@ -137,6 +137,7 @@ class Comparison:
         }
         for calls in (*CALLS, None):
             column = "end" if calls is None else str(calls)
+            # A smaller budget says nothing about this number of calls. No run has 2^62 calls, which stand for the end.
             reached = calls is None or method.stops_by_itself or calls <= method.budget
             excess = self.excess(method.name, 2**62 if calls is None else calls)
             for statistic, share in (("median", 0.5), ("q25", 0.25), ("q75", 0.75), ("worst", 1.0)):
@@ -161,6 +162,7 @@ def quantile(values: NDArray[np.float64], share: float) -> float:
     """
     ordered = np.sort(values)
     position = share * (len(ordered) - 1)
+    # Between two infinite values, their difference would not be a number.
     low, high = ordered[int(np.floor(position))], ordered[int(np.ceil(position))]
     return float(low) if low == high else float(low + (position % 1.0) * (high - low))
 
@@ -329,7 +331,13 @@ def _search_optimum(problem: ComparisonProblem) -> MethodRun:
 
     def make() -> Optimizer:
         return optimizers.make(
-            REFERENCE, problem.lower, problem.upper, 2**31, start=problem.start, starts=starts
+            # A seed that no run of a comparison has.
+            REFERENCE,
+            problem.lower,
+            problem.upper,
+            2**31,
+            start=problem.start,
+            starts=starts,
         )
 
     return run_optimizer(problem, OPTIMUM, make)
@@ -371,6 +379,7 @@ def _finished(
 
 
 def _start(open_problem: OpenProblem) -> None:
+    """Open the problem of a worker process, once for all of its runs."""
     global _opened
     _opened = open_problem()
 

@@ -142,6 +142,7 @@ class BudgetedMethod:
             with suppress(ValueError):
                 budget = int(calls)
         least = 1 if schedule is None else schedule.least
+        # Python also reads 6_00, +600 and " 600" as numbers; the name of a run must state its budget in one way.
         if (calls and calls != str(budget)) or not least <= budget <= LIMITS["budget"]:
             raise InputError(
                 f"method {name!r}: the budget {calls or budget} must be a whole number of RT calls from {least} to "
@@ -245,6 +246,7 @@ class RunFile:
         self._path, self._problem = path, problem
         self._runs: dict[RunKey, MethodRun] = {}
         text = path.read_text(encoding="utf-8") if exists(path) else ""
+        # A killed process may have left a last line without its end.
         self._torn = bool(text) and not text.endswith("\n")
         for line in text.splitlines():
             try:

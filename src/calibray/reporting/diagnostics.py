@@ -79,6 +79,7 @@ def _by_distance(result: Record) -> pd.DataFrame:
     distance = link_distance(links)
     if distance is None or len(residuals) < FEW:
         return pd.DataFrame()
+    # Each class has four links or more.
     classes = np.array_split(np.argsort(distance, kind="stable"), min(CLASSES, len(residuals) // 4))
     return pd.DataFrame(
         [
@@ -157,6 +158,7 @@ def _missing_region(result: Record) -> pd.DataFrame:
     if ends is None:
         return pd.DataFrame()
     known = links[OUT_OF_SIGHT].to_numpy(float) if OUT_OF_SIGHT in links else np.zeros(len(links))
+    # Positive where links lose more than the prediction model says.
     excess_db = links["measured_db"].to_numpy(float) - links["predicted_db"].to_numpy(float)
     region = _searched(np.column_stack([ends, excess_db, known]).tobytes())
     return pd.DataFrame() if region is None else pd.DataFrame([region.row()])
@@ -197,6 +199,7 @@ def _power(result: Record) -> pd.DataFrame:
 
 
 def _trade_offs(result: Record) -> pd.DataFrame:
+    # An unknown that is the same in all draws has no correlation.
     names = [name for name, values in result.uncertainty.draws.items() if np.ptp(values) > 0]
     if not 2 <= len(names) <= MOST_UNKNOWNS:
         return pd.DataFrame()

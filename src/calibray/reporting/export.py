@@ -121,7 +121,8 @@ def _links(result: Record) -> pd.DataFrame:
     if result.prediction.model.parameters is None:
         return result.links.assign(nuisance_db=0.0, reported_db=scene_db)
     both = np.isfinite(scene_db) & np.isfinite(predicted_db)
-    nuisance_db = np.where(both, np.where(both, predicted_db, 0.0) - np.where(both, scene_db, 0.0), 0.0)
+    nuisance_db = np.zeros(len(both))
+    nuisance_db[both] = predicted_db[both] - scene_db[both]
     return result.links.assign(nuisance_db=nuisance_db, reported_db=np.where(both, predicted_db, np.inf))
 
 
@@ -148,6 +149,7 @@ def _rows(result: Record) -> Iterator[dict[str, Any]]:
         for parameter in result.parameters:
             owner, _, constant = parameter.rpartition(".")
             interval = result.intervals.get(parameter) if owner == name else None
+            # All rows have the columns of all calibrated constants.
             row.setdefault(f"{constant}_lower", math.nan)
             row.setdefault(f"{constant}_upper", math.nan)
             row.setdefault(f"{constant}_verdict", "")

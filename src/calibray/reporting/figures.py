@@ -50,8 +50,9 @@ def cumulative_cost(results: Mapping[str, Record]) -> Figure:
             label = f"{method_text(result, method)}: {value.iloc[-1]:.4g}"
             axes.plot(value.index, value, "o-", ms=4, color=style.COLORS.get(method), label=label)
             if method == "sgwo-im":
-                calls = result.history.groupby("iteration")["call"].max().diff()
-                for first in calls[calls < calls.iloc[1]].index[:1]:
+                # The first iterations evaluate all wolves, the others only those that the surrogate selects.
+                calls = result.history.groupby("iteration").size()
+                for first in calls[calls < calls.iloc[0]].index[:1]:
                     axes.axvline(
                         first - 1, color=style.COLORS[method], ls="--", lw=1, label="surrogate takes over"
                     )
@@ -83,13 +84,14 @@ def convergence(results: Mapping[str, Record], optimum_db: float | None = None) 
 @style.styled()
 def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
     """Draw the path loss of every link: measured, before and after calibration; all results are of the same links."""
-    links = next(iter(results.values())).links
+    first = next(iter(results.values()))
+    links = first.links
     few, many = len(links) <= SYMBOLS, len(links) > FILE_ORDER
     number = np.arange(1, len(links) + 1)
     # Curves of many links are readable only if the links are sorted by measured path loss.
     order = np.argsort(links["measured_db"].to_numpy(float), kind="stable") if many else number - 1
     x_label = "Receiver" if few else "Link, by measured path loss" if many else "Link"
-    first, quantity = next(iter(results.values())), measured_quantity(next(iter(results.values())))
+    quantity = measured_quantity(first)
     y_label = f"{quantity.name[:1].upper()}{quantity.name[1:]} [{quantity.unit}]"
     figure, axes = style.plain_figure(x_label, y_label, width=10.0)
     held_out = links["held_out"].to_numpy(bool)
@@ -182,6 +184,7 @@ def result_figures(result: Record, links: Survey | None) -> dict[str, Figure]:
 
 
 def _unequal(results: Mapping[str, Record]) -> bool:
+    """Whether numbers of RT calls differ so much that only a logarithmic axis shows all methods."""
     calls = [result.history["call"].max() for result in results.values()]
     return bool(max(calls) > 4 * min(calls))
 

@@ -83,6 +83,7 @@ def lay_out(ends: NDArray[np.float64], triangles: Triangles | None) -> Plan:
     ends = ends[:, :2]
     low, high = ends.min(axis=0), ends.max(axis=0)
     extent = np.maximum((high - low) * (1 + 2 * MARGIN), LEAST_EXTENT)
+    # The height is LEAST_ASPECT to 1 times the width.
     extent[1] = max(extent[1], LEAST_ASPECT * extent[0])
     extent[0] = max(extent[0], extent[1])
     middle = (low + high) / 2
@@ -152,6 +153,7 @@ def _round(value: float, up: bool = False) -> float:
     """The nearest of 1, 2, 5, 10, ... below a value, or above it."""
     power = 10.0 ** np.floor(np.log10(value))
     steps = np.array([1.0, 2.0, 5.0, 10.0]) * power
+    # A rounding error above a step must not lead to the next one.
     return float(steps[steps >= value * 0.999].min() if up else steps[steps <= value * 1.001].max())
 
 
@@ -178,6 +180,7 @@ def _walls(triangles: Triangles, layout: Plan) -> str:
     lines = sides[np.arange(len(sides)), longest]
     inside = (lines.max(axis=1) > 0).all(axis=1) & (lines.min(axis=1) < [WIDTH, layout.height]).all(axis=1)
     lines = lines[inside]
+    # Every line starts at the end with less x, then less y, so that lines of both faces of a wall are equal.
     backwards = (lines[:, 0] > lines[:, 1]) @ [2, 1] > (lines[:, 0] < lines[:, 1]) @ [2, 1]
     lines[backwards] = lines[backwards][:, ::-1]
     lines = np.unique(lines.reshape(-1, 4), axis=0)

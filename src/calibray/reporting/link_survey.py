@@ -88,6 +88,8 @@ def in_measured_quantity(result: Record, name: str) -> NDArray[np.float64]:
     path_loss_db, column = result.links[f"{name}_db"].to_numpy(float), _column(result)
     if column not in result.links:
         return path_loss_db
+    # Received power plus path loss is the transmitted power, and path gain plus path loss is 0: known from the measured
+    # values, this sum of a link converts its modelled path loss as well.
     reference = result.links[column].to_numpy(float) + result.links["measured_db"].to_numpy(float)
     return reference - path_loss_db
 

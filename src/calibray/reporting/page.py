@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 from base64 import b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -37,6 +36,7 @@ from calibray.result.record import Record
 from calibray.result.verdict import Verdict
 from calibray.scenes import Scene, Triangles, read_scene, read_triangles
 from calibray.support import figure_style as style
+from calibray.support.messages import command
 from calibray.support.output_files import check_file, check_outputs, write_text
 from calibray.support.progress import Progress
 from calibray.tables import Column, Table, decibels, numbers
@@ -125,6 +125,7 @@ def report(
         write_text(target, page(result, data, drawn))
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
+            # Drawn again, because figures within the page have no background.
             for name, figure in result_figures(result, data.links).items():
                 for suffix in ("svg", "png"):
                     style.write(figure, folder / f"{name}.{suffix}")
@@ -264,6 +265,7 @@ def _tiles(result: Record) -> list[tuple[str, str, tuple[str, ...]]]:
 def _held_out_errors(result: Record) -> tuple[float | None, float | None, float | None]:
     """Held-out RMSE of the prediction model, of the initial materials with nuisances, and of the log-distance model."""
     model, accuracy = result.prediction.model, result.accuracy
+    # The residual of a model that held-out links have chosen is its RMSE on them.
     own_db = accuracy.holdout_rmse_db if model.name == Model.CALIBRATED else model.residual_db
     return own_db, accuracy.nuisance_only_holdout_rmse_db, accuracy.log_distance_holdout_rmse_db
 
@@ -307,12 +309,15 @@ def _worst(result: Record, links: Survey | None) -> Table:
 def _commands(result: Record) -> str:
     study = result.study
     options = {"method": study.method.name, "seed": study.method.seed, "engine": study.engine.name}
-    words = [
-        "calibray", "run", study.path.name, *(f"--{name}={value}" for name, value in options.items()), "--out", "DIR",
-    ]  # fmt: skip
     return "\n".join(
         (
-            " ".join(map(shlex.quote, words)),
+            command(
+                "run",
+                study.path.name,
+                *(f"--{name}={value}" for name, value in options.items()),
+                "--out",
+                "DIR",
+            ),
             "calibray report DIR     # this page again",
             "calibray map DIR --tx X Y Z     # path loss over the whole scene",
             "calibray export DIR -o FOLDER     # the calibrated scene for Sionna RT, and its materials as tables",

@@ -233,4 +233,5 @@ def _list(names: Sequence[str]) -> str:
 
 
 def _seconds(value: float) -> str:
-    return f"{value:.2g} s" if value < 100 else f"{value / 60:.0f} min"
+    # Two digits of 99.5 and more would be written as 1e+02.
+    return f"{value:.2g} s" if value < 99.5 else f"{value / 60:.0f} min"

@@ -109,6 +109,7 @@ def held_out_errors(validation: Validation) -> Figure:
     for name, color in _colors(validation):
         error = np.sort(np.abs(validation.errors[name][judged]))
         share = np.arange(1, len(error) + 1) / len(error)
+        # A few gross errors would compress the rest of the curves.
         reach = max(reach, float(np.quantile(error, 0.97)))
         wide = 2.2 if name == validation.best else 1.2
         axes.step(error, share, where="post", color=color, lw=wide, label=f"{name}: {_rmse(error):.2f} dB")
@@ -251,6 +252,7 @@ def _polar_figures(
         axes.scatter(bearing[mask], residuals[mask], s=10, c=style.BLUE, alpha=0.7, lw=0)
         turn = np.linspace(0, 2 * np.pi, 361)
         level = np.maximum(_pattern_db(mounting, int(np.flatnonzero(mask)[0]), turn), DEEPEST_DB)
+        # 0 dB is drawn at the rim, `limit`, and DEEPEST_DB at the centre, minus `limit`.
         axes.plot(turn, limit * (1 - 2 * level / DEEPEST_DB), color=style.ORANGE, lw=1.2)
         axes.set_title(f"{shortened(name, 28)} ({mask.sum():,})", fontsize=9)
     return figure
@@ -260,6 +262,7 @@ def _pattern_db(mounting: Mounting, link: int, bearing: NDArray[np.float64]) -> 
     """Gain on the horizon of the antenna of one link, relative to its largest there [n], [dB]."""
     on_link = mounting.of_paths(np.full(len(bearing), link))
     pose = Pose(*on_link.pose)
+    # On the horizon; azimuths count from the east anticlockwise, bearings from the north clockwise.
     angles = np.stack([np.full(len(bearing), np.pi / 2), np.pi / 2 - bearing], axis=1)
     jones = jones_vectors(AntennaPattern.of(mounting.antennas[on_link.index[0]]), wave_basis(angles), pose)
     power = (np.abs(jones) ** 2).sum(axis=(1, 2))

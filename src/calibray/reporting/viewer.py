@@ -74,6 +74,7 @@ def strongest(paths: Paths, result: Record) -> Rays:
     gain_db = 10 * np.log10(np.maximum(power, 1e-40))
     order = np.lexsort((-gain_db, paths.link))
     link = paths.link[order]
+    # The place of every path among those of its link, 0 for the strongest.
     rank = np.arange(len(link)) - np.searchsorted(link, link)
     # Interactions in all if every link keeps its 1, 2, ... strongest paths.
     interactions = np.cumsum(
@@ -81,6 +82,7 @@ def strongest(paths: Paths, result: Record) -> Rays:
     )
     per_link = int(np.clip(np.searchsorted(interactions, INTERACTIONS, side="right"), 1, PER_LINK))
     chosen = order[rank < per_link]
+    # A link counts once for a material, however many of its paths interact with it.
     link_and_material = np.stack([np.repeat(paths.link, np.diff(paths.first)), paths.material], axis=1)
     links = np.bincount(np.unique(link_and_material, axis=0)[:, 1], minlength=len(paths.materials))
     shown = take(paths, chosen)

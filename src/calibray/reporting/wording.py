@@ -147,6 +147,7 @@ def sampling_text(record: Record) -> str:
             f"The exported script launches {type(trace).samples:,} rays, but a calibration with trace.samples "
             '= "auto" adds as many as it needs.'
         )
+    # Paths that were traced again with the calibrated materials are those of the exported scene.
     sampled = record.study.engine.name == "replay" and (trace.refraction or trace.diffuse_reflection)
     if sampled and not (calibrated and record.fit.retrace_gap_db is not None):
         causes.append(
@@ -217,6 +218,7 @@ def _distance_text(result: Record) -> str:
     distance = link_distance(links)
     if distance is None or len(residuals) < FEW or np.ptp(distance) == 0:
         return ""
+    # A least-squares line over the logarithm of distance; its two coefficients cost two degrees of freedom.
     decades = np.log10(distance) - np.log10(distance).mean()
     slope = float(decades @ residuals / (decades @ decades))
     rest = residuals - residuals.mean() - slope * decades
@@ -229,6 +231,7 @@ def _class_text(tables: dict[str, pd.DataFrame], column: str, described: Callabl
     """The class of links with the largest mean residual."""
     if column not in tables or len(tables[column]) < 2:
         return ""
+    # The mean of one or two links is hardly more than their noise.
     table = tables[column][tables[column]["links"] >= 3]
     if not len(table):
         return ""
@@ -268,6 +271,8 @@ def _missing_region_text(table: pd.DataFrame) -> str:
 def _neighbours_text(table: pd.DataFrame) -> str:
     if len(table) < 3:
         return ""
+    # Distant links share no errors, so half their mean squared difference is the whole variance (the sill). Neighbours
+    # differ by less, as far as their errors are the same.
     nearest, sill = table.iloc[0], float(table["semivariance_db2"].iloc[len(table) // 2 :].mean())
     share = 1.0 - nearest["semivariance_db2"] / sill if sill > 0 else 0.0
     # The relative standard error of a semivariance of n independent pairs is sqrt(2 / n).

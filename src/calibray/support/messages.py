@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable
 from difflib import get_close_matches
 from itertools import islice
@@ -95,6 +96,16 @@ def counted(number: int, noun: str) -> str:
         ('1 link', '1,200 links')
     """
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
+def command(*words: object) -> str:
+    """A command in the form for a terminal, with quotes where a shell needs them.
+
+    Example:
+        >>> command("report", "my result")
+        "calibray report 'my result'"
+    """
+    return shlex.join(["calibray", *map(str, words)])
 
 
 def percent(share: float) -> str:

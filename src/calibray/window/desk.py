@@ -343,6 +343,7 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
         return shown
     overhead = SceneSurfaces.read(source)
     roofed, wrong = overhead.under_roof(links.rx), overhead.outside(links.rx) | overhead.underground(links.rx)
+    # If most receivers are under a roof, the scene is indoors.
     suspicious = wrong if roofed.mean() > 0.8 else wrong | roofed
     rows = zip(links.rx.tolist(), links.path_loss_db.tolist(), suspicious.tolist(), strict=True)
     shown["links"] = [[round(x, 2), round(y, 2), round(loss, 1), int(mark)] for (x, y, _), loss, mark in rows]

@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shlex
 import signal
 import subprocess
 import sys
@@ -28,6 +27,7 @@ from typing import Final
 import psutil
 
 from calibray.errors import InputError
+from calibray.support.messages import command
 from calibray.support.output_files import write_text
 
 FOLDER: Final = ".calibray-window"
@@ -66,7 +66,7 @@ class Job:
     @property
     def command(self) -> str:
         """The command in the form for a terminal."""
-        return shlex.join(["calibray", *self.words])
+        return command(*self.words)
 
 
 class Jobs:
@@ -100,13 +100,10 @@ class Jobs:
                     arguments, cwd=self._study_folder, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
                     start_new_session=True, env={**os.environ, "COLUMNS": WIDTH},
                 )  # fmt: skip
-            # Without a wait the ended process would stay in the system's table.
+            created = psutil.Process(child.pid).create_time()
+            # Without a wait the ended process would stay in the system's table; before, it may be looked up there.
             Thread(target=child.wait, daemon=True).start()
-            record = {
-                "words": list(words),
-                "pid": child.pid,
-                "created": psutil.Process(child.pid).create_time(),
-            }
+            record = {"words": list(words), "pid": child.pid, "created": created}
             write_text(Path(f"{stem}.json"), json.dumps(record) + "\n")
         except OSError as error:
             raise InputError(f"{self._folder}: cannot be written ({error.strerror})") from None
@@ -127,6 +124,7 @@ class Jobs:
         commands = []
         for process in psutil.process_iter(["pid", "ppid", "cmdline", "cwd"]):
             line, parent = process.info["cmdline"] or [], process.info["ppid"]
+            # As `calibray`, `python .../calibray` or `python -m calibray`.
             start = next((k for k, word in enumerate(line[:3]) if Path(word).name == "calibray"), None)
             here = process.info["cwd"] == str(self._study_folder)
             if start is not None and here and parent not in own and line[start + 1 : start + 2] != ["open"]:
@@ -175,6 +173,7 @@ def _read(file: Path) -> Job | None:
 
 
 def _state(exit_file: Path, pid: int, created: float) -> str:
+    # After Ctrl-C a command exits with 130. It ends with -2 if the signal killed it, or came before it started.
     with suppress(OSError, ValueError):
         return {0: "done", 130: "stopped", -2: "stopped"}.get(int(exit_file.read_text()[:20]), "failed")
     with suppress(psutil.Error, OverflowError, ValueError):
@@ -241,8 +240,8 @@ def main() -> None:
     _, status_file, *words = sys.argv
     status = -signal.SIGINT
     if not stopped:
-        command = [sys.executable, "-m", "calibray", *words]
-        status = subprocess.run(command, stdin=subprocess.DEVNULL, check=False).returncode
+        arguments = [sys.executable, "-m", "calibray", *words]
+        status = subprocess.run(arguments, stdin=subprocess.DEVNULL, check=False).returncode
     write_text(Path(status_file), f"{status}\n")
 
 

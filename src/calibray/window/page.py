@@ -38,24 +38,7 @@ def build(desk: Desk) -> None:
     ui.colors(primary="#1f5fa8", negative="#a11d1d", positive="#1d6b3a", info="#1f5fa8")
     ui.add_head_html(HEAD)
     with ui.element("main").classes("calibray"):
-        with ui.element("section").classes("plan").props('aria-label="Map"'):
-            heading("Calibray", 1)
-            ui.label(str(desk.folder.path)).classes("quiet")
-            canvas = ui.element("canvas").props(
-                'id=plan tabindex=0 role=application aria-label="Map: arrow keys move it, plus and minus zoom, Enter '
-                'chooses the middle"'
-            )
-            canvas.classes("map")
-            with ui.row().classes("tools"):
-                # Without the server, so that what follows at once already finds the map as asked.
-                for name, call in (("Whole map", "fit"), ("Draw an area", "drawArea")):
-                    button = ui.button(name).props("outline dense")
-                    button.on("click", js_handler=f"() => plan.{call}()")
-                ui.button("Clear the area", on_click=lambda: clear_area()).props("outline dense")
-                view_button(desk)
-            ui.label("Drag to move, wheel or two fingers to zoom, click to choose a place.").classes("quiet")
-            place = ui.label().classes("quiet").mark("place")
-            activity(desk)
+        place = _show_map(desk)
         with ui.element("div").classes("steps"):
             for number, (name, show) in enumerate(STEPS, 1):
                 with ui.element("section").classes("step").props(f'aria-label="{name}"'):
@@ -64,33 +47,42 @@ def build(desk: Desk) -> None:
                     if name in UPLOADS:
                         upload(desk, UPLOADS[name])
                     show(desk)
+    _answer_map(desk, place)
+    _follow_changes(desk)
 
-    def contents() -> dict[str, object]:
-        """What the steps with fields for texts show; they are shown again only if it changes."""
-        text, files = desk.folder.text(), desk.folder.files((*MAPS, ".tif", ".tiff"))
-        return {
-            "Map or plan": (text, files, desk.folder.scenes(), desk.scene),
-            "Measurements": (text, desk.folder.tables(), desk.folder.files((".gpx",))),
-            "Parameters": text,
-            "Run": desk.folder.study_file.is_file(),
-        }
 
-    shown, watched = contents(), {"job": desk.jobs.running()}
+def _show_map(desk: Desk) -> ui.label:
+    """Draw the map with its buttons, and the last command; returns the label of the chosen place or area."""
 
-    def refresh() -> None:
-        now = contents()
-        for name, show in STEPS:
-            if name not in now or now[name] != shown[name]:
-                show.refresh()
-        show_commands.refresh()
-        shown.update(now)
-        # Otherwise `watch` would show the command again, and a click on its Stop would be lost.
-        watched["job"] = desk.jobs.running()
-        activity.refresh()
-        reload_map()
+    def clear_area() -> None:
+        desk.area = None
+        place.set_text("")
+        desk.mark()
+        show_prediction.refresh()
 
-    def reload_map() -> None:
-        ui.run_javascript(f"plan.load({json.dumps(desk.scene)})")
+    with ui.element("section").classes("plan").props('aria-label="Map"'):
+        heading("Calibray", 1)
+        ui.label(str(desk.folder.path)).classes("quiet")
+        canvas = ui.element("canvas").props(
+            'id=plan tabindex=0 role=application aria-label="Map: arrow keys move it, plus and minus zoom, Enter '
+            'chooses the middle"'
+        )
+        canvas.classes("map")
+        with ui.row().classes("tools"):
+            # Without the server, so that what follows at once already finds the map as asked.
+            for name, call in (("Whole map", "fit"), ("Draw an area", "drawArea")):
+                button = ui.button(name).props("outline dense")
+                button.on("click", js_handler=f"() => plan.{call}()")
+            ui.button("Clear the area", on_click=clear_area).props("outline dense")
+            view_button(desk)
+        ui.label("Drag to move, wheel or two fingers to zoom, click to choose a place.").classes("quiet")
+        place = ui.label().classes("quiet").mark("place")
+        activity(desk)
+    return place
+
+
+def _answer_map(desk: Desk, place: ui.label) -> None:
+    """Take what the script of the map reports: choices of the user, and data that it has loaded."""
 
     def picked(event: events.GenericEventArguments) -> None:
         # Adding 0 removes the sign of a negative zero.
@@ -106,47 +98,69 @@ def build(desk: Desk) -> None:
         place.set_text(f"Chosen area: {east - west:.0f} m by {north - south:.0f} m")
         show_prediction.refresh()
 
-    def clear_area() -> None:
-        desk.area = None
-        place.set_text("")
-        desk.mark()
-        show_prediction.refresh()
-
     def loaded(event: events.GenericEventArguments) -> None:
-        data: dict[str, Any] = event.args
-        desk.sites = data["sites"]
+        desk.sites = event.args["sites"]
         show_prediction.refresh()
 
     def examined(event: events.GenericEventArguments) -> None:
         desk.findings = event.args["findings"]
         findings.refresh()
 
-    desk.refresh = refresh
-
-    def first_map() -> None:
-        reload_map()
-        desk.mark()
-
-    ui.timer(0.1, first_map, once=True)
     ui.on("picked", picked)
     ui.on("area", area_drawn)
     ui.on("plan", loaded)
     ui.on("findings", examined)
 
+
+def _follow_changes(desk: Desk) -> None:
+    """Show steps again when the files of the folder, or the command that is running, have changed."""
+
+    def contents() -> dict[str, object]:
+        """What the steps with fields for texts show; they are shown again only if it changes."""
+        text, files = desk.folder.text(), desk.folder.files((*MAPS, ".tif", ".tiff"))
+        return {
+            "Map or plan": (text, files, desk.folder.scenes(), desk.scene),
+            "Measurements": (text, desk.folder.tables(), desk.folder.files((".gpx",))),
+            "Parameters": text,
+            "Run": desk.folder.study_file.is_file(),
+        }
+
+    shown, watched = contents(), {"job": desk.jobs.running()}
+
+    def reload_map() -> None:
+        ui.run_javascript(f"plan.load({json.dumps(desk.scene)})")
+
+    def refresh() -> None:
+        now = contents()
+        for name, show in STEPS:
+            if name not in now or now[name] != shown[name]:
+                show.refresh()
+        show_commands.refresh()
+        shown.update(now)
+        # Otherwise `watch` would show the command again, and a click on its Stop would be lost.
+        watched["job"] = desk.jobs.running()
+        activity.refresh()
+        reload_map()
+
+    def first_map() -> None:
+        reload_map()
+        desk.mark()
+
     def watch() -> None:
-        job = desk.jobs.running()
-        before = watched["job"]
+        before, job = watched["job"], desk.jobs.running()
         # Only what has changed: a button that is made again loses the keyboard, and a click.
         if job is None or before is None or job.number != before.number:
             if job != before:
                 activity.refresh()
         elif job != before:
             progress.refresh(job)
-        ended = before is not None and job is None
         watched["job"] = job
-        if ended:
+        # A command that has ended may have written files.
+        if before is not None and job is None:
             refresh()
 
+    desk.refresh = refresh
+    ui.timer(0.1, first_map, once=True)
     ui.timer(1.0, watch)
 
 
