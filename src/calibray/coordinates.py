@@ -130,6 +130,7 @@ class Frame:
         if crs == WGS84:
             _check_degrees(x, y)
         easting, northing = transformer(crs, self.crs).transform(x, y)
+        # PROJ answers with infinity outside of a projection, without an error.
         outside = np.flatnonzero(~np.isfinite(np.ravel(easting) + np.ravel(northing)))
         if len(outside):
             raise InputError(

@@ -179,11 +179,13 @@ def versions() -> tuple[tuple[str, str], ...]:
     For a missing package, the value is the command that installs it.
     """
     packages = {"calibray": "pip install calibray"}
+    # A copy of the source that was never installed has no metadata.
     requirements = metadata.requires("calibray") if _version("calibray") else None
     for requirement in requirements or []:
         name, extra = _REQUIREMENT.findall(requirement)[0]
         if extra not in _DEVELOPER_EXTRAS:
             packages.setdefault(name, f"pip install 'calibray[{extra}]'" if extra else f"pip install {name}")
+        # Sionna RT requires certain versions of these two, which its own installation brings.
         if name == "sionna-rt":
             packages |= {needed: "pip install --force-reinstall sionna-rt" for needed in ("mitsuba", "drjit")}
     installed = {name: _version(name) or f"not installed: {command}" for name, command in packages.items()}

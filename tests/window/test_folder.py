@@ -7,12 +7,14 @@ import os
 import numpy as np
 import pandas as pd
 import pytest
+from nicegui import Client, ui
+from nicegui.page import page
 
 from calibray.errors import InputError
 from calibray.study import Study
 from calibray.window.desk import Desk, StudyFolder, sites
 from calibray.window.result_steps import write_links
-from calibray.window.study_steps import likely_tables
+from calibray.window.study_steps import _entry, likely_tables
 from small_scenes import block, write_scene
 
 STUDY = """version = 1
@@ -182,3 +184,16 @@ def test_places_are_at_their_height_above_the_ground(tmp_path):
     assert (table["sector"] == "north").all()
     with pytest.raises(InputError, match="heights above the ground need a scene"):
         write_links(Desk(StudyFolder(tmp_path)), "place.csv", site, np.array([1.0]), np.array([1.0]), 1.5)
+
+
+def test_what_a_parameter_states_is_kept():
+    """A prior of another revision of P.2040 than the list's, and negative bounds within reach of the sliders."""
+    with Client(page("/")) as client:
+        for name, entry in (
+            ("walls.relative_permittivity", {"bounds": [1.5, 12.0], "prior": {"itu": "brick@P.2040-1", "spread": 0.2}}),
+            ("floor.relative_permittivity", {"bounds": [1.5, 12.0], "prior": {"itu": "wood", "spread": 0.3}}),
+            ("tx:A.azimuth", {"bounds": [-10.0, 10.0]}),
+        ):  # fmt: skip
+            assert _entry(name, entry)() == entry
+    for slider in (part for part in client.elements.values() if isinstance(part, ui.slider)):
+        assert slider.props["min"] <= slider.value <= slider.props["max"]

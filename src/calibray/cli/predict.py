@@ -231,6 +231,7 @@ def suggest(
     )
     if options.out is not None:
         write_table(options.out, suggestion)
+        echo(f"Written to {options.out}", err=True)
 
 
 def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:

@@ -142,7 +142,7 @@ def collect(result: Record, progress: Progress | None = None) -> PageData:
         shown = {label: group_text(result, str(label)) for label in set(links.group)}
         links = replace(links, group=np.array([shown[label] for label in links.group], dtype=object))
     if links is None:
-        missing.append(f"Positions of the links: {study.links.file} cannot be read any more.")
+        missing.append(f"Positions of the links: {study.links.file} cannot be read any more, or has changed.")
     scene = result.scene
     if scene is None:
         try:
@@ -337,6 +337,7 @@ def _script_data(result: Record, data: PageData, layout: Plan | None) -> dict[st
     links = data.links
     if links is None or layout is None:
         return None
+    # Links have the number of their group, which takes less space than its name.
     names = [] if links.group is None else sorted(set(links.group.tolist()))
     index = {name: number for number, name in enumerate(names)}
     materials = [] if data.scene is None else list(data.scene.materials)

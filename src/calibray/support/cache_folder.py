@@ -72,6 +72,7 @@ class Store:
                 if hashlib.sha256(value).digest() == digest:
                     os.utime(stream.fileno() if os.utime in os.supports_fd else file)
                     return value
+            # The digest is another one: the entry is damaged.
             os.unlink(file, dir_fd=folder)
         return None
 
@@ -89,6 +90,7 @@ class Store:
                 with suppress(OSError):
                     os.unlink(partial, dir_fd=folder)
                 raise
+            # The digest of the name decides, so that about one new entry in `_PRUNED_AT` causes a check.
             if hashlib.sha256(name.encode()).digest()[0] % _PRUNED_AT == 0:
                 self._remove_oldest()
 

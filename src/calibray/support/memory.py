@@ -115,7 +115,7 @@ def run_limited(code: str, memory: int, size: int) -> bool:
     if not sys.executable:
         return True  # an embedded interpreter cannot start another one
     # Large files are read at 20 MB/s or faster.
-    limit = SECONDS + size / 20e6
+    limit = SECONDS + size / 20e6  # [s]
     program = _LIMITS.format(path=sys.path, memory=memory, refused=REFUSED) + code
     try:
         done = subprocess.run(

@@ -222,6 +222,7 @@ def solid(folder: StudyFolder, scene: str | None) -> Solid | None:
         return None
     read, triangles = _geometry(source, study)
     low, high = triangles.vertex.min(axis=0), triangles.vertex.max(axis=0)
+    # The diagonal of the scene becomes the diameter of the sphere.
     centre, scale = (low + high) / 2, 2 * RADIUS / max(float(np.linalg.norm(high - low)), 1e-6)
     names, corners = list(read.materials), (triangles.corners - centre) * scale
     meshes = {
@@ -361,7 +362,9 @@ def sites(study: Study, links: Measurements) -> list[dict[str, Any]]:
     key = list(dict.fromkeys(name for name in names if name is not None and name in links.frame))
     columns = links.frame[list(dict.fromkeys([*key, *mounting_columns(study)]))]
     tx = pd.DataFrame(links.tx.round(2), columns=["x", "y", "z"])
+    # The first link of every mast, group and carrier stands for the others.
     first = ~pd.concat([tx, columns[key].reset_index(drop=True)], axis=1).duplicated().to_numpy()
+    # By way of JSON: NumPy's numbers and NaN cannot be sent to the page.
     rows = json.loads(columns[first].to_json(orient="records"))
     return [
         {

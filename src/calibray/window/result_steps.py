@@ -263,6 +263,7 @@ def better(first: str, second: str, folder: Path) -> str:
     errors = {first: one.errors[model][judged], second: other.errors[other_model][judged]}
     best, worst = sorted(errors, key=lambda name: float(np.mean(errors[name] ** 2)))
     judgement = compare(errors[best], {worst: errors[worst]}, one.position[judged])
+    # The blocks of the first result: those of the second may be others.
     lower = sum(
         np.mean(errors[best][rows] ** 2) < np.mean(errors[worst][rows] ** 2)
         for rows in (one.block[judged] == block for block in np.unique(one.block[judged]))
@@ -418,6 +419,7 @@ def predicted_text(row: pd.Series) -> str:
     for key, quantity in QUANTITIES.items():
         column = f"{key}_{quantity.unit.lower()}"
         if key != "path_loss" and column in row:
+            # The table has these columns only if the study measured this quantity.
             value, name, unit = column, quantity.name, quantity.unit
             lower, upper = (f"{key}_{end}_{unit.lower()}" for end in ("lower", "upper"))
     return (

@@ -307,7 +307,7 @@ def show_parameters(desk: Desk) -> None:
     if not isinstance(parameters, dict):
         ui.label("Draft the study first.").classes("quiet")
         return
-    edits = {name: _entry(name, entry) for name, entry in parameters.items() if isinstance(entry, dict)}
+    edits = {name: _entry(name, entry) for name, entry in parameters.items()}
 
     def write(changed: dict[str, Any]) -> None:
         shown = {name: read() for name, read in edits.items()}
@@ -319,9 +319,11 @@ def show_parameters(desk: Desk) -> None:
 
 def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | None]:
     """The controls of a parameter, and a function that reads its entry; None if it is not calibrated."""
-    low, high = (float(bound) for bound in entry.get("bounds", [1.5, 15.0]))
+    low, high = map(float, entry["bounds"])
     prior = entry.get("prior", {})
-    known = prior["itu"] if prior.get("itu") in ITU else ""
+    stated = prior.get("itu", "")
+    # The study may state a revision or a material that the list lacks ("concrete@P.2040-1").
+    materials = list(dict.fromkeys(["", stated, *ITU]))
     with ui.element("fieldset"):
         with ui.element("legend"):
             ui.label(name)
@@ -329,15 +331,18 @@ def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | No
             chosen = ui.switch("Calibrate", value=True)
             lower = ui.number("Lowest", value=low, format="%.6g")
             upper = ui.number("Highest", value=high, format="%.6g")
-            itu = ui.select(["", *ITU], label="Prior: ITU-R P.2040", value=known)
+            itu = ui.select(materials, label="Prior: ITU-R P.2040", value=stated)
             spread = ui.number(
                 "Spread of the prior", value=prior.get("spread", 0.3), min=0.01, max=10, step=0.05
             )
         if entry.get("scale") != "log":
             with ui.row():
                 for bound, which in ((lower, "lowest"), (upper, "highest")):
-                    slider = ui.slider(min=0, max=max(2 * high, 20.0), step=0.1).bind_value(bound)
-                    slider.classes("bound").props(f'label aria-label="{safe(name)} {which}, slider"')
+                    # Errors of antennas have negative bounds.
+                    slider = ui.slider(min=min(2 * low, 0.0), max=max(2 * high, 20.0), step=0.1)
+                    slider.bind_value(bound).classes("bound").props(
+                        f'label aria-label="{safe(name)} {which}, slider"'
+                    )
 
     def number(control: ui.number) -> float:
         try:
