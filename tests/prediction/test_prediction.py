@@ -305,3 +305,13 @@ def test_offsets_that_compensate_the_parameters_do_not_widen_intervals(tmp_path,
     half_width = (ends.upper_db - ends.lower_db) / 2
     assert half_width.min() > stdtrit(freedom, 0.95) * result.prediction.model.residual_db
     assert half_width.max() < 1.2 * stdtrit(freedom, 0.95) * result.prediction.model.residual_db
+
+
+def test_the_reach_of_links_held_out_by_a_filter_is_their_distance_from_the_calibration_links(tmp_path):
+    table, marble = planted.campaign(noise_db=1.0), "marble.relative_permittivity"
+    sections = {"holdout": {"where": "rx_x > -9"}, "parameters": {marble: {"bounds": planted.BOUNDS}}}
+    result = calibrate(planted.study(tmp_path, table, **sections))
+    receivers = table[["rx_x", "rx_y", "rx_z"]].to_numpy()
+    held_out = table.rx_x.to_numpy() > -9
+    apart = np.linalg.norm(receivers[held_out][:, None] - receivers[~held_out], axis=2).min(axis=1)
+    assert result.prediction.model.blocks.reach_m == pytest.approx(np.quantile(apart, 0.9))

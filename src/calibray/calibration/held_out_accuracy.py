@@ -130,10 +130,10 @@ def _choice(
         name = predicting(errors, moving_end(setup.links)[judged][finite])
         rms_db, basis = float(np.sqrt(np.mean(errors[name] ** 2))), f"errors of {count} links held out"
         basis = basis if name == Model.CALIBRATED else f"{name}, {basis}"
-        position = np.hstack([setup.links.tx, setup.links.rx])[judged][finite]
+        ends = np.hstack([setup.links.tx, setup.links.rx])
         # These links were held out together; blocks only separate the two levels of their errors.
         block = place_blocks(moving_end(setup.links)[judged][finite], DEFAULT_BLOCKS)
-        levels = two_levels(errors[name], block, position)
+        levels = two_levels(errors[name], block, ends[judged][finite], ends[objective.weight > 0])
         if levels is not None:
             kept = np.flatnonzero(judged)[finite]
             levels = replace(levels, out_of_sight=_out_of_sight(problem, errors[name], kept))

@@ -165,12 +165,16 @@ def least(errors: Errors, names: tuple[str, ...]) -> str:
 
 
 def two_levels(
-    errors: NDArray[np.float64], block: NDArray[np.int64], position: NDArray[np.float64]
+    errors: NDArray[np.float64],
+    block: NDArray[np.int64],
+    position: NDArray[np.float64],
+    fitted: NDArray[np.float64] | None = None,
 ) -> BlockErrors | None:
     """Variance of held-out errors [n], [dB], within and between blocks (analysis of variance of random effects).
 
     A new street has its own error, so a few blocks contain less information than their many links. Positions [n, k],
-    [m], are of the links' ends. None with fewer than two blocks, or if there are no more links than blocks.
+    [m], are of the links' ends; those of the links that the models were fitted to [m, k] are the other blocks' if None.
+    None with fewer than two blocks, or if there are no more links than blocks.
 
     Example:
         >>> blocks = two_levels(np.array([3.0, 4, -4, -3, 1, 0]), np.array([0, 0, 1, 1, 2, 2]), np.eye(6))
@@ -189,7 +193,7 @@ def two_levels(
     distance = np.empty(links)
     for number in range(count):
         here = index == number
-        distance[here] = KDTree(position[~here]).query(position[here])[0]
+        distance[here] = KDTree(position[~here] if fitted is None else fitted).query(position[here])[0]
     reach_m = float(np.quantile(distance, REACHED))
     return BlockErrors(float(np.sqrt(within)), float(np.sqrt(between)), count, reach_m)
 
