@@ -32,7 +32,7 @@ from calibray.result.verdict import Remark, RemarkKind
 from calibray.scenes import read_scene, read_triangles
 from calibray.scenes.buildings import _loops
 from calibray.support.figure_style import plain_number
-from calibray.uncertainty.verdicts import Interval
+from calibray.uncertainty.verdicts import Interval, consistent
 from calibray.validation.validation import Validation
 from changed import changed
 from small_scenes import block, write_scene
@@ -352,6 +352,11 @@ def test_the_summary_says_which_parameters_are_identified(result):
     assert f"Calibrated values outside their intervals: {unidentified}." in answer(
         outside, "How certain are the values?"
     )
+    # One range, which does not contain the calibrated value, is ambiguous, too.
+    one_range = changed(
+        result, intervals={name: consistent(Interval(0.1, 2.0, 3.0, "identified"), 9.0) for name in verdicts}
+    )
+    assert "or the best fit is outside the interval" in answer(one_range, "How certain are the values?")
     material = unidentified.rpartition(".")[0]
     for count, words in ((0, "no path of any link interacts with it"), (1, "paths that interact with it")):
         sentences = summary(known, {material: count})

@@ -32,7 +32,7 @@ LISTED_VALUES: Final = 6
 
 MEANINGS: Final = {
     Verdict.WEAKLY_IDENTIFIED: "weakly identified: each interval covers much of its range",
-    Verdict.AMBIGUOUS: "ambiguous: several separate ranges fit the links",
+    Verdict.AMBIGUOUS: "ambiguous: several separate ranges fit the links, or the best fit is outside the interval",
     Verdict.AT_BOUND: "at a bound: the best value may lie beyond it, or the model lacks something",
     Verdict.NOT_IDENTIFIABLE: "not identifiable: all values within the interval fit the links about equally well",
 }
