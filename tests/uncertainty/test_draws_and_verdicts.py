@@ -48,6 +48,21 @@ def test_an_undetermined_parameter_covers_its_bounds():
     assert [verdict.name for verdict in rough] == ["weakly identified", "not identifiable"]
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_a_parameter_known_for_the_measured_buildings_alone_is_weakly_identified(seed):
+    """The posterior of all buildings is the whole range, with gaps and ends by chance."""
+    random, equal = np.random.default_rng(seed), np.full(300, 1 / 300)
+    every = Draws(random.uniform(0.0, 10.0, (300, 1)), np.zeros(300), equal)
+    seen = Draws(random.normal(4.0, 0.5, (300, 1)), np.zeros(300), equal)
+    axes = Axes(NAMES[:1], np.zeros(1), np.full(1, 10.0))
+    (verdict,) = verdicts(every, lambda x: x, axes, 1.0, seen=seen)
+    assert verdict.name == "weakly identified"
+    assert "measured" in reason_text(verdict.reason)
+    # Also the measured buildings reach a bound.
+    low = replace(seen, point=random.exponential(0.5, (300, 1)))
+    assert verdicts(every, lambda x: x, axes, 1.0, seen=low)[0].name != "weakly identified"
+
+
 def test_gaps_between_draws_of_a_parameter_without_effect_are_chance():
     """Few draws leave gaps; without any effect the interval is the whole range, with an effect it is not."""
     point = np.random.default_rng(4).uniform(0.0, 1.0, (400, 1))

@@ -241,9 +241,10 @@ def verdicts(
         extent = axes.extent(index)
         share, seen_share = _width(pieces) / extent, _width(seen_pieces) / extent
         range_ = {"customary": True} if extent < upper - lower else {}
-        ends = _bounds_reached(pieces, lower, upper)
-        ends = ends or _bounds_reached(seen_pieces, lower, upper)
-        if share > WEAKLY >= seen_share and len(seen_pieces) == 1 and not ends:
+        seen_ends = _bounds_reached(seen_pieces, lower, upper)
+        ends = _bounds_reached(pieces, lower, upper) or seen_ends
+        # A flat posterior of all buildings reaches both bounds, and its pieces are chance.
+        if share > WEAKLY >= seen_share and len(seen_pieces) == 1 and not seen_ends:
             name = Verdict.WEAKLY_IDENTIFIED
             reason = Reason(ReasonKind.SEEN_BUILDINGS, {"share": float(seen_share), **range_})
         elif share > WEAKLY and seen_share > WEAKLY:
