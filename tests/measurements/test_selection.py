@@ -150,6 +150,35 @@ def test_tracks_and_times_that_do_not_fit_are_refused(join, text, times, message
         join(text, [times or "2026-05-01T10:00:00Z"])
 
 
+def test_a_time_zone_with_which_more_rows_lie_on_the_track_is_named(join):
+    minutes = pd.date_range("2026-05-01T10:00", "2026-05-01T12:00", freq="min")
+    track = gpx(
+        "".join(
+            f'<trkpt lat="48" lon="{11 + k / 1000}"><time>{minute.isoformat()}Z</time></trkpt>'
+            for k, minute in enumerate(minutes)
+        )
+    )
+    note = "rows at no time of the track, left out"
+    local = [str(minute + pd.Timedelta(minutes=45)) for minute in minutes]
+    joined = join(track, local, longest_gap=60.0)
+    assert joined.changes == {f"{note}, which links.track.clock = 2700 would keep": 45}
+    # With that clock, every row has the position at its time.
+    right = join(track, local, longest_gap=60.0, clock=2700.0)
+    np.testing.assert_allclose(right.frame["track_longitude"], 11 + np.arange(121) / 1000)
+    assert not right.changes
+    # Rows before the track have no position with any clock: a recorder that started late.
+    early = [str(minute - pd.Timedelta(minutes=20)) for minute in minutes]
+    assert join(track, [*early, *local[-70:]], longest_gap=60.0).changes == {note: 65}
+    with pytest.raises(InputError, match=r"with links\.track\.clock = 7260 they do; check the time zone"):
+        join(track, [str(minutes[-1] + pd.Timedelta(hours=2))], longest_gap=60.0, clock=60.0)
+
+
+def test_the_fraction_of_a_second_may_follow_a_comma(join):
+    track = gpx(point(11.0, 48.0, 0) + point(11.1, 48.0, 10))
+    joined = join(track, ["2026-05-01 10:00:02,500", "2026-05-01 10:00:05"])
+    np.testing.assert_allclose(joined.frame["track_longitude"], [11.025, 11.05])
+
+
 def test_a_missing_track_is_named():
     steps = Preparation(track=Track("nowhere.gpx", "time"))
     with pytest.raises(InputError, match=r"nowhere\.gpx: does not exist"):

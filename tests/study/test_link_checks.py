@@ -236,3 +236,28 @@ def test_a_parked_receiver_whose_gps_positions_spread_is_named(town):
     assert "links have the same position within 5 m" in found(parked)
     assert found(parked, average={"by": "cell", "size": 5.0}) == ""
     assert found(frame) == ""
+
+
+def test_a_log_in_another_time_zone_than_its_track_is_named(town):
+    frame = links()
+    frame["x"], frame["y"] = 10 + frame["x"] / 71_700, 50 + frame["y"] / 111_230
+    clock = pd.date_range("2026-05-04T09:00", periods=len(frame), freq="2min")
+    points = "".join(
+        f'<trkpt lat="{y}" lon="{x}"><time>{time.isoformat()}Z</time></trkpt>'
+        for x, y, time in zip(frame["x"], frame["y"], clock, strict=True)
+    )
+    (town / "walk.gpx").write_text(f"<gpx><trk><trkseg>{points}</trkseg></trk></gpx>")
+    scene = {"file": "scene.xml", "frequency": 3.5e9, "origin": [10.0, 50.0]}
+
+    def found(ahead: str, **track: object) -> str:
+        table = frame.drop(columns=["x", "y"]).assign(time=clock + pd.Timedelta(ahead))
+        steps = {
+            "position": "geographic",
+            "tx": [10 + MAST[0] / 71_700, 50 + MAST[1] / 111_230, MAST[2]],
+            "rx": ["track_longitude", "track_latitude", 1.5],
+            "track": {"file": "walk.gpx", "time": "time", "longest_gap": 120.0} | track,
+        }
+        return suspicions(town, table, links=steps, scene=scene)
+
+    assert found("0 min") == found("1 h", clock=3600.0) == ""
+    assert "30 rows at no time of the track, left out, which links.track.clock = 3600 would keep" in found("1 h")

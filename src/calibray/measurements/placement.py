@@ -13,9 +13,13 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.measurements.preparation import Preparation, Track
 from calibray.measurements.source_table import Coordinates, SourceTable
+from calibray.support.messages import first_line
 
 TRACK_COLUMNS: Final = ("track_longitude", "track_latitude")
 """The columns of a row's position on a track [deg]."""
+
+NOT_ON_TRACK: Final = "rows at no time of the track, left out"
+"""The entry in `changes` of rows outside the times of a track; more follows if another clock fits clearly better."""
 
 MAX_FILE_SIZE: Final = 200_000_000
 """Largest GPX file that is read [bytes]; a track with one point per second reaches it after three weeks."""
@@ -33,22 +37,17 @@ def join_track(table: SourceTable, track: Track) -> SourceTable:
     points = _read_gpx(Path(track.file))
     seconds = _row_times(table, track) - track.clock
     times = _seconds(points["time"])
-    after = np.clip(np.searchsorted(times, seconds, side="left"), 0, len(times) - 1)
-    # At the time of a point itself, gaps next to it do not matter.
-    before = np.where(times[after] == seconds, after, np.maximum(after - 1, 0))
-    # Before and after the track, and at missing times (NaN), one of the comparisons is false.
-    covered = (
-        (times[before] <= seconds)
-        & (seconds <= times[after])
-        & (times[after] - times[before] <= track.longest_gap)
-    )
+    covered = _covered(times, seconds, track.longest_gap)
+    shift = _better_shift(times, seconds, track.longest_gap)
+    clock = f"links.track.clock = {track.clock + shift:g}"
     if not covered.any():
         first, last = points["time"].iloc[0], points["time"].iloc[-1]
+        remedy = f"with {clock} they do; check the time zone" if shift else "check the time zone and the clock"
         raise InputError(
             f"{table.source} with {track.file}: none of {len(table)} times in column {track.time!r} lies on the track, "
-            f"{first} to {last}; check the time zone and the clock"
+            f"{first} to {last}; {remedy}"
         )
-    table = table.keep(covered, "rows at no time of the track, left out")
+    table = table.keep(covered, NOT_ON_TRACK + (f", which {clock} would keep" if shift else ""))
     # Across 180 degrees, unwrapped longitudes continue beyond 180.
     longitude = np.interp(seconds[covered], times, np.unwrap(points["longitude"], period=360.0))
     latitude = np.interp(seconds[covered], times, points["latitude"])
@@ -61,11 +60,44 @@ def _row_times(table: SourceTable, track: Track) -> NDArray[np.float64]:
     try:
         if pd.api.types.is_numeric_dtype(column):
             return _seconds(pd.to_datetime(column, utc=True, unit="s"))
-        return _seconds(pd.to_datetime(column, utc=True, format="ISO8601"))
+        # ISO 8601 allows a comma before the fraction of a second; pandas does not.
+        return _seconds(pd.to_datetime(column.replace(",", ".", regex=True), utc=True, format="ISO8601"))
     except (ValueError, OverflowError) as error:
         raise InputError(
-            f"{table.source}, column {track.time!r}: a time cannot be read ({error}); give ISO 8601 or seconds"
+            f"{table.source}, column {track.time!r}: a time cannot be read ({_reason(error)}); give ISO 8601, such "
+            "as 2026-05-31T14:05:09.2Z, or seconds since 1970"
         ) from None
+
+
+def _covered(
+    times: NDArray[np.float64], seconds: NDArray[np.float64], longest_gap: float
+) -> NDArray[np.bool_]:
+    """Which rows lie between two points of a track, at increasing `times`, that are not too far apart in time."""
+    after = np.clip(np.searchsorted(times, seconds, side="left"), 0, len(times) - 1)
+    # At the time of a point itself, gaps next to it do not matter.
+    before = np.where(times[after] == seconds, after, np.maximum(after - 1, 0))
+    # Before and after the track, and at missing times (NaN), one of the comparisons is false.
+    between = (times[before] <= seconds) & (seconds <= times[after])
+    return between & (times[after] - times[before] <= longest_gap)
+
+
+def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], longest_gap: float) -> float:
+    """How much a clock in another time zone would be ahead of that of the track [s]; 0 if it does not fit better.
+
+    It fits better if at least a tenth of the rows do not lie on the track, and most of them do with this clock.
+    """
+    seconds = seconds[np.isfinite(seconds)]
+    seconds = seconds[:: 1 + len(seconds) // 10_000]
+    if not len(seconds) or (kept := _covered(times, seconds, longest_gap).mean()) > 0.9:
+        return 0.0
+    zones = sorted(900.0 * np.arange(-56, 57), key=abs)  # time zones are quarters of an hour, up to 14 h, from UTC
+    shares = [_covered(times, seconds - zone, longest_gap).mean() for zone in zones]
+    return float(zones[int(np.argmax(shares))]) if max(shares) > (1.0 + kept) / 2 else 0.0
+
+
+def _reason(error: Exception) -> str:
+    """Why pandas cannot read a time, without its advice on arguments."""
+    return first_line(error).partition(". You might")[0]
 
 
 def _seconds(times: pd.Series) -> NDArray[np.float64]:
@@ -100,7 +132,7 @@ def _read_gpx(path: Path) -> pd.DataFrame:
         _seconds(points["time"])
     except (ValueError, OverflowError) as error:
         raise InputError(
-            f"track {path}: a time is not ISO 8601 or out of range ({error}); export it again"
+            f"track {path}: a time is not ISO 8601 or out of range ({_reason(error)}); export it again"
         ) from None
     return points.sort_values("time", kind="stable").drop_duplicates("time").reset_index(drop=True)
 

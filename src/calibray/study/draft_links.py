@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -178,6 +179,8 @@ class LinksDraft:
         rows = len(self.table)
         self.table = select_rows(self.table, Preparation(track=Track(str(self.given.track), name)))
         reason = f"given; it covers {len(self.table)} of {rows} rows"
+        if not re.search(r"(Z|[+-]\d\d(:?\d\d)?|^[\d.]+)$", str(self.table.frame[name].iloc[0])):
+            reason += "; times without a time zone count as UTC"
         self.assume("links.track", f"{self.given.track.name} by {name}", reason)
 
     def _add_transmitters(self) -> None:

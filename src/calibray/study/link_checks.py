@@ -16,6 +16,7 @@ from scipy.constants import speed_of_light
 from calibray.errors import InputError
 from calibray.measurements import FEW, Measurements
 from calibray.measurements.column_names import words
+from calibray.measurements.placement import NOT_ON_TRACK
 from calibray.scenes.checks import Finding, SceneSurfaces, scale_findings
 from calibray.study.model import StudyModel
 from calibray.study.mounting import largest_gain_dbi, link_antennas
@@ -87,6 +88,7 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
         *_angles(study, links),
         *_averages(study, overhead),
         *_dominant_positions(links, study.links.position == "geographic"),
+        *_clock(links),
     )
     return tuple(Finding("warning", links.source, problem, remedy) for problem, remedy in checks)
 
@@ -117,6 +119,12 @@ def _averages(study: StudyModel, overhead: SceneSurfaces) -> Iterator[tuple[str,
             f"averages span {average.size:g} m, {average.size / largest * CELL_SHARE:.0%} of the scene's shorter side",
             f"set links.average.size to {largest:.2g} m or less",
         )
+
+
+def _clock(links: Measurements) -> Iterator[tuple[str, str]]:
+    for change, number in links.prepared.items():
+        if change.startswith(NOT_ON_TRACK) and change != NOT_ON_TRACK:
+            yield f"{number:,} {change}: the positions of the others may be wrong", "check the time zone of the table"
 
 
 def _dominant_positions(links: Measurements, is_geographic: bool) -> Iterator[tuple[str, str]]:
