@@ -250,6 +250,8 @@ def test_markdown_has_a_row_for_each_method(small):
             "'gwo@x': the budget x must be a whole number of RT calls from 24 to 1,000,000",
         ),
         ({"names": ["gwo@-60"]}, "the budget -60 must be"),
+        ({"names": ["gwo@"]}, "'gwo@': the budget  must be a whole number"),
+        ({"names": ["least-squares@60"]}, "least-squares stops by itself and has no budget; omit @60"),
         ({"names": ["gwo"], "budget": 10}, "the budget 10 must be"),
         ({"names": []}, "the list is empty"),
         ({"seeds": 0}, "seeds = 0: must be 1 to 10,000"),

@@ -118,9 +118,10 @@ def compare(
     names = [name.strip() for name in runs.methods.split(",") if name.strip()]
     check_outputs(out, FILES, Study.load(study_file).files(), overwrite)
     parsed = parse_methods(names, runs.budget)
-    calls = runs.seeds * sum(method.budget for method in parsed)
+    calls = runs.seeds * sum(method.budget for method in parsed if not method.stops_by_itself)
+    free = "".join(f", without those of {method.name}" for method in parsed if method.stops_by_itself)
     echo(
-        f"{runs.seeds * len(parsed):,} runs with {calls:,} RT calls in total; "
+        f"{runs.seeds * len(parsed):,} runs with {calls:,} RT calls in total{free}; "
         f"runs that are kept in {out} are not repeated",
         err=True,
     )

@@ -130,23 +130,25 @@ class BudgetedMethod:
         """Parse a method, as in "gwo@600", or with the common budget [RT calls].
 
         Raises:
-            InputError: The method is unknown, or the budget is not a whole number or too small.
+            InputError: The method is unknown, the budget is not a whole number or too small, or the method has none.
 
         Example:
             >>> BudgetedMethod.parse("gwo@600", 225)
             BudgetedMethod(name='gwo@600', method='gwo', budget=600)
         """
-        method, _, calls = name.partition("@")
+        method, at, calls = name.partition("@")
         schedule = optimizers.method(method).schedule
+        if at and schedule is None:
+            raise InputError(f"method {name!r}: {method} stops by itself and has no budget; omit @{calls}")
         if calls:
             with suppress(ValueError):
                 budget = int(calls)
         least = 1 if schedule is None else schedule.least
         # Python also reads 6_00, +600 and " 600" as numbers; the name of a run must state its budget in one way.
-        if (calls and calls != str(budget)) or not least <= budget <= LIMITS["budget"]:
+        if (at and calls != str(budget)) or not least <= budget <= LIMITS["budget"]:
             raise InputError(
-                f"method {name!r}: the budget {calls or budget} must be a whole number of RT calls from {least} to "
-                f"{LIMITS['budget']:,}"
+                f"method {name!r}: the budget {calls if at else budget} must be a whole number of RT calls from "
+                f"{least} to {LIMITS['budget']:,}"
             )
         return BudgetedMethod(name, method, budget)
 
