@@ -159,7 +159,7 @@ BOMBS = (
     Bomb("program: 2 GB of output", *program("head -c 2000000000 /dev/zero")),
     Bomb("program: an answer of 2 GB", *program("head -c 2000000000 /dev/zero > \"$2\"; exit")),
     Bomb("program: JSON 10^6 deep", *program("head -c 1000000 /dev/zero | tr '\\0' '[' > \"$2\"; exit")),
-    Bomb("compare: 10^9 seeds", {}, words=("compare", "study.toml", "--methods", "random", "--seeds", "1000000000")),
+    Bomb("compare: 10^9 seeds", {}, words=("compare", "study.toml", "--seeds", "1000000000", "--out", "out")),
     Bomb("validate: 10^9 blocks", {}, words=("validate", "study.toml", "--blocks", "1000000000")),
     Bomb("links: Parquet of 16 TB", changed("links", file="rows.parquet"), lambda f: parquet_bomb(f / "rows.parquet")),
     Bomb("rays: Parquet of 16 TB", *rays(parquet_bomb, "parquet")),
@@ -243,6 +243,8 @@ def explode(bomb: Bomb, folder: Path) -> tuple[str, float, int, str]:
     text = said.read_text(errors="replace")
     if "Traceback" in text:
         came = "TRACEBACK"
+    if "Missing option" in text or "No such option" in text:  # nothing was requested
+        came = "MISUSED"
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     costly = [line for line in lines if COST.search(line)] if came == "announced" else lines
     return came, after, most, (costly or [""])[-1]

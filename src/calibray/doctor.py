@@ -26,7 +26,7 @@ CHECK_TIMEOUT = 300.0
 _REQUIREMENT = re.compile(r"""^([\w.-]+)(?:.*extra == ['"]([\w-]+)['"])?""")
 
 # Extras for work on Calibray itself; users do not need them.
-_DEVELOPER_EXTRAS = frozenset({"test", "lint"})
+_DEVELOPER_EXTRAS = frozenset({"test", "docs", "lint"})
 
 # Sum of min(0, 2) .. min(3, 2). An unusable LLVM fails to compile the minimum; a sum alone compiles.
 _KERNEL = """
