@@ -260,4 +260,6 @@ def test_a_log_in_another_time_zone_than_its_track_is_named(town):
         return suspicions(town, table, links=steps, scene=scene)
 
     assert found("0 min") == found("1 h", clock=3600.0) == ""
-    assert "30 rows at no time of the track, left out, which links.track.clock = 3600 would keep" in found("1 h")
+    assert "30 rows at no time of the track, left out, which links.track.clock = 3600 would keep" in found(
+        "1 h"
+    )

@@ -42,7 +42,9 @@ def join_track(table: SourceTable, track: Track) -> SourceTable:
     clock = f"links.track.clock = {track.clock + shift:g}"
     if not covered.any():
         first, last = points["time"].iloc[0], points["time"].iloc[-1]
-        remedy = f"with {clock} they do; check the time zone" if shift else "check the time zone and the clock"
+        remedy = (
+            f"with {clock} they do; check the time zone" if shift else "check the time zone and the clock"
+        )
         raise InputError(
             f"{table.source} with {track.file}: none of {len(table)} times in column {track.time!r} lies on the track, "
             f"{first} to {last}; {remedy}"
@@ -90,7 +92,9 @@ def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], long
     seconds = seconds[:: 1 + len(seconds) // 10_000]
     if not len(seconds) or (kept := _covered(times, seconds, longest_gap).mean()) > 0.9:
         return 0.0
-    zones = sorted(900.0 * np.arange(-56, 57), key=abs)  # time zones are quarters of an hour, up to 14 h, from UTC
+    zones = sorted(
+        900.0 * np.arange(-56, 57), key=abs
+    )  # time zones are quarters of an hour, up to 14 h, from UTC
     shares = [_covered(times, seconds - zone, longest_gap).mean() for zone in zones]
     return float(zones[int(np.argmax(shares))]) if max(shares) > (1.0 + kept) / 2 else 0.0
 

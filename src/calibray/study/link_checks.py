@@ -124,7 +124,10 @@ def _averages(study: StudyModel, overhead: SceneSurfaces) -> Iterator[tuple[str,
 def _clock(links: Measurements) -> Iterator[tuple[str, str]]:
     for change, number in links.prepared.items():
         if change.startswith(NOT_ON_TRACK) and change != NOT_ON_TRACK:
-            yield f"{number:,} {change}: the positions of the others may be wrong", "check the time zone of the table"
+            yield (
+                f"{number:,} {change}: the positions of the others may be wrong",
+                "check the time zone of the table",
+            )
 
 
 def _dominant_positions(links: Measurements, is_geographic: bool) -> Iterator[tuple[str, str]]:
