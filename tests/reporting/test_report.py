@@ -124,6 +124,8 @@ def test_one_interaction_is_singular():
 def test_the_rival_with_further_nuisances_is_not_called_an_offset_alone():
     result = shown.result()
     slope = changed(result, coefficients={**result.nuisance.coefficients, "slope": {"": 1.0}})
+    headings = [result_tables.nuisances(found).headings for found in (result, slope)]
+    assert headings == [("Offsets", "[dB]"), ("Nuisances", "[dB per unit]")]
     names = [[text.partition(":")[0] for text in _tiles(found)[0][2]] for found in (result, slope)]
     assert [found[1] for found in names] == [
         "initial materials, offset only",

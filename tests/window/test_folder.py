@@ -12,7 +12,7 @@ from nicegui.page import page
 
 from calibray.errors import InputError
 from calibray.study import Study
-from calibray.window.desk import Desk, StudyFolder, sites
+from calibray.window.desk import Desk, StudyFolder, plan, sites, solid
 from calibray.window.result_steps import write_links
 from calibray.window.study_steps import _entry, likely_tables
 from small_scenes import block, write_scene
@@ -197,3 +197,28 @@ def test_what_a_parameter_states_is_kept():
             assert _entry(name, entry)() == entry
     for slider in (part for part in client.elements.values() if isinstance(part, ui.slider)):
         assert slider.props["min"] <= slider.value <= slider.props["max"]
+
+
+def test_the_map_has_the_materials_of_the_study(tmp_path):
+    """P.2040 has no brick at 60 GHz, so the scene alone could not be read there; the study states its constants."""
+    bsdf = '<bsdf type="itu-radio-material" id="mat-stone"><string name="type" value="brick"/></bsdf>'
+    write_scene(tmp_path, {"house": block((20.0, 20.0, 0.0), (40.0, 40.0, 15.0))}, bsdf)
+    (tmp_path / "links.csv").write_text("rx_x,rx_y,loss\n1,2,90\n3,4,95\n")
+    (tmp_path / "study.toml").write_text(
+        """version = 1
+scene = { file = "scene.xml", frequency = 60e9 }
+links = { file = "links.csv", tx = [0.0, 0.0, 9.0], rx = ["rx_x", "rx_y", 1.5], value = "loss" }
+[materials]
+stone = { relative_permittivity = 4.0, conductivity = 0.1, thickness = 0.2 }
+[objects]
+front = "house"
+[parameters]
+"front.relative_permittivity" = { bounds = [1.5, 12.0] }
+"""
+    )
+    folder = StudyFolder(tmp_path)
+    shown = plan(folder, None)
+    assert len(shown["links"]) == 2
+    # Without columns of transmitters, groups or carriers, a mast has only its position.
+    assert shown["sites"] == [{"name": "at 0, 0, 9", "tx": [0.0, 0.0, 9.0], "columns": {}}]
+    assert list(solid(folder, None).meshes) == ["front"]

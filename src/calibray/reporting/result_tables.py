@@ -157,7 +157,9 @@ def nuisances(result: Record) -> Table:
     rows = [(group_text(result, group) if group else "all links", text) for group, text in offsets.items()]
     for name, values in others.items():
         rows += [(f"{name}, {group}" if group else name, f"{value:+.3g}") for group, value in values.items()]
-    return Table("Nuisances" if others else "Offsets", (Column(), numbers(unit="dB")), tuple(rows))
+    # The column of an offset is 1; that of another nuisance can be a length or a number of walls.
+    title, unit = ("Nuisances", "dB per unit") if others else ("Offsets", "dB")
+    return Table(title, (Column(), numbers(unit=unit)), tuple(rows))
 
 
 def accuracy(result: Record) -> Table:

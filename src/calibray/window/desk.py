@@ -364,8 +364,8 @@ def sites(study: Study, links: Measurements) -> list[dict[str, Any]]:
     tx = pd.DataFrame(links.tx.round(2), columns=["x", "y", "z"])
     # The first link of every mast, group and carrier stands for the others.
     first = ~pd.concat([tx, columns[key].reset_index(drop=True)], axis=1).duplicated().to_numpy()
-    # By way of JSON: NumPy's numbers and NaN cannot be sent to the page.
-    rows = json.loads(columns[first].to_json(orient="records"))
+    # By way of JSON: NumPy's numbers and NaN cannot be sent to the page. A frame without columns becomes no rows.
+    rows = json.loads(columns[first].to_json(orient="records")) or [{}] * int(first.sum())
     return [
         {
             "name": " ".join(
@@ -393,8 +393,12 @@ def opened(folder: StudyFolder, scene: str | None) -> tuple[str | None, Study | 
 
 
 def _geometry(source: str, study: Study | None) -> tuple[Scene, Triangles]:
-    """A scene and its faces; without a study, the carrier only has to be one that the materials allow."""
-    scene = read_scene(source, 1e9 if study is None else study.scene.frequency)
+    """A scene with the materials of its study, and its faces."""
+    if study is None:
+        # Only the names of the materials are used, and nearly all of P.2040 have constants at 1 GHz.
+        scene = read_scene(source, 1e9)
+    else:
+        scene = read_scene(source, study.scene.frequency, study.overrides, study.objects)
     return scene, read_triangles(scene)
 
 

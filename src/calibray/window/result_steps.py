@@ -21,6 +21,7 @@ from calibray.errors import InputError
 from calibray.reporting.link_survey import QUANTITIES
 from calibray.result.files import read
 from calibray.result.held_out import HeldOutErrors, Model
+from calibray.support.messages import counted
 from calibray.support.output_files import write_table
 from calibray.validation.held_out_statistics import compare
 from calibray.window.desk import (
@@ -273,7 +274,7 @@ def better(first: str, second: str, folder: Path) -> str:
     verb = "predicts" if judgement.helped else "does not predict significantly"
     return (
         f"{best} {verb} better than {worst}: RMSE {judgement.rmse_db:.2f} against "
-        f"{judgement.baseline_rmse_db:.2f} dB on {judgement.links} held-out links (difference "
+        f"{judgement.baseline_rmse_db:.2f} dB on {counted(judgement.links, 'held-out link')} (difference "
         f"{judgement.gain_db:.2f} dB{certainty}); lower in {lower} of {blocks} blocks of {first}."
     )
 
