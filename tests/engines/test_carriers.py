@@ -382,6 +382,10 @@ def test_prediction_takes_the_carrier_of_each_link_or_else_the_scenes(
     (warning,) = caplog.messages
     assert "lacks the column of carriers 'carrier'" in warning
     assert "scene.frequency = 10 GHz" in warning
+    caplog.clear()
+    result.predict(frame.assign(carrier=np.where(ten, 10e9, 3 * frame["carrier"].max())))
+    (warning,) = caplog.messages
+    assert f"{(~ten).sum()} of {len(frame)} links have carriers outside" in warning
 
 
 # Bad input

@@ -117,7 +117,8 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
 def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs: bool = False) -> Setup:
     """Open the study of a calibration for new links.
 
-    A warning names the assumed carrier if the study has a column of carriers and the links have none.
+    A warning names the assumed carrier if the study has a column of carriers and the links have none, and carriers
+    outside the range of the measured ones.
 
     Raises:
         InputError: The scene or the parameters cannot be used, or one of these files has changed.
@@ -128,6 +129,15 @@ def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs:
             "%s: lacks the column of carriers %r, so all links are predicted at scene.frequency = %s; add the column "
             "for other carriers", links.source, column, hertz(result.study.scene.frequency),
         )  # fmt: skip
+    if links.frequency is not None and "frequency" in result.links:
+        low, high = result.links["frequency"].min(), result.links["frequency"].max()
+        beyond = (links.frequency < 0.99 * low) | (links.frequency > 1.01 * high)
+        if beyond.any():
+            _LOG.warning(
+                "%s: %d of %d links have carriers outside %s to %s, where links were measured; materials are "
+                "extrapolated, which the intervals do not include", links.source, beyond.sum(), len(links), hertz(low),
+                hertz(high),
+            )  # fmt: skip
     setup = Setup.open(result.study, links=links).placed_at(result.parameters, NEIGHBOURS)
     check_inputs(result, setup, allow_changed_inputs)
     return setup
