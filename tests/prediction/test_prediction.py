@@ -68,6 +68,25 @@ def test_received_power_is_predicted_in_the_measured_quantity(received):
     assert set(predictions.remark[~predictions.basis.str.startswith("no path")]) == {""}
 
 
+def test_links_far_weaker_than_every_measured_one_have_a_remark(received):
+    """Links near the noise floor do not count as measured; a remark on the position comes first."""
+    links = received.links
+    weakest_db = float(links.measured_db.max())
+    table = planted.links(blocked=True).assign(sent_dbm=30.0)
+    loss_db = received.predict_interval(table).path_loss_db.to_numpy()
+    lowered = links.assign(measured_db=links.measured_db - weakest_db + np.median(loss_db) - 10.0)
+    remarks = replace(received, links=lowered).predict_interval(table).remark
+    weaker = loss_db > np.median(loss_db)
+    weaker[planted.INSIDE] = False
+    assert remarks[planted.INSIDE] == "receiver inside a building"
+    assert (remarks == "over 10 dB weaker than every measured link").tolist() == weaker.tolist()
+    assert 0 < weaker.sum() < len(weaker) - 1
+    strong = lowered.assign(faint=lowered.measured_db < lowered.measured_db.max())
+    weak = strong.assign(faint=~strong.faint)
+    assert (replace(received, links=strong).predict_interval(table).remark == remarks).all()
+    assert (replace(received, links=weak).predict_interval(table).remark != remarks).any()
+
+
 def test_a_table_with_the_columns_of_the_measurements_is_predicted(tmp_path):
     """The study names the columns and gives the transmitter's position."""
     names = {"rx_x": "east", "rx_y": "north"}

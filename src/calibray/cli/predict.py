@@ -62,7 +62,8 @@ def predict(
         option(
             "P",
             "Add the interval that contains a measurement with this probability, such as 0.9: columns lower_db "
-            "and upper_db, and a remark if an antenna is inside a building or outside the scene.",
+            "and upper_db, and a remark if an antenna is inside a building or outside the scene, or if the link is far "
+            "weaker than every measured one.",
         ),
     ] = None,
     *,

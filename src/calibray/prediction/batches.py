@@ -14,11 +14,11 @@ from calibray.engines.cluster.chunks import CHUNK_LINKS, for_each_chunk, select_
 from calibray.engines.cluster.workers import InProcess, Workers
 from calibray.measurements import Measurements, PiecedTable
 from calibray.prediction.predict import (
+    add_remarks,
     as_links,
     check_groups,
     interval,
     open_for_links,
-    position_remarks,
     refuse_far_links,
 )
 from calibray.result.record import Record
@@ -64,9 +64,9 @@ def predict_links(
     *,
     with_remarks: bool = False,
 ) -> pd.DataFrame:
-    """Predict path loss, intervals and remarks on positions, in this process or on workers.
+    """Predict path loss, intervals and remarks, in this process or on workers.
 
-    The result is the table of `interval` with a column `remark`, empty if there is none or positions are not checked.
+    The result is the table of `interval` with a column `remark`, empty if there is none or links are not checked.
     The stage of `progress` is "tracing".
 
     Raises:
@@ -144,7 +144,7 @@ def _predict_chunk(task: _Task, links: Measurements, progress: Progress | None =
     predictions = interval(task.result, setup, task.level, progress)
     if not task.with_remarks:
         return predictions.assign(remark="")
-    return predictions.assign(remark=position_remarks(task.result, setup, read_triangles(setup.scene)))
+    return add_remarks(task.result, setup, predictions)
 
 
 LOG: Final = logging.getLogger(__name__)

@@ -49,6 +49,9 @@ NEIGHBOURS: Final = (0.125, 0.5)
 NEAR_SHARE: Final = 0.1
 """Share of the residual field's variance explained by measured links above which a link is near measured links."""
 
+WEAKER_DB: Final = 10.0
+"""Path loss above the largest measured one beyond which a prediction has a remark [dB]."""
+
 
 def predict(
     result: Record,
@@ -86,11 +89,9 @@ def predict_interval(
             the calibration had too few links to estimate the size of residuals.
     """
     setup = open_for_links(result, as_links(result, links), allow_changed_inputs=allow_changed_inputs)
-    triangles = read_triangles(setup.scene)
-    refuse_far_links(result, setup.links, triangles)
+    refuse_far_links(result, setup.links, read_triangles(setup.scene))
     table = interval(result, setup, level, progress)
-    measured_quantity = as_measured(result.study, setup.links, table)
-    return table.assign(**measured_quantity, remark=position_remarks(result, setup, triangles))
+    return add_remarks(result, setup, table.assign(**as_measured(result.study, setup.links, table)))
 
 
 def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -> Measurements:
@@ -403,26 +404,32 @@ def check_inputs(result: Record, setup: Setup, allow_changed: bool) -> None:
         )
 
 
-def position_remarks(result: Record, setup: Setup, triangles: Triangles) -> NDArray[np.str_]:
-    """A remark on the position of every link [links]; empty where the positions are plausible.
+def add_remarks(result: Record, setup: Setup, predictions: pd.DataFrame) -> pd.DataFrame:
+    """Predictions with a column of remarks on the ends of a link or otherwise on its path loss, empty without any.
 
-    Indoors, if most calibrated receivers are inside a building, that remark is omitted.
+    Indoors, if most calibrated receivers are inside a building, the remark on this is omitted.
     """
-    links = setup.links
-    if not len(triangles.face):
-        return np.full(len(links), "")
-    indoors = is_indoors(result, triangles)
-    by_end = []
-    for end, points in (("transmitter", links.tx), ("receiver", links.rx)):
-        locations = locate(triangles, points).tolist()
-        by_end.append(
-            [
-                f"{end} {location}" if location and not (indoors and location == INSIDE) else ""
-                for location in locations
-            ]
-        )
-    joined = [", ".join(filter(None, ends)) for ends in zip(*by_end, strict=True)]
-    return np.array(joined, dtype=np.str_)
+    links, triangles, by_end = setup.links, read_triangles(setup.scene), []
+    if len(triangles.face):
+        indoors = is_indoors(result, triangles)
+        for end, points in (("transmitter", links.tx), ("receiver", links.rx)):
+            locations = locate(triangles, points).tolist()
+            by_end.append(
+                [f"{end} {at}" if at and not (indoors and at == INSIDE) else "" for at in locations]
+            )
+    weak = _weak(result, predictions["path_loss_db"].to_numpy(float))
+    # Positions explain weak links.
+    remarks = [", ".join(filter(None, ends)) or other for *ends, other in zip(*by_end, weak, strict=True)]
+    return predictions.assign(remark=np.array(remarks, dtype=np.str_))
+
+
+def _weak(result: Record, path_loss_db: NDArray[np.float64]) -> list[str]:
+    """The remark on links far weaker than every measured one [links]: the model was never compared with such links."""
+    measured_db = result.links["measured_db"].to_numpy(float)
+    if "faint" in result.links:
+        measured_db = measured_db[~result.links["faint"].to_numpy(bool)]
+    weak = path_loss_db > measured_db.max(initial=-np.inf) + WEAKER_DB
+    return np.where(weak, f"over {WEAKER_DB:g} dB weaker than every measured link", "").tolist()
 
 
 def is_indoors(result: Record, triangles: Triangles) -> bool:
