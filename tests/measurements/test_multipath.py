@@ -64,6 +64,51 @@ def test_limits_bins_and_sectors(tmp_path):
     assert north["7"] == pytest.approx((half - 30) / 2)
 
 
+@pytest.mark.parametrize("name", ["delay_ns", "Delay (ns)", "TOA [ns]", "delayNs"])
+def test_the_unit_of_delays_is_that_of_their_name(tmp_path, name):
+    columns = {"delay_ns": name}
+    TABLE.rename(columns=columns).to_csv(tmp_path / "multipath.csv", index=False)
+    assert values(read_multipath(tmp_path / "multipath.csv", "id"), "rms_delay_spread")["7"] == pytest.approx(
+        75e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("columns", "factor", "reason"),
+    [
+        ({"delay_ns": "delay"}, 1.0, "state its unit"),
+        ({}, -1.0, "losses must be positive"),
+        ({"path_loss_db": "path_gain_db"}, 1.0, "gains and powers negative"),
+        ({"path_loss_db": "power_mw"}, 1e-9, "gains and powers negative"),
+    ],
+)
+def test_delays_and_levels_of_another_unit_or_sign_are_refused(tmp_path, columns, factor, reason):
+    table = TABLE.assign(path_loss_db=TABLE["path_loss_db"] * factor).rename(columns=columns)
+    table.to_csv(tmp_path / "multipath.csv", index=False)
+    with pytest.raises(InputError, match=reason):
+        read_multipath(tmp_path / "multipath.csv", "id")
+
+
+def test_angles_are_those_of_the_end(tmp_path):
+    table = TABLE.rename(columns={"azimuth_deg": "aoa_deg"})
+    table.insert(0, "tx_power_dbm", [-60.0, -20.0, -20.0, -20.0, -20.0])
+    table.insert(1, "aod_deg", [0.0, 60.0, 0.0, 60.0, 0.0])
+    table.to_csv(tmp_path / "multipath.csv", index=False)
+    paths = read_multipath(tmp_path / "multipath.csv", "id")
+    # sqrt(-2 ln cos 45 degrees) and sqrt(-2 ln cos 30 degrees)
+    assert values(paths, "azimuth_spread_arrival")["7"] == pytest.approx(np.sqrt(np.log(2)))
+    assert values(paths, "azimuth_spread_departure")["7"] == pytest.approx(np.sqrt(np.log(4 / 3)))
+    table.drop(columns="aod_deg").to_csv(tmp_path / "arrival.csv", index=False)
+    with pytest.raises(InputError, match="needs angles"):
+        values(read_multipath(tmp_path / "arrival.csv", "id"), "azimuth_spread_departure")
+
+
+def test_snapshots_of_one_component_do_not_count_in_the_k_factor(tmp_path):
+    TABLE.iloc[:3].assign(path_loss_db=[80.0, 86.0, 80.0]).to_csv(tmp_path / "multipath.csv", index=False)
+    paths = read_multipath(tmp_path / "multipath.csv", "id")
+    assert values(paths, "k_factor") == pytest.approx({"7": 6.0})
+
+
 def test_a_table_without_delays_is_refused(tmp_path):
     TABLE.drop(columns="delay_ns").to_csv(tmp_path / "multipath.csv", index=False)
     with pytest.raises(InputError, match="no column of a delay"):
@@ -143,3 +188,15 @@ def test_impulse_responses_that_fit_no_links_are_refused(tmp_path, responses):
         read_impulse_responses(tmp_path / "objects.npy", ["a"], RATE)
     with pytest.raises(InputError, match="no file is named like a link"):
         read_impulse_responses(tmp_path, ["x"], RATE)
+
+
+def test_responses_in_several_arrays_or_in_decibels_are_refused(tmp_path, responses):
+    np.savez(tmp_path / "parts.npz", re=responses.real, im=responses.imag)
+    with pytest.raises(InputError, match="several arrays"):
+        read_impulse_responses(tmp_path / "parts.npz", ["a", "b"], RATE)
+    np.savez(tmp_path / "level.npz", level=20 * np.log10(np.abs(responses) / 2.1))
+    with pytest.raises(InputError, match="in decibels"):
+        read_impulse_responses(tmp_path / "level.npz", ["a", "b"], RATE)
+    np.savez(tmp_path / "both.npz", cir=responses, snr=np.ones(responses.shape))
+    multipath = read_impulse_responses(tmp_path / "both.npz", ["a", "b"], RATE, margin_db=15.0)
+    assert multipath.delay == pytest.approx([2e-7, 5e-7, 3e-7])

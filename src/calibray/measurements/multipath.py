@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,19 +23,26 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.measurements import observables as kinds
+from calibray.measurements.column_names import matches, words
 from calibray.measurements.observables import Statistic
 from calibray.measurements.table_files import read_table
 from calibray.support.messages import shortened
 
 DELAY: Final = r"(^|_)(delay|tau|toa|tof)"
 POWER: Final = r"(^|_)(path_?loss|pl|path_?gain|gain|power|rx_?power|level)(_|$)"
-AZIMUTH: Final = r"(^|_)(azimuth|azi?|aoa|phi)(_|$)"
-ELEVATION: Final = r"(^|_)(elevation|ele?|zenith|theta)(_|$)"
+ANGLE: Final = {
+    "azimuth": r"(^|_)(azimuth|azi?|ao[ad]|phi)(_|$)",
+    "elevation": r"(^|_)(elevation|ele?|zenith|theta|zo[ad]|eo[ad])(_|$)",
+}
+END: Final = {"departure": r"(^|_)([aze]od|departure|tx)(_|$)", "arrival": r"(^|_)([aze]oa|arrival|rx)(_|$)"}
 SNAPSHOT: Final = r"(^|_)(rotation|snapshot|sweep|scan|repetition|orientation)(_|$)"
 ANGLES: Final = (*(kind for kind, unit in kinds.KINDS.items() if unit == "rad"), *kinds.SECTORS)
 """Kinds of statistics that need an angle."""
 
 SECONDS: Final = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
+
+LONGEST: Final = 0.01
+"""Largest delay [s]: light travels 3,000 km in it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,23 +54,23 @@ class Multipath:
         snapshot: Label of the component's measurement of its link [n].
         delay: Delay [n], [s].
         level_db: Power gain [n], [dB].
-        azimuth: Azimuth, counterclockwise from the x axis [n], [rad]; None if it was not measured.
-        elevation: Elevation or zenith angle [n], [rad]; None if it was not measured.
+        angles: Azimuths, counterclockwise from the x axis, and elevations or zenith angles [n], [rad], by plane and
+            end, such as ("azimuth", "arrival").
     """
 
     link: NDArray[np.str_]
     snapshot: NDArray[np.str_]
     delay: NDArray[np.float64]
     level_db: NDArray[np.float64]
-    azimuth: NDArray[np.float64] | None = None
-    elevation: NDArray[np.float64] | None = None
+    angles: Mapping[tuple[str, str], NDArray[np.float64]] = field(default_factory=dict)
 
 
 def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multipath:
     """Read a table with one row per component.
 
     The columns are recognised by their names: a delay (`delay_ns`), a path loss, path gain or power [dB]
-    (`path_loss_db`), and if present an azimuth, an elevation, and the number of the rotation or snapshot.
+    (`path_loss_db`), and if present an azimuth, an elevation, and the number of the rotation or snapshot. An angle is
+    that of both ends unless its name states one (`aoa_deg`, `azimuth_tx`).
 
     Args:
         path: The table.
@@ -71,50 +78,69 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
         compass: Whether azimuths are compass bearings, clockwise from north.
 
     Raises:
-        InputError: The table cannot be read, or lacks links, delays or powers.
+        InputError: The table cannot be read, or lacks links, delays or powers; or its delays or powers have another
+            unit or sign than their names state.
     """
     table = read_table(path)
     names = [str(name) for name in table.frame.columns if name != link]
 
-    def find(pattern: str) -> str | None:
-        return next((name for name in names if re.search(pattern, name.lower())), None)
+    def find(pattern: str, other: str = "spread") -> str | None:
+        lower = {name: name.lower() for name in names}
+        return next(
+            (name for name in names if re.search(pattern, lower[name]) and other not in lower[name]), None
+        )
 
-    delay, power, snapshot = find(DELAY), find(POWER), find(SNAPSHOT)
+    delay, power, snapshot = find(DELAY), find(POWER, "tx"), find(SNAPSHOT)
     if delay is None or power is None:
         missing = (
             "delay, such as delay_ns" if delay is None else "power, such as path_loss_db or path_gain_db"
         )
         raise InputError(f"{path}: no column of a {missing}; its columns are {', '.join(names)}")
     labels = table.labels(link)
-    unit = next((unit for unit in SECONDS if delay.lower().endswith(f"_{unit}")), "s")
-    sign = -1.0 if re.search(r"loss|(^|_)pl(_|$)", power.lower()) else 1.0
+    unit = next((unit for unit in SECONDS if unit in words(delay)), "s")
+    seconds = table.numbers(delay) * SECONDS[unit]
+    if seconds.max() > LONGEST:
+        raise InputError(
+            f"{path}: column {delay!r} has a delay of {seconds.max():g} s, must be at most {LONGEST:g} s; state its "
+            "unit in its name, such as delay_ns"
+        )
+    level_db, is_loss = table.numbers(power), re.search(r"loss|(^|_)pl(_|$)", power.lower()) is not None
+    median, is_level = float(np.median(level_db)), matches(power, "decibel") and "gain" not in power.lower()
+    # A received power of a receiver that is not calibrated can be positive, in decibels.
+    if (median < 0) if is_loss else (median > 0 and not is_level):
+        raise InputError(
+            f"{path}: column {power!r} has values about {median:g}; losses must be positive, gains and powers "
+            "negative, in dB: name it path_loss_db or path_gain_db"
+        )
 
-    def angle(pattern: str) -> NDArray[np.float64] | None:
-        name = find(pattern)
-        if name is None:
-            return None
-        values = table.numbers(name)
-        return values if name.lower().endswith("rad") else np.radians(values)
-
-    azimuth = angle(AZIMUTH)
-    if azimuth is not None and compass:
-        # A compass counts from north clockwise, the scene from east counter-clockwise.
-        azimuth = np.pi / 2 - azimuth
+    angles = {}
+    for plane, pattern in ANGLE.items():
+        for end, other in (("departure", END["arrival"]), ("arrival", END["departure"])):
+            own = [name for name in names if re.search(pattern, name.lower())]
+            own = [
+                name
+                for name in own
+                if re.search(END[end], name.lower()) or not re.search(other, name.lower())
+            ]
+            if len(own) == 1:
+                values = table.numbers(own[0])
+                values = values if own[0].lower().endswith("rad") else np.radians(values)
+                # A compass counts from north clockwise, the scene from east counter-clockwise.
+                angles[plane, end] = np.pi / 2 - values if compass and plane == "azimuth" else values
     return Multipath(
         labels,
         np.full(len(labels), "") if snapshot is None else table.labels(snapshot),
-        table.numbers(delay) * SECONDS[unit],
-        sign * table.numbers(power),
-        azimuth,
-        angle(ELEVATION),
+        seconds,
+        -level_db if is_loss else level_db,
+        angles,
     )
 
 
 def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:
     """A statistic of every link in SI units, by the link's label; the mean over its snapshots.
 
-    Links of which the receiver detects no component are left out. The components already include the bandwidth of the
-    receiver.
+    Snapshots of a single component have no K-factor and do not count in its mean. Links of which the receiver detects
+    no component are left out. The components already include the bandwidth of the receiver.
 
     Raises:
         InputError: The statistic needs an angle that was not measured.
@@ -126,9 +152,13 @@ def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:
     """
     angle = None
     if statistic.kind in ANGLES:
-        angle = multipath.elevation if "elevation" in statistic.kind else multipath.azimuth
+        plane, _, end = statistic.kind.split("_")
+        angle = multipath.angles.get((plane, end))
         if angle is None:
-            raise InputError(f"{statistic.kind} needs angles, which were not measured")
+            raise InputError(
+                f"{statistic.kind} needs angles, which were not measured or are in several columns; give one column, "
+                f"such as {plane}_{end}_deg"
+            )
     snapshots: dict[str, list[float]] = {}
     keys = pd.DataFrame({"link": multipath.link, "snapshot": multipath.snapshot})
     for index in keys.groupby(["link", "snapshot"], sort=False).indices.values():
@@ -136,7 +166,7 @@ def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:
         if len(seen):
             value = _value(multipath, seen, None if angle is None else angle[seen], statistic)
             snapshots.setdefault(str(multipath.link[seen[0]]), []).append(value)
-    return {link: float(np.mean(values)) for link, values in snapshots.items()}
+    return {link: float(pd.Series(values).mean()) for link, values in snapshots.items()}
 
 
 def _seen(multipath: Multipath, index: NDArray[np.int64], statistic: Statistic) -> NDArray[np.int64]:
@@ -238,7 +268,8 @@ def read_impulse_responses(
             )
         for label, own in zip(labels, response, strict=True):
             parts.append(_above_noise(label, np.atleast_2d(own), delay, margin_db))
-    return Multipath(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    link, snapshot, delay, level_db = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Multipath(link, snapshot, delay, level_db)
 
 
 def _above_noise(
@@ -260,7 +291,17 @@ def _read(file: Path, sample_rate: float | None) -> tuple[NDArray[Any], NDArray[
     numeric = {name: array for name, array in arrays.items() if array.dtype.kind in "fciu" and array.ndim}
     if not numeric:
         raise InputError(f"{file}: contains no array of numbers")
-    name, response = max(numeric.items(), key=lambda item: item[1].size)
+    numeric = {name: array for name, array in numeric.items() if array.dtype.kind == "c"} or numeric
+    size = max(array.size for array in numeric.values())
+    largest = {name: array for name, array in numeric.items() if array.size == size}
+    if len(largest) > 1:
+        raise InputError(
+            f"{file}: contains several arrays of {size} numbers ({shortened(', '.join(largest))}); keep one, complex "
+            f"or an amplitude, and name delays {DELAYS[0]}"
+        )
+    ((name, response),) = largest.items()
+    if response.dtype.kind != "c" and (response <= 0).all():
+        raise InputError(f"{file}: {shortened(name)!r} is in decibels; give complex numbers or amplitudes")
     # Axes of a single transmitting or receiving antenna.
     response = np.squeeze(response) if response.ndim > 3 else response
     if not np.isfinite(response).all():
