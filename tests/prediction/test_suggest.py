@@ -14,8 +14,10 @@ from typer.testing import CliRunner
 import calibray as cb
 from calibray.calibration.result import Result
 from calibray.cli.app import app
+from calibray.engines.kinds.replay import replay
 from calibray.errors import InputError
 from calibray.fields import path_loss
+from calibray.measurements.observables import Statistic
 from calibray.scenes import read_scene
 from calibray.study import Study
 from calibray.tracing.settings import Antenna, TraceSettings
@@ -186,6 +188,34 @@ def test_a_new_site_gains_little(result, table):
     interval = result.intervals[NAME]
     assert new[0] > 0.97 * (interval.upper - interval.lower) > measured[0]
     assert new[1] < new[0]
+
+
+def test_an_observable_is_worth_more_where_path_loss_says_nothing(result, table):
+    """At a new site, any number of copies of one link determine the offset alone: n observables add n times one."""
+    copies = pd.concat([table.iloc[[8]]] * 10).assign(site="new")
+    at_optimum = changed(result, draws={NAME: [result.parameters[NAME]] * 64})
+    gains = cb.suggest(at_optimum, copies, 10, observables=True).observable_gain
+    narrowed = gains.str.extract(r" to (\S+) of its width")[0].astype(float).to_numpy()
+    added = 1 / narrowed[0] ** 2 - 1
+    # The text has two digits.
+    assert narrowed == pytest.approx(1 / np.sqrt(1 + np.arange(1, 11) * added), rel=0.05)
+
+
+def test_an_observable_whose_error_is_estimated_counts_as_if_it_was_stated(folder, table):
+    rows, rng = pd.read_csv(folder / "links.csv"), np.random.default_rng(1)
+    content = study(folder).content()
+    content["observables"] = {"spread": {"kind": "rms_delay_spread", "column": "spread_ns", "unit": "ns"}}
+    content["links"]["file"] = "spreads.csv"
+    rows.assign(spread_ns=1.0).to_csv(folder / "spreads.csv", index=False, float_format="%.17g")
+    setup = cb.Setup.open(Study.from_content(content, folder / "spreads.toml"))
+    answer = replay(setup, setup.trace()).respond(np.array([[TRUTH]]), (Statistic("rms_delay_spread"),))
+    spread = answer.observed[0, 0] * 1e9 * np.exp(0.02 * rng.standard_normal(len(rows)))
+    rows.assign(spread_ns=spread).to_csv(folder / "spreads.csv", index=False, float_format="%.17g")
+    found = cb.calibrate(Study.from_content(content, folder / "spreads.toml"))
+    content["observables"]["spread"]["std"] = found.fit.observables["spread"].error
+    stated = replace(found, study=Study.from_content(content, folder / "spreads.toml"))
+    one, other = (cb.suggest(each, table, 3, observables=True) for each in (found, stated))
+    pd.testing.assert_frame_equal(one, other)
 
 
 def test_the_command_prints_and_writes_the_suggestions(folder, result, table):

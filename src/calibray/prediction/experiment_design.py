@@ -93,11 +93,13 @@ class Outlook:
         index: The candidate.
         narrowed: Standard deviation of every parameter relative to its value before any candidate [d]; at most 1.
         range_probability: Probability of knowing in which of its separate ranges a parameter lies [d]; 1 for one range.
+        information: Information matrix of all links that are then measured, at every draw [n, d, d].
     """
 
     index: int
     narrowed: NDArray[np.float64]
     range_probability: NDArray[np.float64]
+    information: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +174,7 @@ def choose_candidates(
         )
         narrowed = np.minimum(left / before, 1.0)
         probability = _range_probability(beliefs.piece[:draws], squares[:, :draws])
-        outlooks.append(Outlook(best, narrowed, probability))
+        outlooks.append(Outlook(best, narrowed, probability, beliefs.information))
     return outlooks
 
 

@@ -14,7 +14,7 @@ from calibray.engines.kinds.replay import ReplaySection, replay
 from calibray.engines.protocol import Differentiable, Observing
 from calibray.errors import InputError
 from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, Term
-from calibray.fitting.preliminary_fits import with_estimated_spreads
+from calibray.fitting.preliminary_fits import with_estimated_errors, with_estimated_spreads
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.measurements import Measurements
 from calibray.measurements.placement import POSITION_COLUMNS
@@ -129,9 +129,7 @@ def suggest(
     if not observables:
         return table
     index = np.array([outlook.index for outlook in outlooks])
-    added = slope[:, index] / errors.own_db
-    information = beliefs.information + np.cumsum(np.einsum("nli,nlj->lnij", added, added), axis=0)
-    best = model.worth(setup, index, information + UNIFORM_INFORMATION * np.eye(slope.shape[2]))
+    best = model.worth(setup, index, np.stack([outlook.information for outlook in outlooks]))
     return table.assign(
         observable=[worth.kind for worth in best],
         observable_gain=[_gain(result, worth.narrowed) for worth in best],
@@ -345,7 +343,7 @@ class _ReplayedDraws:
 
 
 def _as_calibrated(result: Record, problem: Problem) -> Problem:
-    """The problem of the calibration: its links, its spreads of random effects, and priors of the drawn constants.
+    """The problem of the calibration: its links, its spreads and errors, and priors of the drawn constants.
 
     Links near the noise floor are not among its links.
     """
@@ -357,7 +355,8 @@ def _as_calibrated(result: Record, problem: Problem) -> Problem:
         weight = np.where(result.links["faint"].to_numpy(bool), 0.0, objective.weight)
         objective = replace(objective, weight=weight)
     problem = replace(problem, priors=priors.extended(numbers, centres, spread), objective=objective)
-    return with_estimated_spreads(problem, _calibrated_point(result, problem))[0]
+    point = _calibrated_point(result, problem)
+    return with_estimated_spreads(with_estimated_errors(problem, point), point)[0]
 
 
 def _calibrated_point(result: Record, problem: Problem) -> NDArray[np.float64]:
