@@ -343,3 +343,11 @@ def test_values_are_judged_without_the_codes_of_missing_ones():
 def test_columns_of_devices_are_found_in_five_languages(name):
     frame = pd.DataFrame({"Zelle": ["a", "b"], name: ["S21", "Pixel"], "Straße": ["Nord", "Süd"]})
     assert transmitter_columns.find_devices(frame) == [name]
+
+
+@pytest.mark.parametrize("name", ["tx_power_w", "Tx power [mW]", "EIRP [dBW]", "eirp_dbw"])
+def test_transmitted_powers_in_other_units_are_not_taken_for_dbm(name):
+    assert column_names.find_transmit_power(pd.DataFrame({name: [20.0]})) is None
+    assert (
+        column_names.find_transmit_power(pd.DataFrame({name: [20.0], "EIRP [dBm]": [43.0]})) == "EIRP [dBm]"
+    )

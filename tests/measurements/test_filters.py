@@ -152,6 +152,27 @@ def test_a_refusal_names_the_piece_and_the_remedy(expression, piece, remedy):
     assert remedy in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "filter_text",
+    [
+        "t != 5",
+        "t == 5",
+        "5 != t",
+        "t not in [5, 6]",
+        "~t.isin([5])",
+        "n != '5'",
+        "n not in ['5']",
+        "n in '5'",
+    ],
+)
+def test_texts_are_not_compared_with_numbers(filter_text):
+    """No text equals a number, so `t != 5` would pass every row."""
+    frame = pd.DataFrame({"t": ["5", None, "6"], "n": [5.0, np.nan, 6.0], "empty": [np.nan] * 3})
+    with pytest.raises(InputError, match="quotes"):
+        evaluate(filter_text, frame)
+    assert evaluate("t != '5' and n != 5 and empty != 'bad'", frame).tolist() == [False, True, True]
+
+
 def test_nested_filters_cost_no_more_than_their_length():
     """A part that was evaluated twice at every level would take 2^22 times as long."""
     frame = pd.DataFrame({"x": [1.0, -2.0]})

@@ -80,6 +80,9 @@ LENGTH_UNITS: Final = {
 }
 """Units of length in column names, other than the metre [m]."""
 
+WATTS: Final = frozenset({"w", "watt", "watts", "kw", "mw", "dbw"})
+"""Words of names of powers that are not in dBm."""
+
 FREQUENCY_UNITS: Final = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
 """Units of carriers in column names [Hz]."""
 
@@ -304,8 +307,15 @@ def find_value(table: SourceTable) -> ValueColumn:
 
 
 def find_transmit_power(frame: pd.DataFrame) -> str | None:
-    """Column of transmitted powers [dBm], or None."""
+    """Column of transmitted powers [dBm], or None; names in watts or dBW are left out.
+
+    Example:
+        >>> find_transmit_power(pd.DataFrame({"tx_power_w": [20.0], "EIRP [dBW]": [30.0], "TX power (dBm)": [43.0]}))
+        'TX power (dBm)'
+    """
     for name in numeric_columns(frame):
+        if words(name) & WATTS:
+            continue
         if matches(name, "EIRP") or (matches(name, "transmitted") and matches(name, "power")):
             return name
     return None

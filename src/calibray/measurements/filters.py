@@ -77,7 +77,18 @@ def _between(column: pd.Series, left: Any, right: Any, inclusive: Any = "both") 
 def _isin(column: pd.Series, values: Any) -> pd.Series:
     if not isinstance(values, list | tuple):
         raise InputError("must be a list of values, as in ['A', 'B']")
+    _check_equality(column, values)
     return column.isin(list(values))
+
+
+def _check_equality(column: pd.Series, values: Iterable[Any]) -> None:
+    """Refuse to compare a column of texts with numbers alone, or numbers with texts alone: none would be equal."""
+    kinds = {isinstance(value, str) for value in values if value is not None}
+    is_text = pd.api.types.infer_dtype(column, skipna=True) == "string"
+    if kinds == {False} and is_text:
+        raise InputError("the column has texts, which equal no number; put the values in quotes")
+    if kinds == {True} and pd.api.types.is_numeric_dtype(column.dtype) and column.notna().any():
+        raise InputError("the column has numbers, which equal no text; leave out the quotes of the values")
 
 
 def _contains(column: pd.Series, pat: Any, case: Any = True, regex: Any = True, na: Any = False) -> pd.Series:
@@ -357,6 +368,7 @@ class _Interpreter:
             choices = [right] if isinstance(right, str) else right
             if not isinstance(choices, list | tuple | pd.Series):
                 raise self._refusal(sides[1], "must be a list of values, as in ['A', 'B']")
+            self._check_equality(node, left, choices)
             contained = left.isin(choices)
             return contained if kind in (ast.In, ast.Eq) else ~contained
         if kind not in COMPARISONS:
@@ -364,7 +376,20 @@ class _Interpreter:
         for side, value in zip(sides, values, strict=True):
             if isinstance(value, list | tuple):
                 raise self._refusal(side, "a list of values can only be compared by in, not in, == and !=")
+        if kind in (ast.Eq, ast.NotEq):
+            self._check_equality(node, left, [right])
+            self._check_equality(node, right, [left])
         return COMPARISONS[kind](left, right)
+
+    def _check_equality(self, node: ast.Compare, column: Any, values: Any) -> None:
+        is_constant = not isinstance(values, pd.Series) and not any(
+            isinstance(each, pd.Series) for each in values
+        )
+        if isinstance(column, pd.Series) and is_constant:
+            try:
+                _check_equality(column, values)
+            except InputError as error:
+                raise self._refusal(node, str(error)) from None
 
     def _arithmetic(self, node: ast.BinOp) -> _Value:
         operation: Callable[[Any, Any], Any] | None = ARITHMETIC.get(type(node.op))

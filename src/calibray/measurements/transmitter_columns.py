@@ -13,7 +13,7 @@ from typing import Final
 import pandas as pd
 
 from calibray.errors import InputError
-from calibray.measurements.column_names import is_named_value, matches, numeric_columns, words
+from calibray.measurements.column_names import WATTS, is_named_value, matches, numeric_columns, words
 from calibray.measurements.selection import comparison, naming_column
 
 MAX_DEVICES: Final = 12
@@ -249,7 +249,7 @@ def find_powers(frame: pd.DataFrame) -> dict[str, str]:
     likely = [
         name
         for name in numeric_columns(frame)
-        if frame[name].between(*POWERS).all() and not words(name) & {"w", "watt", "kw", "mw"}
+        if frame[name].between(*POWERS).all() and not words(name) & WATTS
     ]
     for key, row in (("eirp_dbm", "EIRP"), ("tx_power_dbm", "power")):
         for name in likely:
