@@ -100,6 +100,27 @@ def test_a_column_that_explains_residuals_is_named_only_if_planted(problem: Prob
     assert text.endswith('[offset] per = "phone".')
 
 
+def test_differences_and_losses_are_in_decibels_whatever_the_weights(problem: Problem) -> None:
+    """Links with stated errors: the precise ones weigh 36 times as much as the others."""
+    truth, random = np.array([two_ray.TRUTH]), np.random.default_rng(2)
+    modelled = problem.modelled(problem.parameters.to_search(truth[None]))[0]
+    links, trail = problem.setup.links, Trail(best=truth, best_modelled=modelled)
+    slow = (links.frame["phone"] == "b").to_numpy()
+    std, equal = np.where(slow, 1.0, 6.0), problem.objective
+    belt = Region(np.array([shapely.box(20, -90, 40, -10)]), np.zeros(1), np.full(1, 10.0))
+    loss = modelled + std * random.normal(size=200)
+    stepped = replace(equal, measured=loss + 8.0 * slow, weight=equal.weight / std**2)
+    (remark,) = groups_remark(replace(problem, objective=stepped), trail)
+    index = remark.values["labels"].index("b")
+    error = remark.values["errors_db"][index]
+    assert remark.values["differences_db"][index] == pytest.approx(8.0, abs=3 * error)
+    assert error < 1.0
+    lossy = replace(equal, measured=loss + 2.0 * belt.length_inside(links.tx, links.rx))
+    weighted = replace(lossy, weight=stepped.weight)
+    one, other = (region_remark(replace(problem, objective=each), trail) for each in (lossy, weighted))
+    assert one == other
+
+
 def test_levels_of_the_signal_are_no_groups(problem: Problem) -> None:
     truth, links = np.array([two_ray.TRUTH]), problem.setup.links
     modelled = problem.modelled(problem.parameters.to_search(truth[None]))[0]

@@ -332,18 +332,23 @@ def region_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
 
     Positions of the links must be known. Residuals that are larger out of sight are explained by that first.
     """
-    links, count = problem.setup.links, problem.objective.num_counted
+    links = problem.setup.links
     if not isinstance(links, Measurements) or not problem.differentiable:
         return ()
     counted = np.flatnonzero(problem.objective.weight > 0)
-    residual_db = problem.residuals(trail.best[None], trail.best_modelled[None])[0, :count]
+    excess_db = _excess_db(problem, trail)[counted]
     known = [links.table.numbers(OUT_OF_SIGHT)[counted]] if OUT_OF_SIGHT in links.table.frame else []
-    region = missing_region(links.tx[counted], links.rx[counted], -residual_db, known)
+    region = missing_region(links.tx[counted], links.rx[counted], excess_db, known)
     if region is None or not region.significant:
         return ()
     values = region.row()
     del values["significant"]
     return (Remark(RemarkKind.MISSING_REGION, values),)
+
+
+def _excess_db(problem: Problem, trail: Trail) -> NDArray[np.float64]:
+    """Measured minus modelled path loss of all links at the optimum [L], [dB], without weights, unlike residuals."""
+    return problem.objective.measured - problem.objective.model(trail.best_modelled[None])[0]
 
 
 def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
@@ -352,7 +357,7 @@ def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
     Labels are texts, carriers, or a few whole numbers that do not follow the measured value, as the levels of a signal
     do.
     """
-    setup, links, count = problem.setup, problem.setup.links, problem.objective.num_counted
+    setup, links = problem.setup, problem.setup.links
     if not isinstance(links, Measurements):
         return ()
     section, counted = setup.study.links, np.flatnonzero(problem.objective.weight > 0)
@@ -369,8 +374,8 @@ def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
             or _are_labels(cells, links.path_loss_db[counted])
         ):
             columns[str(name)] = cells.astype(str).to_numpy(dtype=np.str_)
-    residual_db = problem.residuals(trail.best[None], trail.best_modelled[None])[0, :count]
-    differing = differing_groups(-residual_db, np.hstack([links.tx, links.rx])[counted], columns)
+    excess_db = _excess_db(problem, trail)[counted]
+    differing = differing_groups(excess_db, np.hstack([links.tx, links.rx])[counted], columns)
     if not differing:
         return ()
     column = differing[0].column
