@@ -262,11 +262,13 @@ def blocked(tmp_path_factory) -> dict[str, Result]:
         return calibrate(study, engine=planted.engine(blocked=True))
 
     censored = {"no_path": "censor", "ceiling_db": 120.0}
+    beyond = {"where": "rx_y > 15 or rx_x > 20"}
     return {
         "left out": result(75.0),
         "censored": result(120.0, objective=censored),
         "censored wrongly": result(75.0, objective=censored),
-        "held out": result(75.0, holdout={"where": "rx_y > 15 or rx_x > 20"}),
+        "held out": result(75.0, holdout=beyond),
+        "censored, held out": result(120.0, objective=censored, holdout=beyond),
     }
 
 
@@ -285,6 +287,15 @@ def test_a_censored_link_counts_as_lost_at_the_ceiling(blocked):
     assert right.rmse_db < 1e-4
     assert np.isinf(right.links.after_db[planted.INSIDE])  # the table still says that there is none
     assert wrong.rmse_db == pytest.approx((120 - 75) / np.sqrt(planted.LINKS), rel=1e-3)
+
+
+def test_a_censored_link_is_predicted_at_the_ceiling_as_it_was_fitted_and_judged(blocked):
+    """Whether links are held out by a filter or not; blocks are validated with the ceiling as well."""
+    for result in (blocked["censored"], blocked["censored, held out"]):
+        predicted = result.predict(planted.links(blocked=True))
+        assert predicted == pytest.approx(result.links.predicted_db.to_numpy(), abs=1e-3)
+        assert predicted[planted.INSIDE] == 120.0
+    assert blocked["censored, held out"].holdout_rmse_db < 1e-4
 
 
 def test_a_link_without_a_path_is_not_judged_either(blocked):

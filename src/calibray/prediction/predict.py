@@ -355,8 +355,8 @@ def _modelled(result: Record, links: Measurements, replayed: Replayed | None) ->
     if replayed is None:
         return without_scene(result.study, links)[None]
     path_loss_db = _path_loss(replayed)
-    # Predictions of a model that validation chose end at the ceiling, as the model does in the validation.
-    ceiling_db = None if result.held_out is None else result.study.objective.ceiling_db
+    # The model ends at the ceiling, as in the fit and on held-out links.
+    ceiling_db = result.study.objective.ceiling_db
     path_loss_db = path_loss_db if ceiling_db is None else np.minimum(path_loss_db, ceiling_db)
     mean_db = path_loss_db[: replayed.averaged].mean(axis=0, keepdims=True)
     return np.vstack([mean_db, path_loss_db[replayed.averaged :]])
