@@ -283,6 +283,14 @@ def test_diffuse_paths_need_their_power(yard: Tracer) -> None:
         read(table.drop(columns="power_db"), yard)
 
 
+def test_positions_that_nearly_agree_are_one_link(yard: Tracer, rows: pd.DataFrame) -> None:
+    """At a rounding boundary, too: of paths that end at 1.5005 m +- 0.01 mm, half round up and half down."""
+    table = rows.drop(columns=["link", "delay"])
+    ends = (table.type == "receiver") & (table.z == 1.5)
+    table.loc[ends, "z"] += 0.0005 + 1e-5 * (-1.0) ** np.arange(ends.sum())
+    assert read(table, yard).num_links == read(rows, yard).num_links
+
+
 def test_paths_of_a_study_belong_to_its_links(tmp_path: Path) -> None:
     study = two_ray.study(tmp_path, links=8)
     setup = cb.Setup.open(study, tracer=two_ray.TwoRay)

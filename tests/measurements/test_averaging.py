@@ -89,6 +89,8 @@ def test_cells_stretches_and_windows(by, size, first_rows):
     if by == "time":
         seconds = [pd.Timestamp(time).timestamp() for time in rows["t"]]
         assert average(rows | {"t": seconds}, by, size, time="t").row.tolist() == first_rows
+        with_fraction = [time.replace(":00Z", ":00,0Z") for time in rows["t"]]
+        assert average(rows | {"t": with_fraction}, by, size, time="t").row.tolist() == first_rows
 
 
 @pytest.mark.parametrize(
@@ -97,6 +99,7 @@ def test_cells_stretches_and_windows(by, size, first_rows):
         ({}, {"size": 0.0}, "average.size = 0.0"),
         ({}, {"by": "distance", "size": -1.0}, "average.size = -1.0"),
         ({}, {"by": "time", "time": "t"}, "column 't': a time cannot be read"),
+        ({"t": [1.78e12, 1.78e12 + 9e3]}, {"by": "time", "time": "t"}, "column 't': .* give seconds"),
         ({"t": ["2026-05-01", None]}, {"by": "time", "time": "t"}, "column 't': a time is missing"),
         ({"rx_x": ["here", "there"]}, {}, "'here' is not a number"),
         ({"power": [-80.0, np.nan]}, {}, "missing or not finite in 1 of 2 rows"),

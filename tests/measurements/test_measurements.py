@@ -297,6 +297,11 @@ LATER = TABLE.splitlines()[1:]
         ),
         (TABLE + "0,50,1.5,251,LOS,1\n", {}, "251 means a path loss of 251 dB"),
         (TABLE, {"quantity": "path_gain"}, "row 2, .* means a path loss of -80.5 dB.*path_loss"),
+        (
+            "x,y,z,watts\n10,0,1.5,2e-9\n20,0,1.5,8e-11\n",
+            {"quantity": "rsrp", "value": "watts"},
+            "'watts' has values up to 2e-09, .* convert them to dBm",
+        ),
         (TABLE, {"quantity": "pathloss"}, "did you mean 'path_loss'"),
         (TABLE, {"quantity": "received_power"}, "'received_power' needs tx_power_dbm"),
         (TABLE, {"tx_power_dbm": 30}, "'path_loss' takes no tx_power_dbm"),

@@ -335,6 +335,8 @@ def test_the_summary_says_whether_calibration_helped(result):
     assert "2.00 dB less than a log-distance model, the best baseline" in answer(
         judged(result, 2.0, 4.0), HELP
     )
+    one = changed(result, judgement=Judgement(1, 2.0, "a log-distance model", 4.0, None, 1))
+    assert "on 1 held-out link, 2.00 dB less" in answer(one, HELP)
     assert answer(changed(result, judgement=None), HELP).startswith("No links were held out")
 
 

@@ -83,6 +83,18 @@ def test_position_noise_is_that_of_the_facades(exact: Study) -> None:
     np.testing.assert_allclose(1 / weight, 2.0**2 + np.std(losses, axis=0) ** 2, rtol=1e-9)
 
 
+def test_position_noise_is_that_of_the_antennas_at_their_start_values(exact: Study) -> None:
+    """A sector of stated azimuth 50 degrees with an error that starts at 40 degrees, and one of 90 degrees."""
+    weights = []
+    for azimuth, start in ((50.0, 40.0), (90.0, 0.0)):
+        content = with_error(exact, tx_antenna={"azimuth_deg": azimuth}).content()
+        content["antennas"]["tx"]["pattern"] = "tr38901"
+        content["parameters"]["tx:*.azimuth"] = {"bounds": [-60.0, 60.0], "start": start}
+        setup = Setup.open(Study.from_content(content, exact.path), tracer=TwoRay)
+        weights.append(setup.with_position_noise().links.weight)
+    np.testing.assert_allclose(weights[0], weights[1], rtol=1e-9)
+
+
 def test_a_column_of_errors_and_exact_predictions(exact: Study) -> None:
     table = exact.measurements().frame.assign(error=0.0)
     table.to_csv(exact.path.parent / "errors.csv", index=False, float_format="%.17g")

@@ -132,6 +132,10 @@ PLAUSIBLE_POWER_DBM: Final = (-200.0, 30.0)
 """Range [dBm] of plausible received powers; a value outside usually has the wrong sign, unit or column."""
 
 
+LINEAR: Final = 0.1
+"""Magnitude [dBm] below which all received powers of a table lie only if they are in another unit, such as watts."""
+
+
 def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> Measurements:
     """Make one link of each row; positions are in metres. The steps `noise_floor_dbm` and `censored` are used here.
 
@@ -167,6 +171,11 @@ def _carriers(table: SourceTable, column: str | None) -> NDArray[np.float64] | N
 def _path_loss_db(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
     """Path loss [rows], [dB]; minus the received power [dBm] if the transmitted power is unknown."""
     measured = table.numbers(columns.value)
+    if columns.quantity in ("rsrp", "received_power") and np.abs(measured).max() < LINEAR:
+        raise InputError(
+            f"{table.source}: column {columns.value!r} has values up to {measured.max():g}, as powers in watts have; "
+            "convert them to dBm"
+        )
     match columns.quantity:
         case "rsrp":
             _check_range(table, columns, measured, PLAUSIBLE_POWER_DBM, "check the sign and the unit")
@@ -318,13 +327,23 @@ def _areas(table: SourceTable, averaging: Averaging, rx: Sequence[str]) -> NDArr
     return np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
 
 
+LATEST: Final = 1e11
+"""Largest number of seconds since 1970; loggers on phones write milliseconds, a thousand times as many."""
+
+
 def _elapsed(table: SourceTable, time: str) -> NDArray[np.float64]:
     """Times of the rows [rows], [s] from an arbitrary start."""
     column = table.column(time)
     if pd.api.types.is_numeric_dtype(column):
-        return table.numbers(time)
+        seconds = table.numbers(time)
+        if seconds.max() > LATEST:
+            raise InputError(
+                f"{table.source}, column {time!r}: {seconds.max():g} s since 1970 is beyond the year 5000; give seconds"
+            )
+        return seconds
     try:
-        times = pd.to_datetime(column, utc=True, format="ISO8601")
+        # As for the times of a track.
+        times = pd.to_datetime(column.replace(",", ".", regex=True), utc=True, format="ISO8601")
     except ValueError as error:
         raise InputError(
             f"{table.source}, column {time!r}: a time cannot be read ({error}); give ISO 8601"

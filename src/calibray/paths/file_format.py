@@ -80,6 +80,7 @@ _ANGLE = (-2 * pi - _ROUNDING, 2 * pi + _ROUNDING)
 # Far beyond any antenna (120 dB), scene and path, and far below numbers whose sum of powers overflows.
 _FIELD = (-1e6, 1e6)
 _LENGTH = 1e9  # [m]
+_DIVISOR = 1e-9  # a power divided by 0 is infinite
 _POSITION = (-_LENGTH, _LENGTH)
 
 DATASETS: Final[Mapping[str, Dataset]] = MappingProxyType(
@@ -108,10 +109,10 @@ DATASETS: Final[Mapping[str, Dataset]] = MappingProxyType(
         "diffuse/cos_specular": Dataset(("D",), "f", *_COSINE),
         "diffuse/cos_backward": Dataset(("D",), "f", *_COSINE),
         "diffraction/cos_incidence_n": Dataset(("W",), "f", *_TO_NORMAL),
-        "diffraction/exterior_angle": Dataset(("W",), "f", 0.0, _ANGLE[1]),
+        "diffraction/exterior_angle": Dataset(("W",), "f", _DIVISOR, _ANGLE[1]),
         "diffraction/azimuth_in": Dataset(("W",), "f", *_ANGLE),
         "diffraction/azimuth_out": Dataset(("W",), "f", *_ANGLE),
-        "diffraction/sin_edge": Dataset(("W",), "f", 0.0, _COSINE[1]),
+        "diffraction/sin_edge": Dataset(("W",), "f", _DIVISOR, _COSINE[1]),
         "diffraction/distance": Dataset(("W",), "f", 0.0, _LENGTH),
         "diffraction/rotations": Dataset(("W", 4, 2), "f", *_COSINE),
     }

@@ -8,7 +8,7 @@ from typing import Any, Final
 from calibray.result.held_out import Judgement, Model
 from calibray.result.record import Record
 from calibray.result.verdict import Cause, Interval, Reason, ReasonKind, Remark, RemarkKind
-from calibray.support.messages import percent
+from calibray.support.messages import counted, percent
 
 MOST_ODDS: Final = 1000.0
 """Largest odds that are reported as a number."""
@@ -337,7 +337,7 @@ _BASELINES: Final[dict[str, str]] = {
 
 def judgement_text(judgement: Judgement) -> str:
     """Whether calibration helped on held-out links, by how much compared with the best baseline, and how certainly."""
-    error = f"RMSE {judgement.rmse_db:.2f} dB on {judgement.links} held-out links"
+    error = f"RMSE {judgement.rmse_db:.2f} dB on {counted(judgement.links, 'held-out link')}"
     certainty = "no bootstrap error: one cluster of links"
     if judgement.error_db is not None:
         certainty = f"bootstrap error {judgement.error_db:.2f} dB"

@@ -25,6 +25,7 @@ from calibray.scenes.obstruction import Region, with_obstruction
 from calibray.scenes.scene_file import read_content as scene_content
 from calibray.study.displacement import (
     ACROSS,
+    DIRECTIONS,
     RECEIVER,
     Displacement,
     averaged,
@@ -379,7 +380,7 @@ class Setup:
 
         mountings = mounted_at_displaced(self.mountings, len(links))
         paths = self._mounted(self._trace(displaced(links, errors), self.scene, None), self.scene, mountings)
-        effects = self._path_effects(paths)
+        effects = self._pose_and_region_effects(paths, np.tile(np.arange(len(links)), len(DIRECTIONS)))
         replay = Replay(paths, self.parameters, effects=effects, computation=Computation(batch=1))
         loss = replay.path_loss(self.parameters.start[None])[0]
         # With stated standard deviations, weights are inverse variances.

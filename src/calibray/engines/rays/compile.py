@@ -20,6 +20,7 @@ from calibray.engines.rays.table import RayTable
 from calibray.engines.section import OpenedStudy
 from calibray.errors import InputError
 from calibray.fields import path_gains
+from calibray.measurements.reading import join_positions
 from calibray.paths import Kind, Paths, take_links
 from calibray.paths.chains import Chains
 from calibray.scenes import Scene
@@ -253,9 +254,9 @@ def _assign_links(
         InputError: No path belongs to a link, or the paths of a link have different ends.
     """
     own = np.hstack([table.tx, table.rx])
-    # Without labels, positions that differ by less than a millimetre are the same.
-    label = np.round(own, 3) if table.link is None else table.link
-    _, first, link = np.unique(label, axis=0, return_index=True, return_inverse=True)
+    # Without labels, positions that nearly agree are the same; rounding would part some of them.
+    label = join_positions(own) if table.link is None else table.link
+    _, first, link = np.unique(label, return_index=True, return_inverse=True)
     link = link.reshape(-1)
     apart = np.abs(own - own[first][link]).max(axis=1)
     if (apart > TOLERANCE).any():
