@@ -150,6 +150,12 @@ def test_footprints_of_a_vector_file(tmp_path, driver, ending):
     assert buildings.name == ("building-1", "building-2", "building-3")
 
 
+def test_heights_are_in_the_unit_of_their_name(tmp_path):
+    path = layer(tmp_path / "t.gpkg", [1.0] * 3, "GPKG", HEIGHT_FT=[100.0] * 3, Top_ft=["50", "8 m", "50 ft"])
+    assert read_footprints(path, "HEIGHT_FT")[0].top == pytest.approx([30.48] * 3)
+    assert read_footprints(path, "Top_ft")[0].top == pytest.approx([15.24, 8.0, 15.24])
+
+
 def test_footprints_of_geojson_are_projected(tmp_path):
     corners = FRAME.to_geographic([(*corner, 0) for corner in [*SQUARE, SQUARE[0]]])[:, :2].tolist()
     feature = {

@@ -408,6 +408,23 @@ def test_positions_in_centimetres_are_read_as_such(scene, tmp_path):
     assert links.tx[0].tolist() == [-30, 0, 15]
 
 
+def test_heights_in_another_unit_do_not_scale_the_other_columns(scene, tmp_path):
+    rows = {"x": np.arange(10.0), "y": 20.0, "height_ft": 5.0, "rsrp_dbm": np.arange(-80, -70)}
+    with pytest.raises(InputError, match=r"state a unit of 0.3048 m, except x, y"):
+        draft(scene, table(tmp_path, **rows), tmp_path / "study.toml", frequency=3.5e9, tx=(-30.0, 0.0, 15.0))
+
+
+def test_degrees_in_columns_named_x_and_y_are_degrees(scene, tmp_path):
+    """As metres, all links would be within millimetres of (9.99, 50.01) m."""
+    metres = np.array([[-20.0, 15.0], [-5.0, -15.0], [5.0, 18.0]])
+    x, y, _ = FRAME.to_geographic(np.column_stack([metres, np.zeros(3)])).T
+    links = table(tmp_path, x=x, y=y, tx_x=9.99, tx_y=50.01, rssi=[-50.0, -60.0, -70.0])
+    drafted = draft(scene, links, tmp_path / "study.toml", frequency=3.5e9)
+    assert assumed(drafted)["links.position"] == "geographic"
+    np.testing.assert_allclose(drafted.study.measurements().rx[:, :2], metres, atol=1e-3)
+    np.testing.assert_allclose(drafted.study.measurements().tx[:, :2], 0.0, atol=1e-3)
+
+
 def test_the_origin_of_a_scene_without_a_frame_places_degrees(scene, tmp_path):
     """The radii of curvature of WGS 84 give the metres of a degree; without `--origin`, degrees have no place."""
     file = Path(scene)

@@ -330,6 +330,11 @@ class LinksDraft:
             return rx, tx
         x, y = (pd.to_numeric(self.table.frame[name], errors="coerce").dropna() for name in (rx.x, rx.y))
         low, high = self.overhead.bounds[:2], self.overhead.bounds[3:5]
+        # Exports of geodata call longitude and latitude x and y.
+        if x.abs().max() <= 180 and y.abs().max() <= 90:
+            placed = frame.to_scene(x.to_numpy(), y.to_numpy())[:, :2]
+            if ((placed >= low) & (placed <= high)).mean() > 0.5:
+                return replace(rx, position="geographic"), tx and replace(tx, position="geographic")
         centre, reach = (low + high) / 2, FAR * float(np.max(high - low))
         if np.hypot(x.median() - centre[0], y.median() - centre[1]) < reach:
             return rx, tx
@@ -354,6 +359,8 @@ class LinksDraft:
         unit = "metres of a projection" if "crs" in self.section else unit
         self._add_position_unit(tx, rx)
         reason = f"columns named as {unit}" if "position_unit" not in self.section else "by their names"
+        if unit == "degrees" and not column_names.matches(rx.x, "longitude"):
+            reason = "its numbers are on the scene as degrees"
         reason += "" if rx.height else f"; no height: {RECEIVER_HEIGHT} m"
         self.assume("links.rx", ", ".join(map(str, self.section["rx"])), reason)
         if rx.position != "geographic":
@@ -381,6 +388,14 @@ class LinksDraft:
             raise InputError(f"{self.links}: {error}") from None
         if unit == 1:
             return
+        plain = [
+            name for end in ends for name in (end.x, end.y) if column_names.find_length_unit([name]) == 1
+        ]
+        if plain and rx.position != "geographic":
+            raise InputError(
+                f"{self.links}: the columns {', '.join(names)} state a unit of {unit:g} m, except {', '.join(plain)}; "
+                "state the unit of each in its name, or give metres"
+            )
         if rx.position == "geographic":
             raise InputError(
                 f"{self.links}: heights are not in metres ({', '.join(names)}); give them in metres"

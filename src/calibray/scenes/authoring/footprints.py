@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from calibray.coordinates import WGS84, Frame, transformer
 from calibray.errors import InputError
+from calibray.measurements.column_names import find_length_unit
 from calibray.scenes.authoring.geodata import read_features
 from calibray.scenes.meshes import WIDEST
 from calibray.scenes.scene_file import unique_names
@@ -306,8 +307,9 @@ def read_footprints(
     Args:
         path: A GeoJSON file, Shapefile, GeoPackage, FlatGeobuf file or Esri geodatabase that states its reference
             system.
-        height: Column with the heights of the buildings above the ground [m], or one height for all; a text that is
-            both a number and the name of a column means the column. None if `columns` has the numbers of storeys.
+        height: Column with the heights of the buildings above the ground, in metres or the unit in its name
+            (`height_ft`), or one height for all [m]; a text that is both a number and the name of a column means the
+            column. None if `columns` has the numbers of storeys.
         columns: Further columns.
         layer: Layer of the file, if it has several.
         frame: The scene's frame; by default a local frame centred on the footprints.
@@ -391,13 +393,20 @@ def _is_number(text: str) -> bool:
 def _numbers(
     path: Path, columns: dict[str, NDArray[Any]], source: str | float, count: int
 ) -> NDArray[np.float64]:
-    """Numbers from a column or a constant [count]; NaN if the column has none; texts are parsed as lengths."""
+    """Numbers from a column or a constant [count]; NaN if the column has none; texts are parsed as lengths.
+
+    Numbers are in metres, or in the unit that the column's name states.
+
+    Raises:
+        InputError: There is no such column, or one of its values is not a height.
+    """
     if isinstance(source, str) and source not in columns:
         with suppress(ValueError):
             source = float(source)
     elif isinstance(source, str) and _is_number(source):
         _LOG.warning("%s: %s is interpreted as the column of that name, not as a number", path, source)
     values = _column(path, columns, source) if isinstance(source, str) else np.full(count, float(source))
+    unit = find_length_unit([source]) if isinstance(source, str) else 1.0
     if values.dtype == object:
         lengths = [parse_length(None if value is None else str(value)) for value in values]
         unread = [value for value, length in zip(values, lengths, strict=True) if value and length is None]
@@ -405,8 +414,9 @@ def _numbers(
             raise InputError(
                 f"footprints {path}: column {source!r} contains {unread[0]!r}, must contain metres"
             )
-        values = np.array([np.nan if length is None else length for length in lengths])
-    numbers = np.asarray(values, dtype=float)
+        stated = [1.0 if value is None or not _is_number(str(value)) else unit for value in values]
+        values, unit = np.array([np.nan if length is None else length for length in lengths]) * stated, 1.0
+    numbers = np.asarray(values, dtype=float) * unit
     bad = np.flatnonzero(
         (numbers < 0) | (numbers > HIGHEST) | (np.isnan(numbers) & (not isinstance(source, str)))
     )
