@@ -122,6 +122,21 @@ def test_a_planted_mistake_of_the_study_is_named(town, changes, named):
     assert named in suspicions(town, links(), **changes)
 
 
+def test_upward_tilts_and_relative_gains_are_named(town):
+    """An antenna of 65 degrees has a mean gain of a tenth of its largest one: absolute gains reach 10 dBi."""
+    azimuth, elevation = (
+        angle.ravel() for angle in np.meshgrid(np.arange(-180, 180, 5), np.arange(-90, 91, 5))
+    )
+    gain = -np.minimum(12 * (azimuth / 65) ** 2 + 12 * (elevation / 65) ** 2, 30)
+    grid = pd.DataFrame({"azimuth_deg": azimuth, "elevation_deg": elevation, "gain_dbi": gain})
+    for largest, tilt, named in ((0.0, 6.0, ("relative",)), (9.8, -6.0, ("look up",)), (9.8, 6.0, ())):
+        grid.assign(gain_dbi=gain + largest).to_csv(town / f"{largest}.csv", index=False)
+        mounted = {"tx_antenna": {"azimuth_deg": 30.0, "downtilt_deg": "tilt"}}
+        antenna = {"pattern": f"{largest}.csv", "orientation": [0.0, 0.0, 0.0]}
+        found = suspicions(town, links().assign(tilt=tilt), links=mounted, antenna=antenna)
+        assert [word for word in ("relative", "look up") if word in found] == list(named)
+
+
 @pytest.mark.parametrize(
     ("column", "quantity", "named"),
     [

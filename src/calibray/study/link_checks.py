@@ -19,7 +19,7 @@ from calibray.measurements.column_names import words
 from calibray.measurements.placement import NOT_ON_TRACK
 from calibray.scenes.checks import Finding, SceneSurfaces, scale_findings
 from calibray.study.model import StudyModel
-from calibray.study.mounting import largest_gain_dbi, link_antennas
+from calibray.study.mounting import largest_gain_dbi, link_antennas, link_mountings
 from calibray.tracing.gain_table import read_gain_table
 from calibray.tracing.settings import Antenna
 
@@ -40,6 +40,9 @@ cover 0.86 instead of 0.93 of the links; ten rows at each (100 %) change neither
 SPREAD: Final = 5.0
 """Width of the cells [m] in which positions of a parked GPS receiver lie: phones are accurate to 4.9 m under an open
 sky (GPS.gov, GPS accuracy)."""
+
+LOSSY: Final = 0.5
+"""Mean gain [1] below which a table whose largest gain is exactly 0 dBi probably contains relative levels."""
 
 LINKS_PER_UNKNOWN: Final = 5
 """Number of links per unknown below which a fit hardly constrains its unknowns."""
@@ -86,6 +89,7 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
         *_positions(overhead, links, study.links.position == "geographic"),
         *_levels(study, links),
         *_angles(study, links),
+        *_antennas(study, links),
         *_averages(study, overhead),
         *_dominant_positions(links, study.links.position == "geographic"),
         *_clock(links),
@@ -299,6 +303,28 @@ def _angles(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str]]
                 f"the values fit antennas.{name} better with a yaw of {compass:.2f} rad: {spread_compass:.1f} dB "
                 f"around a line over distance, compared with {spread:.1f} dB",
                 "yaw is measured from x (east) towards y (north); a compass bearing b is pi/2 - b",
+            )
+
+
+def _antennas(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str]]:
+    antennas = [*study.stated_antennas.values(), *study.antenna_types.values()]
+    for file in dict.fromkeys(antenna.gain_file for antenna in antennas if antenna.gain_file is not None):
+        table = read_gain_table(file)
+        # A lossless antenna has a mean gain of 1, so that its largest gain is above 0 dBi.
+        if table.gain_dbi.max() == 0 and table.efficiency < LOSSY:
+            yield (
+                f"the largest gain in {file} is 0 dBi and the mean {table.efficiency:.0%}, as of levels relative to "
+                "the main direction",
+                "give absolute gains [dBi]",
+            )
+    if study.links.tx_antenna is not None and study.links.tx_antenna.aim is None:
+        pose = link_mountings(study, links)["tx"].pose
+        tilt = np.degrees(pose.downtilt + pose.electrical_downtilt)
+        if tilt.max() < 0:
+            yield (
+                f"all downtilts of links.tx_antenna are negative, {tilt.min():g} to {tilt.max():g} degrees: the "
+                "antennas look up",
+                "give the angles below the horizon, which are positive",
             )
 
 
