@@ -323,7 +323,26 @@ def test_offsets_that_compensate_the_parameters_do_not_widen_intervals(tmp_path,
     ends = result.predict_interval(table)
     half_width = (ends.upper_db - ends.lower_db) / 2
     assert half_width.min() > stdtrit(freedom, 0.95) * result.prediction.model.residual_db
-    assert half_width.max() < 1.2 * stdtrit(freedom, 0.95) * result.prediction.model.residual_db
+    # A link's leverage is at most 1, so that of its error and of the fit there is at most the square root of 2.
+    assert half_width.max() < np.sqrt(2) * stdtrit(freedom, 0.95) * result.prediction.model.residual_db
+
+
+def test_an_offset_of_few_links_is_uncertain(tmp_path):
+    """One link determines the offset of a phone, so its error is in the offset and in a further measurement."""
+    table = planted.campaign(noise_db=0.5).assign(phone=["a"] + ["b"] * 11)
+    study = planted.study(
+        tmp_path,
+        table,
+        nuisance={"device": {"by": "constant", "per": "phone"}},
+        parameters={"marble.relative_permittivity": {"bounds": planted.BOUNDS}},
+    )
+    result = calibrate(study)
+    error_db, of_links = result.prediction.model.residual_db, stdtrit(planted.LINKS - 3, 0.95)
+    assert np.std(result.uncertainty.draws["device[a]"]) == pytest.approx(error_db, rel=0.2)
+    ends = result.predict_interval(table)
+    half_width = ((ends.upper_db - ends.lower_db) / 2).to_numpy()
+    assert half_width[0] == pytest.approx(np.sqrt(2) * of_links * error_db, rel=0.1)
+    assert half_width[1:].mean() == pytest.approx(np.sqrt(1 + 2 / 11) * of_links * error_db, rel=0.1)
 
 
 def test_the_reach_of_links_held_out_by_a_filter_is_their_distance_from_the_calibration_links(tmp_path):

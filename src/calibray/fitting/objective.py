@@ -31,7 +31,7 @@ from scipy import sparse
 
 from calibray.errors import InputError
 from calibray.fitting.elimination import Elimination
-from calibray.fitting.nuisance import Nuisance
+from calibray.fitting.nuisance import UNKNOWN_DB, Nuisance
 from calibray.measurements import Measurements
 
 
@@ -142,6 +142,12 @@ class Objective:
             return np.zeros((len(path_loss), 0, derivative.shape[2]))
         slope = self._slopes(path_loss, derivative)
         return -self._elimination.projection(slope, self.coefficients(path_loss))
+
+    def coefficient_root(self) -> NDArray[np.float64]:
+        """Root R of the covariance R R' of the coefficients given path loss [q, q]; wide if not `determined`."""
+        wide_prior = np.where(self.determined, np.inf, UNKNOWN_DB)
+        gram = self._elimination.data.toarray() + np.diag(self._ridge**2 + (self.noise_db / wide_prior) ** 2)
+        return self.noise_db * np.linalg.cholesky(np.linalg.inv(gram))
 
     @property
     def determined(self) -> NDArray[np.bool_]:

@@ -82,7 +82,7 @@ def predict_interval(
     """Predict path loss at new links, with an interval for a measurement there; see `Result.predict_interval`.
 
     The width of the interval has three parts: the residuals of single links, from held-out links if the calibration has
-    any; the draws of the parameters; and for groups without measurements, the spread between groups.
+    any; the draws of parameters and nuisances; and for groups without measurements, the spread between groups.
 
     Raises:
         InputError: `predict` would refuse the input, except for unknown groups; the level is not between 0 and 1; or

@@ -296,21 +296,14 @@ class _ReplayedDraws:
         The uncertainty [candidates, unknowns], [dB] has a column for each coefficient, from its posterior given the
         calibration links, and one for each group without measurements.
         """
-        objective = self.problem.objective
-        nuisance, counted = objective.nuisance, objective.weight > 0
+        objective, nuisance = self.problem.objective, self.problem.objective.nuisance
         if not nuisance.terms:
             return np.zeros((len(links), 0)), np.zeros((len(links), 0))
-        measured = nuisance.design[counted].toarray()
-        weight = objective.weight[counted] * counted.sum() / objective.weight.sum()
-        # Coefficients that the links do not determine get a wide prior, which keeps the matrix regular.
-        wide_prior = np.where(objective.determined, np.inf, UNKNOWN_DB)
-        gram = measured.T @ (weight[:, None] * measured)
-        gram += np.diag((self.noise_db / nuisance.prior) ** 2 + (self.noise_db / wide_prior) ** 2)
-        # The coefficients' covariance is root root'.
-        root = self.noise_db * np.linalg.cholesky(np.linalg.inv(gram))
         parts = [self._term(term, links) for term in nuisance.terms]
         design = np.concatenate([columns for columns, _ in parts], axis=1)
-        return design, np.concatenate([design @ root, *(unknown for _, unknown in parts)], axis=1)
+        return design, np.concatenate(
+            [design @ objective.coefficient_root(), *(unknown for _, unknown in parts)], axis=1
+        )
 
     def _term(self, term: Term, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Columns of a term at candidates, and a column for each group without measurements."""

@@ -293,16 +293,20 @@ def _differ(verdict: JudgedSet) -> bool:
 
 def _named_draws(problem: Problem, model: JointModel, posterior: Posterior) -> dict[str, list[float]]:
     """Draws of equal weight by name: parameters, constants that the scene fixes, coefficients of the nuisance."""
-    parameters, columns, draws = model.parameters, problem.objective.nuisance.columns, posterior.seen
-    kept = systematic_resampling(
-        draws.weight, KEPT_DRAWS, np.random.default_rng(problem.setup.study.method.seed)
-    )
+    parameters, nuisance, draws = model.parameters, problem.objective.nuisance, posterior.seen
+    random = np.random.default_rng(problem.setup.study.method.seed)
+    kept = systematic_resampling(draws.weight, KEPT_DRAWS, random)
     values = parameters.from_unit(posterior.joint[kept])
     values[:, : len(model.study)] = model.study.from_search(draws.point[kept])
     by_name = dict(zip(parameters.names, values.T.tolist(), strict=True))
-    if len(columns) <= MAX_COLUMNS:
-        coefficients = problem.objective.coefficients(model.loss(values))
-        by_name |= dict(zip(columns, coefficients.T.tolist(), strict=True))
+    if 0 < len(nuisance.columns) <= MAX_COLUMNS:
+        # Given the parameters, coefficients scatter about their best values; undetermined ones keep theirs.
+        objective = replace(problem.objective, noise_db=model.marginal.noise_db)
+        normal = random.standard_normal((len(values), len(nuisance.columns)))
+        scatter = np.where(objective.determined, normal @ objective.coefficient_root().T, 0.0)
+        coefficients = objective.coefficients(model.loss(values)) + scatter
+        coefficients = np.clip(coefficients, nuisance.lower, nuisance.upper)
+        by_name |= dict(zip(nuisance.columns, coefficients.T.tolist(), strict=True))
     return by_name
 
 
