@@ -13,11 +13,11 @@ from calibray.errors import EngineError
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import make_objective
 from calibray.measurements import Measurements, SourceTable
-from calibray.prediction.corrections import fill_missing
+from calibray.prediction.corrections import fill_missing, model_terms, nuisance_shift
 from calibray.result.held_out import FittedTerm, Model, PredictionModel
 from calibray.result.record import Prediction
 from calibray.study import Study
-from calibray.validation.choice import with_prior_mean
+from calibray.validation.choice import fitted_terms, with_prior_mean
 from calibray.validation.models import (
     OUT_OF_SIGHT_DB,
     has_obstruction,
@@ -168,6 +168,12 @@ def test_links_in_sight_say_nothing_of_those_out_of_sight():
     assert law == pytest.approx(LOSS + OUT_OF_SIGHT_DB[0] * walls, abs=1e-6)
     assert has_obstruction(links)
     assert not has_obstruction(links.select(walls == 0))
+    study = Study.from_content(planted.content("links.csv"))
+    model, known_db = obstructed(links, objective(links, calibrated=walls == 0), NOTHING)
+    terms = with_prior_mean(fitted_terms(model, known_db, study), study)
+    predicting = PredictionModel(Model.OBSTRUCTION, None, terms, 1.0, "", 15)
+    new = nuisance_shift(model_terms(predicting, links), links).value_db[0]
+    assert new == pytest.approx(law, abs=1e-6)
 
 
 def blocked(walls):

@@ -188,17 +188,17 @@ def averaged_terms(few: tuple[FittedTerm, ...], more: tuple[FittedTerm, ...]) ->
 def with_prior_mean(terms: tuple[FittedTerm, ...], study: StudyModel) -> tuple[FittedTerm, ...]:
     """The terms of the log-distance model with obstruction, the loss out of sight with the mean of its prior.
 
-    The fit treats that mean as known. A nuisance of the study by the same column has no such prior.
+    The fit treats that mean as known, also if no link out of sight has a weight. A nuisance of the study by the same
+    column has no such prior.
     """
-    return tuple(
-        replace(
-            term,
-            coefficients={key: models.OUT_OF_SIGHT_DB[0] + value for key, value in term.coefficients.items()},
-        )
-        if term.by == OUT_OF_SIGHT and term.name not in study.nuisance
-        else term
-        for term in terms
+    if any(term.by == OUT_OF_SIGHT for term in study.nuisance.values()):
+        return terms
+    name, others = OUT_OF_SIGHT.replace("_", " "), tuple(term for term in terms if term.by != OUT_OF_SIGHT)
+    fitted = next(
+        (term for term in terms if term.by == OUT_OF_SIGHT), FittedTerm(name, OUT_OF_SIGHT, "", {"": 0.0})
     )
+    coefficients = {key: models.OUT_OF_SIGHT_DB[0] + value for key, value in fitted.coefficients.items()}
+    return (*others, replace(fitted, coefficients=coefficients))
 
 
 def quantiles(absolute_errors: NDArray[np.float64]) -> tuple[float, ...]:
