@@ -93,6 +93,15 @@ def test_cells_stretches_and_windows(by, size, first_rows):
         assert average(rows | {"t": with_fraction}, by, size, time="t").row.tolist() == first_rows
 
 
+@pytest.mark.parametrize("key", ["weight", "std"])
+def test_weights_and_deviations_of_averages_are_means(key):
+    rows = pd.DataFrame({"x": [0.0, 0.1, 9.0], "power": -80.0, "own": [1.0, 5.0, 2.0]})
+    columns = LinkColumns((0.0, 0.0, 20.0), ("x", 0.0, 1.5), "power", "rsrp", **{key: "own"})
+    links = measured_links(SourceTable(rows), columns, Preparation(averaging=Averaging("cell", 5.0)))
+    expected = np.array([3.0, 2.0])
+    assert links.weight == pytest.approx(expected if key == "weight" else 1 / expected**2)
+
+
 @pytest.mark.parametrize(
     ("changes", "arguments", "message"),
     [

@@ -279,7 +279,14 @@ def test_inputs_that_cannot_be_read_any_more_are_listed(written, result, tmp_pat
         gone, study=cb.Study.from_content(content, "study.toml"), links=gone.links[["row", "measured_db", "before_db",
         "after_db", "log_distance_db", "has_path", "held_out", "predicted_db", "scene_db"]],
     )  # fmt: skip
-    cb.report(gone, tmp_path / "report.html")
+    cb.report(result, tmp_path / "report.html", figures=tmp_path / "figures")
+    assert (tmp_path / "figures" / "residual-over-distance.png").exists()
+    (tmp_path / "figures" / "own.png").write_bytes(b"")
+    cb.report(gone, tmp_path / "report.html", figures=tmp_path / "figures")
+    left = {path.name for path in (tmp_path / "figures").glob("*.png")}
+    # A figure of the earlier report would be taken for one of this result.
+    assert {"path-loss.png", "own.png"} <= left
+    assert "residual-over-distance.png" not in left
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert set(page.ids) >= SECTIONS
     assert "absent.csv cannot be read any more" in page.words

@@ -241,7 +241,7 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     whose uncertainty then exceeds `MAX_UNCERTAINTY_DB` are left out, because the samples above the floor are only the
     strong ones. The steps `averaging`, `keep`, `held_out`, `transmitter` and `noise_floor_dbm` are used. Returns for
     each average the row of its first sample, with the mean receiver position, the mean value, and the columns `std_db`
-    (standard deviation of the samples [dB], NaN for one sample) and `count`; further observables are means.
+    (standard deviation of the samples [dB], NaN for one sample) and `count`; weights and further observables are means.
 
     Raises:
         InputError: A column is missing or not numeric, a time cannot be read, or no average remains.
@@ -296,10 +296,13 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
         mean_level = mean_level + bias_db.fillna(0.0).to_numpy()
     table = _note_steps(table, group, level, samples["below"].to_numpy() == 0, keys)
 
+    # A deviation that averages state themselves, std_db, is no column of the samples.
+    stated = {columns.weight, columns.std} - {"std_db", "count"}
+    weights = [str(name) for name in stated if name in table.frame]
     averages = table.select(~pd.Series(group).duplicated().to_numpy()).assign(
         **{columns.value: sign * mean_level},
         **{name: mean[name].to_numpy() for name in rx},
-        **{name: _means(table, name, group) for name in steps.observables},
+        **{name: _means(table, name, group) for name in (*steps.observables, *weights)},
         std_db=groups["level"].std().to_numpy(),
         count=count.to_numpy(),
     )

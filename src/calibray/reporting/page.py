@@ -109,7 +109,8 @@ def report(
     Args:
         result: The calibration; paths that it does not contain come from the cache or are traced.
         file: File to write; replaced only once the new one is complete.
-        figures: Folder for the figures as SVG and PNG; created if needed. None writes no separate figures.
+        figures: Folder for the figures as SVG and PNG; created if needed. Those of an earlier report are removed. None
+            writes no separate figures.
         overwrite: Replace files that Calibray did not write.
         progress: Called with the stage "tracing" after every launch.
 
@@ -129,6 +130,10 @@ def report(
             for name, figure in result_figures(result, data.links).items():
                 for suffix in ("svg", "png"):
                     style.write(figure, folder / f"{name}.{suffix}")
+            # Figures that an earlier result had and this one lacks.
+            for picture in PICTURES:
+                if Path(picture).stem not in drawn:
+                    (folder / picture).unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{target}: cannot be written ({error.strerror}); choose another file") from None
     return target
