@@ -95,6 +95,20 @@ def test_position_noise_is_that_of_the_antennas_at_their_start_values(exact: Stu
     np.testing.assert_allclose(weights[0], weights[1], rtol=1e-9)
 
 
+def test_position_noise_is_that_of_the_heights_at_their_start_values(exact: Study) -> None:
+    """A mast whose parameter starts 5 m above its stated height, and one whose height is stated right."""
+    weights, table = [], exact.measurements().frame
+    for stated, start in ((0.0, 5.0), (5.0, 0.0)):
+        table.assign(tx_z=table["tx_z"] + stated).to_csv(
+            exact.path.parent / "raised.csv", index=False, float_format="%.17g"
+        )
+        content = with_error(exact, file="raised.csv").content()
+        content["parameters"]["tx:*.height"] = {"bounds": [-8.0, 8.0], "start": start}
+        setup = Setup.open(Study.from_content(content, exact.path), tracer=TwoRay)
+        weights.append(setup.with_position_noise().links.weight)
+    np.testing.assert_allclose(weights[0], weights[1], rtol=1e-9)
+
+
 def test_a_column_of_errors_and_exact_predictions(exact: Study) -> None:
     table = exact.measurements().frame.assign(error=0.0)
     table.to_csv(exact.path.parent / "errors.csv", index=False, float_format="%.17g")

@@ -379,7 +379,8 @@ class Setup:
         from calibray.engines.replay import Computation, Replay
 
         mountings = mounted_at_displaced(self.mountings, len(links))
-        paths = self._mounted(self._trace(displaced(links, errors), self.scene, None), self.scene, mountings)
+        around = displaced(self._links_in_place, errors)
+        paths = self._mounted(self._trace(around, self.scene, None), self.scene, mountings)
         effects = self._pose_and_region_effects(paths, np.tile(np.arange(len(links)), len(DIRECTIONS)))
         replay = Replay(paths, self.parameters, effects=effects, computation=Computation(batch=1))
         loss = replay.path_loss(self.parameters.start[None])[0]
