@@ -122,6 +122,31 @@ def test_a_planted_mistake_of_the_study_is_named(town, changes, named):
     assert named in suspicions(town, links(), **changes)
 
 
+@pytest.mark.parametrize(
+    ("columns", "keys", "named"),
+    [
+        (
+            {"z": "height_ft"},
+            {"rx": ["x", "y", "height_ft"]},
+            "'height_ft' is named like lengths of 0.3048 m",
+        ),
+        ({"z": "z_m"}, {"rx": ["x", "y", "z_m"]}, ""),
+        (
+            {"loss": "rx_dbm"},
+            {"value": "rx_dbm", "quantity": "received_power", "tx_power_dbm": "power_w"},
+            "like watts",
+        ),
+    ],
+)
+def test_units_of_names_that_the_study_does_not_state_are_named(town, columns, keys, named):
+    table = links().assign(power_w=20.0).rename(columns=columns)
+    if "rx_dbm" in table:
+        table["rx_dbm"] = table["power_w"] - table["rx_dbm"]
+    found = suspicions(town, table, links=keys)
+    assert named in found
+    assert bool(named) == bool(found)
+
+
 def test_upward_tilts_and_relative_gains_are_named(town):
     """An antenna of 65 degrees has a mean gain of a tenth of its largest one: absolute gains reach 10 dBi."""
     azimuth, elevation = (

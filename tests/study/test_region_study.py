@@ -85,17 +85,18 @@ def test_a_planted_attenuation_is_found_and_used_for_predictions(tmp_path, engin
     assert calibrate(fixed).rmse_db > result.rmse_db + 0.3
 
 
-def test_a_file_of_polygons_gives_the_same_as_a_box(tmp_path, opened, engine):
+@pytest.mark.parametrize(("column", "height"), [("h", 8.0), ("height_ft", 8.0 / 0.3048)])
+def test_a_file_of_polygons_gives_the_same_as_a_box(tmp_path, opened, engine, column, height):
     west, south, east, north = BOX
     ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
     feature = {
         "type": "Feature",
-        "properties": {"h": 8.0},
+        "properties": {column: height},
         "geometry": {"type": "Polygon", "coordinates": [ring]},
     }
     content = {"type": "FeatureCollection", "features": [feature]}
     (tmp_path / "trees.geojson").write_text(json.dumps(content))
-    section = {"file": "trees.geojson", "position": "scene", "top": "h", "specific_attenuation": 0.3}
+    section = {"file": "trees.geojson", "position": "scene", "top": column, "specific_attenuation": 0.3}
     other = Setup.open(study(tmp_path, regions={"trees": section}), links=links_from_frame(planted.links()))
     (effect,), (expected,) = other.effects(engine.paths), opened.effects(engine.paths)
     assert effect.length == pytest.approx(expected.length)

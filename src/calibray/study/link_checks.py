@@ -15,7 +15,7 @@ from scipy.constants import speed_of_light
 
 from calibray.errors import InputError
 from calibray.measurements import FEW, Measurements
-from calibray.measurements.column_names import words
+from calibray.measurements.column_names import LENGTH_UNITS, WATTS, find_length_unit, words
 from calibray.measurements.placement import NOT_ON_TRACK
 from calibray.scenes.checks import Finding, SceneSurfaces, scale_findings
 from calibray.study.model import StudyModel
@@ -87,6 +87,7 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
     checks = (
         *((finding.problem, finding.remedy) for finding in scale if finding.severity == "error"),
         *_positions(overhead, links, study.links.position == "geographic"),
+        *_units(study),
         *_levels(study, links),
         *_angles(study, links),
         *_antennas(study, links),
@@ -249,6 +250,22 @@ def _better_turn(overhead: SceneSurfaces, rx: NDArray[np.float64], wrong: int) -
     fewest = min(misplaced.values())
     names = " or ".join(name for name, count in misplaced.items() if count == fewest)
     return (names, fewest) if fewest <= wrong / 4 else None
+
+
+def _units(study: StudyModel) -> Iterator[tuple[str, str]]:
+    """Whether names of columns state other units than the study."""
+    links = study.links
+    unit = 1.0 if links.position == "geographic" else links.position_unit
+    for name in dict.fromkeys(name for name in (*links.tx, *links.rx) if isinstance(name, str)):
+        if words(name) & {*LENGTH_UNITS, "m"} and (stated := find_length_unit([name])) != unit:
+            yield (
+                f"column {name!r} is named like lengths of {stated:g} m, and is read as lengths of {unit:g} m",
+                "convert it, or set links.position_unit if all positions have its unit",
+            )
+    for key in ("tx_power_dbm", "eirp_dbm"):
+        name = getattr(links, key)
+        if isinstance(name, str) and words(name) & WATTS:
+            yield f"column {name!r} of links.{key} is named like watts or dBW", "convert it to dBm"
 
 
 def _levels(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str]]:

@@ -14,6 +14,7 @@ from scipy.constants import speed_of_light
 
 from calibray.coordinates import WGS84
 from calibray.errors import InputError
+from calibray.measurements.column_names import find_length_unit
 from calibray.parameters import Parameters
 from calibray.paths import Paths
 from calibray.scenes.obstruction import Region
@@ -56,7 +57,8 @@ class RegionSection(Section):
             scene's frame.
         heights: "ground" for heights above the scene's ground below each polygon, as those of a canopy are; above z = 0
             of the scene if absent.
-        bottom: Height at which the region begins [m], a number or a column of the file.
+        bottom: Height at which the region begins [m], a number or a column of the file, in metres or the unit in its
+            name.
         top: Height at which it ends, in the same form; a canopy defines it.
         specific_attenuation: Loss per length of a short path inside at the study's carrier [dB/m]; the start value if
             it is a parameter.
@@ -205,7 +207,7 @@ def _heights(
     if height not in columns:
         raise InputError(f"{path}: {key}: no column {shortened(height)!r}; {did_you_mean(height, columns)}")
     try:
-        values = columns[height].astype(np.float64)
+        values = columns[height].astype(np.float64) * find_length_unit([height])
     except (TypeError, ValueError):
         values = np.full(count, np.nan)
     if (wrong := np.flatnonzero(~np.isfinite(values))).size:
