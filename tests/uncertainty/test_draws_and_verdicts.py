@@ -59,8 +59,11 @@ def test_a_parameter_known_for_the_measured_buildings_alone_is_weakly_identified
     assert verdict.name == "weakly identified"
     assert "measured" in reason_text(verdict.reason)
     # Also the measured buildings reach a bound.
-    low = replace(seen, point=random.exponential(0.5, (300, 1)))
-    assert verdicts(every, lambda x: x, axes, 1.0, seen=low)[0].name != "weakly identified"
+    low = random.exponential(0.5, (300, 1))
+    for side, point in (("lower", low), ("upper", 10.0 - low)):
+        (verdict,) = verdicts(every, lambda x: x, axes, 1.0, seen=replace(seen, point=point))
+        assert verdict.name == "at bound"
+        assert verdict.reason.values["side"] == side
 
 
 def test_gaps_between_draws_of_a_parameter_without_effect_are_chance():

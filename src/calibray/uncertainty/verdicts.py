@@ -242,8 +242,9 @@ def verdicts(
         share, seen_share = _width(pieces) / extent, _width(seen_pieces) / extent
         range_ = {"customary": True} if extent < upper - lower else {}
         seen_ends = _bounds_reached(seen_pieces, lower, upper)
-        ends = _bounds_reached(pieces, lower, upper) or seen_ends
         # A flat posterior of all buildings reaches both bounds, and its pieces are chance.
+        judged = pieces if share <= WEAKLY else seen_pieces
+        ends = _bounds_reached(judged, lower, upper) or seen_ends
         if share > WEAKLY >= seen_share and len(seen_pieces) == 1 and not seen_ends:
             name = Verdict.WEAKLY_IDENTIFIED
             reason = Reason(ReasonKind.SEEN_BUILDINGS, {"share": float(seen_share), **range_})
@@ -256,10 +257,10 @@ def verdicts(
                 reason = _confounding(index, draws, axes.names, change, noise_db)
         elif len(seen_pieces) > 1:
             name, reason = Verdict.AMBIGUOUS, _modes(index, seen_pieces, seen, axes)
-        elif len(pieces) > 1:
-            name, reason = Verdict.AMBIGUOUS, _modes(index, pieces, draws, axes)
-        elif ends and pieces:
-            other_end = axes.value(index, pieces[-1][1] if ends == ["lower"] else pieces[0][0])
+        elif len(judged) > 1:
+            name, reason = Verdict.AMBIGUOUS, _modes(index, judged, draws, axes)
+        elif ends:
+            other_end = axes.value(index, judged[-1][1] if ends == ["lower"] else judged[0][0])
             reason = Reason(ReasonKind.AT_BOUND, {"side": ends[0], "value": float(other_end)})
             name = Verdict.AT_BOUND
         else:
