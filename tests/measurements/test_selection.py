@@ -143,6 +143,7 @@ def test_a_filter_sees_the_columns_of_a_track(tmp_path):
         ("<gpx", None, "not well-formed"),
         (gpx(point(1, 1, 0) + point(1, 1, 9)), "2026-05-01T12:00:05", "none of 1 times .* lies on the track"),
         (gpx(point(1, 1, 0)), "noon", "log.csv, column 'time': a time cannot be read"),
+        (gpx(point(1, 1, 0) + point(1, 1, 9)), "2026-05-01", "column 'time': contains dates without times"),
     ],
 )
 def test_tracks_and_times_that_do_not_fit_are_refused(join, text, times, message):

@@ -63,12 +63,19 @@ def _row_times(table: SourceTable, track: Track) -> NDArray[np.float64]:
         if pd.api.types.is_numeric_dtype(column):
             return _seconds(pd.to_datetime(column, utc=True, unit="s"))
         # ISO 8601 allows a comma before the fraction of a second; pandas does not.
-        return _seconds(pd.to_datetime(column.replace(",", ".", regex=True), utc=True, format="ISO8601"))
+        seconds = _seconds(pd.to_datetime(column.replace(",", ".", regex=True), utc=True, format="ISO8601"))
     except (ValueError, OverflowError) as error:
         raise InputError(
             f"{table.source}, column {track.time!r}: a time cannot be read ({_reason(error)}); give ISO 8601, such "
             "as 2026-05-31T14:05:09.2Z, or seconds since 1970"
         ) from None
+    days = seconds[np.isfinite(seconds)] / 86_400
+    if len(days) and (days % 1 == 0).all() and not column.astype(str).str.contains(":").any():
+        raise InputError(
+            f"{table.source}, column {track.time!r}: contains dates without times; join both in one column, such as "
+            "2026-05-31T14:05:09.2Z"
+        )
+    return seconds
 
 
 def _covered(
