@@ -259,7 +259,7 @@ def verdicts(
             name, reason = Verdict.AMBIGUOUS, _modes(index, seen_pieces, seen, axes)
         elif len(judged) > 1:
             name, reason = Verdict.AMBIGUOUS, _modes(index, judged, draws, axes)
-        elif ends:
+        elif ends and judged:
             other_end = axes.value(index, judged[-1][1] if ends == ["lower"] else judged[0][0])
             reason = Reason(ReasonKind.AT_BOUND, {"side": ends[0], "value": float(other_end)})
             name = Verdict.AT_BOUND
