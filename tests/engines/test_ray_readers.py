@@ -17,6 +17,7 @@ import calibray as cb
 from calibray.engines.rays.compile import powers
 from calibray.engines.rays.other_programs import Polyline, check_carrier, read_sionna_paths, rows_of
 from calibray.errors import InputError
+from calibray.fields import path_loss
 from calibray.paths import Paths
 
 SCENE = "sionna:simple_street_canyon"
@@ -222,6 +223,17 @@ def test_axes_and_units_of_another_convention_are_refused_or_named(
     metres = write_aodt([line._replace(points=line.points / 100) for line in lines], tmp_path)
     with pytest.raises(InputError, match=r"nearest surface|takes"):
         read(metres)
+
+
+def test_aodt_s_gains_are_those_of_the_paths_time(lines: list[Polyline], tmp_path: Path) -> None:
+    """At time 0 there are gains, but no paths; the first paths are those of time 1."""
+    folder = write_aodt(lines, tmp_path)
+    expected = read(folder)
+    rays, gains = (pd.read_parquet(folder / f"{name}.parquet") for name in ("raypaths", "cirs"))
+    before = gains.assign(cir_re=[values / 100 for values in gains.cir_re])
+    rays.assign(time_idx=1).to_parquet(folder / "raypaths.parquet")
+    pd.concat([before, gains.assign(time_idx=1)]).to_parquet(folder / "cirs.parquet")
+    np.testing.assert_allclose(path_loss(read(folder)), path_loss(expected))
 
 
 REFUSED = {

@@ -191,7 +191,7 @@ AODT_TYPES: Final = {
 
 
 def read_aodt(folder: Path) -> SourceTable:
-    """Read the first time step of NVIDIA's Aerial Omniverse Digital Twin, a folder with two tables.
+    """Read the first time step with paths of NVIDIA's Aerial Omniverse Digital Twin, a folder with two tables.
 
     Both name the time, the radio unit and the user equipment. `raypaths` has a row for each path, with its points in
     units of the scene (centimetres) and its types of interaction. `cirs` has a row for each pair of
@@ -206,10 +206,12 @@ def read_aodt(folder: Path) -> SourceTable:
     for table, names in ((rays, ["points", "interaction_types"]), (gains, ["cir_re", "cir_im", "cir_delay"])):
         for name in (*AODT_PAIR, *names):
             table.column(name)
-    frames = []
-    for table in (rays, gains):
-        time = table.frame["time_idx"].to_numpy() if "time_idx" in table.frame else np.zeros(len(table))
-        frames.append(table.frame[time == time.min()])
+    times = [
+        table.frame["time_idx"].to_numpy() if "time_idx" in table.frame else np.zeros(len(table))
+        for table in (rays, gains)
+    ]
+    # A first step without paths may have rows in one of the tables only.
+    frames = [table.frame[time == times[0].min()] for table, time in zip((rays, gains), times, strict=True)]
     responses = {key: rows for key, rows in frames[1].groupby(AODT_PAIR, sort=False)}
     paths = []
     for pair, rows in frames[0].groupby(AODT_PAIR, sort=False):
