@@ -217,8 +217,8 @@ def fit_fallback(
     measured = ~setup.held_out if links.censored is None else ~setup.held_out & ~links.censored
     usable, name = without_path & measured, WITHOUT_PATH
     usable = usable if problem.faint is None else usable & ~problem.faint
-    table = setup.with_obstruction().links.table
-    if usable.sum() < FEW and OUT_OF_SIGHT in table.frame:
+    # Lines of sight take time, so only if they are needed.
+    if usable.sum() < FEW and OUT_OF_SIGHT in (table := setup.with_obstruction().links.table).frame:
         usable, name = (table.numbers(OUT_OF_SIGHT) > 0) & measured, OUT_OF_SIGHT.replace("_", " ")
     count = int(usable.sum())
     if count >= FEW:

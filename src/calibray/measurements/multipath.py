@@ -116,11 +116,11 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
     angles = {}
     for plane, pattern in ANGLE.items():
         for end, other in (("departure", END["arrival"]), ("arrival", END["departure"])):
-            own = [name for name in names if re.search(pattern, name.lower())]
             own = [
                 name
-                for name in own
-                if re.search(END[end], name.lower()) or not re.search(other, name.lower())
+                for name in names
+                if re.search(pattern, name.lower())
+                and (re.search(END[end], name.lower()) or not re.search(other, name.lower()))
             ]
             if len(own) == 1:
                 values = table.numbers(own[0])

@@ -99,9 +99,8 @@ def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], long
     seconds = seconds[:: 1 + len(seconds) // 10_000]
     if not len(seconds) or (kept := _covered(times, seconds, longest_gap).mean()) > 0.9:
         return 0.0
-    zones = sorted(
-        900.0 * np.arange(-56, 57), key=abs
-    )  # time zones are quarters of an hour, up to 14 h, from UTC
+    # Time zones are quarters of an hour, up to 14 h, from UTC.
+    zones = sorted(900.0 * np.arange(-56, 57), key=abs)
     shares = [_covered(times, seconds - zone, longest_gap).mean() for zone in zones]
     return float(zones[int(np.argmax(shares))]) if max(shares) > (1.0 + kept) / 2 else 0.0
 

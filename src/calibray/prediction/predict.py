@@ -50,7 +50,8 @@ NEAR_SHARE: Final = 0.1
 """Share of the residual field's variance explained by measured links above which a link is near measured links."""
 
 WEAKER_DB: Final = 10.0
-"""Path loss above the largest measured one beyond which a prediction has a remark [dB]."""
+"""Path loss above the largest measured one beyond which a prediction has a remark [dB]. In a planted town with wrong
+heights of buildings, such predictions were wrong by up to 46 dB."""
 
 
 def predict(

@@ -199,10 +199,8 @@ class _ReplayedDraws:
         """The state of the calibration before any candidate is measured."""
         evaluation, draws = self.evaluation, slice(self.num_draws)
         square = evaluation.value**2 * evaluation.num_rows / self.noise_db**2
-        unit, information = (
-            self.problem.parameters.to_unit(self.values[draws]),
-            self._information(evaluation)[draws],
-        )
+        unit = self.problem.parameters.to_unit(self.values[draws])
+        information = self._information(evaluation)[draws]
         return Beliefs(unit, information, self._pieces(self.values), square - square.min())
 
     def at(self, setup: Setup) -> tuple[NDArray[np.float64], NDArray[np.float64], Errors]:
