@@ -14,7 +14,6 @@ Seeds that --out already contains are not run again.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -57,6 +56,7 @@ from calibray.scenes.authoring import (  # noqa: E402
 from calibray.study import Setup, Study  # noqa: E402
 from calibray.study.draft import Given, draft  # noqa: E402
 from calibray.uncertainty.assessment import certainty  # noqa: E402
+from finished_runs import append_run, read_runs  # noqa: E402
 
 CHOICES = 4  # recorded positions to draw from for each stop of the town
 TRACKS = 3  # tracks along the hill
@@ -279,9 +279,8 @@ def main() -> None:
     parser.add_argument("--biased", action="store_true")
     parser.add_argument("--out", type=Path, help="keep what comes of each seed, and go on from there")
     arguments = parser.parse_args()
-    lines = arguments.out.read_text().splitlines() if arguments.out and arguments.out.exists() else []
     how = {"keep_faint": arguments.keep_faint, "biased": arguments.biased}
-    known = {(entry["walk"], entry["seed"]): entry for entry in map(json.loads, lines) if entry["how"] == how}
+    known = {(entry["walk"], entry["seed"]): entry for entry in read_runs(arguments.out, {"how": how})}
     entries = []
     for name in arguments.walks:
         with tempfile.TemporaryDirectory() as folder:
@@ -299,9 +298,7 @@ def main() -> None:
                         **judged(walk, seed, arguments.keep_faint),
                     }
                     known[name, seed] = record
-                    if arguments.out:
-                        with arguments.out.open("a") as file:
-                            file.write(json.dumps(record) + "\n")
+                    append_run(arguments.out, record)
                 entry = known[name, seed]
                 entries.append(entry)
                 shown = (

@@ -13,7 +13,6 @@ with the third's on the same data.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 import time
@@ -35,6 +34,7 @@ from calibray.optimizers import LeastSquares, SpaceMapping, VectorSurrogate
 from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.verdicts import credible_sets
+from finished_runs import append_run, read_runs
 
 LEVELS = (0.9, 0.95)
 NOISES_DB = (1.0, 3.0)
@@ -215,11 +215,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="file of lines, one a repetition; goes on where it stands")
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "calibray-districts")
     given = parser.parse_args()
-    groups = {"development": districts.DEVELOPMENT, "judging": districts.JUDGING}
-    names = [name for word in given.districts.split(",") for name in groups.get(word, (word,))]
-    lines = []
-    if given.out is not None and given.out.exists():
-        lines = [json.loads(line) for line in given.out.read_text().splitlines()]
+    names, lines = districts.named(given.districts), read_runs(given.out, {})
     done = {(line["district"], line["noise_db"], line["turn"]) for line in lines}
     for turn in range(given.repetitions):
         for name in names:
@@ -229,9 +225,7 @@ def main() -> None:
                 lines.append(repetition(name, noise, turn, given.folder))
                 took = f"{lines[-1]['seconds']:.0f} s"
                 print(f"{name}, {noise:g} dB, repetition {turn + 1}: {took}", file=sys.stderr)
-                if given.out is not None:
-                    with given.out.open("a") as file:
-                        file.write(json.dumps(lines[-1]) + "\n")
+                append_run(given.out, lines[-1])
     print(render(_table([line for line in lines if line["district"] in names])))
 
 

@@ -26,7 +26,6 @@ repetitions. Each repetition is a line of the file `--out`; an interrupted run c
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import sys
 from concurrent.futures import ProcessPoolExecutor
@@ -51,6 +50,7 @@ from calibray.tables import Column, Table, numbers, render
 from calibray.validation.held_out_statistics import spatial_blocks
 from calibray.validation.models import fit_variants
 from calibray.validation.validate import fit_models, validate_problem
+from finished_runs import append_run, read_runs
 
 LEVEL = 0.9
 NOISE_DB = 4.0
@@ -215,16 +215,13 @@ def without_a_chance(seed: int) -> tuple[int, str]:
 
 def said_without_a_chance(count: int, workers: int, out: Path | None) -> list[str]:
     """What is said in so many repetitions; those that the file holds already are read from it."""
-    lines = out.read_text().splitlines() if out is not None and out.exists() else []
-    said = {line["seed"]: line["sentence"] for line in map(json.loads, lines)}
+    said = {run["seed"]: run["sentence"] for run in read_runs(out, {})}
     left = [seed for seed in range(count) if seed not in said]
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
         for turn, (seed, sentence) in enumerate(pool.map(without_a_chance, left), start=1):
             said[seed] = sentence
             print(f"repetition {turn} of {len(left)}: {sentence}", file=sys.stderr)
-            if out is not None:
-                with out.open("a") as file:
-                    file.write(json.dumps({"seed": seed, "sentence": sentence}) + "\n")
+            append_run(out, {"seed": seed, "sentence": sentence})
     return [said[seed] for seed in range(count)]
 
 

@@ -23,7 +23,6 @@ weakly identified.
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import sys
 import tempfile
@@ -53,6 +52,7 @@ from calibray.uncertainty.noise_models import GAUSSIAN, Marginal, NoiseModel
 from calibray.uncertainty.sequential_monte_carlo import draw_posterior
 from calibray.uncertainty.verdicts import credible_sets
 from districts import District
+from finished_runs import append_run, read_runs
 from markdown_tables import render_markdown
 
 NOISE_DB = 3.0
@@ -213,7 +213,7 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
             **by_reference,
         })  # fmt: skip
     return {
-        "district": name, "world": world, "repetition": turn, "seed": seed, "parameters": found,
+        "district": name, "world": world, "repetition": turn, "seed": seed, "starts": starts, "parameters": found,
         "noise": assessed.record.noise, "agree": means.agree, "calls": assessed.calls,
         "seconds": time.process_time() - started,
     }  # fmt: skip
@@ -261,15 +261,6 @@ def _holds(pieces: tuple[tuple[float, float], ...], value: float) -> bool:
     return any(low <= value <= high for low, high in pieces)
 
 
-def _read(file: Path | None, seed: int) -> list[dict[str, Any]]:
-    if file is None or not file.exists():
-        return []
-    # A line that was being written when the run was stopped is written again.
-    whole = [line for line in file.read_text().splitlines(keepends=True) if line.endswith("\n")]
-    file.write_text("".join(whole))
-    return [each for each in map(json.loads, whole) if each["seed"] == seed]
-
-
 def _run(tasks: list[tuple[Any, ...]], workers: int) -> Iterator[dict[str, Any]]:
     if workers < 2:
         for task in tasks:
@@ -278,12 +269,6 @@ def _run(tasks: list[tuple[Any, ...]], workers: int) -> Iterator[dict[str, Any]]
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
         for future in as_completed([pool.submit(repetition, *task) for task in tasks]):
             yield future.result()
-
-
-def _named(words: str) -> list[str]:
-    groups = {"all": (districts.DEMO, *districts.DEVELOPMENT, *districts.JUDGING),
-              "development": districts.DEVELOPMENT, "judging": districts.JUDGING}  # fmt: skip
-    return [name for word in words.split(",") for name in groups.get(word, (word,))]
 
 
 def main() -> None:
@@ -301,8 +286,8 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "calibray-districts")
     parser.add_argument("--markdown", action="store_true", help="print tables for the documentation")
     given = parser.parse_args()
-    names, worlds = _named(given.districts), given.worlds.split(",")
-    lines = _read(given.out, given.seed)
+    names, worlds = districts.named(given.districts), given.worlds.split(",")
+    lines = read_runs(given.out, {"seed": given.seed, "starts": given.starts})
     done = {(each["district"], each["world"], each["repetition"]) for each in lines}
     for name in names:
         if given.repetitions:
@@ -317,9 +302,7 @@ def main() -> None:
     ]
     for count, line in enumerate(_run(tasks, given.workers), start=1):
         lines.append(line)
-        if given.out is not None:
-            with given.out.open("a") as file:
-                file.write(json.dumps(line) + "\n")
+        append_run(given.out, line)
         print(f"{count} of {len(tasks)}", end="\r", file=sys.stderr)
     lines = [each for each in lines if each["district"] in names and each["world"] in worlds]
     for table in tables(lines):

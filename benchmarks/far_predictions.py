@@ -20,7 +20,6 @@ Each run is a line of the file `--out`; an interrupted benchmark continues where
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 from dataclasses import replace
@@ -45,6 +44,7 @@ from calibray.validation.held_out_statistics import (
 )
 from calibray.validation.validate import fit_models, fit_variants, validate_problem
 from choice import half_widths, opened
+from finished_runs import append_run, read_runs
 
 LEVEL = 0.9
 CLUSTERS = 4
@@ -147,9 +147,10 @@ def planted(name: str, folder: Path, seed: int) -> Problem:
 
 def in_worlds(names: str, seeds: int, out: Path) -> Table:
     """Regret and coverage in every world, with one block of each district kept apart."""
-    rows = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
+    rows = [row for row in read_runs(out, {}) if row["district"] in misfit_worlds.named(names)]
+    rows = [row for row in rows if row["seed"] < seeds]
     known = {(row["district"], row["world"], row["seed"]) for row in rows}
-    with tempfile.TemporaryDirectory() as folder, out.open("a") as file:
+    with tempfile.TemporaryDirectory() as folder:
         for name in misfit_worlds.named(names):
             wanted = [(name, world, seed) for world in misfit_worlds.WORLDS for seed in range(seeds)]
             missing = tuple(
@@ -168,8 +169,7 @@ def in_worlds(names: str, seeds: int, out: Path) -> Table:
                 rmse = {model: float(np.sqrt(np.mean(error**2))) for model, error in errors.items()}
                 row = {"district": name, "world": world, "seed": seed, "inside": share[USED], "rmse": rmse}
                 rows.append(row)
-                file.write(json.dumps(row) + "\n")
-                file.flush()
+                append_run(out, row)
     columns = (
         Column("the truth has"), numbers("runs"), numbers("median regret", "dB"), numbers("mean regret", "dB"),
         numbers(f"at most {CLOSE_DB} dB"), numbers("mean, of few", "dB"), numbers("not averaged", "dB"),
@@ -206,8 +206,7 @@ def main() -> None:
     if given.worlds:
         print(render(in_worlds(given.districts, given.seeds, given.out)))
         return
-    groups = {"development": districts.DEVELOPMENT, "judging": districts.JUDGING, "": ()}
-    names = groups.get(given.districts, tuple(given.districts.split(",")))
+    names = districts.named(given.districts) if given.districts else []
     rows, accuracy = [], []
     with tempfile.TemporaryDirectory() as folder:
         problems = [(Path(study).stem, opened(study)) for study in given.studies]

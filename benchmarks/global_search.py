@@ -10,7 +10,6 @@ points from another seed, and of a search from the truth. The gap is the RMSE ab
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 import time
 from pathlib import Path
@@ -23,6 +22,7 @@ from calibray.errors import InputError
 from calibray.fitting.search import least_squares, local_searches
 from calibray.optimizers.least_squares import LeastSquares
 from calibray.tables import Column, Table, numbers, render
+from finished_runs import append_run
 from ray_mapping import Foreign, Place, district, office, planted
 
 MANY: Final = 2048
@@ -84,10 +84,10 @@ def main() -> None:
     parser.add_argument("--offices", type=int, default=10)
     parser.add_argument("--truths", type=int, default=4)
     parser.add_argument("--out", type=Path, default=Path("search.jsonl"), help="lines of finished runs")
-    options = parser.parse_args()
+    options, lines = parser.parse_args(), []
     for make, count in ((district, options.districts), (office, options.offices)):
         for seed in range(options.first, options.first + count):
-            with tempfile.TemporaryDirectory() as folder, options.out.open("a") as out:
+            with tempfile.TemporaryDirectory() as folder:
                 try:
                     place = make(seed, Path(folder))
                     engine = Foreign(place, "thicker")
@@ -97,8 +97,9 @@ def main() -> None:
                 for number in range(options.truths):
                     line = {"place": f"{make.__name__}-{seed}", "truth": number}
                     line |= searched(place, engine, number)
-                    print(json.dumps(line), file=out, flush=True)
-    print(render(summary([json.loads(line) for line in options.out.read_text().splitlines()])))
+                    lines.append(line)
+                    append_run(options.out, line)
+    print(render(summary(lines)))
 
 
 if __name__ == "__main__":

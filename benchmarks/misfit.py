@@ -18,7 +18,6 @@ reported for the choice without averaging, and for the calibrated models without
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 import time
@@ -39,6 +38,7 @@ from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.verdicts import credible_sets
 from calibray.validation.models import fit_variants
 from calibray.validation.validate import fit_models, validate_problem
+from finished_runs import append_run, read_runs
 from misfit_worlds import WORLDS, World, make, named
 
 LEVEL = 0.9
@@ -175,11 +175,15 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "calibray-districts")
     given = parser.parse_args()
     worlds = tuple(name for name in WORLDS if any(name.startswith(word) for word in given.worlds.split(",")))
-    lines = []
-    if given.out is not None and given.out.exists():
-        lines = [json.loads(each) for each in given.out.read_text().splitlines()]
+    names = named(given.districts)
+    settings = {
+        "seed": given.seed, "constants_spread": given.constants_spread, "draws": not given.no_draws,
+        "choice": not given.no_choice,
+    }  # fmt: skip
+    lines = read_runs(given.out, settings)
+    lines = [line for line in lines if line["district"] in names and line["world"] in worlds]
     done = {(line["district"], line["world"], line["repetition"]) for line in lines}
-    for name in named(given.districts):
+    for name in names:
         missing = [
             (w, turn) for w in worlds for turn in range(given.repetitions) if (name, w, turn) not in done
         ]
@@ -189,12 +193,10 @@ def main() -> None:
         for world, turn in missing:
             line = repetition(
                 made[world], 1000 * given.seed + turn, given.constants_spread,
-                draws=not given.no_draws, choice=not given.no_choice,
+                draws=settings["draws"], choice=settings["choice"],
             )  # fmt: skip
-            lines.append(line | {"district": name, "world": world, "repetition": turn})
-            if given.out is not None:
-                with given.out.open("a") as file:
-                    file.write(json.dumps(lines[-1]) + "\n")
+            lines.append(line | settings | {"district": name, "world": world, "repetition": turn})
+            append_run(given.out, lines[-1])
     print(render(table(lines)))
 
 

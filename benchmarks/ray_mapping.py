@@ -40,6 +40,7 @@ from calibray.materials import Material, itu_material
 from calibray.paths import Kind, Paths, concatenate, take
 from calibray.study import Setup, Study
 from calibray.tracing.settings import Antenna
+from finished_runs import append_run, read_runs
 from problem_families.sites import office_site
 
 NOISE_DB: Final = 3.0
@@ -354,9 +355,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="file of the repetitions; a run that was stopped goes on")
     parser.add_argument("--minutes", type=float, default=np.inf, help="start no repetition after this time")
     options = parser.parse_args()
-    engines, rows = options.engines.split(","), []
-    if options.out is not None and options.out.exists():
-        rows = [json.loads(line) for line in options.out.read_text().splitlines()]
+    engines, rows = options.engines.split(","), read_runs(options.out, {})
     ends = time.monotonic() + 60 * options.minutes
     done = {(row["place"], row["engine"], row["seed"]) for row in rows}
     order = [
@@ -382,10 +381,8 @@ def main() -> None:
                 if (row := _attempt(place, name, seed)) is None:
                     continue
                 rows.append(row)
-                print(json.dumps(rows[-1]), flush=True)
-                if options.out is not None:
-                    with options.out.open("a") as file:
-                        file.write(json.dumps(rows[-1]) + "\n")
+                print(json.dumps(row), flush=True)
+                append_run(options.out, row)
     _report(rows)
 
 

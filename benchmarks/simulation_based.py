@@ -20,7 +20,6 @@ for each district. The distance is the largest one between both functions; it co
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 import time
@@ -41,6 +40,7 @@ from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.joint_model import JointModel, joint_model
 from calibray.uncertainty.sequential_monte_carlo import BUDGET, draw_posterior
 from calibray.uncertainty.verdicts import credible_sets
+from finished_runs import append_run
 
 NOISE_DB = 3.0
 LEVEL = 0.9
@@ -215,9 +215,7 @@ def main() -> None:
             made = name, problem, Reference.of(problem, given.reference) if given.reference else None
         line = run(made[1], levels[number], number, given.seed, made[2], given.budget)
         lines.append(line | {"district": name})
-        if given.out is not None:
-            with given.out.open("a") as file:
-                file.write(json.dumps(lines[-1]) + "\n")
+        append_run(given.out, lines[-1])
         print(f"{turn + 1} of {given.runs}", end="\r", file=sys.stderr)
     print(render(summary(lines)))
 
