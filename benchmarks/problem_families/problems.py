@@ -55,9 +55,15 @@ def planted_problem(kind: str, seed: int) -> ComparisonProblem:
         answer = planted.evaluate(points, derivatives)
         return Evaluation(*answer, answer.residuals, answer.value)
 
+    # Runs with the cheap model depend on its answers and on the ranges of its constants as well.
+    middle = planted.parameters.from_search(0.5 * (planted.lower + planted.upper)[None])
+    constants = with_constants(planted.parameters, planted.cheap.paths.materials)
+    digest = hashlib.sha256(planted.fingerprint.encode())
+    for part in (planted.cheap.path_loss(middle), *constants.search_bounds):
+        digest.update(np.round(part, 6).astype("<f8").tobytes())
     return ComparisonProblem(
         f"{kind}-{seed}",
-        planted.fingerprint,
+        digest.hexdigest(),
         planted.lower,
         planted.upper,
         planted.parameters.to_search(planted.parameters.start),

@@ -11,7 +11,8 @@ from calibray.fields import path_loss
 from calibray.materials import Material
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import take
-from problem_families.family import LINKS, NOISE_DB, PARAMETERS, problem
+from problem_families import problems
+from problem_families.family import LINKS, NOISE_DB, PARAMETERS, PlantedProblem, problem
 from problem_families.numpy_replay import NumpyReplay
 from problem_families.sites import district_site, office_site
 
@@ -101,6 +102,15 @@ def test_the_cheap_model_differs_from_the_engine(planted):
     reached = np.isfinite(cheap)
     assert reached.mean() > 0.7
     assert np.abs(cheap - engine)[reached].max() > 0.1
+
+
+def test_runs_with_another_cheap_model_are_other_runs(planted, monkeypatch):
+    def fingerprint(problem: PlantedProblem) -> str:
+        monkeypatch.setattr(problems, "problem", lambda seed, kind: problem)
+        return problems.planted_problem("district", 2).fingerprint
+
+    other = NumpyReplay(planted.engine.paths, planted.parameters)
+    assert fingerprint(planted) == fingerprint(planted) != fingerprint(replace(planted, cheap=other))
 
 
 def test_residuals_do_not_depend_on_offsets(planted):
