@@ -1,7 +1,7 @@
 """Districts made from seeds: streets, buildings, materials, carriers and links that no part of the package contains.
 
-Seeds 100 to 109 are for development (the odd ones were used for judging earlier); those for judging are run once, at
-the end. Buildings are boxes with windows, so that the building an interaction belongs to follows from where it happens.
+Seeds 100 to 109 are for development (the odd ones were used for judging earlier). Buildings are boxes with windows, so
+that the building an interaction belongs to follows from where it happens.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ DEVELOPMENT = tuple(f"district-{seed}" for seed in (100, 101, 102, 103, 104, 105
 """Districts to develop on."""
 
 JUDGING = tuple(f"district-{seed}" for seed in (153, 155, 159, 161, 163))
-"""Districts to judge by, run once at the end. (151 and 157 draw a carrier that P.2040 gives no constants for; those
-from 113 to 149 judged versions before, and those from 139 on were developed on since.)"""
+"""Districts that judged earlier versions, and on which the default of `noise.constants_spread` was chosen: a new
+version needs other seeds. (151 and 157 draw a carrier that P.2040 gives no constants for.)"""
 
 DEMO = "demo"
 NEAR_M = 0.1

@@ -1,7 +1,7 @@
 """Every method on families of planted problems at equal budgets of RT calls (docs/measurements/methods-on-families.md).
 
     python benchmarks/family.py --workers 2                      # development: seeds 0 to 19
-    python benchmarks/family.py --seeds 1000:1020 --workers 2    # judging: run once, reported whatever it says
+    python benchmarks/family.py --seeds 5000:5020 --workers 2    # judging: run once, reported whatever it says
 
 needs `pip install "calibray[optimizers,scenes]"` and a tracer. Every finished run is kept under out/family at once; a
 killed benchmark continues where it stopped, and one with more seeds, methods or `--repeats` runs only what is missing.

@@ -1,7 +1,7 @@
 """Hostile input of every kind, thousands of cases from a seed; lists the outcomes of each kind, and forbidden ones.
 
 Run with: python benchmarks/fuzz.py [--cases N] [--seed S] [--workers W] [--kinds NAME ...], or, to see one case again,
-python benchmarks/fuzz.py --seed S --case N [--keep DIR]
+python benchmarks/fuzz.py --seed S --case N
 
 Cases run one after the other in worker processes; one that hangs or crashes is counted and its worker replaced. As root
 on Linux everything but a temporary folder is read-only to them, in a mount namespace of its own.
@@ -90,12 +90,11 @@ def work(place: Path, seed: int, kinds: list[str]) -> None:
 
 
 def _remove(folder: Path) -> None:
-    """Remove a case's folder, unless it is to be kept."""
-    if "CALIBRAY_FUZZ_KEEP" not in os.environ:
-        for path in (folder, *folder.rglob("*")):
-            if path.is_dir() and not path.is_symlink():
-                path.chmod(0o700)
-        shutil.rmtree(folder, ignore_errors=True)
+    """Remove a case's folder."""
+    for path in (folder, *folder.rglob("*")):
+        if path.is_dir() and not path.is_symlink():
+            path.chmod(0o700)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 class Worker:

@@ -4,7 +4,7 @@
 
 A problem is solved to a tolerance t when f <= f_L + t (f_0 - f_L), with the lowest sum of squares f_L that any method
 reached. The data profile is the share of problems solved within a number of simplex gradients, n + 1 evaluations each.
-The box is ten times as wide as the starting point, or 10, around it.
+The box reaches to both sides of the starting point by ten times its largest coordinate, or by 10.
 """
 
 # ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)

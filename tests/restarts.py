@@ -105,7 +105,6 @@ class Outcome:
         kills: Runs that did not come to their end.
         repeated: Calls for a candidate that was in the ledger already when the run that made them began.
         lost: Candidates that were in the ledger once and then no more.
-        wrong_ends: Runs that ended otherwise than the harm makes them end.
     """
 
     result: tuple
@@ -114,7 +113,6 @@ class Outcome:
     kills: int
     repeated: int
     lost: int = 0
-    wrong_ends: int = 0
 
 
 def finish(
@@ -135,8 +133,11 @@ def finish(
 
     Returns:
         What was left.
+
+    Raises:
+        RuntimeError: A run ended otherwise than its harm makes it end.
     """
-    rng, kills, repeated, lost, wrong, out = random.Random(seed), 0, 0, 0, 0, folder / "out"
+    rng, kills, repeated, lost, out = random.Random(seed), 0, 0, 0, folder / "out"
     committed: set[tuple[float, ...]] = set()
     for harm in [*harms, None]:
         each = Harm("kill", harm) if isinstance(harm, int) else harm
@@ -148,13 +149,12 @@ def finish(
             run.harm(rng.uniform(0, 0.04))
         status = run.end()
         kills += status != 0
-        wrong += status not in ({0} if each is None else {0, *ENDS[each.kind]})
         repeated += sum(candidate in known for candidate in programs.calls(folder)[begun:])
-        if wrong:
+        if status not in ({0} if each is None else {0, *ENDS[each.kind]}):
             raise RuntimeError(f"{folder.name}: after {each} the run ended with {status}")
     left = _committed(out)
     lost += len(committed - set(left))
-    return Outcome(result(folder), programs.calls(folder), left, kills, repeated, lost, wrong)
+    return Outcome(result(folder), programs.calls(folder), left, kills, repeated, lost)
 
 
 class Run:

@@ -5,7 +5,8 @@ measured with 1 to 4 dB of noise and perhaps offsets. It also determines an *eng
 a *cheap model* of the same scene that lacks some features of the engine (`Differences`) and may have wrong thicknesses
 and conductivities. Both evaluate traced paths, so a family is judged in minutes.
 
-A family is all problems of one kind over a range of seeds. Seeds below 1000 are for development.
+A family is all problems of one kind over a range of seeds. Seeds below 1020 are for development; those from 1000 on
+judged earlier versions.
 """
 
 from __future__ import annotations
@@ -201,7 +202,7 @@ def problem(seed: int, kind: str = "district") -> PlantedProblem:
     The first call traces, in some tens of seconds; traces are kept (`calibray.tracing.cache`).
 
     Args:
-        seed: Its seed; 1000 and beyond are for judging.
+        seed: Its seed; 1020 and beyond are for judging.
         kind: "district" or "office".
 
     Returns:

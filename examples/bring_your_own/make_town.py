@@ -3,8 +3,9 @@
     python examples/bring_your_own/make_town.py
 
 Everything is synthetic, so the truth is known: `truth.json` holds the materials that the walls and the ground were
-given, what the transmitters and the phones add, and what the noise is. `town.osm` and `rsrp.csv` are all that a
-calibration gets to see. Numbers come from one seed: the same script writes the same files on one machine.
+given, what the transmitters and the phones add, the noise floor and the error of recorded positions. `town.osm`,
+`rsrp.csv` and `cells.csv` are all that a calibration gets to see. Numbers come from one seed: the same script writes
+the same files on one machine.
 """
 
 from __future__ import annotations
