@@ -58,8 +58,8 @@ def repetition(district: District, seed: int) -> list[dict[str, object]]:
             ends = np.log(ends)
         share = np.diff(ends, axis=1)[:, 0] / np.ptp(ends[2])
         rows.append({
-            "material": name.partition(".")[0], "before": share[0], "promised": width / np.ptp(ends[2]),
-            "came about": share[1], "ranges": len(old.pieces),
+            "parameter": name, "before": share[0], "promised": width / np.ptp(ends[2]), "came about": share[1],
+            "ranges": len(old.pieces),
         })  # fmt: skip
     return rows
 
@@ -78,12 +78,12 @@ def main() -> None:
                 rows += repetition(district, seed)
                 print(f"{name}, {seed}", pd.DataFrame(rows[-4:]).round(2).to_string(), file=sys.stderr)
     table = pd.DataFrame(rows)
-    groups = {"all": table, **{f"{name}": group for name, group in table.groupby("material")}}
+    groups = {"all": table, **{f"{name}": group for name, group in table.groupby("parameter")}}
     summary = {
         name: {
             "count": len(group), **group[["before", "promised", "came about"]].mean(),
             "came about by promised, median": (group["came about"] / group["promised"]).median(),
-            "wider than 1.5 times the promise": (group["came about"] > 1.5 * group["promised"]).mean(),
+            "wider than 1.5 times the promise": (group["came about"] > 1.5 * group["promised"]).sum(),
         }
         for name, group in groups.items()
     }  # fmt: skip

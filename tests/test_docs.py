@@ -8,3 +8,12 @@ def test_the_documentation_has_no_faults():
     tool = runpy.run_path(str(Path(__file__).parents[1] / "tools" / "check_docs.py"))
     assert tool["faults"]() == []
     assert list(tool["missing_modules"]("`no_such_module.py`")) == ["no_such_module.py"]
+
+
+def test_the_lock_file_follows_extras_of_packages_that_were_met_before(monkeypatch):
+    tool = runpy.run_path(str(Path(__file__).parents[1] / "tools" / "lock.py"))
+    requires = {"study": ["engine", "maps"], "maps": ["engine[fast]"], "engine": ["kernels; extra == 'fast'"]}
+    monkeypatch.setattr(tool["metadata"], "requires", requires.get)
+    monkeypatch.setattr(tool["metadata"], "version", lambda name: "1.0")
+    found = {name for name, _ in tool["needed"]("study", frozenset(), {})}
+    assert found == {"engine", "maps", "kernels"}

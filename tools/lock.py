@@ -14,29 +14,31 @@ from packaging.utils import canonicalize_name
 LOCK = Path(__file__).resolve().parents[1] / "requirements.lock"
 
 
-def needed(package: str, extras: frozenset[str], found: dict[str, str]) -> dict[str, str]:
+def needed(
+    package: str, extras: frozenset[str], found: dict[tuple[str, frozenset[str]], str]
+) -> set[tuple[str, str]]:
     """Follow the requirements of a package.
 
     Args:
         package: Name of an installed package.
         extras: Which of its extras are wanted.
-        found: The packages met so far; those below this one are added.
+        found: Versions of the packages met so far, each with its extras; those below this one are added.
 
     Returns:
-        `found`: names with their installed versions.
+        Name and installed version of each package in `found`.
     """
     for line in metadata.requires(package) or []:
         requirement = Requirement(line)
         name = canonicalize_name(requirement.name)
         marker = requirement.marker
         wanted = marker is None or any(marker.evaluate({"extra": extra}) for extra in extras | {""})
-        if wanted and name not in found:
-            found[name] = metadata.version(name)
-            needed(name, frozenset(requirement.extras), found)
-    return found
+        if wanted and (name, more := frozenset(requirement.extras)) not in found:
+            found[name, more] = metadata.version(name)
+            needed(name, more, found)
+    return {(name, version) for (name, _), version in found.items()}
 
 
 if __name__ == "__main__":
     every_extra = frozenset(metadata.metadata("calibray").get_all("Provides-Extra") or [])
     packages = needed("calibray", every_extra, {})
-    LOCK.write_text("".join(f"{name}=={version}\n" for name, version in sorted(packages.items())))
+    LOCK.write_text("".join(f"{name}=={version}\n" for name, version in sorted(packages)))
