@@ -82,12 +82,13 @@ def test_sound_links_raise_no_suspicion(town):
         (lambda t: t.assign(x=t.x + 200), "are beyond the scene; their centre is"),
         (lambda t: t.assign(x=t.x + 900 * (t.index == 7)), "1 of 60 receivers are beyond the scene"),
         (lambda t: t.assign(z=t.z - 4), "60 of 60 receivers are below the ground"),
+        (lambda t: t.assign(z=t.z + 540), "60 of 60 receivers are more than 300 m above the whole scene"),
         (lambda t: t.assign(y=np.where(t.index < 5, 20.0, t.y), x=np.where(t.index < 5, 10.0 + t.index, t.x)),
          "5 of 60 receivers are inside buildings"),
         (lambda t: t.assign(loss=t.loss - 30), "path losses are below free space, by"),
         (lambda t: t.assign(z=np.where(t.index < 5, 0.0, t.z)), "5 of 60 receivers touch the ground"),
     ],
-    ids=["swapped", "turned", "origin", "jump", "underground", "indoors", "watts", "height"],
+    ids=["swapped", "turned", "origin", "jump", "underground", "altitudes", "indoors", "watts", "height"],
 )  # fmt: skip
 def test_a_planted_mistake_of_links_is_named(town, mistake, named):
     assert named in suspicions(town, mistake(links()))
@@ -110,13 +111,14 @@ def test_the_gain_of_an_array_is_no_mistake(town):
     [
         ({"links": {"tx": [10.0, 20.0, 5.0]}}, "1 of 1 transmitters are inside buildings"),
         ({"links": {"tx": [*MAST[:2].tolist(), -3.0]}}, "1 of 1 transmitters are below the ground"),
+        ({"links": {"tx": [*MAST[:2].tolist(), 548.0]}}, "1 of 1 transmitters are more than 300 m above"),
         (
             {"antenna": {"orientation": [float(BEARING), 0, 0]}},
             "fit antennas.tx better with a yaw of 1.05 rad",
         ),
         ({"antenna": {"orientation": [60.0, 0, 0]}}, "is more than a full turn"),
     ],
-    ids=["walls", "underground", "compass", "degrees"],
+    ids=["walls", "underground", "altitude", "compass", "degrees"],
 )
 def test_a_planted_mistake_of_the_study_is_named(town, changes, named):
     assert named in suspicions(town, links(), **changes)

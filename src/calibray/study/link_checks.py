@@ -32,6 +32,10 @@ FAR: Final = 10.0
 CELL_SHARE: Final = 0.05
 """Largest width of the areas over which samples are averaged, as a share of the scene's shorter side."""
 
+HIGH: Final = 300.0
+"""Height above the whole scene [m] at which an altitude above sea level was probably counted from the ground: drones
+fly up to 120 m above it (Regulation (EU) 2019/947), and few masts are higher than 300 m."""
+
 DOMINATED: Final = 0.5
 """Effective share of the positions below which a few with many rows dominate the fit. In district 383, three of about
 47 positions with 60 rows each (effectively 10 %) raise the error of predictions from 3.0 to 3.5 dB, and 90 % intervals
@@ -162,6 +166,15 @@ def _positions(
         if below.any():
             problem = f"{int(below.sum())} of {len(points)} {name} are below the ground"
             yield problem, "check heights and their datum"
+        high = points[:, 2] > overhead.bounds[5] + HIGH
+        if high.any():
+            problem = (
+                f"{int(high.sum())} of {len(points)} {name} are more than {HIGH:g} m above the whole scene"
+            )
+            yield (
+                problem,
+                "check heights and their datum: links.heights = 'ground' counts them from the ground",
+            )
         touching = overhead.touching(points)
         if touching.any():
             yield (

@@ -218,7 +218,7 @@ class LinksSection(Section):
             carrier.
         wide: Name of the transmitter by column, for a table with one column per transmitter.
         track: GPX track that gives each row the columns `track_longitude` and `track_latitude` [deg].
-        heights: "ground" for heights above the scene's ground; above z = 0 of the scene if absent.
+        heights: "ground" for heights above the scene's ground; above the datum of the scene's frame if absent.
         transmitters: Table with one row per transmitter, relative to the study file's folder.
         transmitter: Column of both tables with the name of the transmitter.
         missing: Numbers that mean that nothing was measured, in addition to usual ones such as 100 or -999.
