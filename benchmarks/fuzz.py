@@ -49,7 +49,7 @@ PROGRAMS = (
     "section",
 )
 """Kinds that may start programs: the study's, or Calibray itself to read a file within limits."""
-COST = re.compile(r"\b(GiB|MiB|GB|rays|minutes|hours|seconds|calls)\b")
+COST = re.compile(r"\d (GiB|MiB|GB|rays|minutes|hours|days|seconds|RT calls|calls)\b")
 
 
 def work(place: Path, seed: int, kinds: list[str]) -> None:

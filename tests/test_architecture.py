@@ -82,6 +82,11 @@ def test_no_files_import_each_other(structure, trees):
     assert structure["circles"]({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
 
 
+def test_numeric_constants_count_one_by_one(structure):
+    source = "A = 1\nB, C = 2, (3.0, 4)\nD: int = -5\nE, F = 'a', 'b'\ng = 6\nH = len('abc')\nI, J = range(2)"
+    assert structure["constants"]({"module.py": ast.parse(source)}) == 4
+
+
 WRITERS = {"write_text", "write_bytes", "to_csv", "tofile", "savefig", "copyfile", "copy", "copytree"}
 """Methods and functions that write a file, or a CSV text."""
 
