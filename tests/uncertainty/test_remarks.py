@@ -49,6 +49,15 @@ def test_values_outside_their_intervals_are_named_with_the_reason():
     assert "more than 1,000 times" in remarks(outside, 50.0)[0]
 
 
+@pytest.mark.parametrize("log_odds", [-2.0, 0.0, 0.5])
+def test_values_as_probable_as_any_are_not_called_less_probable(log_odds):
+    (text,) = remarks({**dict.fromkeys(NAMES, 2.5), NAMES[1]: 4.4}, log_odds)
+    assert f"{NAMES[1]} 4.4, interval 2 to 3, 6 to 9." in text
+    assert "times as probable" not in text
+    assert "not the most probable" not in text
+    assert "No other candidate is clearly more probable" in text
+
+
 def test_noise_that_the_data_favour_is_reported():
     study = Study.from_content(planted.content("links.csv"))
 

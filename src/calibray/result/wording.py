@@ -13,6 +13,10 @@ from calibray.support.messages import counted, percent
 MOST_ODDS: Final = 1000.0
 """Largest odds that are reported as a number."""
 
+CLEAR_ODDS: Final = 2.0
+"""Odds below which two candidates count as about equally probable: log densities of draws of one Gaussian
+parameter scatter by sqrt(1/2), nearly ln 2."""
+
 SHOWN_PIECES: Final = 3
 """Largest number of pieces of an interval that are listed one by one."""
 
@@ -159,17 +163,25 @@ def _ranges(ends: list[float]) -> str:
 
 def _outside_interval(values: dict[str, Any]) -> str:
     odds = values["odds"]
-    times = f"more than {MOST_ODDS:,.0f}" if odds >= 0.999 * MOST_ODDS else f"{odds:.2g}"
     rows = zip(values["names"], values["values"], values["pieces"], values["most_probable"], strict=True)
-    parameters = "; ".join(
-        f"{name} {value:.4g}, interval {_ranges(ends)}, most probable {probable:.4g}"
+    parameters = [
+        (f"{name} {value:.4g}, interval {_ranges(ends)}", f", most probable {probable:.4g}")
         for name, value, ends, probable in rows
-    )
-    text = (
-        f"The candidate with the lowest RMSE is not the most probable one: {parameters}. RMSE treats the noise of all "
-        f"links as independent; the intervals do not, because {_CAUSES[values['cause']]}. The most probable values are "
-        f"{times} times as probable. Do not use the values with the lowest RMSE as constants of the materials."
-    )
+    ]
+    if odds < CLEAR_ODDS:
+        text = (
+            f"The candidate with the lowest RMSE is outside an interval: {'; '.join(low for low, _ in parameters)}. No "
+            "other candidate is clearly more probable, but few candidates near it fit as well; most that do are in the "
+            "intervals."
+        )
+    else:
+        times = f"more than {MOST_ODDS:,.0f}" if odds >= 0.999 * MOST_ODDS else f"{odds:.2g}"
+        text = (
+            f"The candidate with the lowest RMSE is not the most probable one: {'; '.join(map(''.join, parameters))}. "
+            "RMSE treats the noise of all links as independent; the intervals do not, because "
+            f"{_CAUSES[values['cause']]}. The most probable values are {times} times as probable."
+        )
+    text += " Do not use the values with the lowest RMSE as constants of the materials."
     if values["blocks"]:
         return text + " Held-out blocks show which model predicts best."
     return (
@@ -271,8 +283,8 @@ def _missing_region(values: dict[str, Any]) -> str:
         f"y = {values['south']:.0f} to {values['north']:.0f} m, up to z = {values['height']:.0f} m, on the straight "
         f"line of {values['links']} links, would explain {percent(values['share'])} of the mean square of the "
         f"residuals (chance alone {percent(values['chance'])}). The materials may have absorbed part of these losses, "
-        "and the verdicts assume that nothing is missing there. Check whether there are trees, and state them under "
-        "[regions]; a wrong direction of an antenna can look like this, too."
+        "and the verdicts assume that nothing is missing there. Check whether there are trees, or furniture indoors, "
+        "and state them under [regions]; a wrong direction of an antenna can look like this, too."
     )
 
 
