@@ -94,6 +94,19 @@ def test_a_planted_mistake_of_links_is_named(town, mistake, named):
     assert named in suspicions(town, mistake(links()))
 
 
+def test_receivers_indoors_of_a_transmitter_outdoors_are_no_mistake(town):
+    """All stand in two of the blocks, so that turned axes would put them outdoors; waves reach them through walls."""
+    frame = links()
+    inside = frame.assign(
+        x=np.where(frame.x < 0, frame.x * 0.4 - 46, frame.x * 0.8 + 1), y=-12 - frame.index / 3
+    )
+    inside = inside.assign(loss=inside.loss + 15)
+    named = "60 of 60 receivers are inside buildings"
+    assert named in suspicions(town, inside)
+    assert named not in suspicions(town, inside, trace={"refraction": True})
+    assert "receivers are" not in suspicions(town, inside, trace={"refraction": True})
+
+
 def test_the_gain_of_an_array_is_no_mistake(town):
     """64 antennas have 18 dB more than one of 8 dBi: path losses as much below free space are no suspicion."""
     array = {"rows": 8, "columns": 8}

@@ -90,7 +90,7 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
     scale = scale_findings(overhead.bounds[:3], overhead.bounds[3:])
     checks = (
         *((finding.problem, finding.remedy) for finding in scale if finding.severity == "error"),
-        *_positions(overhead, links, study.links.position == "geographic"),
+        *_positions(overhead, links, study.links.position == "geographic", study.trace.refraction),
         *_units(study),
         *_levels(study, links),
         *_angles(study, links),
@@ -157,7 +157,7 @@ def _dominant_positions(links: Measurements, is_geographic: bool) -> Iterator[tu
 
 
 def _positions(
-    overhead: SceneSurfaces, links: Measurements, is_geographic: bool
+    overhead: SceneSurfaces, links: Measurements, is_geographic: bool, through_walls: bool
 ) -> Iterator[tuple[str, str]]:
     tx, rx = np.unique(links.tx, axis=0), np.unique(links.rx, axis=0)
     refuse_far_receivers(overhead.bounds, rx, links.source, is_geographic)
@@ -183,8 +183,8 @@ def _positions(
                 "give the height of the antenna, at least 1 cm above the surface",
             )
     roofed = overhead.under_roof(rx)
-    if roofed.mean() > 0.8 and overhead.under_roof(tx).any():
-        return  # an indoor scene
+    if roofed.mean() > 0.8 and (through_walls or overhead.under_roof(tx).any()):
+        return  # an indoor scene, or receivers indoors of transmitters outdoors
     wrong = _misplaced(overhead, rx)
     turn = _better_turn(overhead, rx, wrong)
     if turn is not None:
