@@ -35,7 +35,7 @@ from fuzzing.mutations import toml
 from fuzzing.outcome import MEMORY
 
 SAYING, GIVEN_UP = 10.0, 120.0
-"""Within which a bomb ends or says what it will cost, and after which it is stopped [s]."""
+"""Time within which a bomb must end or announce its cost, and after which it is stopped [s]."""
 COST = re.compile(r"[\d.,]+ (GiB|MiB|GB|minutes|hours|days|seconds|RT calls|launches|runs|s left)\b")
 
 
@@ -200,7 +200,7 @@ def memory(process: int) -> int:
 
 
 def explode(bomb: Bomb, folder: Path) -> tuple[str, float, int, str]:
-    """Give a bomb to the command line: what came of it, after how long [s], the memory [bytes], and what was said."""
+    """Give a bomb to the command line: the outcome, its time [s], the memory [bytes], and the last message."""
     world.write(folder)
     (folder / "study.toml").write_text(toml(world.content(**bomb.sections)))
     bomb.prepare(folder)

@@ -6,8 +6,8 @@ The engine is the replay of a district whose fixed constants (thickness, conduct
 whose every link is off by 0.5 dB, so that the study's own replay is a cheap model with wrong constants. Truths are
 drawn evenly from their ranges, and errors have 1 and 3 dB. Two methods only call the engine: space mapping with the
 study's replay, with 10 calls per parameter, and the vector surrogate without it, with 20 calls per parameter. The third
-method uses derivatives. A row says how often 90 % and 95 % intervals cover the truth, and how wide they are compared
-with the third's on the same data.
+method uses derivatives. A row says how often 90 % and 95 % intervals cover the truth, and how wide they are relative to
+those from derivatives on the same data.
 """
 
 from __future__ import annotations

@@ -2,11 +2,11 @@
 
     CALIBRAY_DATA=FOLDER python benchmarks/case_studies.py --samples 60000
 
-The links are traced once with diffuse reflection. For each scattering coefficient S of the walls, the paths are
-replayed: the RMSE of path loss with an offset for links in sight and one for those out of sight, and the RMS delay
-spread in sight, from the power delay profile in bins of 1 ns, those above 132 dB of path loss or 30 dB below the
-strongest left out, as the sounder left them out. The measured one (delay.csv) is printed
-next to it. The script needs the data of the campaign.
+The links are traced once with diffuse reflection, and the paths are replayed for each scattering coefficient S of the
+walls. The table has the RMSE of path loss, with an offset for links in sight and one for those out of sight, and the
+RMS delay spread in sight next to the measured one (delay.csv). Delay spreads come from power delay profiles in bins of
+1 ns. Bins above 132 dB of path loss or 30 dB below the strongest are left out, as the sounder left them out. The script
+needs the data of the campaign.
 """
 
 from __future__ import annotations

@@ -68,10 +68,10 @@ def opened(file: str) -> Problem:
 
 
 LEAST = "least RMSE on the others"
-"""What choosing without a margin comes to."""
+"""The choice without margins."""
 
 APART = (0.0, 0.3, 1.0)
-"""How far truths lie from the study's start, of the way to anywhere."""
+"""Distances of truths from the study's start, as shares of that of a random point."""
 
 
 def left_out(
@@ -85,8 +85,8 @@ def left_out(
         inner_blocks: Number of blocks of the others that choose the model; the study's number if None.
 
     Returns:
-        The model that the others speak for, every model's errors at the links left out, with those of the one of the
-        least RMSE on the others, and whether each that has a path lies in the chosen one's interval.
+        The model that the other links choose; the errors of every model, and of the one with the lowest RMSE on the
+        other links, at the links left out; and which of these with a path lie in the interval of the chosen one.
     """
     objective = problem.objective
     part = replace(problem, objective=replace(objective, weight=np.where(here, 0.0, objective.weight)))

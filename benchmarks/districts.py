@@ -122,9 +122,9 @@ class Streets:
         return self.blocks * self.pitch + self.width
 
 
-def named(words: str) -> list[str]:
-    """Names of districts from names and groups, separated by commas."""
-    groups = {"all": (DEMO, *DEVELOPMENT, *JUDGING), "development": DEVELOPMENT, "judging": JUDGING}
+def named(words: str, judging: tuple[str, ...] = JUDGING) -> list[str]:
+    """Names of districts from names and groups (all, development, judging), separated by commas."""
+    groups = {"all": (DEMO, *DEVELOPMENT, *judging), "development": DEVELOPMENT, "judging": judging}
     return [name for word in words.split(",") for name in groups.get(word, (word,))]
 
 

@@ -47,7 +47,6 @@ AZIMUTH_DEG = 20.0
 FACTOR = 1.5
 DIFFUSE_TRACE = {"max_depth": 2, "samples": 30_000, "diffuse_reflection": True}
 
-DEVELOPMENT = districts.DEVELOPMENT
 JUDGING = tuple(f"district-{seed}" for seed in range(200, 224) if seed not in (201, 206, 208, 209))
 """Twenty districts that no method was developed on. (The others draw a carrier that P.2040 gives no constants for.)"""
 
@@ -119,10 +118,9 @@ def make(name: str, folder: Path, worlds: tuple[str, ...] = WORLDS) -> dict[str,
     return {world: _world(world, full, folder) for world in worlds}
 
 
-def named(names: str) -> list[str]:
-    """Names of districts: "development", "judging", or names between commas."""
-    groups = {"development": DEVELOPMENT, "judging": JUDGING}
-    return list(groups.get(names, names.split(",")))
+def named(words: str) -> list[str]:
+    """Names of districts from names and groups, separated by commas."""
+    return districts.named(words, JUDGING)
 
 
 def _world(name: str, full: District, folder: Path) -> World:

@@ -5,10 +5,9 @@
 runs space mapping on each problem of the families with its own cheap model, with none (the vector surrogate), and with
 three that know nothing of the problem: *scrambled*, the problem's own with its links shuffled and its box mirrored,
 *tones*, smooth random functions of the same size for every link, and *noise*, random numbers without any smoothness,
-the same at the same point. It prints the calls that each takes to come within a tolerance, and how many more than
-without: of the median runs, and on the median of the data profile, the i-th fastest run with it against the i-th
-fastest without for as many as were solved by both. Finished runs are kept under
-out/misleading; a killed benchmark continues.
+the same at the same point. It prints the median calls to come within a tolerance, and how many more these are than
+without a cheap model. It also prints the median difference between the i-th fastest run with it and the i-th fastest
+without, over as many as were solved by both. Finished runs are kept under out/misleading; a killed benchmark continues.
 """
 
 # ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)

@@ -4,20 +4,21 @@
     python benchmarks/suggestion.py --districts demo,11 --repetitions 20
     python benchmarks/suggestion.py --districts 11,12 --repetitions 200 --separate --oracle
 
-In every repetition a truth is drawn evenly from the ranges of the materials, path losses are made of it with noise of
-3 dB, and 20 links are measured. Five more are taken of the others: those that `experiment_design.py` suggests, or
-random ones. The profile of every parameter is taken exactly, on a grid over the whole range, and so are the draws from
-the posterior. The demo has its 40 links. A district with a number is that of the demo built with that seed, with a
-carrier, thicknesses and 160 places in the streets of its own; the demo and 11 to 19 were developed on, others not.
+Each repetition draws a truth evenly from the ranges of the materials, computes path losses with noise of 3 dB, and
+measures 20 links. Then five of the other links are measured: those that `experiment_design.py` suggests, or random
+ones. Profiles of the parameters and draws from the posterior are exact, on a grid over the whole range. The demo has
+its 40 links. A district with a number is the demo's, built with that seed, with its own carrier, thicknesses and 160
+places in the streets. The demo and 11 to 19 were developed on, others not.
 
-Random points are drawn ten times. With `--oracle` who knows the truth, though not the noise, takes five points as well:
-of those suggested and of random ones, each in turn is exchanged for whichever leaves one range the most often in
-simulated noise. With `--separate` a repetition counts only where a material's interval has separate ranges.
+Random points are drawn ten times. With `--oracle`, five points are also chosen by an oracle that knows the truth, but
+not the noise. It starts with the suggested points or random ones, and exchanges each in turn for the point that most
+often leaves one range in simulated noise. With `--separate`, a repetition counts only if the interval of a material has
+separate ranges.
 
-A row tells, for concrete and for glass: the median width of the 95 % interval after suggested points by that after
-random ones; how often it is narrower, ties as half; how often ranges were separate, how often they are one afterwards,
-and how often that is because the others were ruled out, not because what lies between them fits as well now; and what
-width was expected and which one resulted, relative to the width before.
+A row contains, for concrete and for glass: the median width of the 95 % interval after suggested points relative to
+that after random ones, and how often it is narrower (ties count half); how often ranges were separate, how often there
+is one afterwards, and how often the other ranges were then ruled out, so that the values between them do not fit
+either; the expected width and those that resulted, relative to the width before.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
     CALIBRAY_DATA=../shared/data python benchmarks/time_to_result.py
 
 Each study runs in processes of its own with a cache folder of its own: `cold` has nothing compiled, `warm` finds what
-the first one compiled. Both trace. "search" and "inference" include what had to be compiled for them, "compile" says
-how much of both that was, by JAX's own events; "trace" goes from the launches to the path program, the scene in memory.
-Ratios are to be read: (search + inference) / trace. Wall time of an otherwise idle machine, processor time in brackets.
+the first one compiled. Both trace. "search" and "inference" include compilation; "compile" is its time in both by JAX's
+own events. "trace" goes from the launches to the path program, with the scene in memory. The ratio is (search +
+inference) / trace. Times are those of the clock on an otherwise idle machine, processor times are in brackets.
 The last table repeats the search from other seeds, and with all 512 starts: the optimum found, and the evaluations.
 """
 
@@ -24,7 +24,7 @@ from pathlib import Path
 STUDIES = ("demo", "nist_boulder", "auckland_tower")
 PARTS = ("import", "open", "trace", "compile", "search", "inference")
 SEEDS = range(1000, 1025)
-"""Seeds that nothing was chosen on."""
+"""Seeds that were not used for any choice."""
 
 
 def study_path(name: str) -> Path:
