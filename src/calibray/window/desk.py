@@ -258,7 +258,7 @@ class Desk:
         solid: The scene that is shown in 3-D.
         entered: Values that the user entered, by the label of their control.
         edits: Functions that write what a step shows into the study's content, by tab and step.
-        refresh: Shows all steps again.
+        show_again: Functions that show all steps again, by tab.
     """
 
     folder: StudyFolder
@@ -270,7 +270,7 @@ class Desk:
     solid: Solid | None = None
     entered: dict[str, Any] = field(default_factory=dict)
     edits: dict[tuple[str, str], Callable[[dict[str, Any]], None]] = field(default_factory=dict)
-    refresh: Callable[[], None] = lambda: None
+    show_again: dict[str, Callable[[], None]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.jobs = Jobs(self.folder.path)
@@ -281,6 +281,10 @@ class Desk:
             job = self.jobs.start([str(word) for word in words])
             ui.notify(f"Started: {job.command}", type="info", color="primary")
             self.refresh()
+
+    def refresh(self) -> None:
+        """Show all steps of this tab again."""
+        self.show_again[ui.context.client.id]()
 
     def mark(self) -> None:
         """Show the chosen place and area on the map of this tab."""

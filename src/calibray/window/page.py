@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
@@ -35,10 +36,17 @@ HEAD: Final = '<link rel="stylesheet" href="/window/window.css"><script src="/wi
 
 def build(desk: Desk) -> None:
     """Build the page for one tab of the browser."""
+    # Of this tab alone: if a tab shows its command again, the others keep their buttons and the keyboard.
+    progress = ui.refreshable(_progress)
+
+    @ui.refreshable
+    def activity() -> None:
+        _activity(desk, progress)
+
     ui.colors(primary="#1f5fa8", negative="#a11d1d", positive="#1d6b3a", info="#1f5fa8")
     ui.add_head_html(HEAD)
     with ui.element("main").classes("calibray"):
-        place = _show_map(desk)
+        place = _show_map(desk, activity)
         with ui.element("div").classes("steps"):
             for number, (name, show) in enumerate(STEPS, 1):
                 with ui.element("section").classes("step").props(f'aria-label="{name}"'):
@@ -48,10 +56,10 @@ def build(desk: Desk) -> None:
                         upload(desk, UPLOADS[name])
                     show(desk)
     _answer_map(desk, place)
-    _follow_changes(desk)
+    _follow_changes(desk, activity, progress)
 
 
-def _show_map(desk: Desk) -> ui.label:
+def _show_map(desk: Desk, activity: Callable[[], None]) -> ui.label:
     """Draw the map with its buttons, and the last command; returns the label of the chosen place or area."""
 
     def clear_area() -> None:
@@ -77,7 +85,7 @@ def _show_map(desk: Desk) -> ui.label:
             view_button(desk)
         ui.label("Drag to move, wheel or two fingers to zoom, click to choose a place.").classes("quiet")
         place = ui.label().classes("quiet").mark("place")
-        activity(desk)
+        activity()
     return place
 
 
@@ -112,7 +120,9 @@ def _answer_map(desk: Desk, place: ui.label) -> None:
     ui.on("findings", examined)
 
 
-def _follow_changes(desk: Desk) -> None:
+def _follow_changes(
+    desk: Desk, activity: ui.refreshable[[], None], progress: ui.refreshable[[Job], None]
+) -> None:
     """Show steps again when the files of the folder, or the command that is running, have changed."""
 
     def contents() -> dict[str, object]:
@@ -159,7 +169,7 @@ def _follow_changes(desk: Desk) -> None:
         if before is not None and job is None:
             refresh()
 
-    desk.refresh = refresh
+    desk.show_again[ui.context.client.id] = refresh
     ui.timer(0.1, first_map, once=True)
     ui.timer(1.0, watch)
 
@@ -170,8 +180,7 @@ def heading(text: str, level: int) -> None:
         ui.label(text)
 
 
-@ui.refreshable
-def activity(desk: Desk) -> None:
+def _activity(desk: Desk, progress: Callable[[Job], None]) -> None:
     """The command that is running, or ran last, with the end of its output."""
     jobs = desk.jobs.list()
     if not jobs:
@@ -187,8 +196,7 @@ def activity(desk: Desk) -> None:
             ui.label("\n".join(lines[-6:])).classes("log")
 
 
-@ui.refreshable
-def progress(job: Job) -> None:
+def _progress(job: Job) -> None:
     """The stages of a running command: the earlier ones, the progress of the last one, and the best value so far."""
     shown = stages(job.log)
     for stage in shown[:-1]:
