@@ -8,6 +8,10 @@ def test_the_documentation_has_no_faults():
     tool = runpy.run_path(str(Path(__file__).parents[1] / "tools" / "check_docs.py"))
     assert tool["faults"]() == []
     assert list(tool["missing_modules"]("`no_such_module.py`")) == ["no_such_module.py"]
+    # Put together here, where the check itself looks for commands.
+    scripts = [f"benchmarks/{name}.py" for name in ("position_errors", "no_such")]
+    text = f"python {scripts[0]} --first 4 \\\n    --no-such # --comment\n`python {scripts[1]}`"
+    assert list(tool["missing_scripts"](text)) == [f"{scripts[0]} --no-such", scripts[1]]
 
 
 def test_the_lock_file_follows_extras_of_packages_that_were_met_before(monkeypatch):

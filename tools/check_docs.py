@@ -1,4 +1,4 @@
-"""Check the documentation: linked files and headings, make targets, commands and their options, length of pages.
+"""Check the documentation: linked files and headings, make targets, commands, scripts and options, length of pages.
 
 Usage: `python tools/check_docs.py`. It lists the faults, and exits with 1 if there are any.
 """
@@ -34,6 +34,7 @@ _LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 _HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 # At the start of a line of code; settings such as PYTHON=python3.12 may come before the target.
 _OPTIONS = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?calibray ([a-z][\w-]*)((?: (?!#).*)?)$", re.MULTILINE)
+_SCRIPT = re.compile(r"python ((?:benchmarks|tools|examples)/[\w/]+\.py)((?: (?!#)[^\n`]*)?)")
 _COMMAND = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?(make|calibray)(?: \w+=\S+)* ([a-z][\w-]*)", re.MULTILINE)
 
 
@@ -121,6 +122,27 @@ def missing_modules(text: str) -> Iterator[str]:
             yield name
 
 
+def missing_scripts(text: str) -> Iterator[str]:
+    """Find scripts, and options of scripts, that do not exist.
+
+    Args:
+        text: Markdown, or the source of a module whose docstring has commands.
+
+    Yields:
+        Each such script or option. An option may be that of a module next to the script that it imports.
+    """
+    for script, rest in _SCRIPT.findall(re.sub(r"\\\n\s*", "", text)):
+        file = ROOT / script
+        source = file.read_text(encoding="utf-8") if file.exists() else ""
+        imported = re.findall(r"^from (\w+) import", source, re.MULTILINE)
+        neighbours = [file.with_name(f"{name}.py") for name in imported]
+        source += "".join(each.read_text(encoding="utf-8") for each in neighbours if each.exists())
+        options = re.findall(r"(?<![\w-])--[a-z][\w-]*", rest.partition(" #")[0])
+        if not file.exists():
+            yield script
+        yield from (f"{script} {name}" for name in options if f'"{name}"' not in source)
+
+
 def options_of(command: Any) -> set[str]:
     """The options of a command.
 
@@ -171,8 +193,12 @@ def faults() -> list[str]:
             *missing_modules(text),
             *missing_commands(text, commands),
             *missing_options(text, options),
+            *missing_scripts(text),
         ]
         sentences += [f"{document.relative_to(ROOT)}: {name} does not exist" for name in missing]
+    for file in PYTHON_FILES:
+        missing = missing_scripts(file.read_text(encoding="utf-8"))
+        sentences += [f"{file.relative_to(ROOT)}: {name} does not exist" for name in missing]
     return sentences
 
 
