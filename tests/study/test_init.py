@@ -215,6 +215,20 @@ def test_a_column_named_with_any_character_makes_a_study_that_reads(scene, tmp_p
     assert drafted.study.links.rx[0] == "rx_x_m\x7f"
 
 
+@pytest.mark.parametrize(("places", "height"), [(12, 1.5), (2, 10.0)])
+def test_transmitters_that_move_are_as_low_as_receivers(scene, tmp_path, places, height):
+    """Vehicle to vehicle: both positions change from row to row. Those of two masts repeat."""
+    tx = np.array([(-30.0 + 2 * (row % places), -30.0, 0.0) for row in range(12)])
+    rx = np.array([(-20.0, -25.0 + 4 * row, 0.0) for row in range(12)])
+    (tx_lon, tx_lat, _), (rx_lon, rx_lat, _) = FRAME.to_geographic(tx).T, FRAME.to_geographic(rx).T
+    file = table(
+        tmp_path, tx_lon=tx_lon, tx_lat=tx_lat, rx_lon=rx_lon, rx_lat=rx_lat, rssi_dbm=-60.0 - tx[:, 0]
+    )
+    found = draft(scene, file, tmp_path / "study.toml", frequency=5.9e9)
+    assert found.study.links.tx == ("tx_lon", "tx_lat", height)
+    assert found.study.links.rx == ("rx_lon", "rx_lat", 1.5)
+
+
 def test_a_wide_table_indoors(tmp_path):
     plan = tmp_path / "plan.csv"
     plan.write_text(

@@ -26,7 +26,7 @@ from calibray.measurements import (
     transmitter_columns,
 )
 from calibray.measurements.column_names import PositionColumns
-from calibray.measurements.links import MAX_CARRIERS
+from calibray.measurements.links import FEW, MAX_CARRIERS
 from calibray.measurements.selection import comparison, find_codes
 from calibray.scenes import read_frame
 from calibray.scenes.checks import SceneSurfaces
@@ -410,13 +410,20 @@ class LinksDraft:
                     f"{self.links}: the transmitter's position ({tx.x}, {tx.y}) is in other units than the receiver's "
                     f"({rx.x}, {rx.y}); give both in degrees, or both in metres"
                 )
-            position = [tx.x, tx.y, TRANSMITTER_HEIGHT if tx.height is None else tx.height]
+            positions = (
+                1 if self.given.transmitters else len(self.table.frame[[tx.x, tx.y]].drop_duplicates())
+            )
+            moves = positions > max(FEW, len(self.table.frame) / 2)
+            height = RECEIVER_HEIGHT if moves else TRANSMITTER_HEIGHT
+            position = [tx.x, tx.y, height if tx.height is None else tx.height]
             reason = (
                 "columns of these names"
                 if self.given.transmitters is None
                 else f"of {self.given.transmitters.name}"
             )
-            reason += "" if tx.height else f"; no height: {TRANSMITTER_HEIGHT:g} m"
+            reason += (
+                "" if tx.height else f"; no height: {height:g} m{', because they move' if moves else ''}"
+            )
             self.assume("links.tx", ", ".join(map(str, position)), reason)
             if self.given.transmitters is None:
                 self._name_transmitters(tx)
