@@ -199,7 +199,7 @@ def _cautions(result: Record) -> Iterator[Sentence]:
     if gap is not None and gap > tolerance:
         sentences.append(
             f"When the scene is traced again with the calibrated materials, a link changes by up to {gap:.2f} dB, more "
-            f"than the tolerance of {tolerance:g} dB (fidelity.tolerance_db)."
+            f"than the tolerance of {tolerance:g} dB (fidelity.tolerance_db). Raise trace.samples or fidelity.rounds."
         )
     if result.nuisance.groups_without_path:
         groups = named(group_text(result, group) for group in result.nuisance.groups_without_path)
