@@ -74,12 +74,13 @@ BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
         "thickness": Bound(0.0, inf, "m", open_below=True),
         "scattering_coefficient": Bound(0.0, 1.0, "1"),
         "xpd_coefficient": Bound(0.0, 1.0, "1"),
-        "alpha_r": Bound(1.0, inf, "1"),
-        "alpha_i": Bound(1.0, inf, "1"),
+        "alpha_r": Bound(1.0, 126.0, "1"),
+        "alpha_i": Bound(1.0, 126.0, "1"),
         "lambda_": Bound(0.0, 1.0, "1"),
     }
 )
-"""Physical bounds of each field: the bounds of Sionna RT, and a thickness greater than 0."""
+"""Bounds of each field: those of Sionna RT, whose gains are not finite with an exponent of 127, and a thickness greater
+than 0."""
 
 SCATTERING_PATTERNS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {"lambertian": (), "directive": ("alpha_r",), "backscattering": ("alpha_r", "alpha_i", "lambda_")}
@@ -100,8 +101,8 @@ class Material:
         xpd_coefficient: Cross-polarization discrimination coefficient K_x [1] of diffuse fields, in [0, 1].
         scattering_pattern: "lambertian", "directive" or "backscattering" (Degli-Esposti et al., IEEE Trans.
             Antennas and Propagation 55(1), 2007).
-        alpha_r: Exponent [1] of the lobe around the specular direction, at least 1; Sionna RT rounds it.
-        alpha_i: Exponent [1] of the lobe back towards the source, at least 1; Sionna RT rounds it.
+        alpha_r: Exponent [1] of the lobe around the specular direction, 1 to 126; rounded for Sionna RT.
+        alpha_i: Exponent [1] of the lobe back towards the source, 1 to 126; rounded for Sionna RT.
         lambda_: Share [1] of the diffuse energy in the lobe around the specular direction, in [0, 1].
 
     Raises:

@@ -148,6 +148,11 @@ def test_a_material_refuses_what_is_no_number(value):
         replace(PLAIN, relative_permittivity=value)
 
 
+def test_a_material_refuses_lobes_for_which_sionna_rt_has_no_finite_gains():
+    with pytest.raises(InputError, match=r"alpha_r = 127: must be a number in \[1, 126\]"):
+        replace(PLAIN, alpha_r=127)
+
+
 def test_a_material_refuses_an_unknown_pattern_and_cannot_be_changed():
     with pytest.raises(InputError, match="did you mean 'lambertian'"):
         replace(PLAIN, scattering_pattern="lambertain")

@@ -157,9 +157,12 @@ def test_path_loss_is_the_sum_of_the_gains_powers(campaign_of) -> None:
     np.testing.assert_allclose(path_loss(paths), -10 * np.log10(power), rtol=1e-12)
 
 
-def test_replay_follows_the_parameters_of_scattering_patterns(street: Campaign) -> None:
+@pytest.mark.parametrize(("alpha_r", "alpha_i"), [(7, 3), (126, 90)])
+def test_replay_follows_the_parameters_of_scattering_patterns(
+    street: Campaign, alpha_r: int, alpha_i: int
+) -> None:
     materials = {
-        name: replace(material, alpha_r=7, alpha_i=3, lambda_=0.3)
+        name: replace(material, alpha_r=alpha_r, alpha_i=alpha_i, lambda_=0.3)
         for name, material in street.paths.materials.items()
     }
     errors = compare(street, materials)
