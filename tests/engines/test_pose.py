@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import planted
@@ -79,6 +81,27 @@ def test_errors_are_those_of_antennas_mounted_otherwise(
         materials = engine.parameters.materials(value, paths.materials)
         expected = path_loss(turned, materials, combining=engine._combining.kind)
         np.testing.assert_allclose(loss, expected - named["tx:b.gain"] * (labels == "b"), atol=1e-9)
+
+
+def test_a_changed_file_of_gains_counts_at_once(paths: Paths, tmp_path: Path) -> None:
+    errors, links = (Parameter("tx:*.azimuth", -40.0, 40.0, 0.0),), np.zeros(paths.num_links)
+    parameters = Parameters((*planted.engine().parameters.items, *errors))
+    file = tmp_path / "horn.csv"
+    mounting = Mounting((Antenna(str(file)),), links.astype(int), Pose(links, links, links, links))
+    for lost_db in (0.0, 10.0):  # behind the antenna
+        azimuth, elevation = np.meshgrid(np.arange(-180, 180, 15), np.arange(-90, 91, 15))
+        columns = {
+            "azimuth_deg": azimuth,
+            "elevation_deg": elevation,
+            "gain_dbi": -lost_db * np.abs(azimuth) / 180,
+        }
+        pd.DataFrame({name: values.ravel() for name, values in columns.items()}).to_csv(file, index=False)
+        mounted = mount(paths, {"tx": mounting})
+        effect = pose_error(mounted, mounting, links.astype(str), errors, from_north=True)
+        assert effect is not None
+        loss = Replay(mounted, parameters, effects=(effect,)).path_loss(parameters.start[None])[0]
+        expected = path_loss(mounted, parameters.materials(parameters.start, paths.materials))
+        np.testing.assert_allclose(loss, expected, atol=1e-9)
 
 
 def test_derivatives_agree_with_finite_differences(engine: Replay) -> None:

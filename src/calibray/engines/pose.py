@@ -59,6 +59,7 @@ class PoseError:
         weights: The changes of yaw [rad], downtilt [rad] and gain [dB] of a transmitter, per unit of each effect
             parameter [3, T, e].
         antennas: The different antennas.
+        gains: The same by content: a changed file of gains needs another compiled program, whatever its name.
     """
 
     basis: Any
@@ -69,6 +70,7 @@ class PoseError:
     transmitter: Any
     weights: Any
     antennas: tuple[Antenna, ...] = field(metadata={"static": True})
+    gains: str = field(metadata={"static": True})
 
     def ordered(self, order: NDArray[np.int64]) -> PoseError:
         """See `Effect.ordered`."""
@@ -152,4 +154,5 @@ def pose_error(
         transmitter=shared[:, -1].astype(np.int64),
         weights=weights,
         antennas=mounting.antennas,
+        gains=str([antenna.record() for antenna in mounting.antennas]),
     )
