@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -79,6 +80,22 @@ def test_links_differ_in_antenna_and_direction(scene: Scene) -> None:
         alone = Tracer(scene, FREQUENCY, SETTINGS, replace(antenna, orientation=orientation), Antenna())
         expected = alone.trace(LinkPositions(links.tx[[link]], links.rx[[link]]))
         np.testing.assert_allclose(mounted.tx_field[mounted.link == link], expected.tx_field, atol=1e-9)
+
+
+@pytest.mark.parametrize("aside", [0.0, 3e-9, 3e-7])
+def test_a_panel_that_points_straight_down_keeps_its_polarization(tmp_path: Path, aside: float) -> None:
+    room = read_scene(write_scene(tmp_path, {"room": block((-4.0, -3.0, 0.0), (5.0, 6.0, 3.0))}), FREQUENCY)
+    settings = TraceSettings(max_depth=2, samples=20_000)
+    # The direct path has the azimuth of the rounding error of a position.
+    links = LinkPositions(tx=np.array([[1.1, 0.7, 2.9]]), rx=np.array([[1.1, 0.7 + aside, 1.3]]))
+    panel = Antenna("tr38901", "V")
+    upwards, downwards = (replace(panel, orientation=(0.6, pitch, 0.0)) for pitch in (-np.pi / 2, np.pi / 2))
+    paths = Tracer(room, FREQUENCY, settings, Antenna(), upwards).trace(links)
+    pose = Pose(*np.array([[0.6], [np.pi / 2], [0.0], [0.0]]))
+    mounted = mount(paths, {"tx": Mounting((panel,), np.zeros(1, int), pose)})
+    expected = Tracer(room, FREQUENCY, settings, downwards, upwards).trace(links)
+    gains = np.abs(path_gains(expected))
+    np.testing.assert_allclose(np.abs(path_gains(mounted)), gains, rtol=1e-6, atol=1e-6 * gains.max())
 
 
 def test_electrical_downtilt_shifts_the_pattern_in_the_antenna_s_frame() -> None:

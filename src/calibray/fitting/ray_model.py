@@ -36,7 +36,7 @@ from calibray.fitting.cheap_replay import METAL
 from calibray.materials import Material
 from calibray.parameters import Parameters
 from calibray.paths import Paths
-from calibray.paths.chains import spherical_basis
+from calibray.tracing.antennas import wave_basis
 
 HALF_SPACE: Final = 1e4
 """Thickness that no wave crosses [m]: it decays within it unless the conductivity is below 1e-6 S/m."""
@@ -213,7 +213,11 @@ class RayModel:
     @cached_property
     def bases(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Axes theta and phi of the fields at both ends [P, 2, 3]."""
-        return _basis(self.paths.departure), _basis(self.paths.arrival)
+        departure, arrival = (
+            np.moveaxis(wave_basis(angles)[1:], -1, 0)
+            for angles in (self.paths.departure, self.paths.arrival)
+        )
+        return departure, arrival
 
     @cached_property
     def _layout(self) -> Layout:
@@ -282,16 +286,6 @@ def _is_half_space(material: Material, frequency: float) -> bool:
     root = np.sqrt(material.relative_permittivity - 1j * loss)
     attenuation = -2 * np.pi * frequency / speed_of_light * root.imag * material.thickness
     return material.thickness > HALF_SPACE / 2 or bool(attenuation > DECAYED)
-
-
-def _basis(zenith_azimuth: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Axes theta and phi [P, 2, 3] of directions [P, 2], [rad]."""
-    zenith, azimuth = zenith_azimuth.T
-    direction = np.stack(
-        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1
-    )
-    theta = spherical_basis(direction)
-    return np.stack([theta, np.cross(direction, theta)], axis=1)
 
 
 def tilted_theta(basis: Any, axis: Any, xp: Any = np) -> Any:

@@ -233,9 +233,11 @@ def rotate(
 
 
 def zenith_azimuth(direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Zenith in [0, pi] and azimuth in (-pi, pi] of unit vectors [..., 2], [rad]."""
+    """Zenith in [0, pi] and azimuth in (-pi, pi] of unit vectors [..., 2], [rad]; the azimuth is 0 near the poles."""
     x, y, z = np.moveaxis(direction, -1, 0)
-    return np.stack([np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)], axis=-1)
+    rho = np.hypot(x, y)
+    # As in `spherical_basis`; rounding errors would give a vertical path any azimuth.
+    return np.stack([np.arctan2(rho, z), np.where(rho < 1e-6, 0.0, np.arctan2(y, x))], axis=-1)
 
 
 def _diffuse(

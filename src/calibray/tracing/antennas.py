@@ -345,8 +345,8 @@ def antenna_response(
     (x, y, z), theta, phi = stored(
         [[sum(row[axis] * vector[axis] for axis in range(3)) for row in rotation] for vector in basis]
     )
-    # A direction along the antenna's own axis has no azimuth; any will do.
-    axial = x**2 + y**2 < 1e-20
+    # A direction along the antenna's own axis has no azimuth; as in `zenith_azimuth`, it is 0.
+    axial = x**2 + y**2 < 1e-12
     rho = xp.sqrt(xp.where(axial, 1.0, x**2 + y**2))
     cos_own, sin_own = xp.where(axial, 1.0, x / rho), xp.where(axial, 0.0, y / rho)
     sin_zenith = xp.where(axial, 0.0, rho)
