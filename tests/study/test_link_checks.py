@@ -10,12 +10,13 @@ import pytest
 import shapely
 from typer.testing import CliRunner
 
+from calibray import engines
 from calibray.calibration.calibrate import calibrate
 from calibray.cli.app import app
 from calibray.errors import InputError
-from calibray.scenes.authoring import Footprints, make_scene
+from calibray.scenes.authoring import Footprints, make_plan_scene, make_scene, read_plan
 from calibray.scenes.checks import SceneSurfaces, building_outlines
-from calibray.study import Study
+from calibray.study import Setup, Study
 from calibray.study.link_checks import examine
 
 MAST = np.array([-5.0, 3.0, 25.0])
@@ -105,6 +106,32 @@ def test_receivers_indoors_of_a_transmitter_outdoors_are_no_mistake(town):
     assert named in suspicions(town, inside)
     assert named not in suspicions(town, inside, trace={"refraction": True})
     assert "receivers are" not in suspicions(town, inside, trace={"refraction": True})
+
+
+def test_a_corridor_that_guides_waves_is_no_mistake(tmp_path):
+    """By the ray tracer, walls, floor and ceiling gain up to 11 dB over free space; watts for milliwatts are 30 dB."""
+    wall = np.array([[0, 0, 40, 0], [0, 2.4, 40, 2.4], [0, 0, 0, 2.4], [40, 0, 40, 2.4]], dtype=float)
+    rows = "".join(",".join(map(str, line)) + ",plasterboard,0.1\n" for line in wall.tolist())
+    (tmp_path / "plan.csv").write_text("x0,y0,x1,y1,type,thickness\n" + rows)
+    scene = make_plan_scene(read_plan(tmp_path / "plan.csv"), tmp_path / "hall", {}).path
+    tx = [0.6, 1.2, 2.2]
+    frame = pd.DataFrame({"x": np.linspace(2, 39, 60), "y": 0.9, "z": 1.4, "loss": 90.0})
+    frame.to_csv(tmp_path / "links.csv", index=False)
+    content = {
+        "version": 1,
+        "scene": {"file": str(scene), "frequency": 60e9},
+        "links": {"file": "links.csv", "tx": tx, "rx": ["x", "y", "z"], "value": "loss"},
+        "trace": {"max_depth": 4, "samples": 100_000},
+        "parameters": {"plasterboard_wall.relative_permittivity": {"bounds": [1.5, 12.0]}},
+    }
+    study = Study.from_content(content, tmp_path / "study.toml")
+    setup = Setup.open(study)
+    modelled = engines.make(setup).path_loss(np.array([[2.0]]))[0]
+    named = "path losses are below free space"
+    for shift, is_named in ((0.0, False), (-30.0, True)):
+        frame.assign(loss=modelled + shift).to_csv(tmp_path / "links.csv", index=False)
+        problems = [finding.problem for finding in examine(study, study.measurements())]
+        assert any(named in problem for problem in problems) == is_named
 
 
 def test_the_gain_of_an_array_is_no_mistake(town):

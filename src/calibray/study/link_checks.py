@@ -26,6 +26,9 @@ from calibray.tracing.settings import Antenna
 BELOW_FREE_SPACE_DB: Final = 6.0
 """Path loss more than this below free space is suspicious [dB]; a ground reflection alone gains up to 6 dB."""
 
+GUIDED_DB: Final = 12.0
+"""The same under a roof [dB]: along a corridor of 40 m by 2.4 m, four reflections gain up to 11 dB at 60 GHz."""
+
 FAR: Final = 10.0
 """Distance from the scene, in scene sizes, at which links cannot belong to it."""
 
@@ -92,7 +95,7 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
         *((finding.problem, finding.remedy) for finding in scale if finding.severity == "error"),
         *_positions(overhead, links, study.links.position == "geographic", study.trace.refraction),
         *_units(study),
-        *_levels(study, links),
+        *_levels(study, links, overhead),
         *_angles(study, links),
         *_antennas(study, links),
         *_averages(study, overhead),
@@ -281,7 +284,7 @@ def _units(study: StudyModel) -> Iterator[tuple[str, str]]:
             yield f"column {name!r} of links.{key} is named like watts or dBW", "convert it to dBm"
 
 
-def _levels(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str]]:
+def _levels(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> Iterator[tuple[str, str]]:
     name, quantity = study.links.value, study.links.quantity
     column_words = words(name)
     if quantity in ("path_loss", "path_gain") and column_words & {"dbm", "rsrp", "rssi", "rss"}:
@@ -306,7 +309,8 @@ def _levels(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str]]
     )
     # The least loss in free space: in the main directions of the best antennas of both ends.
     excess = free_space - gain - links.path_loss_db
-    below = excess > BELOW_FREE_SPACE_DB
+    roofed = overhead.under_roof(links.tx) & overhead.under_roof(links.rx)
+    below = excess > np.where(roofed, GUIDED_DB, BELOW_FREE_SPACE_DB)
     if below.mean() > 0.1:
         median = float(np.median(excess[below]))
         yield (
