@@ -228,6 +228,19 @@ def test_a_column_named_with_any_character_makes_a_study_that_reads(scene, tmp_p
     assert drafted.study.links.rx[0] == "rx_x_m\x7f"
 
 
+@pytest.mark.parametrize(("column", "height"), [("alt", 1.5), ("height", "height")])
+def test_a_column_of_altitudes_that_is_not_used_is_named(scene, tmp_path, column, height):
+    """A drone at 30 to 120 m, whose altitude may count from the ground or from sea level, is not silently a phone."""
+    lon, lat, _ = FRAME.to_geographic([(-20.0, -25.0 + 4 * row, 0.0) for row in range(12)]).T
+    up = np.linspace(30, 120, 12)
+    file = table(tmp_path, mast="a", lon=lon, lat=lat, **{column: up}, rssi_dbm=-60.0 - np.arange(12.0))
+    (tmp_path / "masts.csv").write_text("mast,lon,lat,height\na,9.9897,50.0101,9\n")
+    found = draft(scene, file, tmp_path / "study.toml", tmp_path / "masts.csv", 2.4e9)
+    (reason,) = [each.reason for each in found.assumptions if each.what == "links.rx"]
+    assert found.study.links.rx == ("lon", "lat", height)
+    assert ("alt may count from sea level" in reason) == (column == "alt")
+
+
 @pytest.mark.parametrize(("places", "height"), [(12, 1.5), (2, 10.0)])
 def test_transmitters_that_move_are_as_low_as_receivers(scene, tmp_path, places, height):
     """Vehicle to vehicle: both positions change from row to row. Those of two masts repeat."""
