@@ -224,3 +224,12 @@ def test_further_priors_extend_those_of_a_study():
     more = prior.extended([3], [2.0], 0.1)
     assert (more.index, more.centre, more.spread) == ((0, 2, 3), (4.0, 1.0, 2.0), (0.3, 5.0, 0.1))
     assert (more.linear, more.like) == (prior.linear, prior.like)
+    # A value of 0 has no logarithm; only a scattering coefficient can have it.
+    zero = prior.extended([3, 4], [2.0, 0.0], 0.1)
+    assert (zero.spread, zero.linear) == ((0.3, 5.0, 0.1, 0.25), (2, 4))
+
+
+def test_points_below_the_lower_bound_have_its_value():
+    parameters = Parameters((Parameter("walls.scattering_coefficient", 0.0, 0.75, 0.0, at_lower=0.25),))
+    assert parameters.from_unit([[0.0], [0.1], [0.25], [0.5], [1.0]])[:, 0].tolist() == [0, 0, 0, 0.25, 0.75]
+    assert parameters.from_unit(parameters.to_unit([[0.0], [0.3]])) == pytest.approx(np.array([[0.0], [0.3]]))

@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import halfnorm
 
 import planted
 from calibray import calibrate, engines, fields
@@ -151,6 +152,53 @@ def test_a_thickness_that_is_not_known_exactly_widens_the_interval(problem):
     without = list(uncertain.record.intervals.values())[widest].without
     assert 1.0 / ratio[widest] < without[Cause.CONSTANTS] < 0.85
     assert all(Cause.CONSTANTS not in interval.without for interval in exact.record.intervals.values())
+
+
+SCATTER = "marble.scattering_coefficient"
+
+
+def test_a_scattering_coefficient_of_0_is_exact_with_a_probability_of_one_half(problem):
+    best = problem.parameters.to_search(np.array(list(planted.TRUTH.values())))
+    problem = _measuring(problem, problem.modelled(best[None])[0])
+    model = joint_model(problem, best, 0.3**2, problem.freedom)
+    index = model.parameters.names.index(SCATTER)
+    drawn = model.parameters.from_unit(model.draw_prior(20_000, np.random.default_rng(3)))[:, index]
+    assert np.mean(drawn == 0.0) == pytest.approx(0.5, abs=0.015)
+    assert drawn.min() == 0.0
+    # The positive half of a Gaussian with a standard deviation of 0.25, up to three of them.
+    half = halfnorm(scale=0.25)
+    levels = half.cdf([0.1, 0.25, 0.5]) / half.cdf(0.75)
+    assert [np.mean(drawn[drawn > 0] < each) for each in (0.1, 0.25, 0.5)] == pytest.approx(levels, abs=0.015)
+    # What it changes: it weakens reflections by the factor 1 - S^2, and those of marble are a part of the power.
+    assert 0 < model.effects_db[SCATTER] < -10 * np.log10(1 - 0.25**2) + 1e-6
+    # A study that states 0 is believed.
+    materials = {"marble": {"scattering_coefficient": 0.0}, "wood": {"conductivity": 0.01}}
+    smooth = planted.content("links.csv", noise=None, materials=materials)
+    stated = replace(problem, setup=replace(problem.setup, study=Study.from_content(smooth)))
+    exact = joint_model(stated, best, 0.3**2, problem.freedom)
+    assert {*model.parameters.names} - {*exact.parameters.names} == {SCATTER}
+
+
+def test_walls_that_scatter_have_no_gaps_at_the_truth(problem):
+    """Without a scattering coefficient, no permittivities are free of gaps."""
+    study = problem.parameters
+    best = study.to_search(np.array(list(planted.TRUTH.values())))
+    every = replace(study, items=(*study.items, Parameter(SCATTER, 0.0, 0.9, 0.0)))
+    truth = np.array([[*planted.TRUTH.values(), 0.4]])
+    replay = split_replay(problem, every, by_building=False)
+    here = _measuring(problem, replay.path_loss(truth, np.ones((1, len(every))))[0])
+    trail = search(here, LeastSquares(*study.search_bounds, starts=16))
+    assert trail.best_value > 0.05
+    model = joint_model(here, best, 0.3**2, here.freedom)
+    start = dict(zip(model.parameters.names, model.parameters.start, strict=True))
+    value = np.array([[*(start | planted.TRUTH | {SCATTER: 0.4}).values()]])
+    none = np.zeros((1, len(model.parameter_of)))
+    assert model.gaps(model.parameters.to_unit(value), none) == pytest.approx(0.0, abs=1e-6)
+    assert np.abs(model.gaps(model.parameters.to_unit(value * (value != 0.4)), none)).max() > 0.05
+
+
+def _measuring(problem: Problem, measured_db: np.ndarray) -> Problem:
+    return replace(problem, objective=replace(problem.objective, measured=measured_db))
 
 
 def at_carriers(problem: Problem) -> Problem:

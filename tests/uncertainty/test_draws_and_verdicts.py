@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from scipy.stats import norm, t
 
+from calibray.result.verdict import Reason, ReasonKind, Verdict
 from calibray.result.wording import reason_text
+from calibray.uncertainty import assessment
 from calibray.uncertainty.draws import Draws
-from calibray.uncertainty.verdicts import Axes, credible_sets, verdicts
+from calibray.uncertainty.verdicts import Axes, JudgedSet, credible_sets, verdicts
 
 NAMES = ("walls.relative_permittivity", "glass.relative_permittivity")
 
@@ -192,3 +194,16 @@ def test_wider_bounds_do_not_improve_a_verdict():
     assert "of a usual range" in reason_text(told(40.0, np.full(1, 10.0)).reason)
     # Narrower bounds count as they are.
     assert told(10.0, np.full(1, 1000.0)).name == "weakly identified"
+
+
+def test_sets_for_the_measured_buildings_are_reported_where_they_differ():
+    def differ(*seen):
+        whole = JudgedSet(((1.5, 12.0),), Verdict.NOT_IDENTIFIABLE, Reason(ReasonKind.NO_EFFECT), seen)
+        return assessment._differ(whole)
+
+    assert not differ((1.5, 12.0))
+    # A gap of 6 % is chance, and not another interval.
+    assert not differ((1.5, 10.0), (10.63, 12.0))
+    assert differ((1.5, 5.0), (7.0, 12.0))
+    assert differ((1.5, 10.5))
+    assert not differ((1.5, 11.2))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
-from math import exp, inf, isfinite, log
+from math import exp, inf, isfinite, log, pi, sqrt
 from types import MappingProxyType
 from typing import Final, Literal, NamedTuple, get_args
 
@@ -94,6 +94,8 @@ class Parameter:
         upper: Upper bound, in the field's unit.
         start: Value before calibration, within the bounds, in the field's unit.
         scale: "linear", or "log" for a constant that spans decades; then `lower` must be greater than 0.
+        at_lower: Length of the search space whose points all have the value `lower`: with a prior, exactly this value
+            has a probability.
 
     Raises:
         InputError: The field is unknown, or bounds or start are out of order or physically impossible.
@@ -108,6 +110,7 @@ class Parameter:
     upper: float
     start: float
     scale: Scale = "linear"
+    at_lower: float = 0.0
 
     def __post_init__(self) -> None:
         split_name(self.name)
@@ -159,16 +162,29 @@ class Parameter:
         return is_effect(self.name)
 
 
+SCATTERING: Final = 0.25
+"""Standard deviation of a scattering coefficient of which a scene says 0, unless it is exactly 0. Facades have 0.2 to
+0.4 (V. Degli-Esposti et al., IEEE Trans. Antennas and Propagation 55, 2007)."""
+
+
 def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:
     """A parameter for a constant that a scene fixes, within four standard deviations of its logarithm.
 
-    None if the constant is 0 or these values are impossible for it.
+    A scattering coefficient of 0 is exactly 0 with a probability of one half, and otherwise has the positive half of a
+    Gaussian with the standard deviation `SCATTERING` as its prior. None if another constant is 0, if these values are
+    impossible, or if the spread is 0.
 
     Example:
         >>> fixed_constant("walls.thickness", 0.2, 0.1).upper
         0.298364939528...
+        >>> fixed_constant("walls.scattering_coefficient", 0.0, 0.1).upper
+        0.75
     """
-    bound, factor = PARAMETER_BOUNDS[split_name(name)[1]], exp(4.0 * spread)
+    constant = split_name(name)[1]
+    if constant == "scattering_coefficient" and value == 0.0 and spread > 0.0:
+        # As long as the integral of the half Gaussian, whose density is 1 at 0.
+        return Parameter(name, 0.0, 3.0 * SCATTERING, 0.0, at_lower=SCATTERING * sqrt(pi / 2.0))
+    bound, factor = PARAMETER_BOUNDS[constant], exp(4.0 * spread)
     # The range ends at a physical bound, such as 1 for a scattering coefficient.
     lower, upper = value / factor, min(value * factor, bound.upper)
     if value <= 0.0 or spread <= 0.0 or lower not in bound or upper not in bound or lower >= upper:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from calibray.parameters.parameter import SCATTERING
 from calibray.parameters.space import Parameters
 
 
@@ -41,12 +42,19 @@ class LogNormal:
         return len(self.index)
 
     def extended(self, index: Sequence[int], centre: Sequence[float], spread: float) -> LogNormal:
-        """These priors, and independent priors of further parameters with one spread of their logarithms."""
+        """These priors, and independent priors of further parameters with one spread of their logarithms.
+
+        Scattering coefficients around 0 have the standard deviation `SCATTERING`.
+        """
         return replace(
             self,
             index=(*self.index, *index),
             centre=(*self.centre, *centre),
-            spread=(*self.spread, *(spread for _ in index)),
+            spread=(*self.spread, *(spread if value > 0 else SCATTERING for value in centre)),
+            linear=(
+                *self.linear,
+                *(number for number, value in zip(index, centre, strict=True) if value == 0),
+            ),
         )
 
     def residuals(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:

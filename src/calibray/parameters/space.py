@@ -310,7 +310,8 @@ class Parameters:
     @property
     def search_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The lower and the upper bounds [parameters] of the search space."""
-        return self.to_search(self.lower), self.to_search(self.upper)
+        at_lower = np.array([parameter.at_lower for parameter in self.items], dtype=np.float64)
+        return self.to_search(self.lower) - at_lower, self.to_search(self.upper)
 
     def to_search(self, candidates: ArrayLike) -> NDArray[np.float64]:
         """Convert candidates [..., parameters] to points of the search space."""

@@ -213,6 +213,7 @@ class NoiseSection(Section):
         heterogeneity: Between-building spread of a material's constants, 0 for none, or "auto".
         constants_spread: Standard deviation of the logarithm of thickness, conductivity and scattering coefficient of
             calibrated materials that are not parameters: how well the scene's values are known; 0 if they are exact.
+            A scattering coefficient of 0 has a prior of its own, unless this is 0.
     """
 
     std_db: Annotated[float, Field(gt=0)] | None = None

@@ -56,7 +56,7 @@ class MaterialSection(Section):
         relative_permittivity: Real part of the relative permittivity [1].
         conductivity: Conductivity [S/m].
         thickness: Thickness [m].
-        scattering_coefficient: Scattering coefficient [1].
+        scattering_coefficient: Scattering coefficient [1]; 0 is exact, unlike that of a scene.
         xpd_coefficient: Cross-polarization discrimination coefficient [1].
         scattering_pattern: "lambertian", "directive" or "backscattering".
         alpha_r: Exponent [1] of the lobe around the specular direction.

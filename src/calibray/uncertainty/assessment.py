@@ -60,8 +60,8 @@ MAX_COLUMNS: Final = 100
 """Number of columns of the nuisance up to which the draws include its coefficients."""
 
 SHOWN_DIFFERENCE: Final = 0.1
-"""Smallest difference between the intervals of measured and of all buildings that is reported, as a share of the
-width."""
+"""Smallest difference between the sets for the measured and for all buildings that is reported, as a share of their
+range."""
 
 CUSTOMARY: Final = {("relative_permittivity", "linear"): 10.0, ("conductivity", "log"): float(np.log(1000.0))}
 """Usual widths of ranges: permittivities of building materials are between 2 and 12, and conductivities within three
@@ -284,11 +284,11 @@ def _intervals(
 
 
 def _differ(verdict: JudgedSet) -> bool:
-    """Whether the interval for the measured buildings differs from that of the mean by a tenth of its width."""
-    one, other = np.array(verdict.pieces), np.array(verdict.seen)
-    return one.shape != other.shape or np.abs(one - other).max() > SHOWN_DIFFERENCE * (
-        verdict.upper - verdict.lower
-    )
+    """Whether the sets for the measured buildings and for the mean differ on more than a tenth of their range."""
+    both = (np.array(verdict.pieces), np.array(verdict.seen))
+    line = np.linspace(min(each.min() for each in both), max(each.max() for each in both), 1000)
+    one, other = (((each[:, :1] <= line) & (line <= each[:, 1:])).any(axis=0) for each in both)
+    return bool(np.mean(one != other) > SHOWN_DIFFERENCE)
 
 
 def _named_draws(problem: Problem, model: JointModel, posterior: Posterior) -> dict[str, list[float]]:

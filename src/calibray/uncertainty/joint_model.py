@@ -2,7 +2,7 @@
 
 - The study's parameters have flat priors over their bounds, or the priors that the study declares.
 - Constants of the same materials that the scene fixes, such as thickness, have a log-normal prior around the scene's
-  value, because nobody knows them exactly.
+  value, because nobody knows them exactly. A scattering coefficient of 0 is exact with a probability of one half.
 - The walls of building b have the constants x exp(s z_b), where x is the material's mean and z_b is standard normal.
   The between-building spread s is zero with probability `ALIKE`, otherwise exponential.
 - Errors follow one of several noise models (`noise_models.py`), whose level, nuisances and undeclared offset are
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from calibray.fitting.nuisance import CONSTANT
 from calibray.fitting.problem import Problem
 from calibray.measurements import FEW
-from calibray.parameters import LogNormal, Parameter, Parameters, fixed_constant, split_name
+from calibray.parameters import SCATTERING, LogNormal, Parameter, Parameters, fixed_constant, split_name
 from calibray.uncertainty.buildings import can_split, replayed_materials, split_replay
 from calibray.uncertainty.noise_models import HEAVY, Marginal, excess_db, noise_models
 
@@ -310,9 +310,10 @@ def _with_constants(
     if fixed:
         values = np.append(study.from_search(best), [item.start for item in fixed])
         # One row per fixed constant, in which it is larger by one standard deviation.
-        steps = np.exp(known_to * np.eye(len(values))[len(study) :])
+        one = np.eye(len(values))[len(study) :]
+        larger = values * np.exp(known_to * one) + SCATTERING * one * (values == 0)
         alike = np.ones((len(values) - len(study) + 1, len(replay.parameter_of)))
-        gaps = gap(loss_at(np.vstack([values, values * steps]), alike))
+        gaps = gap(loss_at(np.vstack([values, larger]), alike))
         with np.errstate(invalid="ignore"):  # inf - inf for a censored link without a path
             change = gaps[1:] - gaps[:1]
         effect_db = np.sqrt(np.mean(np.where(np.isfinite(change), change, 0.0) ** 2, axis=1))
@@ -374,8 +375,13 @@ def has_offset(problem: Problem) -> bool:
 
 
 def _fixed_constants(problem: Problem) -> list[Parameter]:
-    """Constants that the scene fixes, equal at all carriers, of the materials that have a parameter."""
-    materials, spread = problem.engine.materials, problem.setup.study.noise.constants_spread
+    """Constants that the scene fixes, equal at all carriers, of the materials that have a parameter.
+
+    A scattering coefficient of 0 that the study states is exact.
+    """
+    study = problem.setup.study
+    materials, spread = problem.engine.materials, study.noise.constants_spread
+    smooth = {name for name, stated in study.materials.items() if stated.scattering_coefficient == 0}
     replayed = replayed_materials(problem)
     calibrated, _ = problem.parameters.at_carrier(problem.parameters.frequency)
     names = [
@@ -391,7 +397,8 @@ def _fixed_constants(problem: Problem) -> list[Parameter]:
         value = getattr(materials[material], field_name)
         constant = fixed_constant(name, float(value), spread)
         varies = any(getattr(each[material], field_name) != value for each in replayed)
-        if name not in calibrated.names and constant is not None and not varies:
+        exact = field_name == "scattering_coefficient" and value == 0 and material in smooth
+        if name not in calibrated.names and constant is not None and not varies and not exact:
             items.append(constant)
     return items
 
