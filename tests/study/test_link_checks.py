@@ -108,6 +108,16 @@ def test_receivers_indoors_of_a_transmitter_outdoors_are_no_mistake(town):
     assert "receivers are" not in suspicions(town, inside, trace={"refraction": True})
 
 
+@pytest.mark.parametrize(("unit", "is_named"), [("ns", False), ("us", True), ("m", False)])
+def test_delays_of_paths_far_longer_than_the_scene_are_named(town, unit, is_named):
+    """Delay spreads of some 30 ns in a town of 200 m; in microseconds they are those of paths of 9 km."""
+    frame = links().assign(spread=np.linspace(5.0, 60.0, 60))
+    observables = {"ds": {"kind": "rms_delay_spread", "column": "spread", "unit": unit}}
+    named = "column 'spread' [us] is the time of light over 9743 m"
+    assert (named in suspicions(town, frame, observables=observables)) == is_named
+    assert is_named or suspicions(town, frame, observables=observables) == ""
+
+
 def test_a_corridor_that_guides_waves_is_no_mistake(tmp_path):
     """By the ray tracer, walls, floor and ceiling gain up to 11 dB over free space; watts for milliwatts are 30 dB."""
     wall = np.array([[0, 0, 40, 0], [0, 2.4, 40, 2.4], [0, 0, 0, 2.4], [40, 0, 40, 2.4]], dtype=float)

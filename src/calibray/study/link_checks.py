@@ -16,6 +16,7 @@ from scipy.constants import speed_of_light
 from calibray.errors import InputError
 from calibray.measurements import FEW, Measurements
 from calibray.measurements.column_names import LENGTH_UNITS, WATTS, find_length_unit, words
+from calibray.measurements.observables import KINDS
 from calibray.measurements.placement import NOT_ON_TRACK
 from calibray.scenes.checks import Finding, SceneSurfaces, scale_findings
 from calibray.study.model import StudyModel
@@ -96,6 +97,7 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
         *_positions(overhead, links, study.links.position == "geographic", study.trace.refraction),
         *_units(study),
         *_levels(study, links, overhead),
+        *_delays(study, links, overhead),
         *_angles(study, links),
         *_antennas(study, links),
         *_averages(study, overhead),
@@ -317,6 +319,23 @@ def _levels(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> 
             f"{int(below.sum())} of {len(links)} path losses are below free space, by a median of {median:.0f} dB",
             "check tx_power_dbm (30 dB: watts for milliwatts), gains included in the values, scene.frequency, the sign",
         )
+
+
+def _delays(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> Iterator[tuple[str, str]]:
+    """Whether most measured delays are those of paths that are far longer than the scene is wide."""
+    longest = FAR * max(float(np.max(overhead.bounds[3:5] - overhead.bounds[:2])), 100.0)
+    for name, section in study.observables.items():
+        # Devices add unknown delays to times of flight, which are stated as a bias.
+        if KINDS[section.kind] != "s" or section.column is None or section.bias is not None:
+            continue
+        measured = links.table.numbers(section.column, gaps=True) * section.scale
+        length = float(np.nanmedian(measured)) * speed_of_light if np.isfinite(measured).any() else 0.0
+        if length > longest:
+            yield (
+                f"the median of column {section.column!r} [{section.unit}] is the time of light over {length:.0f} m, "
+                f"more than {FAR:g} times the size of the scene",
+                f"check observables.{name}.unit",
+            )
 
 
 def _angles(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str]]:
