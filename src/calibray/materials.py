@@ -7,7 +7,7 @@ so the default "P.2040-3" gives the same numbers below 100 GHz.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from math import inf, isfinite
 from numbers import Real
@@ -176,6 +176,14 @@ class ItuLaw(NamedTuple):
 def frequency_independent_law(material: Material) -> ItuLaw:
     """The law of a material whose constants are the same at all frequencies."""
     return ItuLaw(0, inf, material.relative_permittivity, 0.0, material.conductivity, 0.0)
+
+
+def law_with_stated(law: ItuLaw, material: Material, stated: Collection[str]) -> ItuLaw:
+    """The law of a material of which some fields are stated as numbers, which do not depend on frequency."""
+    # P.2040: permittivity a f^b, conductivity c f^d.
+    if "relative_permittivity" in stated:
+        law = law._replace(a=material.relative_permittivity, b=0.0)
+    return law._replace(c=material.conductivity, d=0.0) if "conductivity" in stated else law
 
 
 _Table = Mapping[str, tuple[ItuLaw, ...]]

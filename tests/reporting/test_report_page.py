@@ -358,9 +358,11 @@ def test_the_summary_says_which_parameters_are_identified(result):
     assert f"{unidentified} is not identifiable" in text
     assert "outside their intervals" not in text
     outside = changed(known, remarks=(Remark(RemarkKind.OUTSIDE_INTERVAL, {"names": [unidentified]}),))
-    assert f"Calibrated values outside their intervals: {unidentified}." in answer(
-        outside, "How certain are the values?"
-    )
+    text = answer(outside, "How certain are the values?")
+    assert f"Calibrated values outside their intervals: {unidentified}." in text
+    # The values inside are many; none of them has to be more probable than the calibrated one.
+    assert "nearly all probable values are inside" in text
+    assert "more probable" not in text
     # One range, which does not contain the calibrated value, is ambiguous, too.
     one_range = changed(
         result, intervals={name: consistent(Interval(0.1, 2.0, 3.0, "identified"), 9.0) for name in verdicts}

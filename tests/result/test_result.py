@@ -97,7 +97,7 @@ def test_the_fallback_predicts_where_no_path_leads(result):
     [
         (
             lambda links: links.assign(half="north"),
-            "group 'north' has no calibrated offset; the calibrated groups are east, west",
+            "group 'north' has no calibrated offset; the calibrated groups are east, west; with an interval \\(--level",
         ),
         (lambda links: links.drop(columns="half"), "no column 'half'"),
         (lambda links: links.drop(columns="rx_z"), "no column 'rx_z'"),

@@ -13,6 +13,7 @@ from calibray.calibration.result import Result
 from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.fields import path_loss
+from calibray.materials import itu_material
 from calibray.paths import Kind
 from calibray.reporting.wording import scene_alone_text
 from calibray.scenes.checks import SceneSurfaces
@@ -33,6 +34,19 @@ def paths():
 def opened(**sections) -> Setup:
     content = planted.content("links.csv", **sections)
     return Setup.open(Study.from_content(content), links=links_from_frame(planted.links()))
+
+
+def test_a_stated_constant_of_a_facade_leaves_the_other_its_law_over_frequency():
+    setup = opened(
+        facades=GROUND_FLOOR,
+        materials={"shop": {"itu": "glass", "relative_permittivity": 5.0}},
+        parameters={"shop.itu_c": {"bounds": [1e-4, 1.0]}},
+    )
+    parameters = setup.parameters
+    for carrier in (setup.study.scene.frequency, 28e9):
+        shop = parameters.materials(parameters.start, setup.scene.materials, carrier)["shop"]
+        assert shop.relative_permittivity == 5.0
+        assert shop.conductivity == pytest.approx(itu_material("glass", carrier).conductivity)
 
 
 def names_of(paths) -> np.ndarray:

@@ -129,6 +129,19 @@ def test_the_noise_floor_is_that_of_the_least_sensitive_receiver(scene, tmp_path
     assert any("none of receiver B is lower" in each.reason for each in found.assumptions)
 
 
+def test_the_noise_floor_is_that_of_the_least_sensitive_receiver_that_states_it(scene, tmp_path):
+    """Each receiver writes its own floor for what it does not receive."""
+    power = np.random.default_rng(4).uniform(-110.0, -60.0, 180).round(1)
+    floor = np.repeat([-92.0, -80.0, -85.0], 60)
+    rows = {"x": np.tile(np.linspace(-40, 10, 60), 3), "y": 20.0, "rsrp_dbm": np.maximum(power, floor)}
+    file = table(tmp_path, **rows, receiver=np.repeat(["A", "B", "C"], 60))
+    found = draft(scene, file, tmp_path / "study.toml", frequency=3.5e9, tx=[-30.0, 0.0, 9.0])
+    assert found.study.links.noise_floor_dbm == -80.0
+    assert any("of receiver B equal its lowest one" in each.reason for each in found.assumptions)
+    # The received powers of all receivers are above it, and none of them is a floor.
+    assert sorted(-found.study.measurements().path_loss_db) == sorted(power[power > -80.0])
+
+
 def test_values_at_the_ends_of_what_a_receiver_states_are_no_measurements(tmp_path, scene):
     """Each access point of a wide table has a third of its values at either end."""
     power = np.random.default_rng(7).normal(-75.0, 15.0, (200, 2)).round(1).clip(-82.0, -68.0)
@@ -213,6 +226,19 @@ def test_a_column_named_with_any_character_makes_a_study_that_reads(scene, tmp_p
     assert tomllib.loads(text)["links"] == {"rx": list(columns), "x\x7f": 1}
     drafted = draft(scene, file, tmp_path / "study.toml", tx=[0.0, 0.0, 12.0], frequency=3.5e9)
     assert drafted.study.links.rx[0] == "rx_x_m\x7f"
+
+
+@pytest.mark.parametrize(("column", "height"), [("alt", 1.5), ("height", "height")])
+def test_a_column_of_altitudes_that_is_not_used_is_named(scene, tmp_path, column, height):
+    """A drone at 30 to 120 m, whose altitude may count from the ground or from sea level, is not silently a phone."""
+    lon, lat, _ = FRAME.to_geographic([(-20.0, -25.0 + 4 * row, 0.0) for row in range(12)]).T
+    up = np.linspace(30, 120, 12)
+    file = table(tmp_path, mast="a", lon=lon, lat=lat, **{column: up}, rssi_dbm=-60.0 - np.arange(12.0))
+    (tmp_path / "masts.csv").write_text("mast,lon,lat,height\na,9.9897,50.0101,9\n")
+    found = draft(scene, file, tmp_path / "study.toml", tmp_path / "masts.csv", 2.4e9)
+    (reason,) = [each.reason for each in found.assumptions if each.what == "links.rx"]
+    assert found.study.links.rx == ("lon", "lat", height)
+    assert ("alt may count from sea level" in reason) == (column == "alt")
 
 
 @pytest.mark.parametrize(("places", "height"), [(12, 1.5), (2, 10.0)])

@@ -7,11 +7,15 @@ import os
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import synthetic
+from calibray.fields import path_loss
+from calibray.study import Setup, Study
 from calibray.support import cache_folder as caching
 from calibray.tracing import cache
+from small_scenes import block, write_scene
 
 
 @pytest.fixture
@@ -96,3 +100,35 @@ def test_a_stored_trace_is_used_whatever_the_umask(entry):
     finally:
         os.umask(old)
     assert cache.load_trace("e") is not None
+
+
+def test_a_mesh_that_changed_after_it_was_loaded_leaves_no_trace_for_its_new_content(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(caching.CACHE_VARIABLE, str(tmp_path / "cache"))
+
+    def scene(west: float) -> Path:
+        ground = [[(-60.0, -60.0, 0.0), (60.0, -60.0, 0.0), (60.0, 60.0, 0.0), (-60.0, 60.0, 0.0)]]
+        wall = block((west, -30.0, 0.0), (west + 4.0, 30.0, 9.0))
+        return write_scene(tmp_path, {"ground": ground, "wall": wall})
+
+    columns = ["tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z"]
+    link = pd.DataFrame([[0.0, 0.0, 5.0, 0.0, 20.0, 1.5]], columns=columns)
+    link.assign(path_loss_db=80.0).to_csv(tmp_path / "links.csv", index=False)
+    content = {
+        "version": 1,
+        "scene": {"file": str(scene(10.0)), "frequency": 3.5e9},
+        "links": {"file": "links.csv", "tx": columns[:3], "rx": columns[3:], "value": "path_loss_db"},
+        "trace": {"max_depth": 1, "samples": 20_000},
+        "parameters": {"stone.relative_permittivity": {"bounds": [2.0, 9.0]}},
+    }
+    study = Study.from_content(content, tmp_path / "study.toml")
+    opened = Setup.open(study)
+    before = opened.tracer.trace(opened.links)
+    scene(12.0)
+    # What is opened stays as it was read.
+    assert path_loss(opened.trace()) == pytest.approx(path_loss(before), abs=1e-9)
+    again = Setup.open(study)
+    expected = path_loss(again.tracer.trace(again.links))
+    assert abs(expected - path_loss(before)) > 0.01
+    assert path_loss(again.trace()) == pytest.approx(expected, abs=1e-9)

@@ -364,7 +364,7 @@ millimetre at best, and conversions of coordinates differ by micrometres."""
 def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
     """Merge the rows of one link: its first row, with means of linear power, of weights and of further observables.
 
-    Rows belong to one link if their positions agree within `SAME_POSITION`, and transmitter, groups, carrier,
+    Rows belong to one link if their positions agree within `SAME_POSITION`, and transmitter, kept columns, carrier,
     transmitted power and times are equal. Rows at different times stay separate links. A link below the noise floor is
     not merged with one above it, and a held-out row not with others. Receivers inside buildings are moved later: two
     positions may be moved to the same corner. The steps `keep`, `held_out`, `observables`, `transmitter`,

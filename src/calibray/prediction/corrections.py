@@ -135,7 +135,7 @@ def nuisance_shift(
             new_label = str(labels[int(np.argmax(group < 0))])
             raise InputError(
                 f"{links.source}: group {new_label!r} has no calibrated {term.name}; the calibrated groups are "
-                f"{', '.join(term.coefficients)}"
+                f"{', '.join(term.coefficients)}; with an interval (--level, predict_interval), others get the mean"
             )
         mean = coefficients.mean(axis=1, keepdims=True)
         value += term.column * np.where(group >= 0, coefficients[:, group], mean)

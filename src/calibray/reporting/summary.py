@@ -144,8 +144,8 @@ def _certainty(result: Record) -> Iterator[Sentence]:
             names = _list(cast("list[str]", remark.values["names"]))
             yield Sentence(
                 "",
-                f"Calibrated values outside their intervals: {names}. They have the lowest RMSE, but values inside are "
-                "more probable. Do not use them as constants of the materials.",
+                f"Calibrated values outside their intervals: {names}. They have the lowest RMSE, but nearly all "
+                "probable values are inside. Do not use them as constants of the materials.",
                 "caution",
             )
 

@@ -31,6 +31,7 @@ from calibray.materials import (
     frequency_independent_law,
     itu_law,
     itu_material,
+    law_with_stated,
 )
 from calibray.scenes.scene_file import (
     MESHES,
@@ -288,18 +289,10 @@ def _material(
             material = replace(_file_material(original, bsdf, frequency), **constants)
     except InputError as error:
         raise InputError(f"{path}: material {name!r}: {error}") from None
-    steady = frequency_independent_law(material)
     itu = _itu_type(original, bsdf) if itu is None else itu
     if itu is None or bulk_given:
-        return material, steady
-    law = itu_law(str(itu), frequency, str(revision))
-    # A constant given as a number does not depend on frequency.
-    if "relative_permittivity" in constants:
-        # P.2040: permittivity a f^b, conductivity c f^d.
-        law = law._replace(a=steady.a, b=0.0)
-    if "conductivity" in constants:
-        law = law._replace(c=steady.c, d=0.0)
-    return material, law
+        return material, frequency_independent_law(material)
+    return material, law_with_stated(itu_law(str(itu), frequency, str(revision)), material, constants)
 
 
 def _file_material(name: str, bsdf: ElementTree.Element | None, frequency: float) -> Material:

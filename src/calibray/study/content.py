@@ -121,7 +121,7 @@ class StudyContent(Section, ABC):
             f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",
             "links.frequency": self.links.frequency is not None,
             "[observables]": bool(self.observables),
-            "coefficients of laws": any(".itu_" in name for name in self.parameters),
+            **self._laws(),
         }
         key = _first_stated(refused)
         if isinstance(getattr(self.engine, "rays", None), str) and self.links.frequency is not None:
@@ -135,12 +135,19 @@ class StudyContent(Section, ABC):
                 f"{key}; remove one of them"
             )
 
+    def _laws(self) -> dict[str, bool]:
+        """Whether parameters are coefficients of laws over frequency."""
+        return {
+            "coefficients of laws": any(split_name(name)[1].startswith("itu_") for name in self.parameters)
+        }
+
     def _without_replay(self) -> dict[str, bool]:
         """Whether keys are stated that do not go with replay of sums of powers at one carrier."""
         return {
             "links.frequency": self.links.frequency is not None,
             f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",
             f"engine.name = {self.engine.name!r}": self.engine.name != "replay",
+            **self._laws(),
         }
 
     def _check_observables(self) -> None:

@@ -58,7 +58,7 @@ class Displacement:
         field: "height" of the transmitters, or "dx" or "dy" of the receivers.
         weights: 1 where a parameter displaces a group of links [G, parameters].
         group: Group of every link [L].
-        reach: Largest displacement of every group within the bounds [G], [m].
+        reach: Largest displacement of every group by one of its parameters [G], [m]; sums count up to it.
     """
 
     field: str

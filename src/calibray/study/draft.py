@@ -148,21 +148,25 @@ def _add_noise_floor(draft: LinksDraft, value: ValueColumn) -> None:
             draft.assume("links.where", draft.section["where"], missing)
         return
     _leave_out_saturated(draft, value, column)
-    lowest, share = float(column.min()), _share_at_lowest(column)
+    floor, reason, share = -np.inf, "", _share_at_lowest(column)
+    some_missing = share == 0 and "wide" not in draft.section and column.isna().any()
     if share > 0:
-        floor, reason = lowest, f"{share:.0%} of the values equal the lowest one"
-    elif column.isna().any() and "wide" not in draft.section:
-        floor, reason = float(np.floor(lowest)), f"{missing}, and none is lower"
-        # A floor below that of the least sensitive device would count its missing powers as weaker than they are.
-        for name in transmitter_columns.find_devices(draft.table.frame):
-            for device, values in column.groupby(draft.table.frame[name]):
-                lacks = values.isna().mean() > MISSING_SHARE and values.notna().sum() >= FEWEST_OF_DEVICE
-                if lacks and np.floor(values.min()) > floor:
-                    floor = float(np.floor(values.min()))
-                    reason = (
-                        f"{missing}, and none of {name} {shortened(device)} is lower, the least sensitive"
-                    )
-    else:
+        floor, reason = float(column.min()), f"{share:.0%} of the values equal the lowest one"
+    elif some_missing:
+        floor, reason = float(np.floor(column.min())), f"{missing}, and none is lower"
+    # A floor below that of the least sensitive device would count what it does not receive as weaker than it is.
+    for name in transmitter_columns.find_devices(draft.table.frame):
+        for device, values in column.groupby(draft.table.frame[name]):
+            if values.notna().sum() < FEWEST_OF_DEVICE:
+                continue
+            lowest, which = float(values.min()), f"{name} {shortened(device)}"
+            if (share := _share_at_lowest(values)) and lowest > floor:
+                floor = lowest
+                reason = f"{share:.0%} of the values of {which} equal its lowest one, the least sensitive"
+            elif some_missing and values.isna().mean() > MISSING_SHARE and np.floor(lowest) > floor:
+                floor = float(np.floor(lowest))
+                reason = f"{missing}, and none of {which} is lower, the least sensitive"
+    if not reason:
         return
     draft.section["noise_floor_dbm"] = floor
     draft.assume("links.noise_floor_dbm", f"{floor:g} dBm", reason)

@@ -37,6 +37,9 @@ from calibray.study.study import Study
 RECEIVER_HEIGHT: Final = 1.5
 """Height of a receiver without a column of heights [m]: a phone in the hand."""
 
+ALTITUDES: Final = frozenset({"alt", "altitude", "altitud", "amsl", "asl", "msl", "nhn"})
+"""Words of columns of altitudes, which satellite receivers count from sea level and drones also from the ground."""
+
 TRANSMITTER_HEIGHT: Final = 10.0
 """Height of a transmitter without a column of heights [m]: a small cell on a mast."""
 
@@ -361,7 +364,11 @@ class LinksDraft:
         reason = f"columns named as {unit}" if "position_unit" not in self.section else "by their names"
         if unit == "degrees" and not column_names.matches(rx.x, "longitude"):
             reason = "its numbers are on the scene as degrees"
-        reason += "" if rx.height else f"; no height: {RECEIVER_HEIGHT} m"
+        if rx.height is None:
+            reason += f"; no height: {RECEIVER_HEIGHT} m"
+            unused = [str(name) for name in self.table.frame if column_names.words(name) & ALTITUDES]
+            if unused:
+                reason += f" ({unused[0]} may count from sea level; name a height above the ground 'height')"
         self.assume("links.rx", ", ".join(map(str, self.section["rx"])), reason)
         if rx.position != "geographic":
             return

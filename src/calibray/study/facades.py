@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from scipy.constants import speed_of_light
 
 from calibray.errors import InputError
-from calibray.materials import DEFAULT_REVISION, Material, frequency_independent_law, itu_law, itu_material
+from calibray.materials import DEFAULT_REVISION, Material, itu_law, itu_material, law_with_stated
 from calibray.parameters import Parameters
 from calibray.parameters.parameter import ROUGHNESS
 from calibray.paths import Kind, Paths
@@ -105,11 +105,9 @@ def with_facade_materials(
             law = itu_law(str(itu), frequency, revision)
         if stated:
             material = replace(material, **stated)  # type: ignore[arg-type]
-        if {"relative_permittivity", "conductivity"} & set(stated):
-            law = frequency_independent_law(material)
         materials[name] = material
         if law is not None:
-            laws[name] = law
+            laws[name] = law_with_stated(law, material, stated)
     return replace(scene, materials=materials, laws=laws)
 
 

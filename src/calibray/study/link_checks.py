@@ -248,7 +248,7 @@ def refuse_far_receivers(
             f"{source}: all receivers are more than {furthest:.0f} m from the scene, near ({centre[0]:.0f}, "
             f"{centre[1]:.0f}) m; "
             + (
-                "check the order of longitude and latitude, and that the scene is at this place"
+                "check links.crs, the order of longitude and latitude, and that the scene is at this place"
                 if is_geographic
                 else "give positions relative to the scene's origin, or state their map projection as links.crs"
             )

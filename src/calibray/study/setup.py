@@ -268,13 +268,17 @@ class Setup:
     def tracer(self) -> Tracer:
         """The ray tracer with the scene at the study's carrier, loaded on first use."""
         if "tracer" not in self._loaded:
+            self._loaded["files"] = self._files_digest()
             self._loaded["tracer"] = self._open_tracer(self.scene, self.study.scene.frequency)
         return self._loaded["tracer"]
 
     @cached_property
-    def _loaded(self) -> dict[str, Tracer]:
-        """The tracer once it is loaded, shared by all setups of one scene."""
+    def _loaded(self) -> dict[str, Any]:
+        """The tracer once it is loaded and the digest of its files, shared by all setups of one scene."""
         return {}
+
+    def _files_digest(self) -> str:
+        return cache.files_digest(self.scene, self.study.antenna_pair)
 
     def __getstate__(self) -> dict[str, Any]:
         """The state for another process: without the loaded tracer, and independent of the current folder."""
@@ -417,7 +421,9 @@ class Setup:
             if plan.seconds > LONG_TRACE_SECONDS:
                 _LOG.warning("%s", plan.announcement(len(links)))
             paths = self.tracer.trace(links, progress, scene.materials)
-            cache.store_trace(digest, paths)
+            # The fingerprint is that of the files now; the tracer may have read them before they changed.
+            if self._files_digest() == self._loaded["files"]:
+                cache.store_trace(digest, paths)
         return paths
 
     def _with_tracer(self, changed: Setup) -> Setup:

@@ -65,6 +65,14 @@ def trace_digest(
     return digest.hexdigest()
 
 
+def files_digest(scene: Scene, antennas: tuple[Antenna, Antenna]) -> str:
+    """Fingerprint of the files that a tracer reads when it loads a scene: its meshes and the gains of the antennas."""
+    digest = hashlib.sha256(json.dumps([antenna.record() for antenna in antennas]).encode())
+    for mesh in mesh_files(scene):
+        digest.update(mesh.read_bytes())
+    return digest.hexdigest()
+
+
 def load_trace(digest: str) -> Paths | None:
     """Load the trace with a fingerprint; None if there is none, or if another user may have written it.
 
