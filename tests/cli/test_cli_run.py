@@ -17,6 +17,7 @@ import programs
 from calibray.calibration.result import Result
 from calibray.cli.console import progress_bars
 from calibray.cli.predict import _columns
+from calibray.errors import InputError
 from calibray.paths import Paths
 from calibray.reporting import result_tables
 from calibray.result.files import FILES
@@ -353,3 +354,8 @@ def test_names_with_underscores_are_not_numbers():
     assert _columns(["sector=1_2", "carrier=3.5e9", "side=east"]) == {
         "sector": "1_2", "carrier": 3.5e9, "side": "east",
     }  # fmt: skip
+
+
+def test_a_column_has_one_value():
+    with pytest.raises(InputError, match="side=west: side is given twice"):
+        _columns(["side=east", "side=west"])

@@ -392,6 +392,8 @@ def _columns(entries: list[str]) -> dict[str, object]:
         name, equals, value = entry.partition("=")
         if not equals or not name:
             raise InputError(f"--column {entry}: must be NAME=VALUE, such as sector=north")
+        if name in columns:
+            raise InputError(f"--column {entry}: {name} is given twice; remove one")
         try:
             # Python reads 1_2 as 12, but tables keep it as text.
             columns[name] = value if "_" in value else float(value)
