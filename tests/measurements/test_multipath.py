@@ -103,6 +103,23 @@ def test_angles_are_those_of_the_end(tmp_path):
         values(read_multipath(tmp_path / "arrival.csv", "id"), "azimuth_spread_departure")
 
 
+@pytest.mark.parametrize("unit", ["{}_{}", "{} [{}]", "{} ({})", "{}\n{}"])
+def test_units_may_be_in_brackets_or_in_a_row_below_the_names(tmp_path, unit):
+    """In radians and of one end, however the unit is written."""
+    radians = TABLE.assign(azimuth_deg=np.radians(TABLE["azimuth_deg"]))
+    units = {"delay": "ns", "azimuth_arrival": "rad", "PL": "dB"}
+    names = [unit.format(*each).partition("\n") for each in units.items()]
+    header = ["id,rotation," + ",".join(name for name, _, _ in names)]
+    header += [",," + ",".join(below for _, _, below in names)] if names[0][2] else []
+    text = "\n".join([*header, radians.to_csv(index=False, header=False)])
+    (tmp_path / "multipath.csv").write_text(text)
+    paths = read_multipath(tmp_path / "multipath.csv", "id")
+    assert list(paths.angles) == [("azimuth", "arrival")]
+    # sqrt(-2 ln cos 45 degrees)
+    assert values(paths, "azimuth_spread_arrival")["7"] == pytest.approx(np.sqrt(np.log(2)))
+    assert paths.level_db.max() == -80.0
+
+
 def test_snapshots_of_one_component_do_not_count_in_the_k_factor(tmp_path):
     TABLE.iloc[:3].assign(path_loss_db=[80.0, 86.0, 80.0]).to_csv(tmp_path / "multipath.csv", index=False)
     paths = read_multipath(tmp_path / "multipath.csv", "id")

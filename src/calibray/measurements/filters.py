@@ -172,7 +172,7 @@ def _check_pattern(pattern: str, column: pd.Series) -> None:
 
 
 def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
-    """Mask [rows] of the rows that pass a filter; a missing value in a comparison does not pass.
+    """Mask [rows] of the rows that pass a filter; missing values pass no comparison but `!=` and `not in`.
 
     Raises:
         InputError: The filter is malformed or too large, names an unknown column or something that is not allowed, or

@@ -82,12 +82,16 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
             unit or sign than their names state.
     """
     table = read_table(path)
-    names = [str(name) for name in table.frame.columns if name != link]
+    # Words of the names, as in delay_ns for "Delay [ns]".
+    names = {
+        str(name): "_".join(re.findall(r"[a-z0-9]+", str(name).lower()))
+        for name in table.frame.columns
+        if name != link
+    }
 
     def find(pattern: str, other: str = "spread") -> str | None:
-        lower = {name: name.lower() for name in names}
         return next(
-            (name for name in names if re.search(pattern, lower[name]) and other not in lower[name]), None
+            (name for name, plain in names.items() if re.search(pattern, plain) and other not in plain), None
         )
 
     delay, power, snapshot = find(DELAY), find(POWER, "tx"), find(SNAPSHOT)
@@ -104,7 +108,7 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
             f"{path}: column {delay!r} has a delay of {seconds.max():g} s, must be at most {LONGEST:g} s; state its "
             "unit in its name, such as delay_ns"
         )
-    level_db, is_loss = table.numbers(power), re.search(r"loss|(^|_)pl(_|$)", power.lower()) is not None
+    level_db, is_loss = table.numbers(power), re.search(r"loss|(^|_)pl(_|$)", names[power]) is not None
     median, is_level = float(np.median(level_db)), matches(power, "decibel") and "gain" not in power.lower()
     # A received power of a receiver that is not calibrated can be positive, in decibels.
     if (median < 0) if is_loss else (median > 0 and not is_level):
@@ -118,13 +122,12 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
         for end, other in (("departure", END["arrival"]), ("arrival", END["departure"])):
             own = [
                 name
-                for name in names
-                if re.search(pattern, name.lower())
-                and (re.search(END[end], name.lower()) or not re.search(other, name.lower()))
+                for name, plain in names.items()
+                if re.search(pattern, plain) and (re.search(END[end], plain) or not re.search(other, plain))
             ]
             if len(own) == 1:
                 values = table.numbers(own[0])
-                values = values if own[0].lower().endswith("rad") else np.radians(values)
+                values = values if "rad" in words(own[0]) else np.radians(values)
                 # A compass counts from north clockwise, the scene from east counter-clockwise.
                 angles[plane, end] = np.pi / 2 - values if compass and plane == "azimuth" else values
     return Multipath(

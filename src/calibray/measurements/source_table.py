@@ -68,7 +68,7 @@ class SourceTable:
         return (self.note(reason, lost) if lost else self).select(mask)
 
     def where(self, expression: str) -> NDArray[np.bool_]:
-        """Mask [rows] of the rows that pass a filter (see `filters`); a missing value in a comparison does not pass.
+        """Mask [rows] of the rows that pass a filter (see `filters`); missing values pass `!=` and `not in` alone.
 
         Raises:
             InputError: The expression is malformed, names an unknown column, or does not give one truth value per row.
