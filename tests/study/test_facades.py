@@ -13,6 +13,7 @@ from calibray.calibration.result import Result
 from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.fields import path_loss
+from calibray.fitting.problem import Problem
 from calibray.materials import itu_material
 from calibray.paths import Kind
 from calibray.reporting.wording import scene_alone_text
@@ -20,6 +21,7 @@ from calibray.scenes.checks import SceneSurfaces
 from calibray.study import Setup, Study
 from calibray.study.facades import FacadeSection, with_facades
 from calibray.study.regions import Place
+from calibray.uncertainty.joint_model import joint_model
 from link_tables import links_from_frame
 
 SHOP = "shop.relative_permittivity"
@@ -47,6 +49,23 @@ def test_a_stated_constant_of_a_facade_leaves_the_other_its_law_over_frequency()
         shop = parameters.materials(parameters.start, setup.scene.materials, carrier)["shop"]
         assert shop.relative_permittivity == 5.0
         assert shop.conductivity == pytest.approx(itu_material("glass", carrier).conductivity)
+
+
+def test_a_facade_of_smooth_walls_is_smooth():
+    """A scattering coefficient of 0 that the study states is exact, also on a part of these walls."""
+    parameters = {name: {"bounds": planted.BOUNDS} for name in ("marble.relative_permittivity", SHOP)}
+    smooth = {"marble": {"scattering_coefficient": 0.0}}
+
+    def uncertain(**sections) -> set[str]:
+        setup = opened(facades=GROUND_FLOOR, parameters=parameters, noise=None, **sections)
+        problem = Problem.of(setup, Replay(setup.trace(), setup.parameters))
+        problem = replace(problem, objective=replace(problem.objective, measured=problem.before))
+        point = setup.parameters.to_search(setup.parameters.start)
+        model = joint_model(problem, point, 0.3**2, problem.freedom)
+        return {name for name in model.parameters.names if name.endswith("scattering_coefficient")}
+
+    assert uncertain() == {"marble.scattering_coefficient", "shop.scattering_coefficient"}
+    assert not uncertain(materials=smooth)
 
 
 def names_of(paths) -> np.ndarray:

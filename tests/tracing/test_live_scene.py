@@ -78,6 +78,18 @@ def test_sionna_and_the_study_agree_and_materials_are_set(study: cb.Study, measu
         apply_materials(scene, {"walls": planted["marble"]})
 
 
+def test_only_scattering_that_a_scene_states_is_stated_by_its_study(
+    measured: np.ndarray, tmp_path: Path
+) -> None:
+    """Sionna RT's default of 0 is no statement of the user, after which it would count as exact."""
+    scene = street()
+    scene.radio_materials["marble"].scattering_coefficient = 0.3
+    study = cb.Study.from_sionna(scene, measured, tmp_path)
+    assert study.materials["marble"].scattering_coefficient == pytest.approx(0.3)
+    assert study.materials["concrete"].scattering_coefficient is None
+    assert study.opened().scene.materials["concrete"].scattering_coefficient == 0.0
+
+
 def test_materials_of_another_carrier_cause_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     scene = street()
     marble = {"marble": cb.itu_material("marble", 28e9, thickness=0.1)}

@@ -6,7 +6,7 @@ import dynesty
 import numpy as np
 import pytest
 
-from calibray.parameters import NO_PRIOR, LogNormal, Parameter, Parameters
+from calibray.parameters import NO_PRIOR, LogNormal, Parameter, Parameters, fixed_constant
 from calibray.result.verdict import Cause
 from calibray.uncertainty import sequential_monte_carlo as module
 from calibray.uncertainty.assessment import remaining_widths
@@ -201,6 +201,41 @@ def test_the_width_without_constants_is_that_of_exact_ones():
     (without,) = remaining_widths(model, draw_posterior(model, seed=3))
     exact = noise.std() / SLOPE / np.sqrt(links)
     assert without == {Cause.CONSTANTS: pytest.approx(exact / np.hypot(exact, known_to), rel=0.3)}
+
+
+def test_the_width_without_a_constant_that_may_be_exactly_0_is_that_of_exact_ones():
+    """Draws of 0 are one value for the regression, although the search space has an interval for it."""
+    links, name = 40, "walls.scattering_coefficient"
+    walls, scattering = _parameters("log").items[0], fixed_constant(name, 0.0, 0.15)
+    study, parameters = Parameters((walls,)), Parameters((walls, scattering))
+    noise = np.random.default_rng(2).standard_normal(links)
+
+    def gaps(point, _):
+        permittivity, coefficient = parameters.from_unit(point).T
+        return noise - SLOPE * (np.log(permittivity / 4.0) - coefficient)[:, None]
+
+    priors = NO_PRIOR.extended([1], [0.0], 0.15)
+    model = replace(_model(parameters, gaps, links, buildings=0, priors=priors), study=study)
+    posterior = draw_posterior(model, seed=3)
+    assert np.mean(parameters.from_unit(posterior.joint)[:, 1] == 0) == pytest.approx(0.5, abs=0.1)
+    (without,) = remaining_widths(model, posterior)
+    exact = noise.std() / SLOPE / np.sqrt(links)
+    # 0 or the positive half of a Gaussian, with the mean s / sqrt(2 pi) and the mean square s^2 / 2.
+    known_to = 0.25 * np.sqrt(0.5 - 0.5 / np.pi)
+    assert without == {Cause.CONSTANTS: pytest.approx(exact / np.hypot(exact, known_to), rel=0.3)}
+
+
+def test_a_constant_of_0_keeps_its_interval_next_to_a_population():
+    """Members that are drawn around their common value change no other coordinate."""
+    names = ("walls.relative_permittivity", "shops.relative_permittivity")
+    scattering = fixed_constant("walls.scattering_coefficient", 0.0, 0.15)
+    parameters = Parameters((*_parameters("log", names).items, scattering))
+    priors = LogNormal((1,), (1.0,), (0.1,), like=((1, 0),)).extended([2], [0.0], 0.15)
+    drawn = _model(parameters, _uninformative, 4, priors=priors).draw_prior(4000, np.random.default_rng(1))
+    zero = drawn[parameters.from_unit(drawn)[:, 2] == 0, 2]
+    end = parameters.to_unit(parameters.start)[2]
+    assert len(zero) == pytest.approx(2000, abs=150)
+    assert np.quantile(zero / end, [0.1, 0.5, 0.9]) == pytest.approx([0.1, 0.5, 0.9], abs=0.05)
 
 
 def test_links_on_one_building_determine_the_mean_only_to_the_spread():

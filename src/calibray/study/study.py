@@ -232,8 +232,14 @@ def _write_live_study(
     return {
         "version": 1,
         "scene": {"file": "scene.xml", "frequency": live.frequency},
+        # A scattering coefficient of 0 is Sionna RT's default; stated here, it would count as exact.
         "materials": {
-            name: constants[name] | {"scattering_pattern": item.scattering_pattern}
+            name: {
+                key: value
+                for key, value in constants[name].items()
+                if value or key != "scattering_coefficient"
+            }
+            | {"scattering_pattern": item.scattering_pattern}
             for name, item in live.materials.items()
         },
         "antennas": {

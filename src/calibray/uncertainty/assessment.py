@@ -333,7 +333,9 @@ def remaining_widths(model: JointModel, posterior: Posterior) -> list[dict[Cause
         without = np.where(mask, 0.0, draws.weight)
         if mask.any() and _effective(without) >= FEWEST_DRAWS:
             _note(shares, cause, _deviation(draws.point, without) / full)
-    constants = posterior.joint[:, width:]
+    # Points of an interval that stands for one value become one point.
+    parameters = model.parameters
+    constants = parameters.to_unit(parameters.from_unit(posterior.joint))[:, width:]
     if constants.shape[1] and _effective(draws.weight) >= FEWEST_DRAWS + constants.shape[1]:
         root = np.sqrt(draws.weight)[:, None]
         design = np.hstack([np.ones((len(constants), 1)), constants]) * root

@@ -208,8 +208,9 @@ class JointModel:
             total = np.append(0.0, cumulative[:, index])
             points[:, index] = np.interp(random.random(count) * total[-1], total, grid)
         if self.priors.like:
+            drawn, _ = np.array(self.priors.like).T
             values = self.priors.draw_like(self.parameters.from_unit(points), self.parameters, random)
-            return self.parameters.to_unit(values)
+            points[:, drawn] = self.parameters.to_unit(values)[:, drawn]
         return points
 
     def draw_spread(self, count: int, random: np.random.Generator) -> NDArray[np.float64]:
@@ -377,11 +378,12 @@ def has_offset(problem: Problem) -> bool:
 def _fixed_constants(problem: Problem) -> list[Parameter]:
     """Constants that the scene fixes, equal at all carriers, of the materials that have a parameter.
 
-    A scattering coefficient of 0 that the study states is exact.
+    A scattering coefficient of 0 that the study states is exact, also that of facades that are part of the material.
     """
     study = problem.setup.study
     materials, spread = problem.engine.materials, study.noise.constants_spread
     smooth = {name for name, stated in study.materials.items() if stated.scattering_coefficient == 0}
+    smooth |= {name for name, facade in study.facades.items() if facade.of in smooth}
     replayed = replayed_materials(problem)
     calibrated, _ = problem.parameters.at_carrier(problem.parameters.frequency)
     names = [
