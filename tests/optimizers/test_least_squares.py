@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from calibray.errors import InputError
-from calibray.optimizers import LeastSquares
+from calibray.optimizers import POUNDERS, LeastSquares
 from calibray.optimizers import least_squares as module
 from calibray.optimizers.derivative_free import improving_point
 from calibray.optimizers.descent import descend
@@ -340,8 +340,23 @@ def test_hops_change_one_or_two_coordinates():
         ([0.1, 0.9], [0.0, 1.0], [0.1, 0.4]),
         ([1.0, 0.5], [0.6, 0.8], [0.7, 0.1]),  # away from a bound
         ([0.5, 0.5], [1.0, 0.0], [1.0, 0.5]),
+        ([0.0, 0.0], [-0.6, 0.8], [0.0, 0.5]),  # both ways leave the corner, so along an axis
     ],
 )
 def test_an_improving_point_lies_where_there_is_most_room(centre, direction, expected):
     point = improving_point(np.array(centre), np.array([direction]), 0.5)
     assert point == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("dimension", [2, 4])
+def test_a_search_that_ends_in_a_corner_does_not_evaluate_it_again_and_again(dimension):
+    optimizer = POUNDERS(np.zeros(dimension), np.ones(dimension), budget=100)
+    points = []
+    while not optimizer.done:
+        x = optimizer.ask()
+        residuals = x + 0.3
+        optimizer.tell(x, np.sqrt(np.mean(residuals**2, axis=1)), residuals=residuals)
+        points.append(x)
+    assert optimizer.best.x == pytest.approx(np.zeros(dimension))
+    # Searches restart elsewhere: each ends in the corner, but evaluates other points before.
+    assert len(np.unique(np.concatenate(points), axis=0)) > 50

@@ -234,13 +234,16 @@ def improving_point(
 ) -> NDArray[np.float64]:
     """The next point of the unit cube [d] for a model around `centre` [d].
 
-    It lies in one of the missing directions [k, d], or against it, where there is most room within the radius.
+    It lies in one of the missing directions [k, d], against it, or along an axis towards the farther face: where its
+    part along the missing directions is largest within the radius. In a corner, only the axes lead into the cube.
     """
-    directions = np.vstack([missing, -missing])
+    directions = np.vstack([missing, -missing, np.diag(np.where(centre <= 0.5, 1.0, -1.0))])
     edge = np.where(directions > 0, 1.0 - centre, centre)
     room = np.divide(edge, np.abs(directions), out=np.full_like(edge, np.inf), where=directions != 0)
     length = np.minimum(room.min(axis=1), radius)
-    return np.clip(centre + length.max() * directions[np.argmax(length)], 0.0, 1.0)
+    part = length * np.concatenate([np.ones(2 * len(missing)), np.linalg.norm(missing, axis=0)])
+    best = np.argmax(part)
+    return np.clip(centre + length[best] * directions[best], 0.0, 1.0)
 
 
 @final
