@@ -111,6 +111,16 @@ def test_three_calls_find_the_truth_and_the_result_has_what_replay_gives(finishe
     assert "The model represents the program" in " ".join(printed.split())
 
 
+def test_a_start_on_a_logarithmic_scale_is_called_once(tmp_path: Path) -> None:
+    """The exponential of the logarithm of 5.0 is another double."""
+    parameter = {"bounds": [1.5, 12.0], "start": 5.0, "scale": "log"}
+    study = write_study(
+        tmp_path / "study", parameters={"ground.relative_permittivity": parameter}, holdout=None
+    )
+    result = cb.calibrate(cb.Study.load(study))
+    assert calls(study.parent) == result.rt_calls == len(result.history)
+
+
 def test_a_second_run_pays_for_no_call(finished: tuple[Path, str]) -> None:
     folder, _ = finished
     before = calls(folder)

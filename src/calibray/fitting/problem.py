@@ -168,8 +168,11 @@ class Problem:
 
     def evaluate(self, points: NDArray[np.float64], derivatives: bool = False) -> Evaluation:
         """Run the engine on points of the search space [n, d]."""
+        return self.evaluate_candidates(self.parameters.from_search(points), derivatives)
+
+    def evaluate_candidates(self, candidates: NDArray[np.float64], derivatives: bool = False) -> Evaluation:
+        """`evaluate` for candidates in the fields' units [n, d], without the rounding of a conversion."""
         parameters, objective, jacobian = self.parameters, self.objective, None
-        candidates = parameters.from_search(points)
         with_slopes = derivatives and self.differentiable
         answer = self.respond(candidates, with_slopes)
         modelled, observed = answer.path_loss, answer.observed

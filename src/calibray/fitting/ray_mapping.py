@@ -135,7 +135,7 @@ def search_rays(
 
     def ask(candidate: NDArray[np.float64]) -> Export:
         export = engine.export(candidate)
-        evaluation = problem.evaluate(problem.parameters.to_search(candidate[None]))
+        evaluation = problem.evaluate_candidates(candidate[None])
         number = len(trail.candidates) + 1
         trail.add(candidate[None], evaluation, number, time.perf_counter() - started)
         if progress is not None:
