@@ -9,10 +9,14 @@ import pandas as pd
 import pytest
 from scipy.optimize import lsq_linear, minimize
 
+import two_ray
+from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import Objective, make_objective
+from calibray.fitting.problem import Problem
 from calibray.measurements import Measurements, SourceTable
+from calibray.study import Setup, Study
 
 LINKS = 30
 
@@ -344,3 +348,33 @@ def test_a_nuisance_of_other_links_is_refused():
     term = make_term(links, "offset", prior=3.0)
     with pytest.raises(InputError, match="a prior needs noise_db"):
         make_objective(links, everything, everything, nuisance=Nuisance(LINKS, (term,)))
+
+
+def test_errors_of_held_out_links_do_not_scale_priors(tmp_path):
+    """The posterior mean of an offset: sum of gap / std^2 over (sum of 1 / std^2 + 1 / prior^2)."""
+    study = two_ray.study(
+        tmp_path, offset={"bounds": [-50.0, 50.0], "prior_db": 1.0}, holdout={"where": 'half == "odd"'}
+    )
+    table = pd.read_csv(tmp_path / "links.csv")
+    std = np.where(table["half"] == "odd", 20.0, 4.0)
+    table.assign(std=std, path_loss_db=table["path_loss_db"] + 5.0).to_csv(
+        tmp_path / "links.csv", index=False
+    )
+    content = study.content()
+    content["links"]["std"] = "std"
+    setup = Setup.open(Study.from_content(content, study.path), two_ray.TwoRay)
+    problem = Problem.of(setup, Replay(setup.trace(), setup.parameters, "coherent"))
+    loss = problem.modelled(problem.parameters.to_search([two_ray.TRUTH])[None])
+    assert problem.objective.noise_db == pytest.approx(4.0)
+    precision = 15 / 4.0**2
+    assert problem.objective.coefficients(loss) == pytest.approx(
+        5.0 * precision / (precision + 1.0), rel=1e-6
+    )
+
+
+def test_other_weights_keep_the_error_of_every_link():
+    whole = replace(objective(), noise_db=3.0)
+    fewer = whole.reweighted(np.where(np.arange(LINKS) < 5, whole.weight, 0.0))
+    variance = [it.noise_db**2 * it.weight[it.weight > 0].mean() / it.weight[0] for it in (whole, fewer)]
+    assert variance[1] == pytest.approx(variance[0])
+    assert not whole.reweighted(np.zeros(LINKS)).weight.any()

@@ -68,6 +68,9 @@ def retrace(
         settled |= displaced and bool((np.abs(best - before) <= near).all())
         if settled or study.method.name != AUTO or turn == rounds - 1:
             break
+        # Links without a path in the new trace are left out of the next calibration.
+        if objective.ceiling_db is None:
+            objective = objective.reweighted(np.where(np.isfinite(gap), objective.weight, 0.0))
         if displaced and paths is not None:
             setup = setup.placed_at(parameters.named(best), AROUND)
             engine, before = replay(setup, paths), best
@@ -76,12 +79,7 @@ def retrace(
             for effect in getattr(engine, "effects", ()):
                 if isinstance(effect, DisplacementLoss):
                     error_db = np.hypot(error_db, effect.error_db)
-            objective = with_interpolation_error(
-                replace(stated, weight=weight), trail.best_modelled, error_db
-            )
-        # Links without a path in the new trace are left out of the next calibration.
-        if objective.ceiling_db is None:
-            objective = replace(objective, weight=np.where(np.isfinite(gap), objective.weight, 0.0))
+            objective = with_interpolation_error(stated.reweighted(weight), trail.best_modelled, error_db)
         problem = replace(problem, setup=setup, engine=engine, objective=objective)
         trail = search(problem, choose(problem), progress)
     return problem, trail, gap

@@ -21,7 +21,7 @@ that use residuals in no other way.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
 
@@ -108,6 +108,13 @@ class Objective:
     nuisance: Nuisance
     ceiling_db: float | None = None
     noise_db: float = 1.0
+
+    def reweighted(self, weight: NDArray[np.float64]) -> Objective:
+        """The objective with other weights [L]; the noise at the mean weight follows, so errors of links stay."""
+        if not (weight > 0).any():
+            return replace(self, weight=weight)
+        before, after = (float(each[each > 0].mean()) for each in (self.weight, weight))
+        return replace(self, weight=weight, noise_db=self.noise_db * float(np.sqrt(before / after)))
 
     def coefficients(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """The best coefficients of the nuisance [n, q], [dB] per unit of their columns, for path loss [n, L], [dB].

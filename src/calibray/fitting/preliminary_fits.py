@@ -113,7 +113,7 @@ def _far_from(
     weight: NDArray[np.float64],
 ) -> Objective:
     """The objective with the weights [links] of the links whose predicted path loss is at most `largest_db` [links]."""
-    return replace(objective, weight=np.where(predicted_db <= largest_db, weight, 0.0))
+    return objective.reweighted(np.where(predicted_db <= largest_db, weight, 0.0))
 
 
 def _determines_as_much(problem: Problem, selected: Objective) -> bool:

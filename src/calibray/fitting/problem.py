@@ -123,9 +123,10 @@ class Problem:
             ~(held_out | censored),
             nuisance=study_nuisance(study, links),
             ceiling_db=study.objective.ceiling_db,
-            noise_db=_noise(study, links),
+            noise_db=1.0,
         )
-        objective = replace(objective, measured=observable.measured(links))
+        noise_db = _noise(study, objective.weight[objective.weight > 0])
+        objective = replace(objective, measured=observable.measured(links), noise_db=noise_db)
         _check_groups(links, objective, held_out & ~censored & np.isfinite(before))
         faint = censored if censored.any() else None
         return cls(setup, engine, objective, before, observable, study.priors, faint, further)
@@ -333,14 +334,18 @@ class Problem:
         return self.engine
 
 
-def _noise(study: StudyModel, links: Measurements) -> float:
-    """Declared standard deviation of a link's error at the mean weight [dB]; 1 until it is estimated."""
+def _noise(study: StudyModel, weight: NDArray[np.float64]) -> float:
+    """Declared standard deviation of a link's error at the mean weight [dB]; 1 until it is estimated.
+
+    The weights are those of the calibration links [m].
+    """
+    if study.links.position_error_m is None:
+        if study.noise.std_db is not None:
+            return study.noise.std_db
+        if study.links.std is None:
+            return 1.0
     # Weights are inverse variances [1/dB^2] if errors of single links are known.
-    if study.links.position_error_m is not None:
-        return float(1.0 / np.sqrt(links.weight.mean()))
-    if study.noise.std_db is not None:
-        return study.noise.std_db
-    return 1.0 if study.links.std is None else float(1.0 / np.sqrt(links.weight.mean()))
+    return float(1.0 / np.sqrt(weight.mean()))
 
 
 def _check_groups(links: Measurements, objective: Objective, judged: NDArray[np.bool_]) -> None:

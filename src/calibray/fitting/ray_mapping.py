@@ -214,7 +214,7 @@ def with_engine(problem: Problem, replay: Replay) -> Problem:
     objective = problem.objective
     if objective.ceiling_db is None:
         reached = np.isfinite(replay.path_loss(problem.parameters.start[None])[0])
-        objective = replace(objective, weight=np.where(reached, objective.weight, 0.0))
+        objective = objective.reweighted(np.where(reached, objective.weight, 0.0))
     return replace(problem, engine=replay, objective=objective)
 
 

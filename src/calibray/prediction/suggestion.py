@@ -344,7 +344,7 @@ def _as_calibrated(result: Record, problem: Problem) -> Problem:
     spread, objective = result.study.noise.constants_spread, problem.objective
     if "faint" in result.links:
         weight = np.where(result.links["faint"].to_numpy(bool), 0.0, objective.weight)
-        objective = replace(objective, weight=weight)
+        objective = objective.reweighted(weight)
     problem = replace(problem, priors=priors.extended(numbers, centres, spread), objective=objective)
     point = _calibrated_point(result, problem)
     return with_estimated_spreads(with_estimated_errors(problem, point), point)[0]

@@ -417,7 +417,8 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
         replace(observable, measured=_means(observable.measured, counted, first))
         for observable in problem.observed
     )
-    return replace(problem, objective=replace(objective, measured=measured, weight=weight), observed=observed)
+    objective = replace(objective, measured=measured).reweighted(weight)
+    return replace(problem, objective=objective, observed=observed)
 
 
 def _means(

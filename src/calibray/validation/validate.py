@@ -132,7 +132,7 @@ def validate_problem(
     for number in range(len(labels)):
         held_out = block == number
         weight = np.where(held_out, 0.0, objective.weight)
-        part = replace(problem, objective=replace(objective, weight=weight))
+        part = replace(problem, objective=objective.reweighted(weight))
         fits = fit_variants(part, all_link_minima)
         best = part.parameters.from_search(fits[Model.CALIBRATED][1][0])
         for name, gap in held_out_gaps(part, best, held_out).items():
