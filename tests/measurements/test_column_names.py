@@ -328,6 +328,21 @@ def test_several_units_of_length_are_asked_about():
         column_names.find_length_unit(["X [cm]", "height_m", "n"])
 
 
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("TimeOfFlight [ns]", "time_of_flight"),
+        ("time_of_flight_ns", "time_of_flight"),
+        ("round_trip_time_ns", "round_trip_time"),
+        ("Round-Trip Time (ns)", "round_trip_time"),
+    ],
+)
+def test_flight_times_are_found_by_their_full_name_and_are_no_times_of_day(name, kind):
+    frame = pd.DataFrame({name: [80.0, 90.0], "flight_time_s": [1.0, 2.0]})
+    assert column_names.find_flight_time(frame) == (name, kind, "ns")
+    assert column_names.find_time(frame) == "flight_time_s"
+
+
 def test_values_are_judged_without_the_codes_of_missing_ones():
     table = SourceTable(pd.DataFrame({"x": 1.0, "rssi": [100.0, 100.0, 100.0, -71.0, -80.0]}))
     guess = column_names.find_value(table)

@@ -391,6 +391,13 @@ def test_rows_of_other_groups_carriers_powers_times_and_transmitters_are_no_repe
     assert links.prepared == {"rows that repeat a link, merged": 1}
 
 
+@pytest.mark.parametrize("name", ["tof_ns", "time_of_flight_ns", "Round-Trip Time [ns]", "RoundTripTimeNs"])
+def test_rows_of_other_flight_times_are_repeats(name):
+    frame = pd.DataFrame({"x": 20.0, "level": 80.0, name: [100.0, 102.0]})
+    links = measured_links(SourceTable(frame), LinkColumns((0, 0, 5), ("x", 0, 1), "level"))
+    assert links.prepared == {"rows that repeat a link, merged": 1}
+
+
 def test_a_repeat_below_the_noise_floor_stays_censored():
     frame = pd.DataFrame({"x": 20.0, "rsrp": [-100.0, np.nan, -130.0]})
     steps = Preparation(noise_floor_dbm=-120.0, censored=True)

@@ -138,9 +138,14 @@ def words(name: object) -> frozenset[str]:
         ['m', 'rx', 'x']
         >>> sorted(words("BSLatitude(deg)"))
         ['bs', 'bslatitude', 'deg', 'latitude']
+        >>> sorted(words("Time of Flight [ns]")), sorted(words("round_trip_time_us"))
+        (['ns', 'tof'], ['rtt', 'us'])
     """
+    # A time of flight is no time of day.
+    text = re.sub(r"(?i)time[ _-]*of[ _-]*flight", "tof", without_accents(name))
+    text = re.sub(r"(?i)round[ _-]*trip[ _-]*time", "rtt", text)
     # Units keep their capitals together: "dBm" is one word.
-    text = re.sub(r"[dD][bB][mM]|dB|[kMG]?Hz", lambda unit: f" {unit[0].lower()} ", without_accents(name))
+    text = re.sub(r"[dD][bB][mM]|dB|[kMG]?Hz", lambda unit: f" {unit[0].lower()} ", text)
     parts = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", text)
     split = (re.split(r"[^a-z0-9]+", spelling.lower()) for spelling in (text, parts))
     return frozenset(word for spelling in split for word in spelling if word)
