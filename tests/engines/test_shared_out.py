@@ -194,6 +194,22 @@ def test_a_row_that_cannot_be_used_is_refused_before_any_is_traced(found, tmp_pa
         next(rows)
 
 
+def test_only_a_table_without_a_receiver_near_the_scene_is_refused(found, tmp_path, monkeypatch):
+    """Not a table of which one batch is far, as of a drive through several towns."""
+    monkeypatch.setattr(
+        batches, "open_for_links", lambda result, links, allow_changed_inputs: opened(result, links)
+    )
+    monkeypatch.setattr(batches, "BATCH", 9)
+    table = new_links()
+    for first, file in ((20, "partly.csv"), (0, "all.csv")):
+        table.loc[first:, "rx_x"] += 1e6
+        table.to_csv(tmp_path / file, index=False)
+    predicted = predict_batches(found, PiecedTable.open(tmp_path / "partly.csv"), None)
+    assert sum(len(rows) for _, rows in predicted) == 40
+    with pytest.raises(InputError, match="all receivers are more than"):
+        next(predict_batches(found, PiecedTable.open(tmp_path / "all.csv"), None))
+
+
 @pytest.mark.parametrize("kind", [".csv", ".parquet"])
 def test_a_failure_in_the_midst_leaves_no_table(tmp_path, kind):
     def full() -> None:

@@ -12,6 +12,7 @@ import pandas as pd
 
 from calibray.engines.cluster.chunks import CHUNK_LINKS, for_each_chunk, select_links, stated_chunk_size
 from calibray.engines.cluster.workers import InProcess, Workers
+from calibray.errors import InputError
 from calibray.measurements import Measurements, PiecedTable
 from calibray.prediction.predict import (
     add_remarks,
@@ -109,19 +110,25 @@ def predict_batches(
         InputError: See `predict` and `predict_interval`.
         EngineError: The paths do not fit into memory, or workers fail repeatedly.
     """
-    setup, triangles, done = None, None, 0
+    setup, triangles, done, far, near = None, None, 0, None, False
     for rows in table.pieces(BATCH):
         links = as_links(result, rows)
         if setup is None or triangles is None:
             setup = open_for_links(result, links, allow_changed_inputs=allow_changed_inputs)
             triangles = read_triangles(setup.scene)
-        refuse_far_links(result, links, triangles)
+        try:
+            refuse_far_links(result, links, triangles)
+            near = True
+        except InputError as error:
+            far = error  # refused if it applies to all batches
         setup.parameters.check_carriers([frequency for frequency, _ in links.carriers])
         if level is None:
             check_groups(result, links)
         done += len(links)
         if progress is not None:
             progress("checking", done, table.rows)
+    if far is not None and not near:
+        raise far
     if setup is None:
         return
     announce(result, table.rows)
