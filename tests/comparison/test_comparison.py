@@ -292,14 +292,26 @@ def test_derivatives_of_a_study_equal_finite_differences_in_search_coordinates(s
         assert jacobian[0, :, k] == pytest.approx((up - down) / 2e-5, rel=1e-4, abs=1e-6)
 
 
-def test_the_fingerprint_depends_on_the_measurements(study, tmp_path):
-    first = study_problem(study).fingerprint
-    assert study_problem(study).fingerprint == first
-    links = study.with_name("links.csv")
-    table = pd.read_csv(links)
-    table.loc[0, "path_loss_db"] += 0.5
+def test_the_fingerprint_depends_on_all_that_changes_an_evaluation(study):
+    """Otherwise runs on other data would count as finished ones."""
+    links, text = study.with_name("links.csv"), study.read_text(encoding="utf-8")
+    table = pd.read_csv(links).assign(spread_ns=5.0)
     table.to_csv(links, index=False)
-    assert study_problem(study).fingerprint != first
+    section = '[observables.spread]\nkind = "rms_delay_spread"\ncolumn = "spread_ns"\nunit = "ns"\nbandwidth = 1e8\n'
+    observed = f"{text}{section}"
+    study.write_text(observed, encoding="utf-8")
+    fingerprints = [study_problem(study).fingerprint]
+    study.write_text(f"{observed}[method]\nseed = 3\n", encoding="utf-8")
+    assert study_problem(study).fingerprint == fingerprints[0]
+    for column, change in (("path_loss_db", 0.5), ("spread_ns", 2.0)):
+        table.loc[0, column] += change
+        table.to_csv(links, index=False)
+        fingerprints.append(study_problem(study).fingerprint)
+    study.write_text(f"{text}[engine]\ncompress_db = 0.1\n", encoding="utf-8")
+    fingerprints.append(study_problem(study).fingerprint)
+    study.write_text(f"{text}[engine]\ncompress_db = 0.5\n", encoding="utf-8")
+    fingerprints.append(study_problem(study).fingerprint)
+    assert len(set(fingerprints)) == 5
 
 
 def test_the_command_writes_tables_and_figure(study, tmp_path):

@@ -75,16 +75,22 @@ def study_problem(path: str | Path) -> ComparisonProblem:
     # The replay engine always gives derivatives.
     engine = cast(engines.Differentiable, engines.make(setup))
     problem = estimate_noise(Problem.of(setup, engine))
-    objective, parameters, links = problem.objective, problem.parameters, setup.links
+    objective, parameters = problem.objective, problem.parameters
     lower, upper = parameters.search_bounds
-    digest = hashlib.sha256(fingerprint(setup).encode())
-    nuisance, design = objective.nuisance, objective.nuisance.design
-    parts = (design.data, design.indices, design.indptr, nuisance.lower, nuisance.upper, nuisance.prior)
-    for part in (lower, upper, objective.measured, objective.weight, *parts):
-        digest.update(np.asarray(part, dtype="<f8").tobytes())
-    digest.update(repr((nuisance.columns, objective.ceiling_db, objective.noise_db)).encode())
-    digest.update(repr(problem.priors).encode() if len(problem.priors) else b"")
-    digest.update(b"" if links.frequency is None else links.frequency.astype("<f8").tobytes())
+    # Everything that changes an evaluation: the study but its method, its files, and the data that follow from them.
+    content = {key: section for key, section in setup.study.content().items() if key != "method"}
+    record = (
+        fingerprint(setup),
+        content,
+        sorted(setup.files.values()),
+        setup.tracer_versions,
+        objective.noise_db,
+    )
+    digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode())
+    digest.update(setup.links.frame.to_csv().encode())
+    values = (objective.measured, objective.weight, *(each.measured for each in problem.observed))
+    for part in (*values, objective.nuisance.prior):
+        digest.update(part.astype("<f8").tobytes())
     start = parameters.to_search(parameters.start)
     return ComparisonProblem(
         Path(path).stem,
