@@ -263,6 +263,24 @@ def test_answers_that_arrive_while_the_ledger_fails_are_kept_too(tmp_path, monke
     assert (engine.calls, len(programs.calls(tmp_path))) == (0, 3)
 
 
+def test_answers_that_arrive_before_the_engine_fails_as_well_are_kept(path, monkeypatch):
+    """A full disk stops the ledger and the files of further calls; two of three calls have ended by then."""
+
+    def fail(*_):
+        raise EngineError("the disk is full")
+
+    class Failing(Summing):
+        def answers(self, candidates, stop=None):
+            yield from super().answers(candidates[:2])
+            fail()
+
+    monkeypatch.setattr(Ledger, "commit", fail)
+    with closing(Ledger(path)) as ledger:
+        engine = Recorded(Failing(), ledger, "r", "command")
+        with pytest.raises(EngineError, match=r"2 answers are kept in"):
+            engine.path_loss(CANDIDATES)
+
+
 @pytest.mark.parametrize("again", [False, True])
 def test_a_folder_that_is_removed_in_mid_run_is_noticed_and_nothing_is_lost(path, state, again):
     """Removed after the third of three calls, and made again by somebody else or not."""

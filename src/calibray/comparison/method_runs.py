@@ -87,7 +87,7 @@ def study_problem(path: str | Path) -> ComparisonProblem:
         objective.noise_db,
     )
     digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode())
-    digest.update(setup.links.frame.to_csv().encode())
+    digest.update(repr(setup.links.frame.to_dict("split")).encode())
     values = (objective.measured, objective.weight, *(each.measured for each in problem.observed))
     for part in (*values, objective.nuisance.prior):
         digest.update(part.astype("<f8").tobytes())

@@ -148,7 +148,8 @@ class Recorded:
                     stop.set()
                     unsaved = [(candidate, entry)]
                     with suppress(EngineError):
-                        unsaved += [(keys[other.index], _entry(other)) for other in answers]
+                        for other in answers:  # one by one, because the engine may fail after some
+                            unsaved.append((keys[other.index], _entry(other)))
                     if isinstance(error, KeyboardInterrupt):
                         for paid in unsaved:
                             self._ledger.commit(self._problem, *paid)
