@@ -129,6 +129,18 @@ def test_devices_of_a_random_effect_that_do_not_differ_promise_the_same(folder, 
     assert new == pytest.approx(known, rel=0.2)
 
 
+def test_constants_of_the_scene_take_no_degrees_of_freedom(folder, table):
+    """Four links, a parameter, an offset, and two constants that vary in the draws."""
+    content = study(folder).content()
+    pd.read_csv(folder / "links.csv")[::4].to_csv(folder / "few.csv", index=False, float_format="%.17g")
+    content["links"]["file"] = "few.csv"
+    del content["noise"]
+    found = cb.calibrate(Study.from_content(content, folder / "few.toml"))
+    assert {*found.uncertainty.constants_db} >= {"ground.conductivity", "ground.scattering_coefficient"}
+    interval, suggested = found.intervals[NAME], cb.suggest(found, table, 1)
+    assert 0 < suggested[f"{NAME}_width"][0] < interval.upper - interval.lower
+
+
 def test_links_that_the_calibration_left_out_near_the_noise_floor_have_no_influence(result, table, folder):
     faint = np.arange(len(result.links)) % 2 == 1
     marked = replace(result, links=result.links.assign(faint=faint))

@@ -180,12 +180,14 @@ class _ReplayedDraws:
         self.engine = self._engine(setup)
         problem = _as_calibrated(result, Problem.of(setup, self.engine))
         parameters, objective = problem.parameters, problem.objective
-        if problem.freedom < 1:
+        # Constants of the scene have tight priors, and take no degree of freedom from the residuals.
+        freedom = problem.freedom + len(parameters) - len(result.study.parameters)
+        if freedom < 1:
             raise InputError(
                 f"{result.study.path}: {objective.num_counted} links are too few to estimate the size of residuals; "
                 "measure more, or calibrate fewer parameters"
             )
-        self.noise_db = max(result.rmse_db * float(np.sqrt(objective.num_counted / problem.freedom)), 1e-3)
+        self.noise_db = max(result.rmse_db * float(np.sqrt(objective.num_counted / freedom)), 1e-3)
         self.problem = replace(problem, objective=replace(objective, noise_db=self.noise_db))
         self.lower, upper = parameters.search_bounds
         self.width = upper - self.lower
