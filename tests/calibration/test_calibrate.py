@@ -13,12 +13,14 @@ import pytest
 from scipy.optimize import minimize
 
 import planted
+import two_ray
 from calibray.calibration.calibrate import calibrate
 from calibray.calibration.held_out_accuracy import rmse_of
 from calibray.calibration.result import Result
 from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.fitting.problem import Problem
+from calibray.fitting.search import choose
 from calibray.optimizers import METHODS
 from calibray.parameters import Parameter, Parameters
 from calibray.reporting.result_tables import nuisances
@@ -368,6 +370,15 @@ def test_the_name_of_a_file_is_no_study():
 def test_an_unknown_option_of_a_method_is_refused(tmp_path, exact):
     with pytest.raises(InputError, match=r"method\.options\.wolfes: the method 'gwo' has no such setting"):
         run(tmp_path, exact, None, method={"name": "gwo", "options": {"wolfes": 3}})
+
+
+def test_starting_points_have_the_units_of_the_parameters(tmp_path):
+    parameter = {"bounds": [1.5, 12.0], "scale": "log"}
+    method = {"name": "least-squares", "options": {"starts": 1, "x0": [[6.0], [9.0]]}}
+    study = two_ray.study(tmp_path, parameters={"ground.relative_permittivity": parameter}, method=method)
+    setup = Setup.open(study, two_ray.TwoRay)
+    problem = Problem.of(setup, Replay(setup.trace(), setup.parameters, "coherent"))
+    assert choose(problem).ask()[:2] == pytest.approx(np.log([[6.0], [9.0]]))
 
 
 def test_a_group_without_a_path_is_named_and_only_held_out_links_are_judged(tmp_path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ import calibray as cb
 import two_ray
 from calibray.calibration.result import Result
 from calibray.errors import EngineError, InputError
-from calibray.fitting import ray_fit, ray_mapping
+from calibray.fitting import ray_fit
 from calibray.study.toml_file import study_text
 from commands import run
 
@@ -153,13 +152,13 @@ def test_predictions_and_the_page_show_the_rays_of_the_program(
 def test_a_program_of_other_physics_is_not_understood(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ray mapping ends after two calls here; the search for an explanation takes longer after each."""
-    monkeypatch.setattr(ray_mapping, "map_rays", partial(ray_mapping.map_rays, most_calls=2))
+    """The budget ends ray mapping here; the search for an explanation takes longer after each call."""
     monkeypatch.setattr(ray_fit, "TRIALS", 5)
     method = {"name": "auto", "options": {"budget": 3}}
     antennas = {"tx": ISOTROPIC, "rx": ISOTROPIC}
     study = write_study(tmp_path / "study", RIPPLE, antennas, method=method, holdout=None)
     ran = run("run", study, "--out", tmp_path / "out")
+    assert calls(study.parent) == 3
     (remark,) = (
         each for each in Result.load(tmp_path / "out").uncertainty.remarks if each.kind == "ray mapping"
     )
@@ -168,6 +167,9 @@ def test_a_program_of_other_physics_is_not_understood(
     output = " ".join(ran.output.split())
     assert "The model does not represent the program" in output
     assert "the optimum may be missed" in output
+    content = cb.Study.load(study).content() | {"method": {"name": "auto", "options": {"budget": 2}}}
+    with pytest.raises(InputError, match=r"method\.options\.budget = 2; it must be a whole number >= 3"):
+        cb.calibrate(cb.Study.from_content(content, study))
 
 
 def test_rays_that_do_not_fit_the_scene_are_refused_with_the_reason(tmp_path: Path) -> None:

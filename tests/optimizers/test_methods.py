@@ -79,8 +79,6 @@ def test_a_start_has_no_effect_on_a_method_that_takes_none(name):
         ({"name": "gwo", "options": {"iteration": 3}}, "setting 'iteration'; did you mean 'iterations'"),
         ({"name": "gwo", "options": {"seed": 3}}, "there is no setting 'seed'"),
         ({"name": "least-squares", "options": {"objective": 3}}, "there is no setting 'objective'"),
-        # Points of the search space; the study states the start in the parameters' units.
-        ({"name": "least-squares", "options": {"x0": 3}}, "there is no setting 'x0'"),
     ],
 )
 def test_unknown_methods_and_settings_are_refused(arguments, message):

@@ -26,6 +26,7 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.ray_fit import Understanding, common, understand
 from calibray.fitting.ray_model import Call, RayModel
 from calibray.fitting.search import AUTO, Trail, least_squares, local_searches
+from calibray.optimizers.arguments import whole
 from calibray.optimizers.sampling import design
 from calibray.result.verdict import Remark, RemarkKind
 from calibray.study import Setup
@@ -61,6 +62,9 @@ optimum was reached to 0.006 dB (docs/measurements/expensive-engines.md)."""
 CHANGED_DB: Final = 0.5
 """Largest change of a link's path loss without the paths that another call lacks, for such an engine [dB]. Paths that
 appear between calls may be missing at the optimum of their replay."""
+
+LEAST_CALLS: Final = 3
+"""Number of calls of the shortest ray mapping: two that show the assumptions, and one at the minimum."""
 
 MOST_CALLS: Final = 10
 """Number of calls after which ray mapping ends in any case."""
@@ -129,9 +133,15 @@ def search_rays(
     assumptions are identified. The stage of `progress` is "calibrating".
 
     Raises:
+        InputError: The study's budget is too small.
         EngineError: A call failed.
     """
-    started, trail = time.perf_counter(), Trail()
+    started, trail, method = time.perf_counter(), Trail(), problem.setup.study.method
+    name, budget = (
+        f"{problem.setup.study.path}: method.options.budget",
+        method.options.get("budget", MOST_CALLS),
+    )
+    most_calls = min(whole(name, budget, at_least=LEAST_CALLS), MOST_CALLS)
 
     def ask(candidate: NDArray[np.float64]) -> Export:
         export = engine.export(candidate)
@@ -139,10 +149,10 @@ def search_rays(
         number = len(trail.candidates) + 1
         trail.add(candidate[None], evaluation, number, time.perf_counter() - started)
         if progress is not None:
-            progress(f"calibrating: best RMSE {trail.best_rmse_db:.2f} dB", number, MOST_CALLS)
+            progress(f"calibrating: best RMSE {trail.best_rmse_db:.2f} dB", number, most_calls)
         return export
 
-    mapped = map_rays(problem, ask, seed=problem.setup.study.method.seed)
+    mapped = map_rays(problem, ask, most_calls=most_calls, seed=method.seed)
     trail.minima = mapped.minima
     trail.rt_calls, trail.ledger_hits = len(mapped.calls), engine.hits
     return with_engine(problem, mapped.engine), trail, _remark(mapped)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -75,7 +76,7 @@ def _make(
     interactions: int | None,
     model: CheapModel | None = None,
 ) -> Optimizer:
-    section, name = study.method, study.method.name
+    section, name, options = study.method, study.method.name, dict(study.method.options)
     if name == AUTO:
         name = "least-squares" if differentiable else "space-mapping"
     if METHODS[name].needs_derivatives() and not differentiable:
@@ -83,6 +84,9 @@ def _make(
             f"method {name!r} needs derivatives, which only the engine 'replay' provides; use method 'auto'"
         )
     try:
+        if "x0" in options:
+            with suppress(ValueError, TypeError), np.errstate(all="ignore"):  # the method refuses these
+                options["x0"] = parameters.to_search(options["x0"])
         return optimizers.make(
             name,
             *parameters.search_bounds,
@@ -90,7 +94,7 @@ def _make(
             start=parameters.to_search(parameters.start),
             starts=None if interactions is None else local_searches(interactions),
             cheap_model=model,
-            options=section.options,
+            options=options,
         )
     except InputError as error:
         raise InputError(f"{study.path}: method.options: {error}") from None

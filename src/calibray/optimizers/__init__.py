@@ -76,7 +76,7 @@ LABELS: Final = {
     "auto": "auto (least squares)",
 }
 
-_NO_OPTIONS: Final = {"lower", "upper", "seed", "x0", "objective", "cheap_model"}
+_NO_OPTIONS: Final = {"lower", "upper", "seed", "objective", "cheap_model"}
 """Constructor arguments that the study sets, so that users cannot set them."""
 
 
