@@ -353,3 +353,18 @@ def test_the_reach_of_links_held_out_by_a_filter_is_their_distance_from_the_cali
     held_out = table.rx_x.to_numpy() > -9
     apart = np.linalg.norm(receivers[held_out][:, None] - receivers[~held_out], axis=2).min(axis=1)
     assert result.prediction.model.blocks.reach_m == pytest.approx(np.quantile(apart, 0.9))
+
+
+def test_constants_that_depend_on_frequency_keep_their_law_at_other_carriers(tmp_path):
+    """Draws of a conductivity at the carrier of all measured links say nothing of another carrier."""
+    table = planted.campaign(noise_db=0.3).assign(carrier_hz=3.5e9)
+    links = planted.content("links.csv")["links"] | {"frequency": "carrier_hz"}
+    noise = {"kind": "gaussian", "range_m": 0, "heterogeneity": 0}
+    result = calibrate(planted.study(tmp_path, table, links=links, noise=noise))
+    assert "marble.conductivity" in result.uncertainty.draws
+    for carrier in (3.5e9, 28e9):
+        new = table.assign(carrier_hz=carrier)
+        ends = result.predict_interval(new)
+        assert ends.path_loss_db.to_numpy() == pytest.approx(result.predict(new), abs=1e-6)
+        assert (ends.lower_db < ends.path_loss_db).all()
+        assert suggest(result, new, 1).path_loss_db[0] == pytest.approx(ends.path_loss_db.mean(), abs=5.0)

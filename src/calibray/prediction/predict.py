@@ -294,15 +294,16 @@ def with_constants(result: Record, setup: Setup) -> Setup:
 
     Returns:
         The study with these parameters, after its own; without them for a program that answers with rays, whose own
-        constants vary in the draws.
+        constants vary in the draws. A constant that another carrier of the links changes keeps its law.
     """
     if result.study.engine.exports_rays:
         return setup
-    spread, materials = result.study.noise.constants_spread, setup.scene.materials
+    spread, carriers = result.study.noise.constants_spread, [setup.scene.materials, *setup.carriers.values()]
     items = []
     for name in (name for name in result.uncertainty.constants_db if name in result.uncertainty.draws):
         material, constant = split_name(name)
-        item = fixed_constant(name, float(getattr(materials[material], constant)), spread)
+        values = {float(getattr(materials[material], constant)) for materials in carriers}
+        item = None if len(values) > 1 else fixed_constant(name, values.pop(), spread)
         items += [] if item is None else [item]
     parameters = replace(setup.parameters, items=(*setup.parameters.items, *items))
     return replace(setup, parameters=parameters)

@@ -110,8 +110,8 @@ def suggest(
     check_inputs(result, setup, allow_changed_inputs)
     refuse_far_links(result, links, read_triangles(setup.scene))
     announce(result, len(links), "candidates")
-    model = _ReplayedDraws(result, with_constants(result, calibrated), progress)
     setup = with_constants(result, setup)
+    model = _ReplayedDraws(result, replace(calibrated, parameters=setup.parameters), progress)
     predicted, slope, errors = model.at(setup)
     reached = np.flatnonzero(np.isfinite(predicted).all(axis=0))
     if not len(reached):
