@@ -154,7 +154,7 @@ def test_places_far_from_the_scene_are_refused(tmp_path):
     places = table[["lon", "lat"]].iloc[::3]
     swapped = places.rename(columns={"lon": "lat", "lat": "lon"})
     for refused in (result.predict, result.predict_interval, result.suggest):
-        with pytest.raises(InputError, match="check the order of longitude and latitude"):
+        with pytest.raises(InputError, match=r"check links\.crs, the order of longitude and latitude"):
             refused(swapped)
     assert len(suggest(result, places, 1)) == 1
     far = planted.links().iloc[::3].assign(rx_x=1e6)

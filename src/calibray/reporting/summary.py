@@ -174,11 +174,13 @@ def _coverage(count: int, total: int) -> str:
         return (
             "no path of any link interacts with it, so these links cannot identify it; measure where paths do"
         )
+    verb = "has" if count == 1 else "have"
+    links = f"{count:,} of {counted(total, 'link')} {verb} paths that interact with it"
     if count < RARE * total:
-        return f"only {count:,} of {total:,} links have paths that interact with it; measure more links of this kind"
+        return f"only {links}; measure more links of this kind"
     return (
-        f"{count:,} of {total:,} links have paths that interact with it, but the errors are too large, these "
-        "paths are too weak, or other unknowns compensate; measure where a path of this kind is the strongest"
+        f"{links}, but the errors are too large, these paths are too weak, or other unknowns compensate; measure where "
+        "a path of this kind is the strongest"
     )
 
 
