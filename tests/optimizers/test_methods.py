@@ -46,6 +46,11 @@ def test_every_budget_from_the_smallest_on_is_kept(name, kind):
         make(name, *BOX, budget=kind.schedule.least - 1)
 
 
+def test_a_budget_too_small_for_the_surrogate_is_to_be_raised():
+    with pytest.raises(InputError, match=r"15 samples; .* 20 parameters needs at least 21: raise the budget"):
+        make("sgwo-im", np.zeros(20), np.ones(20), budget=24)
+
+
 def test_the_papers_schedules():
     assert SGWOIM.within(225) == {"population": 30, "elites": 5, "iterations": 20}
     assert GWO.within(600) == {"population": 30, "iterations": 20}

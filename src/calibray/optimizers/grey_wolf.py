@@ -233,7 +233,7 @@ class SGWOIM(Optimizer):
         if surrogate and samples <= d:
             raise InputError(
                 f"population * full_iterations = {samples} samples; a surrogate of {d} parameters needs at "
-                f"least {d + 1}: raise population or full_iterations"
+                f"least {d + 1}: raise the budget, population or full_iterations"
             )
         full = min(self.full_iterations, self.iterations) if surrogate else self.iterations
         self._budget = self.population * full + self.elites * (self.iterations - full)
