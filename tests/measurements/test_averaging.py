@@ -107,7 +107,7 @@ def test_weights_and_deviations_of_averages_are_means(key):
     [
         ({}, {"size": 0.0}, "average.size = 0.0"),
         ({}, {"by": "distance", "size": -1.0}, "average.size = -1.0"),
-        ({}, {"by": "time", "time": "t"}, "column 't': a time cannot be read"),
+        ({}, {"by": "time", "time": "t"}, "column 't': a time cannot be read .*; give ISO 8601, such as"),
         ({"t": [1.78e12, 1.78e12 + 9e3]}, {"by": "time", "time": "t"}, "column 't': .* give seconds"),
         ({"t": ["2026-05-01", None]}, {"by": "time", "time": "t"}, "column 't': a time is missing"),
         ({"rx_x": ["here", "there"]}, {}, "'here' is not a number"),

@@ -56,19 +56,31 @@ def join_track(table: SourceTable, track: Track) -> SourceTable:
     return table.assign(**dict(zip(TRACK_COLUMNS, ((longitude + 180) % 360 - 180, latitude), strict=True)))
 
 
-def _row_times(table: SourceTable, track: Track) -> NDArray[np.float64]:
-    """Times of the rows [rows], [s] since 1970; NaN if missing."""
-    column = table.column(track.time)
+def read_times(table: SourceTable, name: str) -> NDArray[np.float64]:
+    """Times in a column [rows], texts in ISO 8601 or numbers [s], as seconds since 1970; NaN if missing.
+
+    Raises:
+        InputError: There is no such column, or a time cannot be read.
+    """
+    column = table.column(name)
     try:
         if pd.api.types.is_numeric_dtype(column):
             return _seconds(pd.to_datetime(column, utc=True, unit="s"))
         # ISO 8601 allows a comma before the fraction of a second; pandas does not.
-        seconds = _seconds(pd.to_datetime(column.replace(",", ".", regex=True), utc=True, format="ISO8601"))
+        return _seconds(pd.to_datetime(column.replace(",", ".", regex=True), utc=True, format="ISO8601"))
     except (ValueError, OverflowError) as error:
         raise InputError(
-            f"{table.source}, column {track.time!r}: a time cannot be read ({_reason(error)}); give ISO 8601, such "
-            "as 2026-05-31T14:05:09.2Z, or seconds since 1970"
+            f"{table.source}, column {name!r}: a time cannot be read ({_reason(error)}); give ISO 8601, such as "
+            "2026-05-31T14:05:09.2Z, or seconds since 1970"
         ) from None
+
+
+def _row_times(table: SourceTable, track: Track) -> NDArray[np.float64]:
+    """Times of the rows [rows], [s] since 1970; NaN if missing."""
+    column = table.column(track.time)
+    seconds = read_times(table, track.time)
+    if pd.api.types.is_numeric_dtype(column):
+        return seconds
     days = seconds[np.isfinite(seconds)] / 86_400
     if len(days) and (days % 1 == 0).all() and not column.astype(str).str.contains(":").any():
         raise InputError(

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.measurements import column_names
 from calibray.measurements.links import FEW, Measurements
-from calibray.measurements.placement import RX_COLUMNS, TX_COLUMNS, clear_buildings, place_rows
+from calibray.measurements.placement import RX_COLUMNS, TX_COLUMNS, clear_buildings, place_rows, read_times
 from calibray.measurements.preparation import Averaging, LinkColumns, Preparation, Quantity
 from calibray.measurements.selection import select_rows
 from calibray.measurements.source_table import Coordinates, SourceTable
@@ -344,16 +344,10 @@ def _elapsed(table: SourceTable, time: str) -> NDArray[np.float64]:
                 f"{table.source}, column {time!r}: {seconds.max():g} s since 1970 is beyond the year 5000; give seconds"
             )
         return seconds
-    try:
-        # As for the times of a track.
-        times = pd.to_datetime(column.replace(",", ".", regex=True), utc=True, format="ISO8601")
-    except ValueError as error:
-        raise InputError(
-            f"{table.source}, column {time!r}: a time cannot be read ({error}); give ISO 8601"
-        ) from None
-    if times.isna().any():
+    seconds = read_times(table, time)
+    if np.isnan(seconds).any():
         raise InputError(f"{table.source}, column {time!r}: a time is missing; remove the row")
-    return np.asarray((times - times.min()) / pd.Timedelta(seconds=1), dtype=np.float64)
+    return seconds
 
 
 SAME_POSITION: Final = 1e-4
