@@ -355,7 +355,7 @@ def test_the_reach_of_links_held_out_by_a_filter_is_their_distance_from_the_cali
     assert result.prediction.model.blocks.reach_m == pytest.approx(np.quantile(apart, 0.9))
 
 
-def test_constants_that_depend_on_frequency_keep_their_law_at_other_carriers(tmp_path):
+def test_constants_that_depend_on_frequency_keep_their_law_at_other_carriers(tmp_path, caplog):
     """Draws of a conductivity at the carrier of all measured links say nothing of another carrier."""
     table = planted.campaign(noise_db=0.3).assign(carrier_hz=3.5e9)
     links = planted.content("links.csv")["links"] | {"frequency": "carrier_hz"}
@@ -368,3 +368,4 @@ def test_constants_that_depend_on_frequency_keep_their_law_at_other_carriers(tmp
         assert ends.path_loss_db.to_numpy() == pytest.approx(result.predict(new), abs=1e-6)
         assert (ends.lower_db < ends.path_loss_db).all()
         assert suggest(result, new, 1).path_loss_db[0] == pytest.approx(ends.path_loss_db.mean(), abs=5.0)
+    assert "12 of 12 links have carriers other than 3.5 GHz, where links were measured" in caplog.text

@@ -135,10 +135,10 @@ def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs:
         low, high = result.links["frequency"].min(), result.links["frequency"].max()
         beyond = (links.frequency < 0.99 * low) | (links.frequency > 1.01 * high)
         if beyond.any():
+            where = f"other than {hertz(low)}" if low == high else f"outside {hertz(low)} to {hertz(high)}"
             _LOG.warning(
-                "%s: %d of %d links have carriers outside %s to %s, where links were measured; materials are "
-                "extrapolated, which the intervals do not include", links.source, beyond.sum(), len(links), hertz(low),
-                hertz(high),
+                "%s: %d of %d links have carriers %s, where links were measured; materials are extrapolated, which "
+                "the intervals do not include", links.source, beyond.sum(), len(links), where,
             )  # fmt: skip
     setup = Setup.open(result.study, links=links).placed_at(result.parameters, NEIGHBOURS)
     check_inputs(result, setup, allow_changed_inputs)
