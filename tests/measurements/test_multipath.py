@@ -120,6 +120,19 @@ def test_units_may_be_in_brackets_or_in_a_row_below_the_names(tmp_path, unit):
     assert paths.level_db.max() == -80.0
 
 
+def test_an_angle_of_arrival_may_be_an_elevation(tmp_path):
+    table = TABLE.rename(columns={"azimuth_deg": "AoA elevation [deg]"})
+    table.to_csv(tmp_path / "elevation.csv", index=False)
+    assert list(read_multipath(tmp_path / "elevation.csv", "id").angles) == [("elevation", "arrival")]
+    table.assign(**{"AoA azimuth [deg]": [0.0, 60.0, 0.0, 60.0, 0.0]}).to_csv(
+        tmp_path / "both.csv", index=False
+    )
+    paths = read_multipath(tmp_path / "both.csv", "id")
+    # sqrt(-2 ln cos 45 degrees) and sqrt(-2 ln cos 30 degrees)
+    assert values(paths, "elevation_spread_arrival")["7"] == pytest.approx(np.sqrt(np.log(2)))
+    assert values(paths, "azimuth_spread_arrival")["7"] == pytest.approx(np.sqrt(np.log(4 / 3)))
+
+
 def test_snapshots_of_one_component_do_not_count_in_the_k_factor(tmp_path):
     TABLE.iloc[:3].assign(path_loss_db=[80.0, 86.0, 80.0]).to_csv(tmp_path / "multipath.csv", index=False)
     paths = read_multipath(tmp_path / "multipath.csv", "id")

@@ -119,11 +119,17 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
 
     angles = {}
     for plane, pattern in ANGLE.items():
+        # "AoA" is an azimuth unless the name says elevation.
+        of_plane = {
+            name: plain
+            for name, plain in names.items()
+            if re.search(pattern, plain) and not (plane == "azimuth" and re.search(ANGLE["elevation"], plain))
+        }
         for end, other in (("departure", END["arrival"]), ("arrival", END["departure"])):
             own = [
                 name
-                for name, plain in names.items()
-                if re.search(pattern, plain) and (re.search(END[end], plain) or not re.search(other, plain))
+                for name, plain in of_plane.items()
+                if re.search(END[end], plain) or not re.search(other, plain)
             ]
             if len(own) == 1:
                 values = table.numbers(own[0])
