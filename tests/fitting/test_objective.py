@@ -14,6 +14,7 @@ from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import Objective, make_objective
+from calibray.fitting.preliminary_fits import LEAST_NOISE_DB, estimate_noise
 from calibray.fitting.problem import Problem
 from calibray.measurements import Measurements, SourceTable
 from calibray.study import Setup, Study
@@ -370,6 +371,15 @@ def test_errors_of_held_out_links_do_not_scale_priors(tmp_path):
     assert problem.objective.coefficients(loss) == pytest.approx(
         5.0 * precision / (precision + 1.0), rel=1e-6
     )
+
+
+def test_measurements_that_equal_the_model_have_the_least_noise(tmp_path):
+    study = two_ray.study(tmp_path, offset={"bounds": [-9.0, 9.0], "prior_db": 2.0})
+    setup = Setup.open(study, two_ray.TwoRay)
+    problem = Problem.of(setup, Replay(setup.trace(), setup.parameters, "coherent"))
+    problem = replace(problem, objective=replace(problem.objective, measured=problem.before))
+    assert problem.squares(problem.parameters.to_search(problem.parameters.start)[None]).rmse_db == 0.0
+    assert estimate_noise(problem).objective.noise_db == LEAST_NOISE_DB
 
 
 def test_other_weights_keep_the_error_of_every_link():

@@ -169,7 +169,7 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
         starts = fit.minima[:SEARCHES]
         if progress is not None:
             progress("estimating noise", turn + 1, NOISE_ESTIMATES)
-        before, links, errors = noise_db, problem.objective.num_counted, problem.observed
+        before, links, errors = problem.objective.noise_db, problem.objective.num_counted, problem.observed
         old_spreads, point = problem.objective.nuisance.prior, fit.best.x
         problem = with_estimated_errors(problem, point)
         within_db = None
@@ -179,7 +179,7 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
             in_sample = float(
                 problem.squares(point[None]).rmse_db[0] * np.sqrt(links / max(problem.freedom, 1))
             )
-            noise_db = in_sample if within_db is None else within_db
+            noise_db = max(in_sample if within_db is None else within_db, LEAST_NOISE_DB)
         changes = [abs(noise_db / before - 1)]
         spreads = problem.objective.nuisance.prior
         changes += np.abs(spreads[spreads < np.inf] / old_spreads[spreads < np.inf] - 1).tolist()
