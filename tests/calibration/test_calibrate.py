@@ -372,6 +372,15 @@ def test_an_unknown_option_of_a_method_is_refused(tmp_path, exact):
         run(tmp_path, exact, None, method={"name": "gwo", "options": {"wolfes": 3}})
 
 
+def test_a_single_link_is_refused_before_the_search(tmp_path):
+    study = two_ray.study(tmp_path, holdout={"where": "rx_x > 3.1"})
+    setup = Setup.open(study, two_ray.TwoRay)
+    engine = Replay(setup.trace(), setup.parameters, "coherent")
+    with pytest.raises(InputError, match=r"links\.csv: 1 calibration link has a path; at least 2 must"):
+        calibrate(setup, engine=engine)
+    assert engine.calls == 1
+
+
 def test_starting_points_have_the_units_of_the_parameters(tmp_path):
     parameter = {"bounds": [1.5, 12.0], "scale": "log"}
     method = {"name": "least-squares", "options": {"starts": 1, "x0": [[6.0], [9.0]]}}
