@@ -15,6 +15,8 @@ from calibray.errors import InputError
 from calibray.fields import DisplacementLoss, path_loss
 from calibray.measurements import Measurements
 from calibray.reporting.wording import scene_alone_text
+from calibray.result.verdict import Remark, RemarkKind
+from calibray.result.wording import remark_text
 from calibray.study import Setup, Study
 from calibray.study.displacement import cubics, reached
 from two_ray import COLUMNS, TwoRay
@@ -158,6 +160,21 @@ def test_wrong_heights_and_shifts_are_found_and_verified_by_a_trace(folder: Path
     blind = cb.calibrate(study(folder, "stated.csv", {}), tracer=TwoRay)
     assert blind.fit.retrace_gap_db is None
     assert result.rmse_db < blind.rmse_db - 0.2
+
+
+def test_links_that_change_when_traced_again_are_counted_in_a_remark(folder: Path, result: cb.Result) -> None:
+    def remark(result: cb.Result) -> list[Remark]:
+        return [each for each in result.uncertainty.remarks if each.kind == RemarkKind.RETRACED]
+
+    assert not remark(result)
+    strict = cb.calibrate(
+        study(folder, "stated.csv", fidelity={"rounds": 1, "tolerance_db": 0.3}), tracer=TwoRay
+    )
+    (found,) = remark(strict)
+    gap = np.abs(strict.links["retrace_gap_db"].to_numpy())
+    assert found.values["links"] == (gap > 0.3).sum() > 0
+    assert f"{(gap > 0.3).sum()} of 160 links change by more than 0.3 dB" in remark_text(found)
+    assert f"by up to {gap.max():.2f} dB" in remark_text(found)
 
 
 def test_predictions_have_the_calibrated_height_at_exact_receivers(folder: Path, result: cb.Result) -> None:

@@ -42,7 +42,7 @@ from calibray.result.record import (
     Prediction,
     Provenance,
 )
-from calibray.result.verdict import Remark, RemarkKind
+from calibray.result.verdict import Remark, RemarkKind, Value
 from calibray.scenes.obstruction import OUT_OF_SIGHT, REGION
 from calibray.study import Setup, Study
 from calibray.study.facades import without_facade_materials
@@ -168,6 +168,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
                 *([cheap.remark] if cheap.remark else []),
                 *run.on_links,
                 *certainty.record.remarks,
+                *_retraced(gap_db, counted, study.fidelity.tolerance_db),
                 *_not_judged(study, accuracy),
             ),
         ),
@@ -190,6 +191,17 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
         scene=without_facade_materials(setup.scene, study.facades),
         paths=paths,
     )
+
+
+def _retraced(
+    gap_db: NDArray[np.float64] | None, counted: NDArray[np.bool_], tolerance_db: float
+) -> tuple[Remark, ...]:
+    """A remark that path loss of links [L] changes with a new trace by more than the tolerance."""
+    above = 0 if gap_db is None else int((np.abs(gap_db[counted]) > tolerance_db).sum())
+    if not above:
+        return ()
+    values: dict[str, Value] = {"links": above, "of": int(counted.sum()), "tolerance_db": tolerance_db}
+    return (Remark(RemarkKind.RETRACED, values | {"largest_db": largest_gap(gap_db, counted) or 0.0}),)
 
 
 def _not_judged(study: StudyModel, accuracy: Accuracy) -> tuple[Remark, ...]:

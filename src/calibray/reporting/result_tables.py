@@ -187,10 +187,8 @@ def costs(result: Record) -> Table:
         rows.append(("failed, or a link lost its path", f"{failed:,}"))
     if cost.cheap_replays:
         rows.append(("replays of the cheap model", f"{cost.cheap_replays:,} in {cost.cheap_seconds:.1f} s"))
-    gap_db, tolerance_db = result.fit.retrace_gap_db, result.study.fidelity.tolerance_db
-    if gap_db is not None:
-        excess = f", more than fidelity.tolerance_db = {tolerance_db:g}" if gap_db > tolerance_db else ""
-        rows.append(("largest change when traced again", f"{gap_db:.2f} dB{excess}"))
+    if (gap_db := result.fit.retrace_gap_db) is not None:
+        rows.append(("largest change when traced again", f"{gap_db:.2f} dB"))
     if cost.uncertainty_replays:
         replays = f"{cost.uncertainty_replays:,} in {cost.uncertainty_seconds:.1f} s"
         rows.append(("replays for intervals", replays))

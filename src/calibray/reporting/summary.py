@@ -17,7 +17,7 @@ from calibray.reporting.wording import (
 )
 from calibray.result.record import Record
 from calibray.result.verdict import RemarkKind, Verdict
-from calibray.result.wording import NOT_JUDGED, judgement_text
+from calibray.result.wording import NOT_JUDGED, judgement_text, remark_text
 from calibray.support.messages import counted
 from calibray.tables import named, rows_text
 from calibray.validation.validation import Validation
@@ -197,12 +197,9 @@ def _cautions(result: Record) -> Iterator[Sentence]:
                 sentences.append(
                     f"The {end} is inside a building in {rows_text(list(rows))}: check the positions."
                 )
-    gap, tolerance = result.fit.retrace_gap_db, result.study.fidelity.tolerance_db
-    if gap is not None and gap > tolerance:
-        sentences.append(
-            f"When the scene is traced again with the calibrated materials, a link changes by up to {gap:.2f} dB, more "
-            f"than the tolerance of {tolerance:g} dB (fidelity.tolerance_db). Raise trace.samples or fidelity.rounds."
-        )
+    sentences += [
+        remark_text(remark) for remark in result.uncertainty.remarks if remark.kind == RemarkKind.RETRACED
+    ]
     if result.nuisance.groups_without_path:
         groups = named(group_text(result, group) for group in result.nuisance.groups_without_path)
         sentences.append(f"No calibration link of {groups} has a path, so the offset there is unknown.")

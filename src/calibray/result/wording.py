@@ -305,6 +305,16 @@ def _differing_groups(values: dict[str, Any]) -> str:
     )
 
 
+def _retraced(values: dict[str, Any]) -> str:
+    links, total = values["links"], counted(values["of"], "link")
+    return (
+        f"When the scene is traced again with the calibrated values, {links:,} of {total} "
+        f"{'changes' if links == 1 else 'change'} by more than {values['tolerance_db']:g} dB "
+        f"(fidelity.tolerance_db), by up to {values['largest_db']:.2f} dB. Values and intervals depend on which paths "
+        "were found: raise trace.samples or fidelity.rounds."
+    )
+
+
 _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.CORRELATED_NOISE: _noise_remark("Neighbouring links share part of their errors"),
     RemarkKind.HEAVY_TAILS: _noise_remark("The noise has heavy tails, as with outliers"),
@@ -330,6 +340,7 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.APPROXIMATE_INTERVALS: _approximate_intervals,
     RemarkKind.RAY_MAPPING: _ray_mapping,
     RemarkKind.NO_CHEAP_MODEL: lambda values: f"No cheap model is used: {values['cause']}.",
+    RemarkKind.RETRACED: _retraced,
     RemarkKind.NOT_JUDGED: lambda values: NOT_JUDGED,
     RemarkKind.MISSING_REGION: _missing_region,
     RemarkKind.UNREACHED_LINKS: _unreached_links,
