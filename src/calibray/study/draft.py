@@ -280,7 +280,7 @@ def _content(links: LinksDraft) -> dict[str, Any]:
         reason += "" if "frequency" in section else "; position_error_m models them"
         links.assume("links.inside", "move", reason)
     antenna_section = add_antennas(links)
-    trace = {"max_depth": _depth(links) if indoors else 3, "samples": 200_000}
+    trace: dict[str, Any] = {"max_depth": _depth(links) if indoors else 3, "samples": "auto"}
     # Behind buildings most links have no other path.
     trace["refraction" if indoors else "diffraction"] = True
     scene, constants = _scene(links)
@@ -296,8 +296,6 @@ def _content(links: LinksDraft) -> dict[str, Any]:
         **({"regions": regions} if regions else {}),
         **({"observables": links.observables} if links.observables else {}),
         "offset": {"per": links.groups} if links.groups else {},
-        # Refracted paths are sampled by the materials, so every new trace changes some links: one is enough.
-        **({"fidelity": {"tolerance_db": 2.0, "rounds": 1}} if indoors else {}),
         "method": {"name": "auto", "seed": 0},
     }
 
