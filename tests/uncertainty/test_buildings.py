@@ -157,22 +157,18 @@ def test_a_thickness_that_is_not_known_exactly_widens_the_interval(problem):
 SCATTER = "marble.scattering_coefficient"
 
 
-def test_scattering_coefficients_of_0_are_exact_with_a_probability_of_one_half(problem):
+def test_a_scattering_coefficient_of_0_is_exact_with_a_probability_of_one_half(problem):
     best = problem.parameters.to_search(np.array(list(planted.TRUTH.values())))
     problem = _measuring(problem, problem.modelled(best[None])[0])
     model = joint_model(problem, best, 0.3**2, problem.freedom)
     index = model.parameters.names.index(SCATTER)
     drawn = model.parameters.from_unit(model.draw_prior(20_000, np.random.default_rng(3)))[:, index]
-    every = [k for k, name in enumerate(model.parameters.names) if name.endswith("scattering_coefficient")]
-    together = model.parameters.from_unit(model.draw_prior(20_000, np.random.default_rng(3)))[:, every]
-    assert len(every) == 3
-    assert np.mean((together == 0.0).all(axis=1)) == pytest.approx(0.5, abs=0.015)
-    assert np.mean(drawn == 0.0) == pytest.approx(0.5 ** (1 / 3), abs=0.015)
+    assert np.mean(drawn == 0.0) == pytest.approx(0.5, abs=0.015)
     assert drawn.min() == 0.0
     # The positive half of a Gaussian with a standard deviation of 0.25, up to three of them.
     half = halfnorm(scale=0.25)
     levels = half.cdf([0.1, 0.25, 0.5]) / half.cdf(0.75)
-    assert [np.mean(drawn[drawn > 0] < each) for each in (0.1, 0.25, 0.5)] == pytest.approx(levels, abs=0.025)
+    assert [np.mean(drawn[drawn > 0] < each) for each in (0.1, 0.25, 0.5)] == pytest.approx(levels, abs=0.015)
     # What it changes: it weakens reflections by the factor 1 - S^2, and those of marble are a part of the power.
     assert 0 < model.effects_db[SCATTER] < -10 * np.log10(1 - 0.25**2) + 1e-6
     # A study that states 0 is believed.

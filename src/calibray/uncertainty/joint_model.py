@@ -2,7 +2,7 @@
 
 - The study's parameters have flat priors over their bounds, or the priors that the study declares.
 - Constants of the same materials that the scene fixes, such as thickness, have a log-normal prior around the scene's
-  value, because nobody knows them exactly. All scattering coefficients of 0 are exact with a probability of one half.
+  value, because nobody knows them exactly. A scattering coefficient of 0 is exact with a probability of one half.
 - The walls of building b have the constants x exp(s z_b), where x is the material's mean and z_b is standard normal.
   The between-building spread s is zero with probability `ALIKE`, otherwise exponential.
 - Errors follow one of several noise models (`noise_models.py`), whose level, nuisances and undeclared offset are
@@ -319,9 +319,7 @@ def _with_constants(
             change = gaps[1:] - gaps[:1]
         effect_db = np.sqrt(np.mean(np.where(np.isfinite(change), change, 0.0) ** 2, axis=1))
         effects = dict(zip((item.name for item in fixed), effect_db.tolist(), strict=True))
-    varied = _smooth_together(
-        [item for item in fixed if effects[item.name] > NO_EFFECT * model.marginal.noise_db]
-    )
+    varied = [item for item in fixed if effects[item.name] > NO_EFFECT * model.marginal.noise_db]
     parameters = replace(study, items=(*study.items, *varied))
     index = [every.names.index(name) for name in parameters.names]
 
@@ -405,16 +403,6 @@ def _fixed_constants(problem: Problem) -> list[Parameter]:
         if name not in calibrated.names and constant is not None and not varies and not exact:
             items.append(constant)
     return items
-
-
-def _smooth_together(constants: list[Parameter]) -> list[Parameter]:
-    """The constants, of which all scattering coefficients of 0 together are exact with a probability of one half."""
-    count = sum(item.at_lower > 0 for item in constants)
-    if not count:
-        return constants
-    exact = 0.5 ** (1 / count)
-    # By itself, each is exact with a probability of one half, so that its odds are 1.
-    return [replace(item, at_lower=item.at_lower * exact / (1 - exact)) for item in constants]
 
 
 def _weights_and_censoring(problem: Problem) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
