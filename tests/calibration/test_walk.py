@@ -62,13 +62,8 @@ def planted(folder: Path) -> tuple[dict, dict]:
 
 
 def spread_at_truth(study: Study, materials: dict) -> tuple[float, dict[str, float]]:
-    """Standard deviation [dB] of the links about the planted materials, and the offset of every group [dB].
-
-    The trace sends a quarter of the study's rays.
-    """
-    content = study.content()
-    content["trace"]["samples"] //= 4
-    setup = Setup.open(Study.from_content(content, study.path))
+    """Standard deviation [dB] of the links about the planted materials, and the offset of every group [dB]."""
+    setup = Setup.open(study)
     paths = setup.trace()
     truth = {name: replace(paths.materials[name], **constants) for name, constants in materials.items()}
     gap = setup.links.path_loss_db - path_loss(paths, {**paths.materials, **truth})
