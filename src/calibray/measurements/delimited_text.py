@@ -139,9 +139,10 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
 
 def _layout(text: str, separator: str | None) -> _Layout:
     """The first line from which all lines have the same number of cells, and the mark that gives the most cells."""
+    first_lines = list(islice(io.StringIO(text, newline=""), 30 + 4 * _HEAD))
     for above in range(31):  # lines above a header
         layouts: list[tuple[int, _Layout]] = []
-        head = list(islice(io.StringIO(text, newline=""), above, above + 4 * _HEAD))
+        head = first_lines[above : above + 4 * _HEAD]
         if above and (len(head) < 2 or not head[0].strip()):
             continue
         for mark in ",;\t " if separator is None else separator:
