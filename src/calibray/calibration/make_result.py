@@ -197,11 +197,17 @@ def _retraced(
     gap_db: NDArray[np.float64] | None, counted: NDArray[np.bool_], tolerance_db: float
 ) -> tuple[Remark, ...]:
     """A remark that path loss of links [L] changes with a new trace by more than the tolerance."""
-    above = 0 if gap_db is None else int((np.abs(gap_db[counted]) > tolerance_db).sum())
-    if not above:
+    if gap_db is None or not (np.abs(gap_db[counted]) > tolerance_db).any():
         return ()
-    values: dict[str, Value] = {"links": above, "of": int(counted.sum()), "tolerance_db": tolerance_db}
-    return (Remark(RemarkKind.RETRACED, values | {"largest_db": largest_gap(gap_db, counted) or 0.0}),)
+    change_db = np.abs(gap_db[counted])
+    values: dict[str, Value] = {
+        "links": int((np.isfinite(change_db) & (change_db > tolerance_db)).sum()),
+        "lost": int(np.isinf(change_db).sum()),
+        "of": len(change_db),
+        "tolerance_db": tolerance_db,
+        "largest_db": largest_gap(gap_db, counted) or 0.0,
+    }
+    return (Remark(RemarkKind.RETRACED, values),)
 
 
 def _not_judged(study: StudyModel, accuracy: Accuracy) -> tuple[Remark, ...]:

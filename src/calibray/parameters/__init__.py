@@ -1,6 +1,6 @@
 """Parameters: the quantities that a calibration may change, their search space, and the laws to which some belong."""
 
-from calibray.parameters.parameter import SCATTERING as SCATTERING
+from calibray.parameters.parameter import SCATTERING_SPREAD as SCATTERING_SPREAD
 from calibray.parameters.parameter import Parameter as Parameter
 from calibray.parameters.parameter import Scale as Scale
 from calibray.parameters.parameter import fixed_constant as fixed_constant

@@ -162,7 +162,7 @@ class Parameter:
         return is_effect(self.name)
 
 
-SCATTERING: Final = 0.25
+SCATTERING_SPREAD: Final = 0.25
 """Standard deviation of a scattering coefficient of which a scene says 0, unless it is exactly 0. Facades have 0.2 to
 0.4 (V. Degli-Esposti et al., IEEE Trans. Antennas and Propagation 55, 2007)."""
 
@@ -171,8 +171,8 @@ def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:
     """A parameter for a constant that a scene fixes, within four standard deviations of its logarithm.
 
     A scattering coefficient of 0 is exactly 0 with a probability of one half, and otherwise has the positive half of a
-    Gaussian with the standard deviation `SCATTERING` as its prior. None if another constant is 0, if these values are
-    impossible, or if the spread is 0.
+    Gaussian with the standard deviation `SCATTERING_SPREAD` as its prior. None if another constant is 0, if these
+    values are impossible, or if the spread is 0.
 
     Example:
         >>> fixed_constant("walls.thickness", 0.2, 0.1).upper
@@ -183,7 +183,7 @@ def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:
     constant = split_name(name)[1]
     if constant == "scattering_coefficient" and value == 0.0 and spread > 0.0:
         # As long as the integral of the half Gaussian, whose density is 1 at 0.
-        return Parameter(name, 0.0, 3.0 * SCATTERING, 0.0, at_lower=SCATTERING * sqrt(pi / 2.0))
+        return Parameter(name, 0.0, 3.0 * SCATTERING_SPREAD, 0.0, at_lower=SCATTERING_SPREAD * sqrt(pi / 2.0))
     bound, factor = PARAMETER_BOUNDS[constant], exp(4.0 * spread)
     # The range ends at a physical bound, such as 1 for a scattering coefficient.
     lower, upper = value / factor, min(value * factor, bound.upper)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from calibray.parameters.parameter import SCATTERING
+from calibray.parameters.parameter import SCATTERING_SPREAD
 from calibray.parameters.space import Parameters
 
 
@@ -44,13 +44,13 @@ class LogNormal:
     def extended(self, index: Sequence[int], centre: Sequence[float], spread: float) -> LogNormal:
         """These priors, and independent priors of further parameters with one spread of their logarithms.
 
-        Scattering coefficients around 0 have the standard deviation `SCATTERING`.
+        Scattering coefficients around 0 have the standard deviation `SCATTERING_SPREAD`.
         """
         return replace(
             self,
             index=(*self.index, *index),
             centre=(*self.centre, *centre),
-            spread=(*self.spread, *(spread if value > 0 else SCATTERING for value in centre)),
+            spread=(*self.spread, *(spread if value > 0 else SCATTERING_SPREAD for value in centre)),
             linear=(
                 *self.linear,
                 *(number for number, value in zip(index, centre, strict=True) if value == 0),

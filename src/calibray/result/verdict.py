@@ -123,9 +123,9 @@ class RemarkKind(StrEnum):
     # (links), half_space (all surfaces), half_spaces (materials); names and values of constants
     RAY_MAPPING = "ray mapping"
     NO_CHEAP_MODEL = "no cheap model"  # cause
-    RETRACED = (
-        "retraced"  # links that change by more than tolerance_db when traced again, of (all), largest_db
-    )
+    # when traced again: links that change by more than tolerance_db, of (all), largest_db; lost, those that have a path
+    # in one trace only
+    RETRACED = "retraced"
     NOT_JUDGED = "not judged"
     MISSING_REGION = "missing region"  # west, south, east, north, height, attenuation, links, share, chance
     # transmitters; azimuth_deg and downtilt_deg, what to add to their stated angles, and azimuth_error_deg,

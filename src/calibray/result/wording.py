@@ -306,12 +306,20 @@ def _differing_groups(values: dict[str, Any]) -> str:
 
 
 def _retraced(values: dict[str, Any]) -> str:
-    links, total = values["links"], counted(values["of"], "link")
+    links, lost, total = values["links"], values["lost"], counted(values["of"], "link")
+    changes = []
+    if links:
+        changes.append(
+            f"{links:,} of {total} {'changes' if links == 1 else 'change'} by more than {values['tolerance_db']:g} dB "
+            f"(fidelity.tolerance_db), by up to {values['largest_db']:.2f} dB"
+        )
+    if lost:
+        changes.append(
+            f"{lost:,} of {total} {'has' if lost == 1 else 'have'} a path in one of the traces only"
+        )
     return (
-        f"When the scene is traced again with the calibrated values, {links:,} of {total} "
-        f"{'changes' if links == 1 else 'change'} by more than {values['tolerance_db']:g} dB "
-        f"(fidelity.tolerance_db), by up to {values['largest_db']:.2f} dB. Values and intervals depend on which paths "
-        "were found: raise trace.samples or fidelity.rounds."
+        f"When the scene is traced again with the calibrated values, {', and '.join(changes)}. Values and intervals "
+        "depend on which paths were found: raise trace.samples, if it is a number, or fidelity.rounds."
     )
 
 

@@ -28,7 +28,14 @@ from numpy.typing import NDArray
 from calibray.fitting.nuisance import CONSTANT
 from calibray.fitting.problem import Problem
 from calibray.measurements import FEW
-from calibray.parameters import SCATTERING, LogNormal, Parameter, Parameters, fixed_constant, split_name
+from calibray.parameters import (
+    SCATTERING_SPREAD,
+    LogNormal,
+    Parameter,
+    Parameters,
+    fixed_constant,
+    split_name,
+)
 from calibray.uncertainty.buildings import can_split, replayed_materials, split_replay
 from calibray.uncertainty.noise_models import HEAVY, Marginal, excess_db, noise_models
 
@@ -312,7 +319,7 @@ def _with_constants(
         values = np.append(study.from_search(best), [item.start for item in fixed])
         # One row per fixed constant, in which it is larger by one standard deviation.
         one = np.eye(len(values))[len(study) :]
-        larger = values * np.exp(known_to * one) + SCATTERING * one * (values == 0)
+        larger = values * np.exp(known_to * one) + SCATTERING_SPREAD * one * (values == 0)
         alike = np.ones((len(values) - len(study) + 1, len(replay.parameter_of)))
         gaps = gap(loss_at(np.vstack([values, larger]), alike))
         with np.errstate(invalid="ignore"):  # inf - inf for a censored link without a path
