@@ -35,6 +35,7 @@ from calibray.optimizers import LeastSquares
 from calibray.result.held_out import AVERAGE_OF, Model
 from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import certainty
+from calibray.uncertainty.richer_paths import assess_richer_paths
 from calibray.uncertainty.verdicts import credible_sets
 from calibray.validation.models import fit_variants
 from calibray.validation.validate import fit_models, validate_problem
@@ -53,8 +54,13 @@ PARTLY = ("ambiguous", "at bound")
 NOT_AVERAGED = {str(average): name for name, average in AVERAGE_OF.items()}
 
 
-def repetition(world: World, seed: int, spread: float | None, *, draws: bool, choice: bool) -> dict[str, Any]:
-    """Calibrate one truth: with draws, verdicts and whether their sets contain it; with a choice, errors far away."""
+def repetition(
+    world: World, seed: int, spread: float | None, *, draws: bool, check: bool, choice: bool
+) -> dict[str, Any]:
+    """Calibrate one truth: with draws, verdicts and whether their sets contain it; with a choice, errors far away.
+
+    With a check, draws may follow paths that the study leaves out.
+    """
     started, drawn = time.process_time(), world.planted(seed)
     problem, loss, random = drawn.problem, drawn.loss_db, np.random.default_rng([seed, 4])
     weight, far = problem.objective.weight.copy(), np.zeros(len(loss), dtype=bool)
@@ -73,7 +79,7 @@ def repetition(world: World, seed: int, spread: float | None, *, draws: bool, ch
     line: dict[str, Any] = {"links": int((weight > 0).sum())}
     line |= dict.fromkeys(("verdicts", "inside", "held", "remarks"), ())
     if draws:
-        line |= intervals(planted, trail, drawn.truth)
+        line |= intervals(planted, trail, drawn.truth, check=check)
     if choice and far.any():
         part = replace(planted, setup=planted.setup.with_obstruction())
         minima = {Model.CALIBRATED: trail.minima}
@@ -85,10 +91,12 @@ def repetition(world: World, seed: int, spread: float | None, *, draws: bool, ch
     return line | {"seconds": time.process_time() - started}
 
 
-def intervals(planted: Problem, trail: Trail, point: np.ndarray) -> dict[str, Any]:
+def intervals(planted: Problem, trail: Trail, point: np.ndarray, *, check: bool) -> dict[str, Any]:
     """Verdicts and remarks of a calibration, and whether its sets and intervals contain the truth [d]."""
     parameters, (lower, upper) = planted.parameters, planted.parameters.search_bounds
     assessed = certainty(planted, trail)
+    if check:
+        assessed = assess_richer_paths(planted, trail, assessed)
     if assessed.posterior is None:
         raise RuntimeError(f"no draws; {assessed.record.remarks}")
     means, inside, widths = assessed.posterior.means, [], []
@@ -169,6 +177,7 @@ def main() -> None:
     parser.add_argument(
         "--constants-spread", type=float, help="how well constants are known; the default if absent"
     )
+    parser.add_argument("--no-check", action="store_true", help="do not check for paths that the study lacks")
     parser.add_argument("--no-choice", action="store_true", help="leave validation out")
     parser.add_argument("--no-draws", action="store_true", help="leave verdicts and intervals out")
     parser.add_argument("--out", type=Path, help="file of lines, one a repetition; goes on where it stands")
@@ -178,7 +187,7 @@ def main() -> None:
     names = named(given.districts)
     settings = {
         "seed": given.seed, "constants_spread": given.constants_spread, "draws": not given.no_draws,
-        "choice": not given.no_choice,
+        "check": not given.no_check, "choice": not given.no_choice,
     }  # fmt: skip
     lines = read_runs(given.out, settings)
     lines = [line for line in lines if line["district"] in names and line["world"] in worlds]
@@ -193,7 +202,7 @@ def main() -> None:
         for world, turn in missing:
             line = repetition(
                 made[world], 1000 * given.seed + turn, given.constants_spread,
-                draws=settings["draws"], choice=settings["choice"],
+                draws=settings["draws"], check=settings["check"], choice=settings["choice"],
             )  # fmt: skip
             lines.append(line | settings | {"district": name, "world": world, "repetition": turn})
             append_run(given.out, lines[-1])

@@ -38,6 +38,7 @@ from calibray.support.progress import Progress
 from calibray.tracing import SIONNA
 from calibray.tracing.protocol import TracerFactory
 from calibray.uncertainty.assessment import certainty
+from calibray.uncertainty.richer_paths import assess_richer_paths
 from calibray.validation.models import NO_MINIMA
 from calibray.validation.validate import check_engine, validate_problem
 
@@ -147,6 +148,8 @@ def calibrate(
         gap_db = None
     timing = Timing(search=time.perf_counter() - traced, trace=traced - started)
     assessment = certainty(problem, trail, progress, cheap.model)
+    if can_trace and exporting is None:
+        assessment = assess_richer_paths(problem, trail, assessment, progress)
     if plan.holdout is not None:
         problem = replace(problem, setup=problem.setup.with_obstruction())
     validation = None

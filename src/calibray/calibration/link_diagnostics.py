@@ -298,10 +298,8 @@ def unreached_remark(problem: Problem, progress: Progress | None = None) -> tupl
 
 def _reached(setup: Setup, sample: NDArray[np.int64], change: dict[str, Any]) -> int:
     """Number of links in the sample that have a path with other settings of the tracer."""
-    content = setup.study.content()
-    study = Study.from_content(content | {"trace": content["trace"] | change}, setup.study.path)
     mask = np.isin(np.arange(len(setup.links)), sample)
-    paths = replace(setup, study=study).at(setup.links.select(mask)).trace()
+    paths = setup.traced_with(**change).at(setup.links.select(mask)).trace()
     return len(np.unique(paths.link))
 
 

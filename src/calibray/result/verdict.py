@@ -111,6 +111,9 @@ class RemarkKind(StrEnum):
     ERRORS_OUT_OF_SIGHT = "errors out of sight"
     # observables, names, path_loss, further, standard_errors; slope and slope_error of measured over modelled values
     CONFLICT = "conflict"
+    # probability; settings of [trace] with which the paths were traced; rmse_db with these paths, rmse_without_db;
+    # outside, names of the parameters whose values lie outside their intervals
+    RICHER_PATHS = "richer paths"
     HETEROGENEITY = "heterogeneity"  # weight, gaussian_weight
     UNDECLARED_OFFSET = "undeclared offset"  # offset_db, error_db, rmse_db, rmse_without_db
     MISSED_OPTIMUM = "missed optimum"  # draws_db, found_db

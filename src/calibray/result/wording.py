@@ -147,6 +147,19 @@ def _errors_out_of_sight(values: dict[str, Any]) -> str:
     return f"{text} To find more paths, set in [trace]: {', '.join(lacking)}." if lacking else text
 
 
+def _richer_paths(values: dict[str, Any]) -> str:
+    settings, outside = ", ".join(values["settings"]), values["outside"]
+    text = (
+        f"The measurements favour paths that the study's settings leave out, with a probability of "
+        f"{values['probability']:.2f}. With {settings}, the RMSE would be {values['rmse_db']:.2f} instead of "
+        f"{values['rmse_without_db']:.2f} dB. The intervals, verdicts and remarks on noise are those with these paths; "
+        "calibrated values and predictions are not."
+    )
+    if outside:
+        text += f" Calibrated values outside of their intervals: {', '.join(outside)}."
+    return f"{text} Set these keys in [trace], and calibrate again."
+
+
 _CAUSES: Final = {
     "correlated": "neighbouring links share part of their errors, so that many links count as few",
     "out_of_sight": "weak links out of sight count less if the scene lacks paths to them",
@@ -335,6 +348,7 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
         f"{values['error_db']:.1f} dB. With this offset, the RMSE would be {values['rmse_db']:.2f} instead of "
         f"{values['rmse_without_db']:.2f} dB. Add [offset] if cable losses or antenna gains are uncertain."
     ),
+    RemarkKind.RICHER_PATHS: _richer_paths,
     RemarkKind.MISSED_OPTIMUM: lambda values: (
         f"The method missed the optimum: posterior draws reach an RMSE of {values['draws_db']:.2f} dB, but the "
         f"method reached {values['found_db']:.2f} dB. The intervals are around the optimum: use the "

@@ -77,6 +77,7 @@ class Posterior:
         model: Index of the noise model of every draw [n].
         replays: Evaluations of path loss that the draws took.
         shape: Numbers of populations, of states that each member kept as draws, and of members of a population.
+        log_evidence: Logarithm of the probability density of the measurements, averaged over the prior.
     """
 
     means: Draws
@@ -86,6 +87,7 @@ class Posterior:
     model: NDArray[np.int64]
     replays: int = 0
     shape: tuple[int, int, int] = (0, 0, 0)
+    log_evidence: float = 0.0
 
 
 def joined(posteriors: Sequence[Posterior]) -> Posterior:
@@ -98,6 +100,7 @@ def joined(posteriors: Sequence[Posterior]) -> Posterior:
         np.concatenate([each.model for each in posteriors]),
         sum(each.replays for each in posteriors),
         (sum(each.shape[0] for each in posteriors), *posteriors[0].shape[1:]),
+        float(np.logaddexp.reduce([each.log_evidence for each in posteriors])) - np.log(len(posteriors)),
     )
 
 
@@ -173,7 +176,10 @@ def draw_posterior(
     # Populations that disagree count alike: the estimates of their evidence are then unreliable.
     share = _weights(np.array(evidences)) if agree else np.full(len(populations), 1.0 / len(populations))
     posterior = _posterior(model, _together(populations), np.repeat(share, members) / members, agree)
-    return replace(posterior, replays=replays, shape=(len(populations), members // size, size))
+    # Noise models were drawn uniformly, but the likelihood contains their weights.
+    log_evidence = float(np.logaddexp.reduce(evidences)) - np.log(len(evidences) / len(model.marginal.models))
+    shape = (len(populations), members // size, size)
+    return replace(posterior, replays=replays, shape=shape, log_evidence=log_evidence)
 
 
 def _together(populations: Sequence[Population]) -> Population:

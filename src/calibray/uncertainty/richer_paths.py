@@ -1,0 +1,105 @@
+"""Uncertainty if the measurements favour paths that the study's trace leaves out.
+
+Intervals of a twin that lacks paths, such as paths through buildings, are around wrong values: the constants make up
+for the missing power. The links are therefore traced once more with refraction and diffraction.
+The evidence of both twins, from their draws, decides between them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from calibray.engines.kinds.replay import replay
+from calibray.engines.replay import Replay, ReplayCarriers
+from calibray.fitting.problem import Problem
+from calibray.fitting.search import BASINS, STARTS, Trail, search
+from calibray.measurements import FEW
+from calibray.optimizers import LeastSquares
+from calibray.result.verdict import Remark, RemarkKind
+from calibray.scenes.obstruction import OUT_OF_SIGHT
+from calibray.study.displacement import displaces
+from calibray.support.progress import Progress, with_stage
+from calibray.uncertainty.assessment import Certainty, certainty
+from calibray.uncertainty.remarks import LIKELY
+from calibray.uncertainty.verdicts import consistent
+
+LONGEST_TRACE: Final = 60.0
+"""Estimated duration above which no richer paths are traced [s]."""
+
+LIKELY_LOG_ODDS: Final = float(np.log(LIKELY / (1.0 - LIKELY)))
+"""Smallest logarithm of the odds in favour of richer paths at which their uncertainty is used."""
+
+OF_THE_FIT: Final = (RemarkKind.MISSED_OPTIMUM, RemarkKind.OUTSIDE_INTERVAL)
+"""Remarks that compare draws with the calibrated values."""
+
+
+def assess_richer_paths(
+    problem: Problem, trail: Trail, assessed: Certainty, progress: Progress | None = None
+) -> Certainty:
+    """The uncertainty on richer paths, with a remark, if the measurements favour these; otherwise the given one.
+
+    Nothing is traced if the study states the noise, if its `fidelity.rounds` are 0, or if no link is out of sight. The
+    stage of `progress` is "tracing more paths".
+
+    Args:
+        problem: The problem.
+        trail: Its search.
+        assessed: Its uncertainty.
+        progress: Called with the stage, the work done and the total.
+    """
+    changes = lacking(problem)
+    if assessed.posterior is None or not changes:
+        return assessed
+    setup = problem.setup.traced_with(**changes)
+    if setup.tracer.plan(setup.links).seconds > LONGEST_TRACE:
+        return assessed
+    materials = problem.parameters.materials(trail.best, problem.engine.materials)
+    paths = setup.trace(materials, with_stage(progress, "tracing more paths"))
+    richer = replace(problem, setup=setup, engine=replay(setup, paths))
+    counted = problem.objective.weight > 0
+    if not np.isfinite(richer.engine.path_loss(trail.best[None])[0][counted]).all():
+        return assessed
+    method = LeastSquares(*problem.parameters.search_bounds, starts=STARTS[0], x0=trail.minima[:BASINS])
+    fitted = search(richer, method)
+    # The likelihood ratio of Gaussian errors of unknown level; draws take much longer.
+    if counted.sum() * np.log(trail.best_value / fitted.best_value) < LIKELY_LOG_ODDS:
+        return assessed
+    other = certainty(richer, fitted, progress)
+    calls, seconds = assessed.calls + other.calls, assessed.seconds + other.seconds
+    log_odds = 0.0
+    if other.posterior is not None:
+        log_odds = other.posterior.log_evidence - assessed.posterior.log_evidence
+    if log_odds < LIKELY_LOG_ODDS:
+        return replace(assessed, calls=calls, seconds=seconds)
+    best = problem.parameters.named(trail.best)
+    intervals = {name: consistent(each, best[name]) for name, each in other.record.intervals.items()}
+    remark = Remark(
+        RemarkKind.RICHER_PATHS,
+        {
+            "probability": float(1.0 / (1.0 + np.exp(-log_odds))),
+            "settings": [f"{name} = {str(value).lower()}" for name, value in changes.items()],
+            "rmse_db": fitted.best_rmse_db,
+            "rmse_without_db": trail.best_rmse_db,
+            "outside": [name for name, each in intervals.items() if not each.contains(best[name])],
+        },
+    )
+    remarks = (remark, *(each for each in other.record.remarks if each.kind not in OF_THE_FIT))
+    record = replace(other.record, intervals=intervals, remarks=remarks)
+    return Certainty(record, other.posterior, calls, seconds)
+
+
+def lacking(problem: Problem) -> dict[str, bool]:
+    """Settings of the tracer that find more paths than the study's; none if these are not to be tried."""
+    study, counted = problem.setup.study, problem.objective.weight > 0
+    traced = isinstance(problem.engine, Replay | ReplayCarriers) and study.rays_path is None
+    displaced = any(displaces(name) for name in problem.parameters.names)
+    stated = study.noise.kind != "auto" or study.fidelity.rounds == 0
+    if not traced or displaced or stated or counted.sum() < FEW:
+        return {}
+    links = problem.setup.with_obstruction().links
+    if not (links.table.numbers(OUT_OF_SIGHT)[counted] > 0).any():
+        return {}
+    return {name: True for name in ("refraction", "diffraction") if not getattr(study.trace, name)}
