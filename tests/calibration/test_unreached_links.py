@@ -247,3 +247,28 @@ def test_calibrated_links_and_known_candidates_are_not_traced_again(
     assert len(opened) == 1
     result.predict(places(SEEN, (-40.0, 5.0)))
     assert len(opened) == 1
+
+
+def test_every_cell_of_a_wide_table_counts_as_a_link(shadowed: Result, tmp_path: Path) -> None:
+    """Two masts at one place, as columns of their own; a third one was never measured."""
+    folder = shadowed.study.path.parent
+    (folder / "masts.csv").write_text(
+        "mast,tx_x,tx_y,tx_z\na,-20,60,6\nb,-20,60,6\nc,-20,60,6\n", encoding="utf-8"
+    )
+    table = pd.read_csv(folder / "links.csv")[["rx_x", "rx_y", "rx_z", "path_loss_db"]]
+    table = table.rename(columns={"path_loss_db": "a"}).assign(b=lambda rows: rows["a"] + 2.0)
+    table.to_csv(folder / "wide.csv", index=False)
+    content = shadowed.study.content()
+    content["links"] |= {
+        "file": "wide.csv", "wide": {"a": "a", "b": "b"}, "transmitters": "masts.csv", "transmitter": "mast",
+    }  # fmt: skip
+    content["offset"] = {"per": "mast"}
+    result = cb.calibrate(cb.Study.from_content(content, folder / "wide.toml"), out=tmp_path / "out")
+    table.iloc[[0, -1]].to_csv(tmp_path / "new.csv", index=False)
+    run = CliRunner().invoke(app, ["predict", str(tmp_path / "out"), str(tmp_path / "new.csv")])
+    assert run.exit_code == 0, run.output
+    assert "Tracing 4 links: " in run.stderr
+    assert "Warning: no path: 2 of 4 links, row 3\n" in run.stderr
+    found = result.predict_interval(places(SEEN, HIDDEN, HIDDEN).assign(mast=["c", "c", "a"]))
+    assert found.basis.str.startswith("no path").tolist() == [False, True, True]
+    assert found.basis.str.endswith("group without measurements").tolist() == [True, True, False]

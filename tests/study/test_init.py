@@ -276,6 +276,17 @@ def test_a_wide_table_indoors(tmp_path):
     assert "brick_wall.conductivity" in found.study.parameters
 
 
+def test_a_wide_table_of_cells_whose_table_names_their_sites_too(scene, tmp_path):
+    """Scanners name the columns of a drive test by the physical cell identity (PCI)."""
+    file = table(
+        tmp_path, x=[2.0, -4.0], y=-15.0, **{"PCI 101 RSRP [dBm]": -80.0, "PCI 102 RSRP [dBm]": -85.0}
+    )
+    (tmp_path / "cells.csv").write_text("Site,PCI,x,y,z\nnorth,101,-20,0,9\nwest,102,-60,0,9\n")
+    found = draft(scene, file, tmp_path / "study.toml", tmp_path / "cells.csv", 1.8e9)
+    assert found.study.links.wide == {"PCI 101 RSRP [dBm]": "101", "PCI 102 RSRP [dBm]": "102"}
+    assert found.study.measurements().group_names == ("101", "102")
+
+
 def test_a_track_and_a_hill(tmp_path):
     """A house on a slope of 1 in 10, a walk of 40 m past it: each row at its time, each antenna above its ground."""
     rows, columns = np.mgrid[0:2, 0:2]

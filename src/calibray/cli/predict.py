@@ -98,6 +98,7 @@ def predict(
         if out is not None:
             check_table(out, [links_file, *study.files()], permissions.overwrite)
         warnings: dict[str, array[int]] = {}
+        count = 0
         with (
             open_workers(pool.workers, pool.scheduler) as workers,
             _printer() if out is None else growing_table(out) as append,
@@ -113,8 +114,9 @@ def predict(
                 remark = {} if level is None else {"remark": columns.pop("remark")}
                 append(links.frame.rename(columns=renamed).assign(**columns, **measured, **remark))
                 _collect_warnings(warnings, links.row, predictions)
+                count += len(links)
     for warning in sorted(warnings, key=lambda text: (text != UNREACHED, text)):
-        _warn(warning, warnings[warning], table.rows)
+        _warn(warning, warnings[warning], count)
     if UNREACHED in warnings and result.prediction.fallback is not None:
         received = study.links.noise_floor_dbm is not None
         reason = (
@@ -164,7 +166,9 @@ def _warn(warning: str, rows: Sequence[int], count: int) -> None:
     from calibray.tables import rows_text
 
     if rows:
-        echo(f"Warning: {warning}: {len(rows)} of {count} links, {rows_text(rows)}", err=True)
+        echo(
+            f"Warning: {warning}: {len(rows)} of {count} links, {rows_text([*dict.fromkeys(rows)])}", err=True
+        )
 
 
 def _renamed_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -> dict[str, str]:

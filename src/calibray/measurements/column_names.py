@@ -26,7 +26,7 @@ _DEVICES: Final = (
 
 PATTERNS: Final = {
     # What a column may hold, and the regular expression that a whole word of its name matches.
-    "transmitter": r"tx|transmitter|bs|bts|site|cell|cell_?(id|name)|[en]?ci|eci|ap|bssid|[ge]nb|[ge]?nodeb|base|"
+    "transmitter": r"tx|transmitter|bs|bts|site|cell|cell_?(id|name)|[enp]?ci|ap|bssid|[ge]nb|[ge]?nodeb|base|"
     r"basestation|anchor|beacon|gateway|gw|sender|basisstation|((mobil)?funk)?zelle|celda|cellule|cella|celula|emisor|"
     r"transmisor|emetteur|trasmettitore|estacion|station|stazione",
     "receiver": rf"rx|receiver|ue|phone|mobile|device|mobil|{_DEVICES}",

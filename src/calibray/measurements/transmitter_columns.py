@@ -145,19 +145,23 @@ def find_transmitter_of_positions(frame: pd.DataFrame, position: Sequence[str]) 
     return None
 
 
-def find_transmitter_names(transmitters: pd.DataFrame) -> str:
-    """Find the column of names in a table of transmitters with one row each.
+def find_transmitter_names(transmitters: pd.DataFrame) -> list[str]:
+    """Find the columns of names in a table of transmitters with one row each, such as those of sites and of cells.
 
     Raises:
         InputError: No column with a name of this kind distinguishes the transmitters.
     """
-    for name in transmitters:
-        is_named_so = matches(name, "name of a transmitter", "transmitter")
-        if is_named_so and transmitters[name].nunique() == len(transmitters):
-            return str(name)
-    raise InputError(
-        f"transmitters: no column names them ({', '.join(map(str, transmitters))}); call it 'transmitter'"
-    )
+    names = [
+        str(name)
+        for name in transmitters
+        if matches(name, "name of a transmitter", "transmitter")
+        and transmitters[name].nunique() == len(transmitters)
+    ]
+    if not names:
+        raise InputError(
+            f"transmitters: no column names them ({', '.join(map(str, transmitters))}); call it 'transmitter'"
+        )
+    return names
 
 
 def find_devices(frame: pd.DataFrame) -> list[str]:

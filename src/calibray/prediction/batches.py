@@ -110,7 +110,7 @@ def predict_batches(
         InputError: See `predict` and `predict_interval`.
         EngineError: The paths do not fit into memory, or workers fail repeatedly.
     """
-    setup, triangles, done, far, near = None, None, 0, None, False
+    setup, triangles, checked, count, far, near = None, None, 0, 0, None, False
     for rows in table.pieces(BATCH):
         links = as_links(result, rows)
         if setup is None or triangles is None:
@@ -124,20 +124,20 @@ def predict_batches(
         setup.parameters.check_carriers([frequency for frequency, _ in links.carriers])
         if level is None:
             check_groups(result, links)
-        done += len(links)
+        checked, count = checked + len(rows), count + len(links)
         if progress is not None:
-            progress("checking", done, table.rows)
+            progress("checking", checked, table.rows)
     if far is not None and not near:
         raise far
     if setup is None:
         return
-    announce(result, table.rows)
+    announce(result, count)
     done, size = 0, BATCH if workers is None else batch_size(setup, workers)
     for rows in table.pieces(size):
         setup = setup.at(as_links(result, rows))
-        batch_progress = with_total(progress, done, table.rows)
+        batch_progress = with_total(progress, done, count)
         predictions = predict_links(result, setup, level, batch_progress, workers, with_remarks=True)
-        done += len(rows)
+        done += len(setup.links)
         yield setup.links, predictions
 
 

@@ -26,7 +26,7 @@ from scipy.spatial.distance import cdist
 from calibray.errors import InputError
 from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, column, deviations_of, transmitters
 from calibray.measurements import Measurements
-from calibray.result.held_out import NO_PATH, PredictionModel, ResidualField
+from calibray.result.held_out import NEW_GROUP, NO_PATH, PredictionModel, ResidualField
 from calibray.result.record import Prediction
 from calibray.study.model import StudyModel
 from calibray.validation.held_out_statistics import interval_half_width
@@ -171,9 +171,11 @@ def fill_missing(
     shift = nuisance_shift(model_terms(model, at), at, new_groups=True)
     path_loss_db = without_scene(study, at) + shift.value_db[0]
     filled.loc[missing, "path_loss_db"] = path_loss_db
-    filled.loc[missing, "basis"] = f"{NO_PATH}: {model.name if level is None else model.basis}"
+    basis = f"{NO_PATH}: {model.name if level is None else model.basis}"
+    filled.loc[missing, "basis"] = basis
     if level is None:
         return filled
+    filled.loc[missing, "basis"] = np.where(shift.spread_db > 0, f"{basis}, {NEW_GROUP}", basis)
     half_width = np.broadcast_to(least_db, len(links))[missing]
     if model.residual_db:
         # A group without a coefficient adds its spread to the errors of the fallback.

@@ -203,8 +203,11 @@ class LinksDraft:
             self._leave_out_unknown_transmitters(name, self.sites.frame[of_table])
             self._keep_used_transmitters(of_table, self.table.frame[name])
             return
-        name = transmitter_columns.find_transmitter_names(self.sites.frame)
-        columns = transmitter_columns.find_wide_columns(self.table.frame, self.sites.labels(name).tolist())
+        wide = {
+            name: transmitter_columns.find_wide_columns(self.table.frame, self.sites.labels(name).tolist())
+            for name in transmitter_columns.find_transmitter_names(self.sites.frame)
+        }
+        name, columns = max(wide.items(), key=lambda item: len(item[1]))
         if not columns:
             raise InputError(
                 f"{self.links}: no column names the transmitter of a row, and no columns are named like the "
