@@ -129,6 +129,18 @@ def test_the_noise_floor_is_that_of_the_least_sensitive_receiver(scene, tmp_path
     assert any("none of receiver B is lower" in each.reason for each in found.assumptions)
 
 
+def test_receivers_with_numbers_are_devices_and_the_directions_of_their_antennas_are_none(scene, tmp_path):
+    power = np.linspace(-105.0, -60.0, 60)
+    rows = {"x": np.tile(np.linspace(-40, 10, 60), 2), "y": 20.0, "rx_azimuth_deg": np.tile([0.0, 90.0], 60)}
+    rows |= {"rsrp_dbm": np.concatenate([np.where(power > -90, power, np.nan), power])}
+    file = table(tmp_path, **rows, rx_id=np.repeat([1, 2], 60))
+    found = draft(scene, file, tmp_path / "study.toml", frequency=60e9, tx=[-30.0, 0.0, 9.0])
+    assert found.study.offset.per == ("rx_id",)
+    reasons = {each.what: each.reason for each in found.assumptions}
+    assert reasons["links.noise_floor_dbm"].endswith("none of rx_id 1 is lower, the least sensitive")
+    assert reasons["links.rx_antenna.azimuth_deg"].startswith("column rx_azimuth_deg may be")
+
+
 def test_the_noise_floor_is_that_of_the_least_sensitive_receiver_that_states_it(scene, tmp_path):
     """Each receiver writes its own floor for what it does not receive."""
     power = np.random.default_rng(4).uniform(-110.0, -60.0, 180).round(1)

@@ -166,12 +166,15 @@ def find_transmitter_names(transmitters: pd.DataFrame) -> list[str]:
 
 def find_devices(frame: pd.DataFrame) -> list[str]:
     """Columns that distinguish receiving devices."""
-    coordinates = ("x", "y", "longitude", "latitude", "height", "altitude or floor")
+    quantities = (
+        "x", "y", "longitude", "latitude", "height", "altitude or floor", "azimuth", "downtilt", "path gain", "power",
+        "received power", "path loss", "decibel", "frequency", "bandwidth or shift", "time", "distance",
+    )  # fmt: skip
     return [
         str(name)
         for name in frame
         if matches(name, "receiving device")
-        and not matches(name, *coordinates)
+        and not matches(name, *quantities)
         and 1 < frame[name].nunique() <= MAX_DEVICES
     ]
 

@@ -159,7 +159,7 @@ def _add_noise_floor(draft: LinksDraft, value: ValueColumn) -> None:
         for device, values in column.groupby(draft.table.frame[name]):
             if values.notna().sum() < FEWEST_OF_DEVICE:
                 continue
-            lowest, which = float(values.min()), f"{name} {shortened(device)}"
+            lowest, which = float(values.min()), f"{name} {shortened(str(device))}"
             if (share := _share_at_lowest(values)) and lowest > floor:
                 floor = lowest
                 reason = f"{share:.0%} of the values of {which} equal its lowest one, the least sensitive"
@@ -431,6 +431,13 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
         antennas["tx"]["pattern"] = "tr38901"
     if mount:
         links.section["tx_antenna"] = mount
+    for column in (
+        name for name in links.table.frame if matches(name, "receiver") and matches(name, "azimuth")
+    ):
+        reason = (
+            f"column {column} may be that of a phone; state it, and the pattern, of a directional antenna"
+        )
+        links.assume("links.rx_antenna.azimuth_deg", "none", reason)
     name = transmitter_columns.find_antenna_names(frame) if of_transmitters else None
     if folder is not None:
         reason = f"files of {folder.resolve().name}; the receiver's antenna is unknown"
