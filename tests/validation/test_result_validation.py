@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import shown
 from calibray.errors import InputError
 from calibray.reporting.page import page
 from calibray.reporting.summary import summary
@@ -77,6 +78,38 @@ def test_a_validation_of_another_study_or_of_other_measurements_is_refused(valid
     for study, measured in ((Study.from_content(content), MEASURED), (STUDY, MEASURED + 0.1)):
         with pytest.raises(InputError, match="belongs to another study or other measurements"):
             read_validation(tmp_path, study, measured)
+
+
+def test_a_validation_of_other_links_is_refused_before_it_replaces_that_of_a_result(validation, tmp_path):
+    result = shown.result()
+    validation = replace(validation, measured_db=result.links["measured_db"].to_numpy())
+    result.save(tmp_path)
+    write_validation(validation, result.study, tmp_path, {})
+    written = (tmp_path / VALIDATION_FILE).read_text()
+    twice = replace(validation, measured_db=np.tile(validation.measured_db, 2))
+    content = result.study.content()
+    content["scene"]["frequency"] = 7e9
+    for other, study in ((twice, result.study), (validation, Study.from_content(content))):
+        with pytest.raises(InputError, match=r"another study or other links \(12"):
+            write_validation(other, study, tmp_path, {})
+    assert (tmp_path / VALIDATION_FILE).read_text() == written
+
+
+def test_parameters_that_opening_adds_do_not_change_the_study(validation, tmp_path):
+    content = STUDY.content()
+    name = next(iter(content["parameters"]))
+    prior = {"std": 7.0, "shared": True}
+    added = {"tx:S1.azimuth": {**content["parameters"][name], "bounds": [-40.0, 40.0], "prior": prior}}
+    opened = Study.from_content(
+        content
+        | {
+            "parameters": content["parameters"] | added,
+            "links": content["links"] | {"tx_antenna": {"azimuth_deg": "azimuth"}},
+        }
+    )
+    alone = Study.from_content(opened.content() | {"parameters": content["parameters"]})
+    write_validation(validation, alone, tmp_path, {})
+    assert read_validation(tmp_path, opened, MEASURED) is not None
 
 
 def test_the_report_shows_the_validation(validation):

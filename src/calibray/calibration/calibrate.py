@@ -24,7 +24,7 @@ from calibray.engines.rays.export import Exporting
 from calibray.errors import InputError
 from calibray.fitting.cheap_replay import CheapReplay, make_cheap_replay
 from calibray.fitting.fidelity_loop import retrace
-from calibray.fitting.preliminary_fits import estimate_noise, estimate_spreads, leave_out_near_floor
+from calibray.fitting.preliminary_fits import with_preliminary_fits
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_mapping import maps_rays, search_rays
 from calibray.fitting.search import check_fit, check_method, choose, search
@@ -132,8 +132,7 @@ def calibrate(
     # With a given engine, this machine may have no ray tracer, which the check for enclosed antennas needs.
     enclosed = setup.enclosed if can_trace else None
     traced = time.perf_counter()
-    problem = estimate_noise(leave_out_near_floor(problem, progress), progress)
-    problem = estimate_spreads(problem, progress)
+    problem = with_preliminary_fits(problem, progress)
     # Making the cheap model does not count as time of the search.
     paused = time.perf_counter()
     cheap, of_rays = CheapReplay(), ()

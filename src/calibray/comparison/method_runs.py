@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from calibray import engines, optimizers
 from calibray.engines.make_engine import fingerprint
 from calibray.errors import InputError
-from calibray.fitting.preliminary_fits import estimate_noise
+from calibray.fitting.preliminary_fits import with_preliminary_fits
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Evaluate, local_searches, rounds
 from calibray.optimizers import METHODS, Optimizer
@@ -74,11 +74,11 @@ def study_problem(path: str | Path) -> ComparisonProblem:
     setup = Setup.open(study.replace(engine="replay"))
     # The replay engine always gives derivatives.
     engine = cast(engines.Differentiable, engines.make(setup))
-    problem = estimate_noise(Problem.of(setup, engine))
+    problem = with_preliminary_fits(Problem.of(setup, engine))
     objective, parameters = problem.objective, problem.parameters
     lower, upper = parameters.search_bounds
     # Everything that changes an evaluation: the study but its method, its files, and the data that follow from them.
-    content = {key: section for key, section in setup.study.content().items() if key != "method"}
+    content = {key: section for key, section in problem.setup.study.content().items() if key != "method"}
     record = (
         fingerprint(setup),
         content,

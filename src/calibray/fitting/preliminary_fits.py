@@ -348,3 +348,9 @@ def estimate_spreads(problem: Problem, progress: Progress | None = None) -> Prob
         if all(abs(spreads[field] / before[field] - 1) <= TOLERANCE for field in fields):
             break
     return estimate_noise(problem, progress)
+
+
+def with_preliminary_fits(problem: Problem, progress: Progress | None = None) -> Problem:
+    """The problem that is calibrated: without links near the noise floor, with estimated noise and spreads."""
+    problem = estimate_noise(leave_out_near_floor(problem, progress), progress)
+    return estimate_spreads(problem, progress)

@@ -151,7 +151,7 @@ def write(
         # A validation of an earlier calibration does not belong to this result.
         (target / VALIDATION_FILE).unlink(missing_ok=True)
         if record.held_out is not None:
-            write_validation(record.held_out, study, target, validation or {})
+            _write_validation(record.held_out, study, target, validation or {})
         digests = {name: file_digest(target / name) for name in SIGNED_FILES}
         write_text(target / RESULT_FILE, json.dumps(content(record, sentences, digests), indent=2) + "\n")
     except OSError as error:
@@ -278,7 +278,25 @@ def _check_consistent(stored: Stored, study: Study, source: Path) -> None:
 
 
 def write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figures: dict[str, Any]) -> None:
-    """Write held-out errors of a study into a result's folder; the figures are for readers of the file."""
+    """Write held-out errors of a study into a folder; the figures are for readers of the file.
+
+    Raises:
+        InputError: The folder contains a result of another study or of other links, or one that cannot be read.
+    """
+    if (folder / RESULT_FILE).is_file():
+        _, calibrated = _read_stored(folder / RESULT_FILE)
+        measured_db = read_rows(folder, LINKS_FILE, LINKS)["measured_db"].to_numpy()
+        same_study = _problem_digest(study) == _problem_digest(calibrated)
+        if not same_study or not _same(held_out.measured_db, measured_db):
+            raise InputError(
+                f"{folder}: its result is of another study or other links ({len(measured_db)}, but the validation has "
+                f"{len(held_out.measured_db)}); give another folder, or run the study again, with [holdout] by if --by "
+                "separates rows of one link"
+            )
+    _write_validation(held_out, study, folder, figures)
+
+
+def _write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figures: dict[str, Any]) -> None:
     values = {
         "version": VERSION,
         **figures,
@@ -305,7 +323,17 @@ def _problem_digest(study: Study) -> str:
     content = {
         key: value for key, value in study.content().items() if key not in ("method", "engine", "holdout")
     }
+    # `Setup.open` adds one parameter per transmitter of a population.
+    entries = content["parameters"].items()
+    content["parameters"] = {
+        name: entry for name, entry in entries if not entry.get("prior", {}).get("shared")
+    }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _same(first_db: NDArray[np.float64], second_db: NDArray[np.float64]) -> bool:
+    """Whether path loss was measured on the same links [links], [dB]; files contain rounded values."""
+    return len(first_db) == len(second_db) and bool(np.abs(first_db - second_db).max() <= 1e-3)
 
 
 def read_validation(folder: Path, study: Study, measured_db: NDArray[np.float64]) -> HeldOutErrors | None:
@@ -327,7 +355,7 @@ def read_validation(folder: Path, study: Study, measured_db: NDArray[np.float64]
         raise InputError(
             f"{file}: is not a validation of `calibray validate` ({error}); validate again"
         ) from None
-    if not belongs or np.abs(held_out.measured_db - measured_db).max() > 1e-3:
+    if not belongs or not _same(held_out.measured_db, measured_db):
         raise InputError(
             f"{file}: belongs to another study or other measurements than {RESULT_FILE}; run the study again, or "
             "remove the file and validate again"

@@ -16,7 +16,7 @@ from calibray.engines.protocol import Answering
 from calibray.engines.rays.export import Exporting
 from calibray.errors import InputError
 from calibray.fitting.nuisance import CONSTANT
-from calibray.fitting.preliminary_fits import estimate_noise, leave_out_near_floor
+from calibray.fitting.preliminary_fits import with_preliminary_fits
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_mapping import maps_rays, search_rays
 from calibray.fitting.search import AUTO
@@ -60,7 +60,7 @@ def validate(
         blocks: Number of spatial blocks, each held out in turn; if None and `by` is None, the study's number, or 4.
         by: Column whose labels are held out in turn; "tx" for the position of the transmitter.
         workers: Workers that trace and replay chunks of links (`engines.open_workers`); this process if None.
-        progress: Called with the stages "tracing" and "validating".
+        progress: Called with the name of each stage, the work done and the total.
         tracer: Opens the scene in a ray tracer; an opened study has its own.
 
     Returns:
@@ -89,7 +89,7 @@ def validate(
         problem, *_ = search_rays(Problem.of(setup, exporting), exporting, progress)
     else:
         problem = Problem.of(setup, engine)
-    return validate_problem(estimate_noise(leave_out_near_floor(problem)), blocks, by, progress)
+    return validate_problem(with_preliminary_fits(problem, progress), blocks, by, progress)
 
 
 def check_engine(study: StudyModel) -> None:
