@@ -33,8 +33,9 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, search
 from calibray.optimizers import LeastSquares
 from calibray.result.held_out import AVERAGE_OF, Model
+from calibray.result.verdict import RemarkKind
 from calibray.tables import Column, Table, numbers, render
-from calibray.uncertainty.assessment import certainty
+from calibray.uncertainty.assessment import Certainty, certainty
 from calibray.uncertainty.richer_paths import assess_richer_paths
 from calibray.uncertainty.verdicts import credible_sets
 from calibray.validation.models import fit_variants
@@ -51,16 +52,12 @@ NEARLY_DB = 0.3
 """Loss compared with the best model up to which a choice is right."""
 IDENTIFIED = ("identified", "weakly identified")
 PARTLY = ("ambiguous", "at bound")
+OWN_PATHS = "own paths"
 NOT_AVERAGED = {str(average): name for name, average in AVERAGE_OF.items()}
 
 
-def repetition(
-    world: World, seed: int, spread: float | None, *, draws: bool, check: bool, choice: bool
-) -> dict[str, Any]:
-    """Calibrate one truth: with draws, verdicts and whether their sets contain it; with a choice, errors far away.
-
-    With a check, draws may follow paths that the study leaves out.
-    """
+def repetition(world: World, seed: int, spread: float | None, *, draws: bool, choice: bool) -> dict[str, Any]:
+    """Calibrate one truth: with draws, verdicts and whether their sets contain it; with a choice, errors far away."""
     started, drawn = time.process_time(), world.planted(seed)
     problem, loss, random = drawn.problem, drawn.loss_db, np.random.default_rng([seed, 4])
     weight, far = problem.objective.weight.copy(), np.zeros(len(loss), dtype=bool)
@@ -79,7 +76,7 @@ def repetition(
     line: dict[str, Any] = {"links": int((weight > 0).sum())}
     line |= dict.fromkeys(("verdicts", "inside", "held", "remarks"), ())
     if draws:
-        line |= intervals(planted, trail, drawn.truth, check=check)
+        line |= intervals(planted, trail, drawn.truth)
     if choice and far.any():
         part = replace(planted, setup=planted.setup.with_obstruction())
         minima = {Model.CALIBRATED: trail.minima}
@@ -91,12 +88,20 @@ def repetition(
     return line | {"seconds": time.process_time() - started}
 
 
-def intervals(planted: Problem, trail: Trail, point: np.ndarray, *, check: bool) -> dict[str, Any]:
-    """Verdicts and remarks of a calibration, and whether its sets and intervals contain the truth [d]."""
+def intervals(planted: Problem, trail: Trail, point: np.ndarray) -> dict[str, Any]:
+    """Verdicts and remarks of a calibration, and whether its sets and intervals contain the truth [d].
+
+    If the measurements favour paths that the study leaves out, those on its own paths are under `OWN_PATHS`.
+    """
+    own_paths = certainty(planted, trail)
+    assessed = assess_richer_paths(planted, trail, own_paths)
+    line = _judged(planted, trail, point, assessed)
+    favoured = str(RemarkKind.RICHER_PATHS) in line["remarks"]
+    return line | ({OWN_PATHS: _judged(planted, trail, point, own_paths)} if favoured else {})
+
+
+def _judged(planted: Problem, trail: Trail, point: np.ndarray, assessed: Certainty) -> dict[str, Any]:
     parameters, (lower, upper) = planted.parameters, planted.parameters.search_bounds
-    assessed = certainty(planted, trail)
-    if check:
-        assessed = assess_richer_paths(planted, trail, assessed)
     if assessed.posterior is None:
         raise RuntimeError(f"no draws; {assessed.record.remarks}")
     means, inside, widths = assessed.posterior.means, [], []
@@ -177,7 +182,7 @@ def main() -> None:
     parser.add_argument(
         "--constants-spread", type=float, help="how well constants are known; the default if absent"
     )
-    parser.add_argument("--no-check", action="store_true", help="do not check for paths that the study lacks")
+    parser.add_argument("--own-paths", action="store_true", help="show intervals on the study's own paths")
     parser.add_argument("--no-choice", action="store_true", help="leave validation out")
     parser.add_argument("--no-draws", action="store_true", help="leave verdicts and intervals out")
     parser.add_argument("--out", type=Path, help="file of lines, one a repetition; goes on where it stands")
@@ -187,7 +192,7 @@ def main() -> None:
     names = named(given.districts)
     settings = {
         "seed": given.seed, "constants_spread": given.constants_spread, "draws": not given.no_draws,
-        "check": not given.no_check, "choice": not given.no_choice,
+        "choice": not given.no_choice,
     }  # fmt: skip
     lines = read_runs(given.out, settings)
     lines = [line for line in lines if line["district"] in names and line["world"] in worlds]
@@ -202,11 +207,12 @@ def main() -> None:
         for world, turn in missing:
             line = repetition(
                 made[world], 1000 * given.seed + turn, given.constants_spread,
-                draws=settings["draws"], check=settings["check"], choice=settings["choice"],
+                draws=settings["draws"], choice=settings["choice"],
             )  # fmt: skip
             lines.append(line | settings | {"district": name, "world": world, "repetition": turn})
             append_run(given.out, lines[-1])
-    print(render(table(lines)))
+    shown = [line | line.get(OWN_PATHS, {}) for line in lines] if given.own_paths else lines
+    print(render(table(shown)))
 
 
 if __name__ == "__main__":
