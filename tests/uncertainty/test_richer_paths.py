@@ -12,6 +12,7 @@ import pytest
 import calibray as cb
 from calibray import fields
 from calibray.calibration.result import Result
+from calibray.errors import EngineError
 from calibray.result.verdict import Remark, RemarkKind
 from calibray.result.wording import remark_text
 from small_scenes import write_scene
@@ -45,17 +46,22 @@ def study(folder: Path, values: np.ndarray | None = None, **sections: dict[str, 
     return cb.Study.from_content(content | sections, folder / "study.toml")
 
 
+def measured(folder: Path, noise_db: float, *, refraction: bool) -> np.ndarray:
+    """Path loss with the true constant, with or without paths through the screen."""
+    setup = study(folder, trace={"max_depth": 2, "samples": 20_000, "refraction": refraction}).opened()
+    paths = setup.trace()
+    materials = setup.parameters.materials(np.array([TRUTH]), paths.materials)
+    noise = np.random.default_rng(5).normal(0.0, noise_db, len(setup.links))
+    return fields.path_loss(paths, materials, "power") + noise
+
+
 @pytest.fixture(scope="module", params=[True, False], ids=["with refraction", "without"])
 def calibrated(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[bool, Result]:
-    """Measurements with or without paths through the screen, calibrated without them."""
+    """A calibration without paths through the screen of measurements with or without them."""
     folder = tmp_path_factory.mktemp("screen")
-    setup = study(folder, trace={"max_depth": 2, "samples": 20_000, "refraction": request.param}).opened()
-    paths = setup.trace()
-    materials = setup.parameters.materials(np.array([TRUTH]), paths.materials)
-    noise = np.random.default_rng(5).normal(0.0, 1.0, len(setup.links))
-    return request.param, cb.calibrate(study(folder, fields.path_loss(paths, materials, "power") + noise))
+    return request.param, cb.calibrate(study(folder, measured(folder, 1.0, refraction=request.param)))
 
 
 def test_measurements_decide_whether_paths_are_missing(calibrated: tuple[bool, Result]) -> None:
@@ -77,17 +83,41 @@ def test_a_stated_noise_model_or_no_further_traces_rule_the_check_out(
     calibrated: tuple[bool, Result], tmp_path: Path
 ) -> None:
     _, result = calibrated
-    measured = result.links.measured_db.to_numpy()
+    values = result.links.measured_db.to_numpy()
     for number, sections in enumerate([{"noise": {"kind": "gaussian"}}, {"fidelity": {"rounds": 0}}]):
         folder = tmp_path / str(number)
         folder.mkdir()
         stages = Counter[str]()
         plain = cb.calibrate(
-            study(folder, measured, **sections),
+            study(folder, values, **sections),
             progress=lambda stage, *_, seen=stages: seen.update([stage]),
         )
         assert "tracing more paths" not in stages
         assert RemarkKind.RICHER_PATHS not in {each.kind for each in plain.uncertainty.remarks}
+
+
+def test_paths_that_explain_exact_measurements_are_certain(tmp_path: Path) -> None:
+    result = cb.calibrate(study(tmp_path, measured(tmp_path, 0.0, refraction=True)))
+    (remark,) = (each for each in result.uncertainty.remarks if each.kind == RemarkKind.RICHER_PATHS)
+    assert remark.values["probability"] == 1.0
+    assert result.intervals[STONE].contains(TRUTH, 1e-3)
+    assert not result.intervals[STONE].contains(result.parameters[STONE])
+
+
+def test_a_failing_trace_keeps_the_calibration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    plan, trace = study(tmp_path, measured(tmp_path, 1.0, refraction=True)), cb.Setup.trace
+
+    def failing(setup: cb.Setup, *rest: object, **named: object) -> object:
+        if setup.study.trace.refraction:
+            raise EngineError("too many paths")
+        return trace(setup, *rest, **named)
+
+    monkeypatch.setattr(cb.Setup, "trace", failing)
+    result = cb.calibrate(plan)
+    assert RemarkKind.RICHER_PATHS not in {each.kind for each in result.uncertainty.remarks}
+    assert "No check for refraction and diffraction: too many paths" in caplog.text
 
 
 def test_the_remark_names_settings_errors_and_values_outside_of_their_intervals() -> None:

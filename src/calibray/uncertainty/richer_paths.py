@@ -7,6 +7,7 @@ The evidence of both twins, from their draws, decides between them.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from typing import Final
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from calibray.engines.kinds.replay import replay
 from calibray.engines.replay import Replay, ReplayCarriers
+from calibray.errors import EngineError, InputError
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import BASINS, STARTS, Trail, search
 from calibray.measurements import FEW
@@ -22,9 +24,11 @@ from calibray.result.verdict import Remark, RemarkKind
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study.displacement import displaces
 from calibray.support.progress import Progress, with_stage
-from calibray.uncertainty.assessment import Certainty, certainty
+from calibray.uncertainty.assessment import EXACT_DB, Certainty, certainty
 from calibray.uncertainty.remarks import LIKELY
 from calibray.uncertainty.verdicts import consistent
+
+_LOG: Final = logging.getLogger(__name__)
 
 LONGEST_TRACE: Final = 60.0
 """Estimated duration above which no richer paths are traced [s]."""
@@ -57,7 +61,11 @@ def assess_richer_paths(
     if setup.tracer.plan(setup.links).seconds > LONGEST_TRACE:
         return assessed
     materials = problem.parameters.materials(trail.best, problem.engine.materials)
-    paths = setup.trace(materials, with_stage(progress, "tracing more paths"))
+    try:
+        paths = setup.trace(materials, with_stage(progress, "tracing more paths"))
+    except (InputError, EngineError) as error:  # for example too many paths; the calibration is finished
+        _LOG.warning("No check for %s: %s", " and ".join(changes), error)
+        return assessed
     richer = replace(problem, setup=setup, engine=replay(setup, paths))
     counted = problem.objective.weight > 0
     if not np.isfinite(richer.engine.path_loss(trail.best[None])[0][counted]).all():
@@ -65,11 +73,15 @@ def assess_richer_paths(
     method = LeastSquares(*problem.parameters.search_bounds, starts=STARTS[0], x0=trail.minima[:BASINS])
     fitted = search(richer, method)
     # The likelihood ratio of Gaussian errors of unknown level; draws take much longer.
-    if counted.sum() * np.log(trail.best_value / fitted.best_value) < LIKELY_LOG_ODDS:
+    if (
+        counted.sum() * (np.log(trail.best_value) - np.log(max(fitted.best_value, EXACT_DB)))
+        < LIKELY_LOG_ODDS
+    ):
         return assessed
     other = certainty(richer, fitted, progress)
     calls, seconds = assessed.calls + other.calls, assessed.seconds + other.seconds
-    log_odds = 0.0
+    # No draws are needed if the richer paths explain the measurements exactly.
+    log_odds = np.inf
     if other.posterior is not None:
         log_odds = other.posterior.log_evidence - assessed.posterior.log_evidence
     if log_odds < LIKELY_LOG_ODDS:
