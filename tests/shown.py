@@ -42,6 +42,7 @@ def bare_result() -> Result:
     return changed(
         full,
         study=study,
+        fallback=None,
         intervals={},
         coefficients={},
         nuisance_only_rmse_db=None,

@@ -13,6 +13,7 @@ from calibray.fitting.fidelity_loop import with_interpolation_error
 from calibray.fitting.nuisance import Nuisance
 from calibray.fitting.objective import Objective
 from calibray.paths import take
+from calibray.reporting.wording import prediction_text
 from calibray.tracing.settings import TraceSettings
 from calibray.tracing.trace_plan import plan_trace
 
@@ -108,6 +109,17 @@ def test_a_link_lost_by_the_new_trace_is_left_out_and_reported(tmp_path):
     assert result.links["has_path"].sum() == planted.LINKS - 1
     assert np.isfinite(result.rmse_db)
     assert np.isfinite(result.fit.retrace_gap_db)
+
+
+def test_a_ceiling_predicts_a_link_lost_by_the_new_trace(tmp_path):
+    kept = take(stronger(0.0), np.flatnonzero(stronger(0.0).link != 3))
+    ceiling = {"no_path": "censor", "ceiling_db": 150.0}
+    result, _ = run(tmp_path, [], tracer=StandIn(kept), fidelity={"rounds": 1}, objective=ceiling)
+    assert np.isinf(result.links["retrace_gap_db"][3])
+    # As `predict` does at a link without a path.
+    assert result.links["predicted_db"][3] == 150.0
+    assert result.prediction.fallback is None
+    assert "log-distance" not in prediction_text(result)
 
 
 def test_links_whose_interpolation_errs_count_less():

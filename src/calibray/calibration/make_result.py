@@ -139,7 +139,8 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
     chosen = fit_prediction_model(problem, trail, name, residuals, gap_db)
     table = table.assign(predicted_db=chosen.path_loss_db, scene_db=chosen.scene_db, basis=str(name))
     prediction = Prediction(chosen.model, chosen.materials, _residual_field(problem, table, validation))
-    if chosen.model.parameters is not None:
+    # A ceiling predicts links without a path.
+    if chosen.model.parameters is not None and objective.ceiling_db is None:
         without_path = ~table["has_path"].to_numpy(bool)
         fallback = fit_fallback(problem, without_path, *log_distance_errors(problem, models, validation))
         prediction = replace(prediction, fallback=fallback)
@@ -211,8 +212,8 @@ def _retraced(
 
 
 def _not_judged(study: StudyModel, accuracy: Accuracy) -> tuple[Remark, ...]:
-    """A remark that no link was held out, if replay could hold out blocks at little cost."""
-    if accuracy.judgement is None and (not study.engine.expensive or study.engine.exports_rays):
+    """A remark that no link was held out, if blocks can be held out at little cost."""
+    if accuracy.judgement is None and study.allows_blocks:
         return (Remark(RemarkKind.NOT_JUDGED),)
     return ()
 

@@ -116,8 +116,8 @@ def run(
     else:
         echo(render(tables.heading(result), *tables.tables(result)))
     names = [*FILES, *_write_report(result, out, output)]
-    judged = result.accuracy.judgement is not None
-    following = command("predict", out, "LINKS") if judged else command("validate", study_file, "--out", out)
+    judge = result.accuracy.judgement is None and result.study.allows_blocks
+    following = command("validate", study_file, "--out", out) if judge else command("predict", out, "LINKS")
     echo(f"Written to {out}: {', '.join(names)}; next: {following}", err=True)
 
 

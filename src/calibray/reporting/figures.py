@@ -127,7 +127,7 @@ def residual_over_distance(survey: Survey) -> Figure:
     for mask, color, marker, name in (
         (~held_out & survey.has_path, style.BLUE, "o", "calibration links"),
         (held_out & survey.has_path, style.ORANGE, "^", "held out"),
-        (~survey.has_path, style.FAINT, "s", "no path: log-distance model"),
+        (~survey.has_path, style.FAINT, "s", "no path"),
     ):
         shown = mask & np.isfinite(residuals)
         if shown.any():

@@ -48,7 +48,7 @@ class Survey:
 
     @property
     def has_path(self) -> NDArray[np.bool_]:
-        """Whether a link has a path [L]; otherwise the log-distance model predicts it."""
+        """Whether a link has a path [L]."""
         return self.table["has_path"].to_numpy(bool)
 
 

@@ -207,6 +207,7 @@ def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
         accuracy=tables.accuracy(result),
         observables=(tables.observables(result), observables_table(result.accuracy.observables)),
         validation=None if result.held_out is None else Validation.of(result.held_out).summary(),
+        blocks_allowed=result.study.allows_blocks,
         diagnostics=(
             replace(diagnostics_table(result), title=""),
             tables.remarks(result),

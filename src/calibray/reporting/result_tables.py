@@ -58,8 +58,7 @@ def links(result: Record) -> Table:
     treatment = (
         f"counted with a path loss of {result.study.objective.ceiling_db:g} dB" if censored else "left out"
     )
-    # A model without a scene predicts links without a path like all others.
-    if not censored and result.prediction.fallback is not None:
+    if result.prediction.fallback is not None:
         treatment += ", predicted by the log-distance model"
     rows = [
         *((cause, str(number), "") for cause, number in result.provenance.rows.items()),

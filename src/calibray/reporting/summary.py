@@ -17,7 +17,7 @@ from calibray.reporting.wording import (
 )
 from calibray.result.record import Record
 from calibray.result.verdict import RemarkKind, Verdict
-from calibray.result.wording import NOT_JUDGED, judgement_text, remark_text
+from calibray.result.wording import NOT_JUDGED, UNKNOWN_BEST, judgement_text, remark_text
 from calibray.support.messages import counted
 from calibray.tables import named, rows_text
 from calibray.validation.validation import Validation
@@ -103,7 +103,8 @@ def _held_out_accuracy(result: Record) -> Sentence:
         best_db = validation.table["rmse_db"].min()
         text = f"{block_sentence(validation)} The best model is {validation.best!r} with {best_db:.2f} dB."
     if judgement is None:
-        return Sentence(heading, NOT_JUDGED, "caution")
+        by_filter = f"{UNKNOWN_BEST} Hold out links by [holdout] where."
+        return Sentence(heading, NOT_JUDGED if result.study.allows_blocks else by_filter, "caution")
     return Sentence(
         heading, f"{judgement_text(judgement)} {text}".strip(), "good" if judgement.helped else "caution"
     )

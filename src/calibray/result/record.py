@@ -167,7 +167,7 @@ class Prediction:
         model: The model: the one that held-out links choose, or the calibrated one if no links were held out.
         materials: All materials of the scene at its carrier with the model's parameters; None if it uses no scene.
         residual_field: The correlated part of its residuals; None if they are uncorrelated.
-        fallback: The model for links without a path; None if the model uses no scene.
+        fallback: The model for links without a path; None if the model uses no scene, or the study states a ceiling.
     """
 
     model: PredictionModel

@@ -23,10 +23,10 @@ SHOWN_PIECES: Final = 3
 SHOWN_GROUPS: Final = 4
 """Largest number of groups that a remark lists."""
 
-NOT_JUDGED: Final = (
-    "No links were held out, so nothing shows which model predicts new links best. Set [holdout] blocks = 4, or run "
-    "calibray validate."
+UNKNOWN_BEST: Final = (
+    "No errors on held-out links are known, so nothing shows which model predicts new links best."
 )
+NOT_JUDGED: Final = f"{UNKNOWN_BEST} Set [holdout] blocks = 4, or run calibray validate."
 
 
 def interval_text(interval: Interval) -> str:
@@ -199,8 +199,7 @@ def _outside_interval(values: dict[str, Any]) -> str:
         return text + " Held-out blocks show which model predicts best."
     return (
         text
-        + " Predictions use the values with the lowest RMSE unless validation chooses another model: set [holdout] "
-        "blocks = 4."
+        + " Predictions use the values with the lowest RMSE unless held-out links choose another model: add [holdout]."
     )
 
 
@@ -233,10 +232,7 @@ def _conflict(values: dict[str, Any]) -> str:
 def _unreached_links(values: dict[str, Any]) -> str:
     trials, sample = zip(values["switches"], values["reached"], strict=True), values["sample"]
     reached = ", ".join(f"{switch} gives {count:.0f} of them a path" for switch, count in trials)
-    text = (
-        f"{values['links']:,} of {values['of']:,} links have no path. They enter no RMSE, and no material is fitted to "
-        "them."
-    )
+    text = f"{values['links']:,} of {values['of']:,} links have no path, so no material is fitted to them."
     if max(values["reached"], default=0.0) == 0:
         return (
             f"{text} No setting of [trace] gives any of {sample} sampled links a path: check their positions."

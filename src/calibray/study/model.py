@@ -87,6 +87,12 @@ class StudyModel(StudyContent, ABC):
         return self._path
 
     @property
+    def allows_blocks(self) -> bool:
+        """Whether blocks of links can be held out in turn: each takes a calibration, too expensive without replay."""
+        replaced = self.engine.exports_rays and self.method.name == "auto"
+        return self.engine.name == "replay" or replaced
+
+    @property
     def scene_source(self) -> str:
         """The scene: the path of its file, or "sionna:NAME"."""
         return (

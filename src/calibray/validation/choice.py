@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calibray.engines.kinds.replay import replay
 from calibray.engines.protocol import ReplaysScene
-from calibray.fitting.fidelity_loop import traced_again
+from calibray.fitting.fidelity_loop import path_loss_change, traced_again
 from calibray.fitting.nuisance import OFFSET
 from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
@@ -138,7 +138,9 @@ def fit_prediction_model(
         scene_db = problem.engine.scene_path_loss(candidate[None], walls)[0]
     if retrace_gap_db is not None and (candidate == trail.best).all():
         scene_db = scene_db if displaced else traced_again(scene_db, retrace_gap_db)
-        path_loss_db = traced_again(path_loss_db, retrace_gap_db) if uses_scene else path_loss_db
+        if uses_scene:
+            again = objective.capped(traced_again(modelled, retrace_gap_db))
+            path_loss_db = path_loss_db + path_loss_change(again, objective.capped(modelled))
     return FittedModel(model, materials, path_loss_db, scene_db)
 
 

@@ -19,7 +19,6 @@ from calibray.fitting.nuisance import CONSTANT
 from calibray.fitting.preliminary_fits import with_preliminary_fits
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_mapping import maps_rays, search_rays
-from calibray.fitting.search import AUTO
 from calibray.result.held_out import Model
 from calibray.scenes.obstruction import CLUSTER
 from calibray.study import Setup, Study
@@ -98,8 +97,7 @@ def check_engine(study: StudyModel) -> None:
     Raises:
         InputError: The engine is not "replay".
     """
-    by_rays = study.engine.exports_rays and study.method.name == AUTO
-    if study.engine.name != "replay" and not by_rays:
+    if not study.allows_blocks:
         raise InputError(
             f"{study.path}: each block that is held out takes a calibration, which is too expensive on the engine "
             f"{study.engine.name!r}; set engine.name to 'replay', or hold links out by [holdout] where"

@@ -23,7 +23,7 @@
   const signed = (value) => (value === null ? "none" : `${fixed(value) < 0 ? "−" : "+"}${fixed(Math.abs(value))} dB`);
   const links = data.links, count = links.row.length;
   const residual = links.predicted.map((predicted, i) => (predicted === null || links.faint[i] ? null : predicted - links.measured[i]));
-  const marks = (i) => (links.held[i] ? ", held out" : "") + (links.lost[i] ? ", no path: log-distance model" : "") + (links.faint[i] ? ", near or below the noise floor" : "");
+  const marks = (i) => (links.held[i] ? ", held out" : "") + (links.lost[i] ? ", no path" : "") + (links.faint[i] ? ", near or below the noise floor" : "");
   const tx = decode(data.solid.tx, Uint16Array), rx = decode(data.solid.rx, Uint16Array);
   // The end with more positions represents the link: receivers, or transmitters if there are more of these.
   const places = (ends) => new Set(Array.from({ length: count }, (_, i) => ends.slice(3 * i, 3 * i + 3).join())).size;
@@ -91,7 +91,7 @@
     const facts = [
       [`measured ${data.quantity.name}`, decibel(links.measured[i])], ["before calibration", decibel(links.before[i])],
       ["predicted", decibel(links.predicted[i])], ["predicted − measured", signed(residual[i])],
-      ["held out", links.held[i] ? "yes" : "no"], ["basis", links.lost[i] ? "no path: log-distance model" : "prediction model"], ["transmitter [m]", end(tx)], ["receiver [m]", end(rx)],
+      ["held out", links.held[i] ? "yes" : "no"], ["basis", links.lost[i] ? "no path" : "prediction model"], ["transmitter [m]", end(tx)], ["receiver [m]", end(rx)],
     ];
     const box = byId("facts");
     box.replaceChildren();
