@@ -239,8 +239,11 @@ def test_a_study_without_offset_has_none(tmp_path, exact):
 
 
 def test_a_group_that_is_held_out_completely_is_refused(tmp_path, exact):
-    with pytest.raises(InputError, match="group 'east' has held-out links but no calibration link"):
+    with pytest.raises(InputError, match=r"need offset\[east\], which no calibration link determines"):
         run(tmp_path, exact, offset={"per": "half"}, holdout={"where": "half == 'east'"})
+    slope = {"slope": {"by": "log_distance", "per": "half"}}
+    with pytest.raises(InputError, match=r"need slope\[east\], which no calibration link determines"):
+        run(tmp_path, exact, nuisance=slope, holdout={"where": "half == 'east'"})
 
 
 def test_the_log_distance_baseline_is_fitted_to_the_calibration_links_only(tmp_path, exact):

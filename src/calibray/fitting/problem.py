@@ -127,7 +127,7 @@ class Problem:
         )
         noise_db = _noise(study, objective.weight[objective.weight > 0])
         objective = replace(objective, measured=observable.measured(links), noise_db=noise_db)
-        _check_groups(links, objective, held_out & ~censored & np.isfinite(before))
+        _check_groups(links, objective, held_out & ~censored & np.isfinite(objective.capped(before)))
         faint = censored if censored.any() else None
         return cls(setup, engine, objective, before, observable, study.priors, faint, further)
 
@@ -349,10 +349,12 @@ def _noise(study: StudyModel, weight: NDArray[np.float64]) -> float:
 
 
 def _check_groups(links: Measurements, objective: Objective, judged: NDArray[np.bool_]) -> None:
-    """Refuse held-out links with a group offset that no calibration link determines."""
-    unknown = links.group_index[judged & ~objective.supported]
+    """Refuse held-out links with a coefficient of the nuisance that no calibration link determines."""
+    unknown = np.flatnonzero(judged & ~objective.supported)
     if len(unknown):
+        needed = objective.nuisance.design[unknown[:1]].toarray()[0] != 0
+        name = objective.nuisance.columns[int(np.argmax(needed & ~objective.determined))]
         raise InputError(
-            f"{links.source}: group {links.group_names[unknown.min()]!r} has held-out links but no calibration "
-            "link to fit its offset to; change [holdout] or [offset]"
+            f"{links.source}: held-out links need {name}, which no calibration link determines; change [holdout], "
+            "[offset] or [nuisance]"
         )
