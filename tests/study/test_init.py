@@ -654,6 +654,23 @@ def test_blocks_are_held_out_if_links_suffice(scene, tmp_path, places, held_out)
     assert not held_out or drafted.study.holdout.blocks == 4
 
 
+@pytest.mark.parametrize("samples", [1, 3, 25])
+def test_receivers_above_each_other_are_not_averaged_together(scene, tmp_path, samples):
+    """A profile of ten heights from 1.5 to 30 m over each of 20 places, in one or several samples."""
+    random = np.random.default_rng(1)
+    places = np.column_stack([random.uniform(-40, 10, 20), random.uniform(-40, 40, 20)])
+    x, y = np.repeat(places, 10 * samples, axis=0).T
+    height = np.tile(np.repeat(np.linspace(1.5, 30, 10), samples), 20)
+    loss = random.uniform(80, 120, len(x))
+    file = table(tmp_path, rx_x=x, rx_y=y, rx_z=height, path_loss_db=loss)
+    drafted = draft(scene, file, tmp_path / "study.toml", frequency=3.5e9, tx=(0, 0, 40))
+    links = drafted.study.measurements()
+    assert len(links) == 200
+    assert sorted(set(links.rx[:, 2])) == pytest.approx(np.linspace(1.5, 30, 10).tolist())
+    reason = next((each.reason for each in drafted.assumptions if each.what == "links.average"), "")
+    assert reason == ("" if samples == 1 else f"{len(x)} rows at 200 positions, {samples} at each")
+
+
 def test_averages_fit_the_site_and_few_links_are_warned_of(tmp_path):
     plan = tmp_path / "plan.csv"
     plan.write_text("x0,y0,x1,y1,type\n0,0,12,0,brick\n12,0,12,8,brick\n12,8,0,8,brick\n0,8,0,0,brick\n")

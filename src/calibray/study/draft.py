@@ -194,7 +194,8 @@ def _share_at_lowest(values: pd.Series) -> float:
 def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
     """Average along tracks, and if most positions or some values repeat; by position if scans are stationary."""
     frame, name = draft.table.frame, draft.section.get("transmitter")
-    keys = [rx.x, rx.y, *draft.groups, *([name] if name and name not in draft.groups else [])]
+    heights = [] if rx.height is None else [rx.height]
+    keys = [rx.x, rx.y, *heights, *draft.groups, *([name] if name and name not in draft.groups else [])]
     keys += [part for part in draft.section["tx"] if isinstance(part, str) and part in frame]
     positions = len(frame[keys].drop_duplicates())
     repeated = frame.duplicated([*keys, draft.section["value"]]).any()
@@ -202,8 +203,11 @@ def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
         return
     rows = f"{len(frame)} rows " + ("along a track" if draft.given.track else f"at {positions} positions")
     samples = int(frame.groupby(keys, dropna=False).size().median())
-    if draft.given.track is None and samples >= PLACE_SAMPLES:
-        draft.section["average"] = "place"
+    # Cells are areas in plan, and would average the heights of a profile or of several storeys.
+    stacked = any(frame.groupby([rx.x, rx.y])[height].nunique().median() > 1 for height in heights)
+    if draft.given.track is None and (samples >= PLACE_SAMPLES or stacked):
+        few = samples < PLACE_SAMPLES
+        draft.section["average"] = {"by": "place", "unbiased": True} if few else "place"
         draft.assume("links.average", "place", f"{rows}, {samples} at each")
         return
     fading = float(np.clip(round(AVERAGING_WAVELENGTHS * speed_of_light / draft.frequency, 1), 1.0, 10.0))
