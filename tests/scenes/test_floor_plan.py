@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -384,3 +385,47 @@ def test_a_number_of_400_digits_is_refused(tmp_path):
     (tmp_path / "plan.csv").write_text(f"x0,y0,x1,y1,type\n0,0,{'9' * 400},0,brick\n0,0,4,0,brick\n")
     with pytest.raises(InputError, match=r"row 2: x1 = 999.*\.\.\..*999 is not a number"):
         read_plan(tmp_path / "plan.csv")
+
+
+def drawn(folder: Path, **attributes: object) -> Path:
+    """A GeoJSON file of two labels and one wall with these attributes."""
+    line = {"type": "LineString", "coordinates": [[0, 0], [5, 0]]}
+    label = {"type": "Point", "coordinates": [1, 1]}
+    shapes = [({"type": "label"}, label), ({"type": "label"}, label), ({"type": "brick", **attributes}, line)]
+    features = [{"type": "Feature", "properties": names, "geometry": shape} for names, shape in shapes]
+    path = folder / "plan.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    return path
+
+
+def test_units_in_the_names_of_a_vector_files_attributes_count(tmp_path):
+    (wall,) = read_plan(drawn(tmp_path, thickness_cm=24, height_m=4.5, Bottom_mm=500), unit=0.5)
+    assert (wall.thickness, wall.bottom, wall.top) == pytest.approx((0.24, 0.5, 5.0))
+    assert wall.length == pytest.approx(2.5)
+    # A door is as wide as it is drawn: its width is no thickness.
+    assert read_plan(drawn(tmp_path, width=0.9))[0].thickness is None
+
+
+@pytest.mark.parametrize("thickness", [9.0, "thick"])
+def test_a_feature_is_named_by_its_number_in_the_file(tmp_path, thickness):
+    with pytest.raises(InputError, match=r"plan.geojson, feature 3: thickness = "):
+        read_plan(drawn(tmp_path, thickness=thickness))
+
+
+@pytest.mark.parametrize("columns", ["thickness,thickness_cm", "height,Height [m]"])
+def test_two_columns_of_one_meaning_are_refused(tmp_path, columns):
+    path = tmp_path / "plan.csv"
+    path.write_text(f"x0,y0,x1,y1,type,{columns}\n0,0,5,0,brick,3,3\n")
+    with pytest.raises(InputError, match="and another one both state"):
+        read_plan(path)
+
+
+def test_thicknesses_less_than_a_millimetre_apart_are_two_materials(tmp_path):
+    """4.5 inches and 11.45 cm; a difference of rounding is one material."""
+    widths = [0.1143, 0.1143 + 1e-12, 0.1145, 0.1145]
+    walls = [replace(wall, thickness=width) for wall, width in zip(OUTER, widths, strict=True)]
+    made = make_plan_scene(walls, tmp_path / "scene", lids=(), merge=False)
+    materials = read_scene(made.path, 3.5e9).materials
+    assert {name: item.thickness for name, item in materials.items()} == {
+        "brick_wall_114_3mm": 0.1143, "brick_wall_114_5mm": 0.1145
+    }  # fmt: skip

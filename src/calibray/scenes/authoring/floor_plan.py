@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -95,8 +95,9 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
         path: A table as text with the columns x0, y0, x1, y1 and type, or, instead of the coordinates, a column wkt
             with lines, polylines or outlines; thickness, bottom and height are optional. Similar names are understood,
             and a unit of length in a name, as in `width_cm`, applies to its column. The file can also be a DXF, GeoJSON
-            or other vector file with these attributes, whose coordinates are those of the plan; without an attribute
-            type, the layer of DXF is the type. Points and texts of such files are left out.
+            or other vector file with attributes of exactly these names, with or without a unit, whose coordinates are
+            those of the plan; without an attribute type, the layer of DXF is the type. Points and texts of such files
+            are left out.
         height: Height of the top of segments without a height [m].
         unit: The plan's unit of length [m]: 0.001 for millimetres. If None, that of a DXF file, or metres.
 
@@ -113,17 +114,16 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
             )
     path = Path(path)
     is_vector = path.suffix.lower() in VECTOR_SUFFIXES
-    frame, lines = _read_vector(path) if is_vector else _read_table(path, unit or 1.0)
     if unit is None:
-        unit = stated_unit(path) or 1.0 if is_vector else 1.0
+        unit = (stated_unit(path) if exists(path) else None) or 1.0
         if unit != 1:
             _LOG.warning("floor plan %s: its header states a unit of %g m; --unit overrides it", path, unit)
+    frame, lines = (_read_vector if is_vector else _read_table)(path, unit)
     numbers = {name: _numbers(path, frame, name) * unit for name in ("thickness", "bottom", "height")}
-    places = [f"feature {index + 1}" if is_vector else f"row {index}" for index in frame.index]
     segments = []
     for index, (kind, parts) in enumerate(zip(frame["type"], lines, strict=True)):
         thickness, bottom, extent = (float(values[index]) for values in numbers.values())
-        row = f"floor plan {path}, {places[index]}"
+        row = f"floor plan {path}, {frame.index[index]}"
         points = np.concatenate(parts) * unit if parts else np.empty((0, 2))
         if not isinstance(kind, str) or not len(points) or not np.isfinite(points).all():
             raise InputError(f"{row}: lacks its type or a coordinate; complete or remove it")
@@ -163,21 +163,18 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
 
 
 def _read_table(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
-    """The columns of a table under the names of this module, by the lines of its rows; lengths in the plan's unit."""
+    """The columns of a table, see `_with_known_names`, by the lines of its rows."""
     if not exists(path):
         raise InputError(f"floor plan {path}: is not a file; check the path")
     table = parse_text(path, read_text(path))
-    known = _known_names(map(str, table.frame))
-    frame = table.frame.rename(columns=known).set_index(table.row)
+    rows = [f"row {row}" for row in table.row]
+    frame = _with_known_names(path, table.frame.set_axis(rows), unit, _OTHER_NAMES)
     for column in ("type",) if "wkt" in frame else (*_ENDS, "type"):
         if column not in frame:
             raise InputError(
                 f"floor plan {path}: no column {column!r}; {did_you_mean(column, map(str, table.frame))}; a plan has "
                 "x0, y0, x1, y1 (or wkt) and type"
             )
-    for column, name in known.items():
-        if words(column) & {*LENGTH_UNITS, "m"}:
-            frame[name] = _numbers(path, frame, name) * find_length_unit([column]) / unit
     if "wkt" not in frame:
         ends = np.stack([_numbers(path, frame, name) for name in _ENDS], axis=1)
         return frame, [[row.reshape(2, 2)] for row in ends]
@@ -189,17 +186,20 @@ def _read_table(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
                 lines.append(_parts(shapely.from_wkt(text)))
         except (shapely.GEOSException, TypeError) as error:
             raise InputError(
-                f"floor plan {path}, row {row}: wkt = {shortened(repr(text))} is not a geometry "
+                f"floor plan {path}, {row}: wkt = {shortened(repr(text))} is not a geometry "
                 f"({first_line(error)}); write LINESTRING (0 0, 4 0, 4 3), for example"
             ) from None
     return frame, lines
 
 
-def _read_vector(path: Path) -> tuple[pd.DataFrame, Lines]:
+def _read_vector(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
+    """The attributes of a vector file, see `_with_known_names`, by the lines of its features."""
     features = read_features(path, None)
     lines = [_parts(geometry) for geometry in features.outline]
     has_lines = [bool(parts) for parts in lines]
-    frame = pd.DataFrame(features.columns)[has_lines].reset_index(drop=True)
+    names = [f"feature {number}" for number in range(1, len(lines) + 1)]
+    frame = pd.DataFrame(features.columns, index=names)[has_lines]
+    frame = _with_known_names(path, frame, unit, dict.fromkeys(_OTHER_NAMES, ()))
     if "type" not in frame and "Layer" in frame:
         frame = frame.rename(columns={"Layer": "type"})
     if "type" not in frame:
@@ -207,11 +207,27 @@ def _read_vector(path: Path) -> tuple[pd.DataFrame, Lines]:
     return frame, [parts for parts in lines if parts]
 
 
-def _known_names(columns: Iterable[str]) -> dict[str, str]:
+def _with_known_names(
+    path: Path, frame: pd.DataFrame, unit: float, others: Mapping[str, Sequence[str]]
+) -> pd.DataFrame:
+    """The columns under the names of this module or, if unknown, their own; lengths in the plan's unit [m]."""
+    known = _known_names(map(str, frame), others)
+    frame = frame.rename(columns=known)
+    for column, name in known.items():
+        if (frame.columns == name).sum() > 1:
+            raise InputError(
+                f"floor plan {path}: column {column!r} and another one both state {name}; keep one"
+            )
+        if words(column) & {*LENGTH_UNITS, "m"}:
+            frame[name] = _numbers(path, frame, name) * find_length_unit([column]) / unit
+    return frame
+
+
+def _known_names(columns: Iterable[str], other_names: Mapping[str, Sequence[str]]) -> dict[str, str]:
     """Maps the name of a column, without case and unit, to the name that this module uses.
 
     Example:
-        >>> _known_names(["X1 [cm]", "Y1 [cm]", "X2 [cm]", "Y2 [cm]", "Material", "width_cm"])["X2 [cm]"]
+        >>> _known_names(["X1 [cm]", "Y1 [cm]", "X2 [cm]", "Y2 [cm]", "width_cm"], _OTHER_NAMES)["X2 [cm]"]
         'x1'
     """
     plain = {}
@@ -224,7 +240,7 @@ def _known_names(columns: Iterable[str]) -> dict[str, str]:
         if set(ends) <= set(plain.values()):
             known = dict(zip(ends, _ENDS, strict=True))
             break
-    for name, others in _OTHER_NAMES.items():
+    for name, others in other_names.items():
         stated = next((other for other in (name, *others) if other in plain.values()), name)
         known[stated] = name
     return {column: known[name] for column, name in plain.items() if name in known}
@@ -252,6 +268,6 @@ def _numbers(path: str | Path, frame: pd.DataFrame, name: str) -> NDArray[np.flo
     if (bad := np.flatnonzero((np.isnan(values) & frame[name].notna().to_numpy()) | np.isinf(values))).size:
         cell = shortened(repr(frame[name].iloc[bad[0]]))
         raise InputError(
-            f"floor plan {path}, row {frame.index[bad[0]]}: {name} = {cell} is not a number; correct it"
+            f"floor plan {path}, {frame.index[bad[0]]}: {name} = {cell} is not a number; correct it"
         )
     return values

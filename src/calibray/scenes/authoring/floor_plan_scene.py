@@ -144,12 +144,14 @@ def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) 
             base = types[sheet.kind]
         else:
             base = SurfaceMaterial(f"{sheet.kind}_wall", sheet.kind, WALL_THICKNESS)
-        materials.append(base if sheet.thickness is None else replace(base, thickness=sheet.thickness))
+        # To a thousandth of a millimetre: two rounding errors are no two materials.
+        stated = base.thickness if sheet.thickness is None else round(sheet.thickness, 6)
+        materials.append(replace(base, thickness=stated))
     thicknesses: dict[str, set[float]] = defaultdict(set)
     for material in materials:
         thicknesses[material.name].add(material.thickness)
     return [
-        replace(material, name=f"{material.name}_{round(material.thickness * 1000)}mm")
+        replace(material, name=f"{material.name}_{material.thickness * 1000:g}mm".replace(".", "_"))
         if len(thicknesses[material.name]) > 1
         else material
         for material in materials
