@@ -75,6 +75,22 @@ def test_buildings_of_an_extract_have_holes_and_heights(extract):
     assert buildings.bounds == pytest.approx([0, 0, 220, 20], abs=0.011)
 
 
+def test_a_denied_part_is_no_part(tmp_path):
+    """An outline of 30 m with building:part=no has a part of 12 m over its whole area; another part is denied too."""
+    tags = [
+        {"building": "yes", "building:part": "no", "height": "30"},
+        {"building": "no", "building:part": "yes", "height": "12"},
+    ]
+    ways = [(SQUARE, tag) for tag in tags] + [(moved(SQUARE, 50), {"building:part": "no", "height": "7"})]
+    buildings, frame = read_openstreetmap(write_extract(tmp_path / "town.osm", ways), FRAME)
+    assert dict(zip(buildings.top.tolist(), buildings.part.tolist(), strict=True)) == {
+        30.0: False,
+        12.0: True,
+    }
+    made = make_scene(buildings, tmp_path / "scene", frame)
+    assert made.bounds[5] == 12.0
+
+
 def test_a_binary_extract_gives_the_same_buildings(extract, tmp_path):
     binary = tmp_path / "town.osm.pbf"
     with osmium.SimpleWriter(str(binary)) as writer:

@@ -251,7 +251,9 @@ def read_openstreetmap(
     announced = 0  # ways and relations that should become areas
     try:
         for item in osmium.FileProcessor(path).with_areas(is_building).with_filter(is_building):
-            if item.tags.get("building") == "no" or item.tags.get("location") == "underground":
+            # "no" denies a tag: an outline with building:part=no is no part that takes precedence.
+            stated = any(item.tags.get(key, "no") != "no" for key in _KEYS)
+            if not stated or item.tags.get("location") == "underground":
                 continue
             if item.is_area():
                 outlines.append(shapely.from_wkb(geometry.create_multipolygon(item)))
@@ -273,7 +275,7 @@ def read_openstreetmap(
         top=np.array(tops),
         name=tuple(names),
         height_from=sources,
-        part=np.array(["building:part" in building for building in tags]),
+        part=np.array([building.get("building:part", "no") != "no" for building in tags]),
         repairs={"incomplete in the extract, left out": incomplete} if incomplete > 0 else {},
     )
     return clean_footprints(raw), frame
