@@ -371,6 +371,19 @@ def test_a_table_goes_with_one_carrier(tmp_path: Path) -> None:
         cb.Study.from_content(content | {"engine": {"name": "replay", "rays": "rays.csv"}}, study.path)
 
 
+def test_rays_of_a_study_with_antennas_per_link_keep_their_powers(tmp_path: Path) -> None:
+    """Direct paths 15 dB above those of isotropic antennas: the table contains the antennas, whichever they are."""
+    study = two_ray.study(tmp_path, links=8)
+    cb.write_rays(cb.Setup.open(study, tracer=two_ray.TwoRay).trace(), tmp_path / "rays.csv")
+    rows = pd.read_csv(tmp_path / "rays.csv").assign(power_db=lambda table: table.power_db + 15)
+    content = study.content()
+    content["antennas"]["tx"] = {"pattern": "tr38901", "polarization": "V"}
+    content["links"]["tx_antenna"] = {"aim": "other end"}
+    paths = cb.read_rays(rows, cb.Study.from_content(content, study.path))
+    power = 10 ** (rows[rows.type == "receiver"].set_index("link").power_db / 10)
+    np.testing.assert_allclose(path_loss(paths), -10 * np.log10(power.groupby("link").sum()), atol=1e-4)
+
+
 def test_a_study_replays_the_rays_of_another_engine(tmp_path: Path) -> None:
     """Nothing is traced: the table has the paths of all links, and of those that are predicted."""
     traced = cb.Setup.open(two_ray.study(tmp_path), tracer=two_ray.TwoRay).trace()

@@ -245,10 +245,13 @@ class Setup:
 
     @property
     def known_antennas(self) -> tuple[Antenna, Antenna] | None:
-        """Transmit and receive antenna, if the study states them; otherwise those of an engine are unknown."""
+        """Transmit and receive antenna, if the study states them; otherwise those of an engine are unknown.
+
+        Antennas that differ between links are not a pair.
+        """
         section = self.study.antennas
         known = section != AntennasSection() if section.known is None else section.known
-        return self.radio.antennas if known else None
+        return self.radio.antennas if known and not self.study.links.mountings else None
 
     @property
     def trace_settings(self) -> TraceSettings:
