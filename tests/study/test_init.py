@@ -654,6 +654,12 @@ def test_blocks_are_held_out_if_links_suffice(scene, tmp_path, places, held_out)
     assert not held_out or drafted.study.holdout.blocks == 4
 
 
+def test_an_empty_column_of_frequencies_states_none(scene, tmp_path):
+    file = table(tmp_path, rx_x=[5.0, 6.0], rx_y=40.0, path_loss_db=[90.0, 91.0], frequency_mhz=np.nan)
+    with pytest.raises(InputError, match="no column of carrier frequencies; give --frequency"):
+        draft(scene, file, tmp_path / "study.toml", tx=(0, 0, 40))
+
+
 @pytest.mark.parametrize("samples", [1, 3, 25])
 def test_receivers_above_each_other_are_not_averaged_together(scene, tmp_path, samples):
     """A profile of ten heights from 1.5 to 30 m over each of 20 places, in one or several samples."""

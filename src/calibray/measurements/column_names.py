@@ -370,6 +370,8 @@ def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
     ]
     for name in dict.fromkeys([*(name for name in names if matches(name, "frequency")), *in_hertz]):
         values = frame[name].to_numpy(dtype=float)
+        if np.isnan(values).all():
+            continue
         median = float(np.nanmedian(values))
         # Carriers are below 300 GHz: a larger number is in a smaller unit.
         likely_unit = "ghz" if median < 300 else "mhz" if median < 3e5 else "hz"
