@@ -14,6 +14,7 @@ from calibray.fields import path_gains
 from calibray.reporting.diagnostics import CLASSES
 from calibray.reporting.link_map import marks, plan
 from calibray.reporting.link_survey import survey
+from calibray.reporting.trust_figures import by_depth
 from calibray.reporting.wording import diagnostics_table
 from calibray.result.verdict import Remark, RemarkKind
 from calibray.scenes.obstruction import Region
@@ -110,6 +111,17 @@ def test_shares_of_power_are_those_of_paths_that_interact_with_a_material(result
             assert depth[link] == np.diff(paths.first)[of_link[np.argmax(power[of_link])]]
         else:
             assert np.isnan(depth[link])
+
+
+def test_a_mean_over_few_links_has_a_bar_of_two_standard_errors_and_one_link_has_none():
+    residuals = np.array([-3.0, 5.0])
+    row = {"links": 2, "mean_db": residuals.mean(), "standard_deviation_db": residuals.std()}
+    single = {"links": 1, "mean_db": 4.0, "standard_deviation_db": 0.0}
+    figure = by_depth(pd.DataFrame([{"depth": 1.0, **row}, {"depth": 2.0, **single}]))
+    (bars,) = figure.axes[0].collections
+    (drawn,) = (segment for segment in bars.get_segments() if np.isfinite(segment).all() and len(segment))
+    half_width = 2 * residuals.std(ddof=1) / np.sqrt(2)
+    np.testing.assert_allclose(drawn[:, 1], [1 - half_width, 1 + half_width])
 
 
 def test_tables_without_data_are_left_out():

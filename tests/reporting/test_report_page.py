@@ -28,7 +28,7 @@ from calibray.reporting.trust_figures import held_out_blocks
 from calibray.reporting.viewer import INTERACTIONS, PER_LINK, Grid, strongest
 from calibray.reporting.wording import diagnostics_table, group_text
 from calibray.result.held_out import HeldOutErrors, Judgement, Model
-from calibray.result.verdict import Remark, RemarkKind
+from calibray.result.verdict import Remark, RemarkKind, Verdict
 from calibray.scenes import read_scene, read_triangles
 from calibray.scenes.buildings import _loops
 from calibray.support.figure_style import plain_number
@@ -376,6 +376,10 @@ def test_the_summary_says_which_parameters_are_identified(result):
     for count, words in ((0, "no path of any link interacts with it"), (1, "1 of 12 links has paths that")):
         sentences = summary(known, {material: count})
         assert any(part.text.startswith(material) and words in part.text for part in sentences)
+    # No path interacts with an antenna or a region.
+    pose = Interval(5.0, -9.0, 9.0, Verdict.NOT_IDENTIFIABLE)
+    turned = changed(result, intervals={"tx:S1.azimuth": pose, "region:trees.specific_attenuation": pose})
+    assert not any("interact" in part.text for counts in (None, {}) for part in summary(turned, counts))
     without_intervals = changed(result, intervals={})
     assert "gives no derivatives" in answer(without_intervals, "How certain are the values?")
 

@@ -154,7 +154,9 @@ def _certainty(result: Record) -> Iterator[Sentence]:
 def _advice(result: Record, links_by_material: Mapping[str, int] | None) -> Iterator[Sentence]:
     heading = "What to measure next?"
     unidentified = _by_verdict(result, Verdict.NOT_IDENTIFIABLE)
-    materials = list(dict.fromkeys(name.rpartition(".")[0] for name in unidentified))
+    owners = dict.fromkeys(name.rpartition(".")[0] for name in unidentified)
+    # No path interacts with the owners of other parameters, such as antennas.
+    materials = [name for name in owners if name in result.materials]
     sentences = []
     if result.uncertainty.draws and (unidentified or _by_verdict(result, Verdict.AMBIGUOUS)):
         sentences.append(

@@ -187,7 +187,8 @@ def leverage(table: pd.DataFrame) -> Figure:
 def by_depth(table: pd.DataFrame) -> Figure:
     """Draw the mean residual by the number of interactions of the strongest path, with two standard errors."""
     figure, axes = style.residual_figure("Interactions of the strongest path")
-    error = table["standard_deviation_db"] / np.sqrt(table["links"])
+    # One link has no standard error, and no bar.
+    error = table["standard_deviation_db"] / np.sqrt((table["links"] - 1).replace(0, np.nan))
     axes.errorbar(table["depth"], table["mean_db"], 2 * error, fmt="o", color=style.BLUE, capsize=3)
     labels = [f"{row.depth:.0f}\n({row.links:,})" for row in table.itertuples()]
     axes.set_xticks(table["depth"].to_numpy(float), labels)

@@ -238,7 +238,7 @@ def _class_text(tables: dict[str, pd.DataFrame], column: str, described: Callabl
     worst = table.iloc[int(np.argmax(table["mean_db"].abs()))]
     if abs(worst["mean_db"]) < 0.1:
         return ""
-    clear = abs(worst["mean_db"]) > CLEAR * worst["standard_deviation_db"] / np.sqrt(worst["links"])
+    clear = abs(worst["mean_db"]) > CLEAR * worst["standard_deviation_db"] / np.sqrt(worst["links"] - 1)
     return (
         f"largest mean residual: {worst['mean_db']:+z.1f} dB, {described(worst[column])}, {worst['links']:.0f} links"
         + ("" if clear else " (not significant)")

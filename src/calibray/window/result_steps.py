@@ -165,7 +165,8 @@ def _facts(desk: Desk, name: str) -> dict[str, str]:
     for parameter, value in (_inside(record, "fit", "parameters") or {}).items():
         interval = _inside(record, "uncertainty", "intervals", parameter) or {}
         ends = f" ({_number(interval.get('lower'))} to {_number(interval.get('upper'))})" if interval else ""
-        facts[parameter] = f"{_number(value)}{ends}, {interval.get('verdict', NONE)}"
+        approximate = ", approximate" if interval.get("approximate") else ""
+        facts[parameter] = f"{_number(value)}{ends}, {interval.get('verdict', NONE)}{approximate}"
     return facts
 
 
