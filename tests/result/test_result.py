@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import typer
+from typer.testing import CliRunner
 
 import planted
 from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
+from calibray.cli.app import app
 from calibray.errors import InputError
 from calibray.result.files import FILES
 from calibray.scenes import read_scene
@@ -316,3 +319,17 @@ def test_an_edited_table_is_refused_even_without_signatures(folder):
     with pytest.raises(InputError, match=r"differs from the file.*--allow-changed-inputs"):
         Result.load(folder)
     assert Result.load(folder, allow_changed_inputs=True) is not None
+
+
+@pytest.mark.parametrize("command", ["report", "export", "predict", "suggest", "map"])
+def test_every_command_that_reads_a_result_has_the_option_that_its_refusal_names(command):
+    options = typer.main.get_command(app).commands[command].params
+    assert "--allow-changed-inputs" in {name for option in options for name in option.opts}
+
+
+def test_a_report_of_an_edited_result_is_written_with_the_option_that_its_refusal_names(folder):
+    file = folder / "result-links.csv"
+    file.write_text(file.read_text().replace(",True,", ",False,", 1))
+    refused = CliRunner().invoke(app, ["report", str(folder)])
+    assert (refused.exit_code, "--allow-changed-inputs" in refused.output) == (2, True)
+    assert CliRunner().invoke(app, ["report", str(folder), "--allow-changed-inputs"]).exit_code == 0

@@ -11,6 +11,7 @@ import typer
 
 from calibray.cli.console import (
     Overwrite,
+    Permissions,
     Pool,
     ResultFolder,
     StudyFile,
@@ -261,6 +262,7 @@ def _trace(
     return paths, convergence.check(tracer, links, paths, loss, with_stage(progress, "checking"))
 
 
+@with_groups
 def report(
     folder: ResultFolder,
     out: Annotated[
@@ -269,7 +271,8 @@ def report(
     figures: Annotated[
         bool, typer.Option("--figures", help="Also write the figures as SVG and PNG into DIR/figures.")
     ] = False,
-    overwrite: Overwrite = False,
+    *,
+    permissions: Permissions,
 ) -> None:
     """Write a result as one HTML file: summary, values, figures, map, and the scene in 3-D."""
     with progress_bars(log()) as progress:
@@ -277,32 +280,34 @@ def report(
         from calibray.reporting.page import FIGURES, FILE
         from calibray.reporting.page import report as write_report
 
-        result = Result.load(folder)
+        result = Result.load(folder, allow_changed_inputs=permissions.allow_changed_inputs)
         file = write_report(
             result,
             out or folder / FILE,
             figures=folder / FIGURES if figures else None,
-            overwrite=overwrite,
+            overwrite=permissions.overwrite,
             progress=progress,
         )
     echo(f"Written to {file}", err=True)
 
 
+@with_groups
 def export(
     folder: ResultFolder,
     out: Annotated[Path, option("FOLDER", "Folder to write into.", "--out", "-o", show_default=False)],
     copy: Annotated[
         bool, typer.Option("--copy", help="Copy the meshes too, so that the folder is self-contained.")
     ] = False,
-    overwrite: Overwrite = False,
+    *,
+    permissions: Permissions,
 ) -> None:
     """Write the calibrated scene for Sionna RT, a script that loads it, and its materials as tables."""
     from calibray.calibration.result import Result
     from calibray.reporting.export import export as write
     from calibray.reporting.wording import sampling_text, scene_alone_text
 
-    result = Result.load(folder)
-    names = write(result, out, copy, overwrite)
+    result = Result.load(folder, allow_changed_inputs=permissions.allow_changed_inputs)
+    names = write(result, out, copy, permissions.overwrite)
     for note in filter(None, (scene_alone_text(result), sampling_text(result))):
         echo(f"Note: {note}", err=True)
     echo(f"Written to {out}: {', '.join(names)}", err=True)
