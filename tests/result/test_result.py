@@ -17,7 +17,11 @@ from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.cli.app import app
 from calibray.errors import InputError
+from calibray.reporting.summary import summary
 from calibray.result.files import FILES
+from calibray.result.held_out import HeldOutErrors, Model
+from calibray.result.verdict import Remark, RemarkKind
+from calibray.result.wording import NOT_JUDGED
 from calibray.scenes import read_scene
 from calibray.study import Study
 from calibray.support.output_files import SIGNATURES
@@ -319,6 +323,28 @@ def test_an_edited_table_is_refused_even_without_signatures(folder):
     with pytest.raises(InputError, match=r"differs from the file.*--allow-changed-inputs"):
         Result.load(folder)
     assert Result.load(folder, allow_changed_inputs=True) is not None
+
+
+def test_a_validation_of_a_finished_result_changes_no_prediction_and_no_sentence_about_them(result):
+    random, count = np.random.default_rng(4), len(result.links)
+    rx = result.links[["rx_x", "rx_y", "rx_z"]].to_numpy()
+    sizes = {Model.INITIAL: 1.0, Model.CALIBRATED: 5.0, Model.LOG_DISTANCE: 9.0}
+    errors = {name: size * random.standard_normal(count) for name, size in sizes.items()}
+    held_out = HeldOutErrors(
+        ("1", "2"), np.arange(count) % 2, errors, rx, result.links["measured_db"].to_numpy()
+    )
+    validated = replace(result, held_out=held_out)
+    links = planted.links()
+    pd.testing.assert_frame_equal(validated.predict_interval(links), result.predict_interval(links))
+    # The blocks would choose another model than the one that predicts.
+    assert validated.validation.chosen == Model.INITIAL
+    text = " ".join([*(part.text for part in summary(validated)), *map(str, validated.validation.summary())])
+    assert "Predictions and maps use the model 'calibrated'" in text
+    assert "predictions use the model 'initial materials'" not in text.lower()
+    assert "'initial materials', which predictions do not use yet" in text
+    unjudged = replace(result.uncertainty, remarks=(Remark(RemarkKind.NOT_JUDGED),))
+    assert NOT_JUDGED in replace(result, uncertainty=unjudged).remarks
+    assert NOT_JUDGED not in replace(validated, uncertainty=unjudged).remarks
 
 
 @pytest.mark.parametrize("command", ["report", "export", "predict", "suggest", "map"])

@@ -107,8 +107,7 @@ def calibrate(
     check_method(plan.method.name)
     if out is not None:
         check_outputs(out, FILES, plan.files(), overwrite)
-    by_blocks = plan.holdout is not None and plan.holdout.where is None
-    if by_blocks:
+    if plan.holds_out_blocks:
         check_engine(plan)
     started = time.perf_counter()
     can_trace = setup is not None
@@ -152,7 +151,7 @@ def calibrate(
     if plan.holdout is not None:
         problem = replace(problem, setup=problem.setup.with_obstruction())
     validation = None
-    if by_blocks:
+    if plan.holds_out_blocks:
         # A method without a multi-start returns at most two minima, too few starting points for a validation.
         many = len(trail.minima) > 2
         starts = {Model.CALIBRATED: trail.minima} if many else NO_MINIMA

@@ -222,7 +222,9 @@ def interval(
         )
     field_db, known_share = _residual_field(result, links)
     # Draws belong to the calibrated model; errors on held-out blocks already include the parameters' uncertainty.
-    draws = result.uncertainty.draws if model.name == Model.CALIBRATED and result.held_out is None else {}
+    # A validation that was added to a finished result does not change the model's errors.
+    by_blocks = result.study.holds_out_blocks
+    draws = result.uncertainty.draws if model.name == Model.CALIBRATED and not by_blocks else {}
     shift = nuisance_shift(model_terms(model, links), links, draws, new_groups=True)
     replayed = _replay(result, setup, draws, progress)
     modelled = _modelled(result, links, replayed) + shift.value_db
@@ -234,7 +236,7 @@ def interval(
     variance = (between * shift.spread_db) ** 2 + (np.mean(deviation**2, axis=0) if draws else 0.0)
     best = np.where(reached, best, np.inf)
     basis = model.basis
-    if result.held_out is None and model.parameters is not None and not draws:
+    if not by_blocks and model.parameters is not None and not draws:
         basis += ", without uncertainty of the parameters"
     # Near measured links the residual field is known, and only the uncorrelated part of the residual is left.
     far_db = _residual_db(result, links, between)

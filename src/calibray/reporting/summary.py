@@ -102,6 +102,11 @@ def _held_out_accuracy(result: Record) -> Sentence:
         judgement = validation.judgement
         best_db = validation.table["rmse_db"].min()
         text = f"{block_sentence(validation)} The best model is {validation.best!r} with {best_db:.2f} dB."
+        if validation.chosen != result.prediction.model.name:
+            text += (
+                f" The blocks choose the model {str(validation.chosen)!r}, which predictions do not use yet: run the "
+                "study again with [holdout] blocks."
+            )
     if judgement is None:
         by_filter = f"{UNKNOWN_BEST} Hold out links by [holdout] where."
         return Sentence(heading, NOT_JUDGED if result.study.allows_blocks else by_filter, "caution")

@@ -391,14 +391,14 @@ def judgement_text(judgement: Judgement) -> str:
 
 
 def choice_text(chosen: str, best: str, partner: str | None = None) -> str:
-    """Which model predictions use, and why; `best` has the lowest held-out RMSE among those that predict anywhere.
+    """Which model held-out blocks choose, and why; `best` has the lowest RMSE there among those that predict anywhere.
 
     `partner` is the model with which the chosen one is averaged.
     """
     if partner is None:
-        used, preferred = f"Predictions use the model {str(chosen)!r}", ""
+        used, preferred = f"The blocks choose the model {str(chosen)!r}", ""
     else:
-        used = f"Predictions use the average of the models {str(chosen)!r} and {str(partner)!r}"
+        used = f"The blocks choose the average of the models {str(chosen)!r} and {str(partner)!r}"
         preferred = (
             f", because the best model on a few blocks is often not the best elsewhere. The model {str(chosen)!r} is "
             "preferred"
@@ -428,7 +428,12 @@ def remarks(record: Record, choice: str = "") -> tuple[str, ...]:
 
     `choice` is the reason for the prediction model, if validation chose it.
     """
-    sentences = [remark_text(remark) for remark in record.uncertainty.remarks]
+    sentences = [
+        remark_text(remark)
+        for remark in record.uncertainty.remarks
+        # A finished result can be validated.
+        if remark.kind != RemarkKind.NOT_JUDGED or record.held_out is None
+    ]
     if record.accuracy.judgement is not None:
         sentences.append(judgement_text(record.accuracy.judgement))
     chosen = chosen_model_text(record)

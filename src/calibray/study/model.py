@@ -93,6 +93,11 @@ class StudyModel(StudyContent, ABC):
         return self.engine.name == "replay" or replaced
 
     @property
+    def holds_out_blocks(self) -> bool:
+        """Whether a calibration holds out blocks of links in turn."""
+        return self.holdout is not None and self.holdout.where is None
+
+    @property
     def scene_source(self) -> str:
         """The scene: the path of its file, or "sionna:NAME"."""
         return (

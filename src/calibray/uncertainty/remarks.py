@@ -233,7 +233,6 @@ def outside_interval(
             outside.append(parameter.name)
     if not outside:
         return ()
-    holdout = problem.setup.study.holdout
     values: dict[str, Value] = {
         "names": outside,
         "values": [float(optimum[name]) for name in outside],
@@ -241,7 +240,7 @@ def outside_interval(
         "most_probable": [float(most_probable[name]) for name in outside],
         "cause": max(CAUSES, key=lambda kind: noise.get(kind, 0.0)),
         "odds": float(np.exp(np.clip(log_odds, 0.0, np.log(MOST_ODDS)))),
-        "blocks": holdout is not None and holdout.where is None,
+        "blocks": problem.setup.study.holds_out_blocks,
     }
     return (Remark(RemarkKind.OUTSIDE_INTERVAL, values),)
 

@@ -127,7 +127,7 @@ class Validation(HeldOutErrors):
 
     @property
     def choice(self) -> str:
-        """Which model predictions use, with the reason."""
+        """Which model the blocks choose for predictions, with the reason."""
         errors = self._on(self.judged)
         best = least(errors, (Model.INITIAL, *FITTED, *WITHOUT_MATERIALS))
         chosen = choose(errors, self.position[self.judged])
