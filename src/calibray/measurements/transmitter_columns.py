@@ -132,14 +132,17 @@ def find_transmitter_of_positions(frame: pd.DataFrame, position: Sequence[str]) 
         >>> links = pd.DataFrame({"cell": ["a", "b", "a"], "tx_x": [0, 50, 0], "tx_y": 0, "rsrp": [-80, -90, -85]})
         >>> find_transmitter_of_positions(links, ["tx_x", "tx_y"])
         'cell'
+        >>> find_transmitter_of_positions(links.rename(columns={"cell": "tx"}), ["tx_x", "tx_y"])
+        'tx'
     """
     positions = frame.groupby(list(position), dropna=False).ngroup()
     quantities = ("x", "y", "longitude", "latitude", "height", "power", "frequency", "another quantity")
     for name in frame:
-        is_name = pd.api.types.is_integer_dtype(frame[name]) or not pd.api.types.is_numeric_dtype(frame[name])
+        is_number = pd.api.types.is_numeric_dtype(frame[name])
+        is_name = pd.api.types.is_integer_dtype(frame[name]) or not is_number
         if not is_name or not matches(name, "transmitter") or name in position:
             continue
-        is_quantity = matches(name, *quantities) and not matches(name, "name of a transmitter")
+        is_quantity = is_number and matches(name, *quantities) and not matches(name, "name of a transmitter")
         if not is_quantity and positions.groupby(frame[name], dropna=False).nunique().max() == 1:
             return str(name)
     return None
