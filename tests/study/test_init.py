@@ -299,6 +299,15 @@ def test_a_wide_table_of_cells_whose_table_names_their_sites_too(scene, tmp_path
     assert found.study.measurements().group_names == ("101", "102")
 
 
+def test_a_value_below_a_limit_is_refused_with_the_key_that_states_the_limit(scene, tmp_path):
+    file = table(tmp_path, x=[2.0, -4.0], y=-15.0, rsrp_a=["-80", "<-95"], rsrp_b=["-85", "-90"])
+    (tmp_path / "masts.csv").write_text("name,x,y,z\na,-20,0,9\nb,-60,0,9\n")
+    with pytest.raises(
+        InputError, match="row 3, column 'rsrp_a': '<-95' is not a number; write the limit itself, and"
+    ):
+        draft(scene, file, tmp_path / "study.toml", tmp_path / "masts.csv", 3.5e9)
+
+
 def test_a_track_and_a_hill(tmp_path):
     """A house on a slope of 1 in 10, a walk of 40 m past it: each row at its time, each antenna above its ground."""
     rows, columns = np.mgrid[0:2, 0:2]

@@ -114,9 +114,10 @@ class SourceTable:
         parsed = pd.to_numeric(column, errors="coerce")
         if (text := parsed.isna().to_numpy() & ~missing).any():
             first = int(np.flatnonzero(text)[0])
-            raise InputError(
-                f"{self.cell(first, source)}: {column.iloc[first]!r} is not a number; correct it"
-            )
+            value = column.iloc[first]
+            is_limit = str(value).strip().startswith(("<", "≤"))
+            remedy = "write the limit itself, and state links.noise_floor_dbm" if is_limit else "correct it"
+            raise InputError(f"{self.cell(first, source)}: {value!r} is not a number; {remedy}")
         numbers = parsed.to_numpy(dtype=np.float64, na_value=np.nan)
         unusable = np.isinf(numbers) if gaps else ~np.isfinite(numbers)
         if unusable.any():
