@@ -10,6 +10,9 @@ import pytest
 
 import calibray as cb
 import two_ray
+from calibray.cli.run import _trace
+from calibray.engines.cluster.chunks import trace_in_chunks
+from calibray.engines.cluster.workers import InProcess
 from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.study import Setup, Study
@@ -118,6 +121,18 @@ def test_a_stated_spread_is_kept_and_own_parameters_stay(folder: Path) -> None:
     assert changed["tx:S2.azimuth"]["prior"]["std"] == 5.0
     again = Setup.open(Study.from_content(Setup.open(stated, TwoRay).study.content(), stated.path), TwoRay)
     assert again.study.content() == Setup.open(stated, TwoRay).study.content()
+
+
+def test_traces_and_their_check_have_the_stated_antennas(folder: Path) -> None:
+    setup = Setup.open(study(folder, "stated.csv"), tracer=TwoRay)
+    calibrated = path_loss(setup.trace())
+    alone = _trace(setup, None, overwrite=False, trace_again=True, progress=lambda *_: None)
+    chunked = trace_in_chunks(setup, InProcess(), check=True)
+    for paths, change in (alone, chunked):
+        assert path_loss(paths) == pytest.approx(calibrated)
+        assert change is not None
+        # This tracer always finds the same paths.
+        assert change.converged(1e-6)
 
 
 def test_only_all_transmitters_have_a_spread(folder: Path) -> None:

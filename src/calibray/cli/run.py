@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from calibray.calibration.result import Result
     from calibray.paths import Paths
     from calibray.study import Setup
+    from calibray.study.model import StudyModel
     from calibray.support.progress import Progress
     from calibray.tracing.convergence import Convergence
 
@@ -218,6 +219,10 @@ def trace(
         study = Study.load(study_file)
         if out is None and not check:
             raise InputError("trace: give -o FILE to store the paths, --check to check them, or both")
+        if check and not _traces(study):
+            raise InputError(
+                f"--check: {study.path} reads its paths from engine.rays, so no rays are traced; omit it"
+            )
         if out is not None:
             check_file(out, study.files(), overwrite)
         setup = study.opened()
@@ -240,6 +245,11 @@ def trace(
         echo(f"Written to {out}", err=True)
 
 
+def _traces(study: StudyModel) -> bool:
+    """Whether the ray tracer finds the paths of a study, and no table or program."""
+    return study.rays_path is None and not study.engine.exports_rays
+
+
 def _trace(
     setup: Setup, out: Path | None, overwrite: bool, trace_again: bool, progress: Progress
 ) -> tuple[Paths, Convergence | None]:
@@ -250,16 +260,19 @@ def _trace(
     from calibray.support.progress import with_stage
     from calibray.tracing import convergence
 
-    study, links, tracer = setup.study, setup.links, setup.tracer
-    if announcement := tracer.plan(links).announcement(len(links)):
+    study, links = setup.study, setup.links
+    if _traces(study) and (announcement := setup.tracer.plan(links).announcement(len(links))):
         echo(announcement, err=True)
-    paths = tracer.trace(links, progress)
+    # With the antennas and facades of the study, as a calibration traces.
+    paths = setup.trace(progress=progress)
     if out is not None:
         paths.save(out, overwrite)
     if not trace_again:
         return paths, None
     loss = partial(path_loss, combining=study.objective.combining, bandwidth=study.scene.bandwidth)
-    return paths, convergence.check(tracer, links, paths, loss, with_stage(progress, "checking"))
+    settings = convergence.finer(study.trace)
+    after = setup.with_trace(settings).trace(progress=with_stage(progress, "checking"))
+    return paths, convergence.compare(paths, after, int(settings.samples) // 2, loss)
 
 
 @with_groups

@@ -115,6 +115,10 @@ class OpenedStudy(Protocol):
         """The paths of the links, with `materials` in place of the scene's materials."""
         ...
 
+    def with_trace(self, settings: TraceSettings) -> Self:
+        """The same with other settings of the ray tracer, whose scene is not loaded again."""
+        ...
+
     def effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
         """Effects, other than materials, on the paths of links; of all links if None."""
         ...

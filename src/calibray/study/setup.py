@@ -435,6 +435,13 @@ class Setup:
                 cache.store_trace(digest, paths)
         return paths
 
+    def with_trace(self, settings: TraceSettings) -> Setup:
+        """The same with other settings of the ray tracer, whose scene is not loaded again."""
+        changed = replace(self, study=self.study.model_copy(update={"trace": settings}))
+        tracer = self.tracer.with_settings(settings)
+        changed.__dict__["_loaded"] = {**self._loaded, "tracer": tracer}
+        return changed
+
     def _with_tracer(self, changed: Setup) -> Setup:
         """A changed setup with the same tracer, which depends neither on links nor on methods."""
         changed.__dict__["_loaded"] = self._loaded

@@ -16,7 +16,7 @@ from calibray.errors import InputError
 from calibray.paths import Paths
 from calibray.support.progress import Progress
 from calibray.tracing.protocol import Links, Tracer
-from calibray.tracing.settings import RANGES
+from calibray.tracing.settings import RANGES, TraceSettings
 
 PathLoss = Callable[[Paths], NDArray[np.float64]]
 """Path loss of every link of a path program [L], [dB]; as `calibray.path_loss`."""
@@ -98,7 +98,17 @@ def check(
         InputError: `before` contains other links, or its rays were added in rounds, of which the last is the check.
         EngineError: The paths exceed what the tracer can store.
     """
-    settings = tracer.settings
+    settings = finer(tracer.settings)
+    after = tracer.with_settings(settings).trace(links, progress)
+    return compare(before, after, int(settings.samples) // 2, path_loss)
+
+
+def finer(settings: TraceSettings) -> TraceSettings:
+    """The settings with twice the rays and the next seed.
+
+    Raises:
+        InputError: Rays are added in rounds, of which the last is the check.
+    """
     if settings.samples == "auto":
         raise InputError(
             "trace.samples = 'auto' needs no second trace: its last round of rays is the check; its change is "
@@ -106,8 +116,7 @@ def check(
         )
     # The largest seed is followed by 0.
     next_seed = (settings.seed + 1) % (RANGES["seed"][1] + 1)
-    finer = tracer.with_settings(replace(settings, samples=2 * settings.samples, seed=next_seed))
-    return compare(before, finer.trace(links, progress), settings.samples, path_loss)
+    return replace(settings, samples=2 * settings.samples, seed=next_seed)
 
 
 def join(parts: Sequence[tuple[NDArray[np.int64], Convergence]]) -> Convergence:

@@ -214,7 +214,9 @@ def _trace_chunk(check: bool, study: OpenedStudy, links: Measurements) -> tuple[
     if not check:
         return paths, None
     loss = partial(path_loss, combining=study.radio.combining, bandwidth=study.radio.bandwidth)
-    return paths, convergence.check(chunk.tracer, links, paths, loss)
+    settings = convergence.finer(chunk.trace_settings)
+    after = chunk.with_trace(settings).trace()
+    return paths, convergence.compare(paths, after, int(settings.samples) // 2, loss)
 
 
 Open = Callable[[OpenedStudy, Mapping[str, Material]], Differentiable]
