@@ -13,7 +13,7 @@ from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.errors import InputError
 from calibray.reporting.wording import scene_alone_text
-from calibray.scenes.authoring import make_scene, read_openstreetmap, read_trees
+from calibray.scenes.authoring import Terrain, make_scene, read_openstreetmap, read_trees
 from calibray.scenes.checks import SceneSurfaces
 from calibray.scenes.obstruction import clutter_loss_db
 from calibray.study import Setup, Study
@@ -186,9 +186,46 @@ def test_heights_above_the_ground_follow_a_slope():
     heights = {"bottom": 2.0, "top": 8.0, "heights": "ground"}
     section = RegionSection(boxes=boxes, specific_attenuation=0.3, **heights)
     region = section.region(None, Place(None, lambda: surfaces))
-    # The third box is cut at the edge of the ground, the fourth has none.
-    assert region.bottom == pytest.approx([2 + 7.5, 2 + 32.5, 2 + 47.5])
-    assert region.top == pytest.approx(region.bottom + 6)
+    # The third box is cut at the edge of the ground, the fourth has none. A line along the slope 5 m above the ground;
+    # a level one, which enters the first box 9.5 m above the ground and is at 8 m after 3 m; and an upright one.
+    start = np.array([[0, 15, 5.0], [0, 15, 14.5], [65, 15, 100.0]])
+    end = np.array([[100, 15, 55.0], [100, 15, 14.5], [65, 15, 0.0]])
+    assert region.length_inside(start, end) == pytest.approx([30 * np.hypot(1, 0.5), 7.0, 6.0])
+
+
+def test_a_wood_follows_the_hills_below_it():
+    """A wood of 15 m over hills of 50 m; lines from 1.5 to 25 m above the ground to 1.5 m."""
+    side = np.linspace(0.0, 400.0, 81)
+    hills = Terrain(side, side, 25 * np.outer(np.cos(side / 60), np.sin(side / 70)))
+    mesh = hills.mesh()
+    corners = mesh.vertices[mesh.faces]
+    bounds = np.concatenate([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))])
+    surfaces = SceneSurfaces(corners, np.zeros((0, 3, 3)), bounds)
+    section = RegionSection(boxes=((40, 40, 360, 360),), top=15.0, heights="ground", specific_attenuation=0.3)
+    region = section.region(None, Place(None, lambda: surfaces))
+    random = np.random.default_rng(0)
+    plan = random.uniform(50, 350, (2, 300, 2))
+    above = np.array([random.uniform(1.5, 25, 300), np.full(300, 1.5)])
+    start, end = (np.column_stack([p, hills.heights(*p.T) + h]) for p, h in zip(plan, above, strict=True))
+    share = (np.arange(400) + 0.5)[:, None, None] / 400
+    point = start + share * (end - start)
+    height = point[..., 2] - hills.heights(*point[..., :2].reshape(-1, 2).T).reshape(point.shape[:2])
+    inside = ((height > 0) & (height < 15)).mean(axis=0) * np.linalg.norm(end - start, axis=1)
+    error = region.length_inside(start, end) - inside
+    assert inside.mean() > 50
+    assert np.sqrt(np.mean(error**2)) < 0.5
+
+
+def test_a_polygon_without_ground_below_it_is_refused_by_its_number():
+    """The ground is an L."""
+    quads = [((0, 0), (100, 50)), ((0, 50), (50, 100))]
+    faces = [[[a, b, 0], [c, b, 0], [c, d, 0]] for (a, b), (c, d) in quads]
+    faces += [[[a, b, 0], [c, d, 0], [a, d, 0]] for (a, b), (c, d) in quads]
+    surfaces = SceneSurfaces(np.array(faces, float), np.zeros((0, 3, 3)), np.array([0, 0, 0, 100, 100, 0.0]))
+    boxes = ((400, 0, 410, 9), (10, 10, 20, 20), (60, 60, 90, 90))
+    section = RegionSection(boxes=boxes, top=8.0, heights="ground", specific_attenuation=0.3)
+    with pytest.raises(InputError, match=r"boxes: the scene has no ground below polygon 3; remove it"):
+        section.region(None, Place(None, lambda: surfaces))
 
 
 def test_attenuation_rises_with_the_carrier(opened, engine):

@@ -8,7 +8,7 @@ polygons, through which rays pass undeflected.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -22,6 +22,12 @@ from calibray.scenes.scene import Scene
 from calibray.scenes.triangles import BATCH, LEVEL, Triangles, read_triangles, vertical_crossings
 from calibray.support.lazy_imports import library
 
+STEP: Final = 5.0
+"""Length of the steps in which lines follow the ground [m]. Lengths in a wood over hills of 50 m then err by 0.1 m."""
+
+LINES: Final = 5000
+"""Largest number of lines that are divided at once; each may have hundreds of steps."""
+
 
 @dataclass(frozen=True, eq=False)
 class Region:
@@ -31,11 +37,14 @@ class Region:
         outline: Shapely polygons [n] in the scene's frame [m].
         bottom: Height at which each begins [n], [m].
         top: Height at which each ends [n], [m].
+        ground: Height of the ground [k], [m], from which heights count, at x and y [k], [m], NaN where there is none;
+            if None, they count from z = 0.
     """
 
     outline: NDArray[Any]
     bottom: NDArray[np.float64]
     top: NDArray[np.float64]
+    ground: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]] | None = None
 
     def length_inside(self, start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
         """Length inside the region [k], [m], of straight lines from `start` to `end` [k, 3], [m].
@@ -50,19 +59,25 @@ class Region:
             >>> belt.length_inside(start, end).tolist()
             [20.0, 0.0]
         """
+        # Over hills, each line is divided: only some at once.
+        parts = [self._lengths(start[k : k + LINES], end[k : k + LINES]) for k in range(0, len(start), LINES)]
+        return np.concatenate([np.zeros(0), *parts])
+
+    def _lengths(self, start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
         shapely = library("shapely", "scenes")
         total = np.zeros(len(start))
-
         lines = shapely.linestrings(np.stack([start[:, :2], end[:, :2]], axis=1))
         line, prism = shapely.STRtree(self.outline).query(lines, predicate="intersects")
-        low, high = _between(start[line, 2], end[line, 2], self.bottom[prism], self.top[prism])
+        low, high = np.zeros(len(line)), np.ones(len(line))
+        if self.ground is None:
+            low, high = _between(start[line, 2], end[line, 2], self.bottom[prism], self.top[prism])
         # Lines beside the heights of a prism are dropped before the costly intersection in plan.
         near = high > low
         line, prism, low, high = line[near], prism[near], low[near], high[near]
         step = (end - start)[line]
         plan = np.hypot(step[:, 0], step[:, 1])
         upright = plan < 1e-6
-        spans = [np.column_stack([line, low, high])[upright]]
+        spans = [np.column_stack([line, low, high, prism])[upright]]
         sloping = np.flatnonzero(~upright)
         parts, of = shapely.get_parts(
             shapely.intersection(lines[line[sloping]], self.outline[prism[sloping]]), return_index=True
@@ -73,16 +88,36 @@ class Region:
         # Shares of the line at which the pieces begin and end, by projection in plan.
         away = ((ends - start[line[of], None, :2]) * step[of, None, :2]).sum(axis=2) / plan[of, None] ** 2
         away = np.clip(np.sort(away, axis=1), low[of, None], high[of, None])
-        spans.append(np.column_stack([line[of], away])[away[:, 1] > away[:, 0]])
-        for number, lower, upper in united(np.concatenate(spans)):
+        spans.append(np.column_stack([line[of], away, prism[of]])[away[:, 1] > away[:, 0]])
+        for number, lower, upper in united(self._over_ground(np.concatenate(spans), start, end)):
             np.add.at(total, number, upper - lower)
         return total * np.linalg.norm(end - start, axis=1)
+
+    def _over_ground(
+        self, spans: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """The parts of spans (line, lower, upper, prism) between the heights above the ground, in steps over hills."""
+        if self.ground is None:
+            return spans
+        step = (end - start)[spans[:, 0].astype(np.int64)]
+        count = np.ceil((spans[:, 2] - spans[:, 1]) * np.hypot(step[:, 0], step[:, 1]) / STEP)
+        count = np.maximum(count, 1).astype(np.int64)
+        span = np.repeat(np.arange(len(spans)), count)
+        number = np.arange(len(span)) - np.repeat(np.cumsum(count) - count, count)
+        line, lower, upper, prism = spans[span].T
+        line, prism = line.astype(np.int64), prism.astype(np.int64)
+        share = np.array([lower + (upper - lower) * (number + k) / count[span] for k in (0, 1)])
+        x, y, z = np.moveaxis(start[line] + share[..., None] * (end - start)[line], -1, 0)
+        first, last = z - self.ground(x.ravel(), y.ravel()).reshape(z.shape)
+        low, high = _between(first, last, self.bottom[prism], self.top[prism])
+        length = share[1] - share[0]
+        return np.column_stack([line, share[0] + low * length, share[0] + high * length])[high > low]
 
 
 def united(
     spans: NDArray[np.float64],
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-    """The union of spans (line, lower, upper) that may overlap: line, lower and upper end of each piece."""
+    """The union of spans (line, lower, upper, ...) that may overlap: line, lower and upper end of each piece."""
     count = len(spans)
     if not count:
         return

@@ -17,7 +17,7 @@ from calibray.errors import InputError
 from calibray.measurements.column_names import find_length_unit
 from calibray.parameters import Parameters
 from calibray.paths import Paths
-from calibray.scenes.obstruction import Region
+from calibray.scenes.obstruction import STEP, Region
 from calibray.support.lazy_imports import library
 from calibray.support.messages import did_you_mean, shortened
 from calibray.support.strict_models import Section, Text
@@ -26,6 +26,7 @@ from calibray.tracing.antennas import wave_basis
 if TYPE_CHECKING:
     from calibray.coordinates import Frame
     from calibray.fields import Effects
+    from calibray.scenes.authoring import Terrain
     from calibray.scenes.checks import SceneSurfaces
 
 PREFIX: Final = "region:"
@@ -37,6 +38,9 @@ WOODLAND: Final = (1.15, 0.43)
 EXPONENT: Final = 0.284
 """Exponent of the specific attenuation over frequency: Weissberger 1982, 0.45 f^0.284 dB/m on paths of up to 14 m in
 dense, dry, in-leaf trees, f in GHz from 0.23 to 95."""
+
+MOST_CELLS: Final = 400
+"""Largest number of cells of the grid of the ground along either side; 160,000 heights take a second."""
 
 Height = float | str
 
@@ -55,8 +59,8 @@ class RegionSection(Section):
         boxes: Rectangles in place of a file: west, south, east, north [m] in the scene's frame.
         position: "geographic" if the file's coordinates are those of its reference system, "scene" for metres in the
             scene's frame.
-        heights: "ground" for heights above the scene's ground below each polygon, as those of a canopy are; above z = 0
-            of the scene if absent.
+        heights: "ground" for heights above the scene's ground, which the region follows, as those of a canopy are;
+            above z = 0 of the scene if absent.
         bottom: Height at which the region begins [m], a number or a column of the file, in metres or the unit in its
             name.
         top: Height at which it ends, in the same form; a canopy defines it.
@@ -137,16 +141,35 @@ class RegionSection(Section):
                 f"{path}: bottom = {bottom[wrong[0]]:g} of polygon {wrong[0] + 1} must be less than top = "
                 f"{top[wrong[0]]:g} [m]"
             )
-        if self.heights == "ground" or self.canopy is not None:
-            surfaces = place.surfaces()
-            # Outside of the scene, no height of the ground is known.
-            outline = shapely.intersection(outline, shapely.box(*surfaces.bounds[[0, 1, 3, 4]]))
-            inside = ~shapely.is_empty(outline)
-            outline, bottom, top = outline[inside], bottom[inside], top[inside]
-            # The ground at one point inside each polygon; the centroid of a bent one can be outside of it.
-            ground = surfaces.ground_height(*shapely.get_coordinates(shapely.point_on_surface(outline)).T)
-            bottom, top = bottom + ground, top + ground
-        return Region(outline, bottom, top)
+        if self.heights is None and self.canopy is None:
+            return Region(outline, bottom, top)
+        surfaces = place.surfaces()
+        # Outside of the scene, no height of the ground is known.
+        outline = shapely.intersection(outline, shapely.box(*surfaces.bounds[[0, 1, 3, 4]]))
+        inside = np.flatnonzero(~shapely.is_empty(outline))
+        outline, bottom, top = outline[inside], bottom[inside], top[inside]
+        # One point inside each polygon; the centroid of a bent one can be outside of it.
+        ground = surfaces.lowest_surface(*shapely.get_coordinates(shapely.point_on_surface(outline)).T)
+        if (missing := inside[np.isinf(ground)]).size:
+            raise InputError(
+                f"{path or 'boxes'}: the scene has no ground below polygon {missing[0] + 1}; remove it, or give "
+                "heights above z = 0, without heights = 'ground'"
+            )
+        terrain = _terrain(surfaces)
+        if np.ptp(terrain.z) == 0:
+            return Region(outline, bottom + ground, top + ground)
+        return Region(outline, bottom, top, terrain.heights)
+
+
+def _terrain(surfaces: SceneSurfaces) -> Terrain:
+    """The ground of a scene on a grid; NaN where there is none."""
+    from calibray.scenes.authoring import Terrain
+
+    low, high = surfaces.bounds[:2], surfaces.bounds[3:5]
+    count = int(np.clip(np.ceil(np.max(high - low) / STEP), 1, MOST_CELLS)) + 1
+    x, y = np.linspace(low, high, count).T
+    heights = surfaces.lowest_surface(*(axis.ravel() for axis in np.meshgrid(x, y))).reshape(count, count)
+    return Terrain(x, y, np.where(np.isfinite(heights), heights, np.nan))
 
 
 def read_polygons(path: Path, position: str, frame: Frame | None) -> tuple[NDArray[Any], dict[str, NDArray]]:

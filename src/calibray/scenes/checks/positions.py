@@ -130,17 +130,22 @@ class SceneSurfaces:
             >>> SceneSurfaces(slope, np.zeros((0, 3, 3)), np.zeros(6)).ground_height([1, 2], [1, 1])
             array([0.5, 1. ])
         """
+        lowest = self.lowest_surface(x, y)
+        if (missing := np.flatnonzero(np.isinf(lowest))).size:
+            east, north = np.ravel(x)[missing[0]], np.ravel(y)[missing[0]]
+            raise InputError(
+                f"heights above the ground: the scene has no ground at {len(missing)} of {len(lowest)} positions, "
+                f"the first at ({east:.1f}, {north:.1f}) m; make the scene with a wider --margin, or leave those rows "
+                "out"
+            )
+        return lowest
+
+    def lowest_surface(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
+        """The same, +inf where the scene has no surface."""
         position = np.column_stack([np.asarray(x, dtype=float), np.asarray(y, dtype=float)])
         index, height = self._surfaces(position)
         lowest = np.full(len(position), np.inf)
         np.minimum.at(lowest, index, height)
-        if (missing := np.flatnonzero(np.isinf(lowest))).size:
-            east, north = position[missing[0]]
-            raise InputError(
-                f"heights above the ground: the scene has no ground at {len(missing)} of {len(position)} positions, "
-                f"the first at ({east:.1f}, {north:.1f}) m; make the scene with a wider --margin, or leave those rows "
-                "out"
-            )
         return lowest
 
     def _count_surfaces(self, position: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
