@@ -218,6 +218,16 @@ def test_heights_are_calibrated_in_one_process(folder: Path) -> None:
         engines.make(setup, workers=engines.InProcess())
 
 
+def test_held_out_blocks_judge_the_initial_materials_at_the_stated_positions(folder: Path) -> None:
+    stated = study(folder, "stated.csv")
+    held_out = cb.calibrate(study(folder, "stated.csv", holdout={"blocks": 4}), tracer=TwoRay).validation
+    assert held_out is not None
+    initial_db = held_out.table["rmse_db"]["initial materials"]
+    # Here the stated positions are traced, not interpolated.
+    exact_db = cb.validate(stated, tracer=TwoRay).table["rmse_db"]["initial materials"]
+    assert initial_db == pytest.approx(exact_db, abs=0.02)
+
+
 def test_the_scene_alone_has_the_stated_positions(folder: Path, result: cb.Result) -> None:
     stated = Setup.open(study(folder, "stated.csv", {}), tracer=TwoRay)
     materials = stated.parameters.materials([result.parameters[GROUND]], stated.scene.materials)

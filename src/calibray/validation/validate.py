@@ -203,8 +203,11 @@ def fit_models(
     Kriging is left out if it is impossible. `fits` are the fitted variants that use the scene, from `fit_variants`.
     """
     setup, objective = part.setup, part.objective
+    # A trace around calibrated positions interpolates path loss at the stated ones.
     path_loss_db: dict[str, NDArray[np.float64]] = {
-        name: variant.objective.with_nuisance(variant.modelled(minima[:1])[0])
+        name: variant.objective.with_nuisance(
+            part.before if name == Model.INITIAL else variant.modelled(minima[:1])[0]
+        )
         for name, (variant, minima) in fits.items()
     }
     path_loss_db |= averages(path_loss_db)
