@@ -164,6 +164,11 @@ def test_several_workers_give_the_same_runs(small, tmp_path):
         assert [run.best for run in spread.runs[name]] == [run.best for run in small[0].runs[name][:2]]
 
 
+def test_one_method_at_one_budget_runs_once_whatever_it_is_called():
+    methods = parse_methods(["gwo", "gwo@600", "random", "gwo@300"], 600)
+    assert [method.name for method in methods] == ["gwo", "random", "gwo@300"]
+
+
 def test_a_failed_run_is_kept_with_its_last_value(tmp_path, monkeypatch):
     class Broken:
         uses, schedule, takes_starts = RandomSearch.uses, RandomSearch.schedule, False

@@ -319,10 +319,12 @@ def parse_methods(names: Sequence[str], budget: int) -> tuple[BudgetedMethod, ..
     Raises:
         InputError: The list is empty, a method is unknown, or a budget is invalid.
     """
-    methods = tuple(BudgetedMethod.parse(name, budget) for name in dict.fromkeys(names))
+    methods: dict[tuple[str, int], BudgetedMethod] = {}
+    for method in (BudgetedMethod.parse(name, budget) for name in names):
+        methods.setdefault((method.method, method.budget), method)
     if not methods:
         raise InputError(f"methods: the list is empty; {did_you_mean('', METHODS)}")
-    return methods
+    return tuple(methods.values())
 
 
 def _search_optimum(problem: ComparisonProblem) -> MethodRun:
