@@ -132,6 +132,20 @@ def applied(place, point, files=None, **rules):
     return names_of(with_facades(few, {"part": section}, {"part": files}, place, materials)) == "part"
 
 
+@pytest.mark.parametrize(
+    "rules", [{"storeys": (1, 1)}, {"facing": (90.0, 270.0)}, {"share": 0.9, "module": 12.0}]
+)
+def test_ground_of_the_walls_material_is_no_part_of_a_facade(rules):
+    """Points on the ground up to 40 m south of the wall; a scene of ground alone has no facade either."""
+    place, point = wall_points()
+    middle = point[50:70] * [1, 1, 0.25]
+    assert applied(place, middle, **rules).all()
+    ground = middle * [1, 0, 0] - np.linspace(0, 40, 20)[:, None] * [0, 1, 0]
+    assert not applied(place, ground[1:], **rules).any()
+    bare = replace(place.surfaces(), walls=np.zeros((0, 3, 3)))
+    assert not applied(Place(None, lambda: bare), ground, **rules).any()
+
+
 def test_strips_take_their_share_of_a_wall():
     place, point = wall_points()
     found = applied(place, point, share=0.25, module=3.2)  # four strips, one in the middle of every 3 m

@@ -18,6 +18,7 @@ from calibray.parameters import Parameters
 from calibray.parameters.parameter import ROUGHNESS
 from calibray.paths import Kind, Paths
 from calibray.scenes import Scene, check_material_name
+from calibray.scenes.meshes import MILLIMETRE
 from calibray.study.regions import Place, read_polygons
 from calibray.support.lazy_imports import library
 from calibray.support.messages import did_you_mean, shortened
@@ -32,7 +33,7 @@ NEAR: Final = 0.5
 """Largest distance of a wall from the polygon to which it belongs [m]: walls are on the outlines of buildings."""
 
 BESIDE: Final = 0.1
-"""Distance from a wall at which its sides are distinguished [m]."""
+"""Distance from a wall at which its sides are distinguished, and within which a point is on it [m]."""
 
 
 class FacadeSection(Section):
@@ -164,8 +165,14 @@ def _applies(
         # Storeys count from 1, the ground floor.
         storey = np.floor(height / section.storey_height) + 1
         applies &= (storey >= section.storeys[0]) & (storey <= section.storeys[1])
+        # The ground is no storey, even if it has the material of the walls.
+        applies &= height > MILLIMETRE
     if section.facing is not None or section.share is not None:
-        bearing, along, length = _walls(surfaces, point)
+        if not len(surfaces.walls):
+            return np.zeros(len(point), dtype=bool)
+        bearing, along, length, beside = _walls(surfaces, point)
+        # Neither ground nor roofs face a direction.
+        applies &= beside < BESIDE
         if section.facing is not None:
             start, end = section.facing
             # Clockwise from start to end, also across north; equal ends are the full turn.
@@ -193,12 +200,10 @@ def _applies(
     return applies
 
 
-def _walls(
-    surfaces: SceneSurfaces, point: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _walls(surfaces: SceneSurfaces, point: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
     """The wall nearest to each point in plan: bearing [deg], place along it from west or south, 0 to 1, length [m].
 
-    Each is [n]; the compass bearing is that of its outward normal.
+    The last one is its distance from the point [m]. Each is [n]; the compass bearing is that of its outward normal.
     """
     shapely, walls = library("shapely", "scenes"), surfaces.walls
     # In plan, an upright triangle is a line: from its first to its last corner in order of x and y.
@@ -207,9 +212,9 @@ def _walls(
     ends = np.stack([plan[np.arange(len(plan)), order[:, k]] for k in (0, 2)], axis=1)
     normal = np.cross(walls[:, 1] - walls[:, 0], walls[:, 2] - walls[:, 0])
     tree = shapely.STRtree(shapely.linestrings(ends))
-    nearest = np.zeros(len(point), dtype=np.int64)
-    query, wall = tree.query_nearest(shapely.points(point[:, :2]), all_matches=False)
-    nearest[query] = wall
+    (_, nearest), distance = tree.query_nearest(
+        shapely.points(point[:, :2]), all_matches=False, return_distance=True
+    )
     start, step = ends[nearest, 0], ends[nearest, 1] - ends[nearest, 0]
     length = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
     along = np.clip(((point[:, :2] - start) * step).sum(axis=1) / length**2, 0.0, 1.0)
@@ -219,7 +224,7 @@ def _walls(
     outward = np.where((front & ~back)[:, None], -outward, outward)
     # East over north: clockwise from north.
     bearing = np.degrees(np.arctan2(outward[:, 0], outward[:, 1])) % 360
-    return bearing, along, length
+    return bearing, along, length, distance
 
 
 def roughness_effects(stated: Mapping[str, float], parameters: Parameters, paths: Paths) -> Effects:
