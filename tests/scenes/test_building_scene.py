@@ -10,7 +10,7 @@ import shapely
 import trimesh
 
 from calibray.errors import InputError
-from calibray.scenes import buildings, read_frame, read_scene, read_triangles
+from calibray.scenes import buildings, read_frame, read_meshes, read_scene, read_triangles
 from calibray.scenes.authoring import Palette, SurfaceMaterial, Terrain, Windows, make_scene
 from calibray.scenes.authoring.extrusion import (
     ROOF,
@@ -170,6 +170,22 @@ def test_buildings_stand_on_the_lowest_ground_under_their_walls(tmp_path):
     assert made.counts == {"buildings": 1}
     ground = trimesh.load_mesh(tmp_path / "meshes" / "ground-surface.ply", process=False)
     assert (ground.face_normals[:, 2] > 0).all()
+
+
+def test_the_parts_of_a_building_on_a_slope_stand_on_each_other(tmp_path):
+    """A hall of 60 m on a slope of 10 %; its tower begins at 20 m, where the lower part ends, and has own ground."""
+    axis = np.linspace(-50, 150, 41)
+    slope = Terrain(axis, axis, np.add.outer(0.0 * axis, 0.1 * axis))
+    outlines = [BOX(0, 0, 60, 20), BOX(0, 0, 60, 20), BOX(40, 0, 60, 20), BOX(80, 0, 100, 20)]
+    parts = footprints(
+        outlines, [20.0, 20.0, 40.0, 9.0], [0.0, 0.0, 20.0, 0.0], [False, True, True, True],
+        ["hall", "podium", "tower", "lonely"],
+    )  # fmt: skip
+    made = make_scene(parts, tmp_path, terrain=slope, per_building=True)
+    heights = {item.name: item.mesh.vertices[:, 2] for item in read_meshes(made.path)}
+    assert heights["podium-walls"].max() == heights["tower-walls"].min() == pytest.approx(19.5)
+    assert heights["tower-roofs"].max() == pytest.approx(39.5)
+    assert heights["lonely-walls"].min() == pytest.approx(7.5)
 
 
 def test_terrain_is_interpolated_on_its_triangles():

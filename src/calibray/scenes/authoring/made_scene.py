@@ -218,7 +218,7 @@ def make_scene(
         folder: Folder for `scene.xml`, `scene.json` and the meshes.
         frame: Position of the scene on the globe, which the files store.
         terrain: The ground; by default it is level, z = 0, and extends `margin` beyond the buildings. On a terrain, the
-            heights of a building are measured from the lowest ground under its walls.
+            heights of a building and of its parts are measured from the lowest ground under its walls.
         palette: The materials.
         windows: How walls are divided into wall and window; None for walls without windows.
         margin: Distance by which level ground extends beyond the buildings [m].
@@ -276,6 +276,11 @@ def _base_heights(footprints: Footprints, terrain: Terrain | None) -> NDArray[np
     )
     lowest = np.full(len(footprints), np.inf)
     np.minimum.at(lowest, building, terrain.heights(*corners.T))
+    # The heights of a building's parts count from the ground of the whole building, so that they stand on each other.
+    parts, wholes = np.flatnonzero(footprints.part), np.flatnonzero(~footprints.part)
+    inside = shapely.point_on_surface(footprints.polygon[parts])
+    part, whole = shapely.STRtree(footprints.polygon[wholes]).query(inside, predicate="within")
+    np.minimum.at(lowest, parts[part], lowest[wholes[whole]])
     return np.floor((lowest - SINK) * 100) / 100
 
 
