@@ -299,7 +299,8 @@ def unreached_remark(problem: Problem, progress: Progress | None = None) -> tupl
 def _reached(setup: Setup, sample: NDArray[np.int64], change: dict[str, Any]) -> int:
     """Number of links in the sample that have a path with other settings of the tracer."""
     mask = np.isin(np.arange(len(setup.links)), sample)
-    paths = setup.traced_with(**change).at(setup.links.select(mask)).trace()
+    changed = setup.with_trace(replace(setup.study.trace, **change))
+    paths = changed.at(setup.links.select(mask)).trace()
     return len(np.unique(paths.link))
 
 

@@ -142,12 +142,6 @@ class Setup:
         setup = self._with_tracer(replace(self, links=links, held_out=np.zeros(len(links), dtype=bool)))
         return setup.with_obstruction() if self.study.uses_obstruction else setup
 
-    def traced_with(self, **settings: Any) -> Setup:
-        """The same traced with other settings of the section ``[trace]``."""
-        content = self.study.content()
-        trace = {**content["trace"], **settings}
-        return replace(self, study=type(self.study).from_content(content | {"trace": trace}, self.study.path))
-
     def with_obstruction(self) -> Setup:
         """The same with the columns of the links' table that follow from the scene (`obstruction.COLUMNS`)."""
         study = self.study

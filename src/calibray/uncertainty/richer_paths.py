@@ -57,7 +57,7 @@ def assess_richer_paths(
     changes = lacking(problem)
     if assessed.posterior is None or not changes:
         return assessed
-    setup = problem.setup.traced_with(**changes)
+    setup = problem.setup.with_trace(replace(problem.setup.study.trace, **changes))
     if setup.tracer.plan(setup.links).seconds > LONGEST_TRACE:
         return assessed
     materials = problem.parameters.materials(trail.best, problem.engine.materials)
