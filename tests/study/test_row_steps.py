@@ -11,7 +11,7 @@ import pytest
 from calibray.coordinates import Frame
 from calibray.errors import InputError
 from calibray.measurements import POSITION_COLUMNS, SourceTable
-from calibray.scenes.authoring import Footprints, make_scene
+from calibray.scenes.authoring import Footprints, Terrain, make_scene
 from calibray.study import Setup, Study, row_steps
 
 FRAME = Frame.local(9.99, 50.01)
@@ -130,6 +130,32 @@ def test_receivers_inside_buildings(folder, inside, left, counts):
     assert (len(links), links.prepared) == (left, counts)
     if inside == "move":
         assert links.rx[8] == pytest.approx([41, 0, 1.5], abs=0.01)
+
+
+def test_receivers_moved_out_of_a_building_on_a_slope_keep_their_height_above_the_ground(tmp_path):
+    """A slope of 20 %; two receivers move by 3 m up and by 13 m down."""
+    import shapely
+
+    axis = np.linspace(-100, 200, 61)
+    slope = Terrain(axis, axis, np.add.outer(0.0 * axis, 0.2 * axis))
+    box = np.array([shapely.box(0, 0, 30, 100)])
+    house = Footprints(box, np.zeros(1), np.full(1, 9.0), ("house",), ("height",), np.zeros(1, bool), {})
+    make_scene(house, tmp_path, FRAME, terrain=slope)
+    table = pd.DataFrame({"x": [28.0, 12.0, 40.0], "y": 50.0, "path_loss_db": 90.0})
+    table.to_csv(tmp_path / "links.csv", index=False)
+    content = {
+        "version": 1,
+        "scene": {"file": "scene.xml", "frequency": 3.5e9},
+        "links": {
+            "file": "links.csv", "tx": [100, 0, 20], "rx": ["x", "y", 1.5], "value": "path_loss_db",
+            "heights": "ground", "inside": "move",
+        },
+        "parameters": STUDY["parameters"],
+        "offset": {},
+    }  # fmt: skip
+    rx = Study.from_content(content, tmp_path / "study.toml").measurements().rx
+    assert rx[:, 0] == pytest.approx([31.0, -1.0, 40.0])
+    assert rx[:, 2] - slope.heights(rx[:, 0], rx[:, 1]) == pytest.approx(1.5)
 
 
 def test_averages_stay_within_transmitter_and_group(folder):

@@ -241,17 +241,23 @@ def _positions(
 def clear_buildings(table: SourceTable, steps: Preparation, rx: Coordinates) -> SourceTable:
     """Leave out or move receivers that are inside buildings, as seen from above.
 
-    The steps `inside` and `outside` are used; without them, the table itself is returned.
+    The steps `inside` and `outside` are used; without them, the table itself is returned. With the step `ground`, a
+    moved receiver keeps its height above the ground.
 
     Raises:
         InputError: No row remains.
     """
     if steps.inside is None or steps.outside is None:
         return table
-    positions, moved = steps.outside(table.positions("rx", rx))
+    before = table.positions("rx", rx)
+    positions, moved = steps.outside(before)
     if steps.inside == "drop":
         return table.keep(moved == 0, "receivers inside buildings, left out")
     too_deep = np.isnan(positions).any(axis=1)
+    if steps.ground is not None:
+        changed = (moved > 0) & ~too_deep
+        here, there = (steps.ground(*place[changed, :2].T) for place in (before, positions))
+        positions[changed, 2] += there - here
     if count := int(((moved > 0) & ~too_deep).sum()):
         table = table.note("receivers inside buildings, moved out", count)
     table = table.assign(**{str(name): values for name, values in zip(rx, positions.T, strict=True)})
