@@ -14,6 +14,7 @@ from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.measurements import Measurements
 from calibray.study import Setup, Study
+from small_scenes import write_scene
 from two_ray import TwoRay
 
 ERROR_M = 4.0
@@ -47,6 +48,44 @@ def test_power_is_the_mean_over_displaced_receivers(exact: Study) -> None:
     np.testing.assert_allclose(1 / weight, 2.0**2 + np.std(losses, axis=0) ** 2, rtol=1e-9)
     # Near the transmitter, four metres matter.
     assert weight[0] < weight[-1] / 1.5
+
+
+def sloping(exact: Study, folder: Path, **links: object) -> Study:
+    """The study with heights above ground that rises by 20 % to the east."""
+    plane = [
+        [(x, y, 0.2 * x) for x, y in [(-300.0, -300.0), (300.0, -300.0), (300.0, 300.0), (-300.0, 300.0)]]
+    ]
+    write_scene(folder / "slope", {"ground": plane}, two_ray.GROUND, "mat-ground")
+    content = with_error(exact, heights="ground", file=str(exact.links_path), **links).content()
+    content["scene"]["file"] = "slope/scene.xml"
+    return Study.from_content(content, folder / "study.toml")
+
+
+def test_displaced_receivers_keep_their_height_above_the_ground(exact: Study, tmp_path: Path) -> None:
+    setup = Setup.open(sloping(exact, tmp_path), tracer=TwoRay)
+    plain = setup.study.content()
+    del plain["links"]["position_error_m"]
+    links, powers = setup.links, []
+    np.testing.assert_allclose(links.rx[:, 2], 1.5 + 0.2 * links.rx[:, 0], atol=1e-4)
+    for east, north in [(1, 0), (0, 1), (-1, 0), (0, -1)]:
+        rx = links.rx + np.sqrt(2) * ERROR_M * np.array([east, north, 0.2 * east])
+        moved = Measurements(tx=links.tx, rx=rx, path_loss_db=np.zeros(len(links)))
+        loss = path_loss(Setup.open(Study.from_content(plain, setup.study.path), TwoRay, moved).trace())
+        powers.append(10 ** (-loss / 10))
+    np.testing.assert_allclose(path_loss(setup.trace()), -10 * np.log10(np.mean(powers, axis=0)), atol=1e-3)
+
+
+def test_a_shifted_device_keeps_its_height_above_the_ground(exact: Study, tmp_path: Path) -> None:
+    content = sloping(exact, tmp_path).content()
+    del content["links"]["position_error_m"]
+    shifted = content | {"parameters": {"rx:*.dx": {"bounds": [-5.0, 5.0]}}}
+    setup = Setup.open(Study.from_content(shifted, tmp_path / "study.toml"), tracer=TwoRay)
+    links = setup.links
+    rx = links.rx + np.array([3.0, 0.0, 0.6])
+    moved = Measurements(tx=links.tx, rx=rx, path_loss_db=np.zeros(len(links)))
+    expected = Setup.open(Study.from_content(content, tmp_path / "study.toml"), TwoRay, moved).trace()
+    placed = setup.placed_at({"rx:*.dx": 3.0}).trace()
+    np.testing.assert_allclose(placed.rx_position, expected.rx_position, atol=1e-3)
 
 
 def test_a_region_attenuates_the_paths_to_the_displaced_receivers(exact: Study) -> None:

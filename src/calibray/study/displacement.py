@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from calibray.errors import InputError
-from calibray.measurements import Measurements
+from calibray.measurements import Ground, Measurements
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Paths, concatenate, take_links
 from calibray.support.messages import did_you_mean
@@ -59,18 +59,23 @@ class Displacement:
         weights: 1 where a parameter displaces a group of links [G, parameters].
         group: Group of every link [L].
         reach: Largest displacement of every group by one of its parameters [G], [m]; sums count up to it.
+        ground: The ground that receivers follow; None if their heights do not count from it.
     """
 
     field: str
     weights: NDArray[np.float64]
     group: NDArray[np.int64]
     reach: NDArray[np.float64]
+    ground: Ground | None = None
 
     def moved(self, links: Measurements, displacement: NDArray[np.float64]) -> Measurements:
         """The links with displaced ends [L], [m]."""
         end = "tx" if self.field == "height" else "rx"
-        position = np.array(getattr(links, end))
+        stated = getattr(links, end)
+        position = np.array(stated)
         position[:, AXES[self.field]] += displacement
+        if end == "rx":
+            follow(self.ground, stated, position)
         return replace(links, **{end: position})
 
     def knots(self, values: NDArray[np.float64], neighbours: Sequence[float]) -> NDArray[np.float64]:
@@ -93,8 +98,20 @@ class Displacement:
         return np.concatenate(knots)[:, self.group]
 
 
+def follow(ground: Ground | None, before: NDArray[np.float64], after: NDArray[np.float64]) -> None:
+    """Keep the height above the ground of displaced positions [n, 3], [m]; where there is no ground, keep z."""
+    if ground is None:
+        return
+    with np.errstate(invalid="ignore"):  # inf - inf where there is no ground
+        rise = ground(*after[:, :2].T) - ground(*before[:, :2].T)
+    after[:, 2] += np.where(np.isfinite(rise), rise, 0.0)
+
+
 def displacements(
-    items: tuple[Parameter, ...], links: Measurements, columns: Mapping[str, str | None]
+    items: tuple[Parameter, ...],
+    links: Measurements,
+    columns: Mapping[str, str | None],
+    ground: Ground | None = None,
 ) -> tuple[Displacement, ...]:
     """The displacements of links, one for each axis that parameters displace them along.
 
@@ -121,7 +138,8 @@ def displacements(
         for number, item in named:
             weights[concerned(names, item.material.removeprefix(kind), own), number] = 1.0
         largest = np.array([max(abs(item.lower), abs(item.upper)) for item in items])
-        displacements.append(Displacement(field, weights, group.reshape(-1), (weights * largest).max(axis=1)))
+        reach = (weights * largest).max(axis=1)
+        displacements.append(Displacement(field, weights, group.reshape(-1), reach, ground))
     return tuple(displacements)
 
 
@@ -239,10 +257,17 @@ DIRECTIONS: Final = np.sqrt(2.0) * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]
 spherical rule of degree three in the plane)."""
 
 
-def displaced(links: Measurements, error_m: NDArray[np.float64]) -> Measurements:
-    """Links to displaced receivers, all those in one direction after the other; errors are standard deviations [L]."""
-    rx = np.tile(links.rx, (len(DIRECTIONS), 1))
+def displaced(
+    links: Measurements, error_m: NDArray[np.float64], ground: Ground | None = None
+) -> Measurements:
+    """Links to displaced receivers, all those in one direction after the other; errors are standard deviations [L].
+
+    If there is a `ground`, receivers keep their height above it.
+    """
+    stated = np.tile(links.rx, (len(DIRECTIONS), 1))
+    rx = stated.copy()
     rx[:, :2] += (DIRECTIONS[:, None] * error_m[:, None]).reshape(-1, 2)
+    follow(ground, stated, rx)
     tx = np.tile(links.tx, (len(DIRECTIONS), 1))
     return Measurements(tx=tx, rx=rx, path_loss_db=np.full(len(rx), np.nan))
 

@@ -17,7 +17,7 @@ from calibray.engines.protocol import Answering
 from calibray.engines.section import EngineSection, RadioSettings
 from calibray.errors import InputError
 from calibray.materials import Material
-from calibray.measurements import Measurements
+from calibray.measurements import Ground, Measurements
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take_links
 from calibray.scenes import Scene, check_material_name, read_scene
@@ -185,7 +185,7 @@ class Setup:
         if not any(displaces(item.name) for item in self.parameters):
             return ()
         columns = {POSE: self.study.links.transmitter, RECEIVER: self.study.links.device}
-        return displacements(self.parameters.items, self.links, columns)
+        return displacements(self.parameters.items, self.links, columns, self._ground)
 
     @property
     def _placed(self) -> NDArray[np.float64]:
@@ -358,7 +358,12 @@ class Setup:
         errors = self._position_error_m
         if errors is None:
             return self._trace(links, scene, progress)
-        return averaged(self._trace(displaced(links, errors), scene, progress), links)
+        return averaged(self._trace(displaced(links, errors, self._ground), scene, progress), links)
+
+    @cached_property
+    def _ground(self) -> Ground | None:
+        """Heights of the lowest surfaces, +inf where there is none; None if heights do not count from the ground."""
+        return None if self.study.links.heights is None else scene_place(self.study).surfaces().lowest_surface
 
     @cached_property
     def _position_error_m(self) -> NDArray[np.float64] | None:
@@ -386,7 +391,7 @@ class Setup:
         from calibray.engines.replay import Computation, Replay
 
         mountings = mounted_at_displaced(self.mountings, len(links))
-        around = displaced(self._links_in_place, errors)
+        around = displaced(self._links_in_place, errors, self._ground)
         paths = self._mounted(self._trace(around, self.scene, None), self.scene, mountings)
         effects = self._pose_and_region_effects(paths, np.tile(np.arange(len(links)), len(DIRECTIONS)))
         replay = Replay(paths, self.parameters, effects=effects, computation=Computation(batch=1))
@@ -439,8 +444,8 @@ class Setup:
     def _with_tracer(self, changed: Setup) -> Setup:
         """A changed setup with the same tracer, which depends neither on links nor on methods."""
         changed.__dict__["_loaded"] = self._loaded
-        if "regions" in self.__dict__:
-            changed.__dict__["regions"] = self.regions
+        known = {name: value for name, value in vars(self).items() if name in ("regions", "_ground")}
+        changed.__dict__.update(known)
         return changed
 
     def _scene_at(self, frequency: float) -> Scene:
