@@ -131,6 +131,15 @@ def test_names_that_sionna_refuses_are_found(tmp_path):
     assert "a BSDF of type 'diffuse' has no id" in problems(check_scene(file))
 
 
+def test_two_objects_of_one_id_are_found(tmp_path):
+    file = write_scene(tmp_path, [MeshObject(name, "stone", cube()) for name in ("one", "other")], STONE)
+    file.write_text(file.read_text().replace('id="mesh-other"', 'id="mesh-one"'))
+    found = [item for item in check_scene(file).findings if item.severity == "error"]
+    assert [(item.subject, item.problem) for item in found] == [
+        ("mesh-one", "is the id of 2 objects, which Sionna RT refuses")
+    ]
+
+
 def test_meshes_that_cannot_be_read_are_named(tmp_path):
     file = write_scene(tmp_path, [MeshObject("body", "stone", cube())], STONE)
     mesh = tmp_path / "meshes" / "body.ply"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -181,6 +182,11 @@ def _material_findings(root: ElementTree.Element, objects: Sequence[MeshFaults])
         elif bsdf.get("type") != "itu-radio-material" and name in ITU_NAMES:
             remedy = f"name it mat-itu_{name} for ITU's constants, or choose another name"
             yield Finding("error", identifier, "has a name of ITU-R P.2040, which Sionna RT refuses", remedy)
+    for name, count in Counter(shape.get("id") for shape in root.findall("shape")).items():
+        if name is not None and count > 1:
+            yield Finding(
+                "error", name, f"is the id of {count} objects, which Sionna RT refuses", "rename one"
+            )
     for item in objects:
         if item.material not in defined:
             problem = f"refers to no material of the scene ({item.material!r})"
