@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from calibray import engines
 from calibray.calibration.calibrate import calibrate
 from calibray.cli.app import app
+from calibray.coordinates import Frame
 from calibray.errors import InputError
 from calibray.scenes.authoring import Footprints, make_plan_scene, make_scene, read_plan
 from calibray.scenes.checks import SceneSurfaces, building_outlines
@@ -197,6 +198,29 @@ def test_units_of_names_that_the_study_does_not_state_are_named(town, columns, k
     found = suspicions(town, table, links=keys)
     assert named in found
     assert bool(named) == bool(found)
+
+
+@pytest.mark.parametrize("position", ["scene", "geographic"])
+def test_the_remedy_for_a_unit_can_be_followed(town, position):
+    """A unit of positions cannot be stated for degrees."""
+    frame = Frame.local(9.99, 50.01)
+    table = links().assign(height_ft=5.0)
+    if position == "geographic":
+        table["x"], table["y"], _ = frame.to_geographic(table[["x", "y", "z"]].to_numpy()).T
+    table.to_csv(town / f"{position}.csv", index=False)
+    tx = frame.to_geographic(MAST) if position == "geographic" else MAST
+    content = {
+        "version": 1,
+        "scene": {"file": "scene.xml", "frequency": 3.5e9, "origin": [9.99, 50.01]},
+        "links": {
+            "file": f"{position}.csv", "tx": tx.tolist(), "rx": ["x", "y", "height_ft"], "value": "loss",
+            "position": position,
+        },
+        "parameters": {"walls.relative_permittivity": {"bounds": [1.5, 12.0]}},
+    }  # fmt: skip
+    study = Study.from_content(content, town / "study.toml")
+    (remedy,) = [item.remedy for item in examine(study, study.measurements()) if "height_ft" in item.problem]
+    assert ("links.position_unit" in remedy) == (position == "scene")
 
 
 def test_upward_tilts_and_relative_gains_are_named(town):

@@ -278,7 +278,10 @@ def _units(study: StudyModel) -> Iterator[tuple[str, str]]:
         if words(name) & {*LENGTH_UNITS, "m"} and (stated := find_length_unit([name])) != unit:
             yield (
                 f"column {name!r} is named like lengths of {stated:g} m, and is read as lengths of {unit:g} m",
-                "convert it, or set links.position_unit if all positions have its unit",
+                # Degrees have no length, so that positions on the globe have no unit to state.
+                "convert it"
+                if links.position == "geographic"
+                else "convert it, or set links.position_unit if all positions have its unit",
             )
     for key in ("tx_power_dbm", "eirp_dbm"):
         name = getattr(links, key)
