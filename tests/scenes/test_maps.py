@@ -193,7 +193,7 @@ def test_footprints_of_geojson_are_projected(tmp_path):
     [
         ({"height": "height"}, "no column 'height'"),
         ({"height": "word"}, "contains 'high', must contain metres"),
-        ({"height": "negative"}, "feature 2: negative = -1, must be finite, not negative and at most 1000"),
+        ({"height": "negative"}, "polygon 2: negative = -1, must be finite, not negative and at most 1000"),
         ({"layer": "roads"}, "cannot be read"),
     ],
 )

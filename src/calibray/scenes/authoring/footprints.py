@@ -424,7 +424,7 @@ def _numbers(
     )
     if bad.size:
         raise InputError(
-            f"footprints {path}, feature {bad[0] + 1}: {source} = {numbers[bad[0]]:g}, must be finite, not "
+            f"footprints {path}, polygon {bad[0] + 1}: {source} = {numbers[bad[0]]:g}, must be finite, not "
             f"negative and at most {HIGHEST:g}; correct it"
         )
     return numbers
