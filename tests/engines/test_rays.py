@@ -115,6 +115,23 @@ def test_materials_are_those_of_the_faces_unless_stated(yard: Tracer, rows: pd.D
         cb.read_rays(reflected.assign(object="c"), scene, frequency=FREQUENCY)
 
 
+def test_an_edge_where_two_houses_meet_has_the_stated_material(tmp_path: Path) -> None:
+    """The eaves of two houses of different materials continue each other; the ray bends where they meet."""
+    houses = {"a": block((0, 0, 0), (10, 10, 8)), "b": block((0, 10, 0), (10, 20, 8))}
+    scene = read_scene(write_scene(tmp_path, houses), FREQUENCY, split={"other": "b"})
+    bent = pd.DataFrame(
+        {
+            "path": 0, "point": [0, 1, 2], "type": ["transmitter", "diffraction", "receiver"], "x": [-10.0, 0, 15],
+            "y": 10.0, "z": [6.0, 8, 14], "power_db": -100.0,
+        }
+    )  # fmt: skip
+    with pytest.raises(InputError, match="'stone' and 'other' coincide there; state the material"):
+        cb.read_rays(bent, scene, frequency=FREQUENCY)
+    for column, value, expected in (("material", "stone", 0), ("material", "other", 1), ("object", "b", 1)):
+        stated = cb.read_rays(bent.assign(**{column: ["", value, ""]}), scene, frequency=FREQUENCY)
+        assert stated.material.tolist() == [expected]
+
+
 WRONG = {
     "points of the path missing": (lambda t: t.drop(t.index[t.point == 3][0] - 1), "count up by 1"),
     "a receiver missing": (lambda t: t[t.type != "receiver"], "the last its receiver"),

@@ -160,6 +160,7 @@ def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
         leaving=direction[row, step + 1],
         length=np.minimum(length[row, step], length[row, step + 1]),
         reflects=table.kind[present] == Kind.SPECULAR,
+        diffracts=table.kind[present] == Kind.DIFFRACTION,
         material=_stated_materials(table, scene)[present],
         label=np.array(
             [f"{table.source}: path {table.path[p]}, point {s + 1}" for p, s in zip(row, step, strict=True)]
@@ -167,14 +168,13 @@ def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
     )
     _check_straight(hits, table.kind[present] == Kind.REFRACTION)
     surfaces = Surfaces.of(scene)
-    wedge = table.kind[present] == Kind.DIFFRACTION
-    face, distance = match(surfaces, replace(hits, material=np.where(wedge, -1, hits.material)), names)
+    face, distance = match(surfaces, hits, names)
     normal = np.zeros((*table.kind.shape, 3))
     normal[present] = surfaces.normal[face]
     edge, normal_n, lengths = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2))
-    if wedge.any():
+    if hits.diffracts.any():
         edge, normal_n, lengths = (np.zeros((len(stops), width)) for width in (3, 3, 2))
-    for number in np.flatnonzero(wedge).tolist():
+    for number in np.flatnonzero(hits.diffracts).tolist():
         path, at = row[number], step[number]
         found = find_edge(surfaces, hits, number)
         face[number], normal[path, at] = found.face, found.normal_0

@@ -97,6 +97,7 @@ class Hits:
         leaving: Unit vectors of travel after [n, 3].
         length: The shorter one of the two segments [n], [m].
         reflects: Whether the mirror law must hold [n].
+        diffracts: Whether an edge diffracts, whose faces may have two materials [n].
         material: Index of the stated material; -1 if none is stated [n].
         label: What messages call them [n].
     """
@@ -106,6 +107,7 @@ class Hits:
     leaving: NDArray[np.float64]
     length: NDArray[np.float64]
     reflects: NDArray[np.bool_]
+    diffracts: NDArray[np.bool_]
     material: NDArray[np.int64]
     label: NDArray[np.str_]
 
@@ -127,7 +129,8 @@ def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.
             surface reflects the wave into the direction of the path.
     """
     index, face, distance = surfaces.near(hits.point, TOLERANCE)
-    right = (hits.material[index] < 0) | (hits.material[index] == surfaces.material[face])
+    free = (hits.material < 0) | hits.diffracts
+    right = free[index] | (hits.material[index] == surfaces.material[face])
     index, face, distance = index[right], face[right], distance[right]
     error = hits.mirror_error(index, surfaces.normal[face])
     # A point that is off by the tolerance turns both segments.
@@ -171,7 +174,8 @@ def _refuse_ambiguous(
     best = first[np.searchsorted(index[first], index)]
     material = surfaces.material[face]
     parallel = np.abs(np.sum(surfaces.normal[face] * surfaces.normal[face[best]], axis=1)) > 0.999
-    rival = (material != material[best]) & (distance - distance[best] < SAME) & parallel & ~bent
+    unstated = hits.material[index] < 0
+    rival = unstated & (material != material[best]) & (distance - distance[best] < SAME) & parallel & ~bent
     if rival.any():
         pair = int(np.argmax(rival))
         raise InputError(
