@@ -18,6 +18,7 @@ from rasterio.transform import Affine
 
 from calibray.coordinates import Frame
 from calibray.errors import InputError
+from calibray.scenes import export_scene, read_frame, read_scene
 from calibray.scenes.authoring import (
     FootprintColumns,
     HeightRule,
@@ -73,6 +74,15 @@ def test_buildings_of_an_extract_have_holes_and_heights(extract):
     # Corners come back to the grid of 1 cm.
     assert shapely.area(buildings.polygon) == pytest.approx([400, 400, 400, 400, 300], rel=2e-3)
     assert buildings.bounds == pytest.approx([0, 0, 220, 20], abs=0.011)
+
+
+def test_an_exported_scene_keeps_its_position_on_the_globe(extract, tmp_path):
+    buildings, frame = read_openstreetmap(extract)
+    made = make_scene(buildings, tmp_path / "scene", frame)
+    scene = read_scene(made.path, 3.5e9)
+    export_scene(scene, scene.materials, tmp_path / "exported.xml")
+    assert read_frame(tmp_path / "exported.xml") == frame
+    assert read_scene(tmp_path / "exported.xml", 3.5e9).sizes == scene.sizes
 
 
 def test_a_denied_part_is_no_part(tmp_path):

@@ -35,9 +35,11 @@ from calibray.materials import (
 )
 from calibray.scenes.scene_file import (
     MESHES,
+    frame_comment,
     keep_traced_elements,
     parse,
     plain_name,
+    read_frame,
     scene_path,
     unique_names,
 )
@@ -355,7 +357,7 @@ def export_scene(
     copy_meshes: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Write a scene file with other constants; it refers to the original meshes or to copies.
+    """Write a scene file with other constants; it refers to the original meshes or to copies, and keeps the frame.
 
     Materials and objects get names that Sionna RT accepts (`exported_names`). Sionna's scene files support the
     Lambertian scattering pattern only; set another pattern after loading the scene.
@@ -397,6 +399,8 @@ def export_scene(
             filename.set("value", os.path.relpath(mesh, target.parent.resolve()))
     for index, (name, material) in enumerate(materials.items()):
         root.insert(index, material_element(f"mat-{names[name]}", material))
+    if scene.path.is_file() and (frame := read_frame(scene.path)) is not None:
+        root.insert(0, ElementTree.Comment(frame_comment(frame)))
     ElementTree.indent(root)
     write_text(target, ElementTree.tostring(root, encoding="unicode") + "\n")
 

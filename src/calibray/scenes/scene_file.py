@@ -315,9 +315,7 @@ def _scene_xml(
 ) -> str:
     lines = ['<scene version="2.1.0">']
     if frame is not None:
-        # XML comments must not contain a double hyphen.
-        comment = escape(f"{_FRAME_COMMENT}{frame}").replace("--", "- -")
-        lines.append(f"    <!-- {comment} -->")
+        lines.append(f"    <!--{frame_comment(frame)}-->")
     for name, constants in materials.items():
         kind = "itu-radio-material" if "type" in constants else "radio-material"
         lines.append(f'    <bsdf type="{kind}" id={quoteattr(f"mat-{name}")}>')
@@ -334,6 +332,12 @@ def _scene_xml(
             "    </shape>",
         ]
     return "\n".join([*lines, "</scene>", ""])
+
+
+def frame_comment(frame: Frame) -> str:
+    """The text of the XML comment that states a frame."""
+    # XML comments must not contain a double hyphen.
+    return " " + escape(f"{_FRAME_COMMENT}{frame}").replace("--", "- -") + " "
 
 
 def read_frame(source: str | Path) -> Frame | None:
