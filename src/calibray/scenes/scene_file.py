@@ -347,8 +347,7 @@ def read_frame(source: str | Path) -> Frame | None:
         InputError: The scene does not exist, or its file states an invalid frame.
     """
     path = scene_path(str(source))
-    with path.open(encoding="utf-8", errors="replace") as stream:
-        head = stream.read(8192)
+    head = read_content(path)[:8192].decode("utf-8", "replace")
     comment = re.search(f"<!-- {_FRAME_COMMENT}(.*?) -->", head, re.DOTALL)
     if comment is None:
         return None
