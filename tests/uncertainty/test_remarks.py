@@ -42,9 +42,9 @@ def test_values_outside_their_intervals_are_named_with_the_reason():
     assert NAMES[0] not in text
     assert "neighbouring links share part of their errors" in text
     assert f"{np.exp(3.0):.2g} times as probable" in text
-    assert "blocks = 4" in text
+    assert "unless held-out links ([holdout]) choose another model" in text
     # With blocks held out already, that advice would be empty.
-    assert "blocks = 4" not in remarks(outside, holdout={"blocks": 3})[0]
+    assert "[holdout]" not in remarks(outside, holdout={"blocks": 3})[0]
     assert remarks(outside, holdout={"where": "rx_x > 0"})[0] == text
     assert "more than 1,000 times" in remarks(outside, 50.0)[0]
 

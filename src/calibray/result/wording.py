@@ -198,8 +198,8 @@ def _outside_interval(values: dict[str, Any]) -> str:
     if values["blocks"]:
         return text + " Held-out blocks show which model predicts best."
     return (
-        text
-        + " Predictions use the values with the lowest RMSE unless held-out links choose another model: add [holdout]."
+        f"{text} Predictions use the values with the lowest RMSE unless held-out links ([holdout]) choose another "
+        "model."
     )
 
 
