@@ -82,7 +82,7 @@ def test_the_last_round_is_the_check(yard: Tracer, rounds: Paths) -> None:
         "(fidelity.tolerance_db = 0.5); increase trace.samples, or reduce trace.max_depth."
     )
     with pytest.raises(InputError, match="its last round of rays is the check"):
-        convergence.check(yard, LINKS, rounds, path_loss)
+        convergence.check(yard.settings, lambda _: rounds, rounds, path_loss)
 
 
 def test_rays_are_sent_once_for_all_links_of_a_source(yard: Tracer, monkeypatch: pytest.MonkeyPatch) -> None:

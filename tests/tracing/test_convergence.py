@@ -11,10 +11,12 @@ import pytest
 
 from calibray.errors import InputError
 from calibray.fields import path_loss
+from calibray.paths import Paths
 from calibray.reporting import scene_tables as report
 from calibray.scenes import read_scene
 from calibray.tables import render
-from calibray.tracing.convergence import Convergence, check, compare
+from calibray.tracing import convergence
+from calibray.tracing.convergence import Convergence, PathLoss, compare
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
 
@@ -31,6 +33,12 @@ def links():
 def tracer(file, materials=None, **settings) -> Tracer:
     scene = read_scene(file, FREQUENCY, materials)
     return Tracer(scene, FREQUENCY, TraceSettings(max_depth=2, **settings), Antenna(), Antenna())
+
+
+def check(tracer: Tracer, links: SimpleNamespace, before: Paths, loss: PathLoss) -> Convergence:
+    return convergence.check(
+        tracer.settings, lambda finer: tracer.with_settings(finer).trace(links), before, loss
+    )
 
 
 def test_enough_rays_change_nothing(yard_file, links):

@@ -18,6 +18,7 @@ import calibray as cb
 import planted
 from calibray.errors import InputError
 from calibray.fields import path_loss
+from calibray.paths import Paths
 from calibray.scenes import Scene, read_scene
 from calibray.study import Setup
 from calibray.support import cache_folder as caching
@@ -131,7 +132,11 @@ def test_any_tracer_tells_progress_launches_and_points_below_the_ground(plane: S
 
 def test_convergence_is_checked_of_any_tracer(plane: Scene) -> None:
     tracer = open_with(TwoRay, plane)
-    found = convergence.check(tracer, LINKS, tracer.trace(LINKS), COHERENT)
+
+    def trace(settings: TraceSettings) -> Paths:
+        return tracer.with_settings(settings).trace(LINKS)
+
+    found = convergence.check(tracer.settings, trace, tracer.trace(LINKS), COHERENT)
     assert found.samples == SETTINGS.samples
     assert found.converged(0.0)
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from calibray.study.model import StudyModel
     from calibray.support.progress import Progress
     from calibray.tracing.convergence import Convergence
+    from calibray.tracing.settings import TraceSettings
 
 
 @dataclass(frozen=True)
@@ -270,9 +271,11 @@ def _trace(
     if not trace_again:
         return paths, None
     loss = partial(path_loss, combining=study.objective.combining, bandwidth=study.scene.bandwidth)
-    settings = convergence.finer(study.trace)
-    after = setup.with_trace(settings).trace(progress=with_stage(progress, "checking"))
-    return paths, convergence.compare(paths, after, int(settings.samples) // 2, loss)
+
+    def finer(settings: TraceSettings) -> Paths:
+        return setup.with_trace(settings).trace(progress=with_stage(progress, "checking"))
+
+    return paths, convergence.check(study.trace, finer, paths, loss)
 
 
 @with_groups

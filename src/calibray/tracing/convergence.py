@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.paths import Paths
-from calibray.support.progress import Progress
-from calibray.tracing.protocol import Links, Tracer
 from calibray.tracing.settings import RANGES, TraceSettings
 
 PathLoss = Callable[[Paths], NDArray[np.float64]]
@@ -90,24 +88,19 @@ def compare(before: Paths, after: Paths, samples: int, path_loss: PathLoss) -> C
 
 
 def check(
-    tracer: Tracer, links: Links, before: Paths, path_loss: PathLoss, progress: Progress | None = None
+    settings: TraceSettings, trace: Callable[[TraceSettings], Paths], before: Paths, path_loss: PathLoss
 ) -> Convergence:
     """Trace links again with twice the rays and the next seed, and compare with the paths found before.
+
+    Args:
+        settings: Settings with which `before` was traced.
+        trace: Traces the same links with other settings.
+        before: The paths found before.
+        path_loss: Path loss of every link [L], [dB].
 
     Raises:
         InputError: `before` contains other links, or its rays were added in rounds, of which the last is the check.
         EngineError: The paths exceed what the tracer can store.
-    """
-    settings = finer(tracer.settings)
-    after = tracer.with_settings(settings).trace(links, progress)
-    return compare(before, after, int(settings.samples) // 2, path_loss)
-
-
-def finer(settings: TraceSettings) -> TraceSettings:
-    """The settings with twice the rays and the next seed.
-
-    Raises:
-        InputError: Rays are added in rounds, of which the last is the check.
     """
     if settings.samples == "auto":
         raise InputError(
@@ -116,7 +109,8 @@ def finer(settings: TraceSettings) -> TraceSettings:
         )
     # The largest seed is followed by 0.
     next_seed = (settings.seed + 1) % (RANGES["seed"][1] + 1)
-    return replace(settings, samples=2 * settings.samples, seed=next_seed)
+    after = trace(replace(settings, samples=2 * settings.samples, seed=next_seed))
+    return compare(before, after, settings.samples, path_loss)
 
 
 def join(parts: Sequence[tuple[NDArray[np.int64], Convergence]]) -> Convergence:

@@ -214,9 +214,10 @@ def _trace_chunk(check: bool, study: OpenedStudy, links: Measurements) -> tuple[
     if not check:
         return paths, None
     loss = partial(path_loss, combining=study.radio.combining, bandwidth=study.radio.bandwidth)
-    settings = convergence.finer(chunk.trace_settings)
-    after = chunk.with_trace(settings).trace()
-    return paths, convergence.compare(paths, after, int(settings.samples) // 2, loss)
+    again = convergence.check(
+        chunk.trace_settings, lambda finer: chunk.with_trace(finer).trace(), paths, loss
+    )
+    return paths, again
 
 
 Open = Callable[[OpenedStudy, Mapping[str, Material]], Differentiable]
