@@ -43,9 +43,8 @@ def measured(path_loss_db, **columns):
 def objective(links, *terms, calibrated=None):
     """The objective of a study with some nuisances."""
     every = np.ones(len(links), dtype=bool)
-    return make_objective(
-        links, every, every if calibrated is None else calibrated, nuisance=Nuisance(len(links), terms)
-    )
+    mask = every if calibrated is None else calibrated
+    return make_objective(links, every, mask, nuisance=Nuisance(len(links), terms), noise_db=1.0)
 
 
 def test_a_log_distance_law_is_recovered_exactly():
@@ -149,6 +148,30 @@ def test_the_law_has_the_nuisances_of_the_study():
     # A group without calibration links gets the mean of the others.
     only_a = objective(links, bounded, calibrated=labels == "a")
     assert log_distance(links, only_a, NOTHING).path_loss_db() == pytest.approx(loss + 15.0 * (labels == "b"))
+
+
+@pytest.mark.parametrize("by", ["constant", "log_distance"])
+def test_a_prior_of_the_study_does_not_draw_the_law_towards_zero(by):
+    """A prior of 3 dB says that the twin's offset or slope is small, not that the law's intercept or slope is."""
+    loss = LOSS + 5.0 * np.random.default_rng(1).standard_normal(20)
+    links = measured(loss)
+    plain = log_distance(links, objective(links), NOTHING).path_loss_db()
+    term = make_term(links, "narrow", by, prior=3.0)
+    narrow = log_distance(links, replace(objective(links, term), noise_db=5.0), NOTHING)
+    assert narrow.path_loss_db() == pytest.approx(plain, abs=1e-6)
+    # Groups deviate from a common intercept or slope, as in the twin.
+    labels = np.where(np.arange(20) % 2, "a", "b")
+    term = make_term(links, "narrow", by, labels=labels, prior=0.01)
+    grouped = log_distance(links, replace(objective(links, term), noise_db=5.0), NOTHING)
+    assert grouped.path_loss_db() == pytest.approx(plain, abs=0.01)
+
+
+def test_a_further_nuisance_keeps_its_bounds():
+    foliage = np.arange(20.0) % 3
+    links = measured(LOSS - 6.0 * foliage, table=SourceTable(pd.DataFrame({"foliage": foliage})))
+    term = make_term(links, "foliage", "foliage", bounds=(0.0, 2.0))
+    model, known_db = log_distance(links, objective(links, term), NOTHING)
+    assert model.coefficients(known_db[None])[0, 0] == 0.0
 
 
 def test_losses_out_of_sight_and_per_wall_are_recovered():

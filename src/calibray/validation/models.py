@@ -102,8 +102,14 @@ def log_distance(links: Measurements, objective: Objective, known_db: NDArray[np
     """
     if np.count_nonzero(objective.weight) < 2:
         raise EngineError("the log-distance model needs at least two calibration links")
-    # An intercept is no offset, so the bounds of the study's offset do not apply to it.
-    terms = [replace(term, bounds=UNBOUNDED) for term in objective.nuisance.terms]
+    # Bounds and priors of an offset or a slope do not apply to the law's intercept and slope; groups may deviate from
+    # these by as much as the study says.
+    terms = [
+        replace(term, bounds=UNBOUNDED, prior=np.inf if term.labels == ("",) else term.prior)
+        if term.by in (CONSTANT, LOG_DISTANCE)
+        else term
+        for term in objective.nuisance.terms
+    ]
     present = [(term.by, term.labels) for term in terms]
     for by in (CONSTANT, LOG_DISTANCE):
         if (by, ("",)) not in present:
