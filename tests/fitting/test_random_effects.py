@@ -75,10 +75,9 @@ def test_spread_noise_and_shrinkage_follow_from_the_data():
     expected = means.mean() + share * (means - means.mean())
     assert list(sums) == ["street"]
     assert list(sums["street"].values()) == pytest.approx(expected.tolist(), abs=1e-6)
-    # A group that is left out has the mean 0 and the spread.
-    filled, deviation = fitted.objective.nuisance.filled(coefficients[None], GROUP > 0)
-    assert filled[0, 1] == 0
-    assert deviation[1] == spread
+    # A group that is left out has the mean 0.
+    without = fitted.objective.reweighted(np.where(GROUP == 0, 0.0, 1.0))
+    assert without.completed((80.0 + 5.0 * way)[None])[0, 1] == 0
     block = np.where(GROUP < 3, 0, 1 + GROUP % 2)
     alone = fitted.objective.nuisance.new_group_spread(block)
     assert alone[GROUP < 3] == pytest.approx(spread)

@@ -174,6 +174,33 @@ def test_a_further_nuisance_keeps_its_bounds():
     assert model.coefficients(known_db[None])[0, 0] == 0.0
 
 
+@pytest.mark.parametrize("bounds", [None, (3.0, 40.0)])
+def test_a_group_whose_links_do_not_determine_its_slope_has_that_of_the_others(bounds):
+    """One link gives an offset only; the link is predicted as it is fitted, and others with the common slope."""
+    labels = np.array(["a"] * 10 + ["b"] * 10)
+    labels[[4, 7]] = "c"
+    shift_db = np.select([labels == "a", labels == "b"], [2.0, -3.0], 7.0)
+    links = measured(
+        90.0 + shift_db + 12.0 * np.log10(DISTANCE), table=SourceTable(pd.DataFrame({"set": labels}))
+    )
+    terms = (
+        make_term(links, "offset", labels=labels),
+        make_term(links, "clutter", "log_distance", labels=labels, bounds=bounds),
+    )
+    fitted = objective(links, *terms, calibrated=np.arange(20) != 7)
+    scene_db = np.full(20, 90.0)
+    assert fitted.with_nuisance(scene_db) == pytest.approx(links.path_loss_db)
+    content = planted.content(
+        "links.csv", offset={"per": "set"}, nuisance={"clutter": {"by": "log_distance", "per": "set"}}
+    )
+    every = fitted_terms(fitted, scene_db, Study.from_content(content))
+    predicting = PredictionModel(
+        Model.CALIBRATED, {}, tuple(replace(term, per="set") for term in every), 1.0, "", 15
+    )
+    added_db = nuisance_shift(model_terms(predicting, links), links).value_db[0]
+    assert scene_db + added_db == pytest.approx(links.path_loss_db)
+
+
 def test_losses_out_of_sight_and_per_wall_are_recovered():
     walls = np.arange(20) % 4
     links = measured(LOSS + 12.0 * (walls > 0) + 3.0 * walls, table=blocked(walls))

@@ -263,28 +263,19 @@ class Nuisance:
         """Contribution of the nuisance to path loss [n, L], [dB]: design times coefficients [n, q]."""
         return (self.design @ coefficients.T).T
 
-    def filled(
-        self, coefficients: NDArray[np.float64], counted: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Coefficients [n, q], the mean of a term's measured groups for the others, and standard deviations [q].
+    def filled(self, coefficients: NDArray[np.float64], determined: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Coefficients [n, q], with the mean of a term's determined ones [q] for its others.
 
-        Measured groups have links in `counted` [L]. Deviations of a random effect have the mean 0 and its spread. The
-        standard deviation is the spread between groups for a filled-in coefficient, otherwise 0.
+        Undetermined deviations of a random effect keep their value, 0.
         """
-        measured = np.asarray(abs(self.design[counted]).sum(axis=0)).ravel() > 0
-        filled, deviation, first = coefficients.copy(), np.zeros(len(measured)), 0
+        filled, first = coefficients.copy(), 0
         for term in self.terms:
             columns = np.arange(first, first + len(term.labels))
             first += len(term.labels)
-            fitted, missing = columns[measured[columns]], columns[~measured[columns]]
-            if term.around:
-                filled[:, missing], deviation[missing] = 0.0, term.prior
-            elif len(fitted) and len(missing):
-                filled[:, missing] = coefficients[:, fitted].mean(axis=1, keepdims=True)
-                # Variance between groups, plus that of their mean.
-                spread = np.std(coefficients[0, fitted], ddof=1) if len(fitted) > 1 else UNKNOWN_DB
-                deviation[missing] = spread * np.sqrt(1 + 1 / len(fitted))
-        return filled, deviation
+            known, others = columns[determined[columns]], columns[~determined[columns]]
+            if len(known) and not term.around:
+                filled[:, others] = coefficients[:, known].mean(axis=1, keepdims=True)
+        return filled
 
     def new_group_spread(self, block: NDArray[np.int64]) -> NDArray[np.float64]:
         """Standard deviation of random effects at links whose group is only in one block, if it is left out [L], [dB].

@@ -125,9 +125,26 @@ class Objective:
         Raises:
             EngineError: No minimum within the bounds was found.
         """
+        return self._fitted(self.measured - self.capped(path_loss))
+
+    def completed(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The `coefficients` with which other links are predicted [n, q], for path loss [n, L], [dB].
+
+        One that is not `determined` has the mean of its term's other groups, and the rest fit best with these.
+        """
+        gap = self.measured - self.capped(path_loss)
+        coefficients = self._fitted(gap)
+        filled = self.nuisance.filled(coefficients, self.determined)
+        added_db = self.nuisance.contribution(filled - coefficients)
+        if not added_db[:, self._counted].any():
+            return filled
+        return np.where(self.determined, self._fitted(gap - added_db), filled)
+
+    def _fitted(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The coefficients [n, q] that explain measured minus modelled path loss best [n, L], [dB]."""
         if not self.nuisance.terms:
-            return np.zeros((len(path_loss), 0))
-        gap = (self.measured - self.capped(path_loss))[:, self._counted]
+            return np.zeros((len(gap), 0))
+        gap = gap[:, self._counted]
         reached = np.isfinite(gap)
         if reached.all():
             return self._elimination.coefficients(gap)
@@ -271,8 +288,7 @@ class Objective:
 
     def with_nuisance(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss [L], [dB], plus the nuisance fitted to links with weight; a group without any gets the mean."""
-        filled, _ = self.nuisance.filled(self.coefficients(path_loss[None]), self.weight > 0)
-        return self.capped(path_loss) + self.nuisance.contribution(filled)[0]
+        return self.capped(path_loss) + self.nuisance.contribution(self.completed(path_loss[None]))[0]
 
     def _model(
         self, path_loss: NDArray[np.float64], coefficients: NDArray[np.float64]

@@ -217,9 +217,7 @@ class _ReplayedDraws:
             slope[loss >= objective.ceiling_db] = 0.0
             loss = objective.capped(loss)
         design, common = self._nuisance(links)
-        coefficients, _ = objective.nuisance.filled(
-            objective.coefficients(self.evaluation.modelled), objective.weight > 0
-        )
+        coefficients = objective.completed(self.evaluation.modelled)
         position, correlation = np.hstack([links.rx, links.tx]), self._correlation()
         errors = Errors(self.noise_db, common, position)
         if correlation is not None:

@@ -228,10 +228,13 @@ def fitted_terms(
         study: The study.
 
     Returns:
-        The terms. Groups whose coefficient no link determines are left out.
+        The terms. Groups without links are left out.
     """
-    coefficients = objective.coefficients(path_loss_db[None])[0]
-    by_term, terms = objective.nuisance.by_term(coefficients, objective.determined), []
+    coefficients = objective.completed(path_loss_db[None])[0]
+    # Links of a group that do not determine its coefficient are still fitted with one.
+    has_links = np.asarray(abs(objective.nuisance.design[objective.weight > 0]).sum(axis=0)).ravel() > 0
+    used = objective.determined | has_links & (coefficients != 0)
+    by_term, terms = objective.nuisance.by_term(coefficients, used), []
     spreads = {term.around: term.prior for term in objective.nuisance.terms if term.around}
     # A random effect is one term, with the groups of its deviations.
     grouped = {term.around or term.name: term for term in objective.nuisance.terms}
