@@ -14,7 +14,10 @@ from calibray.fitting.nuisance import Nuisance, random_effect
 from calibray.fitting.objective import make_objective
 from calibray.fitting.preliminary_fits import estimate_noise, group_spread
 from calibray.fitting.problem import Problem
+from calibray.fitting.search import least_squares
 from calibray.measurements import Measurements
+from calibray.result.held_out import Model
+from calibray.validation.models import variants
 from fitting.test_preliminary_fits import Ramp
 
 GROUPS, EACH = 40, 6
@@ -83,6 +86,30 @@ def test_spread_noise_and_shrinkage_follow_from_the_data():
     assert alone[GROUP < 3] == pytest.approx(spread)
     split = np.arange(len(GROUP)) % 2
     assert not fitted.objective.nuisance.new_group_spread(split).any()
+
+
+@pytest.mark.parametrize("spread_db", [0.0, 6.0])
+def test_groups_of_few_links_do_not_raise_the_noise(spread_db):
+    """Two links in each group: a coefficient of each that its prior keeps small explains none of their errors."""
+    random, group = np.random.default_rng(3), np.repeat(np.arange(150), 2)
+    way = random.uniform(0.0, 10.0, len(group))
+    errors = 4.0 * random.standard_normal(len(group)) + spread_db * random.standard_normal(150)[group]
+    place = np.column_stack([way, np.zeros((len(way), 2))])
+    links = Measurements(tx=place + 1.0, rx=place, path_loss_db=80.0 + 5.0 * way + errors)
+    effect = random_effect(links, "street", "constant", [f"{each:03d}" for each in group])
+    every, engine = np.ones(len(way), dtype=bool), Ramp(way)
+    study = SimpleNamespace(noise=SimpleNamespace(std_db=None), links=SimpleNamespace(std=None))
+    objective = make_objective(links, every, every, nuisance=Nuisance(len(way), effect), noise_db=1.0)
+    setup = SimpleNamespace(links=links, study=study)
+    before = engine.path_loss(engine.parameters.start[None])[0]
+    fitted = estimate_noise(Problem(setup, engine, objective, before))  # type: ignore[arg-type]
+    best = least_squares(fitted, 4, np.zeros((0, 1))).best.x
+    optimum = fitted.squares(best[None])
+    noise_db = optimum.rmse_db[0] * np.sqrt(len(way) / fitted.freedom)
+    assert fitted.objective.noise_db == pytest.approx(4.0, rel=0.1)
+    assert noise_db == pytest.approx(fitted.objective.noise_db, rel=0.03)
+    prior = variants(fitted, best)[Model.PRIOR].objective
+    assert prior.noise_db == pytest.approx(noise_db)
 
 
 def test_a_new_street_is_predicted_with_the_mean_and_the_spread(tmp_path):

@@ -142,7 +142,7 @@ def _choice(
     if problem.freedom >= 1:
         rms_db = float(trail.best_rmse_db * np.sqrt(objective.num_counted / problem.freedom))
     basis = f"errors of {objective.num_counted} calibration links"
-    return Model.CALIBRATED, HeldOutResiduals(rms_db, basis, max(problem.freedom, 1), np.zeros(0))
+    return Model.CALIBRATED, HeldOutResiduals(rms_db, basis, max(round(problem.freedom), 1), np.zeros(0))
 
 
 def log_distance_errors(

@@ -425,8 +425,9 @@ def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Rema
         return ()
     evaluation, columns = _derivatives(problem, engine, best, tested)
     directions = {}
+    freedom = evaluation.num_rows - problem.unknowns
     for label in tested:
-        direction = _direction(evaluation, columns, label, problem.freedom, SIGNIFICANCE / len(tested))
+        direction = _direction(evaluation, columns, label, freedom, SIGNIFICANCE / len(tested))
         if direction is not None:
             directions[label] = direction
     if not directions:

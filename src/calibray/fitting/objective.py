@@ -185,6 +185,17 @@ class Objective:
         return self._elimination.determined
 
     @property
+    def fitted(self) -> float:
+        """Number of coefficients that the links determine; with a prior, by the links' share in its precision.
+
+        Coefficients that their priors keep at zero explain no residuals, however many groups there are.
+        """
+        if not self.nuisance.terms:
+            return 0.0
+        data = self._elimination.data.diagonal()[self.determined]
+        return float(np.sum(data / (data + self._ridge[self.determined] ** 2)))
+
+    @property
     def supported(self) -> NDArray[np.bool_]:
         """Mask of the links whose columns are all determined; the model of other links is incomplete [L]."""
         return ~((self.nuisance.design != 0) @ ~self.determined)

@@ -158,9 +158,9 @@ class Problem:
         return len(self.parameters) + int(self.objective.determined.sum())
 
     @property
-    def freedom(self) -> int:
-        """Degrees of freedom: calibration links minus unknowns; below 1 the noise cannot be estimated."""
-        return self.objective.num_counted - self.unknowns
+    def freedom(self) -> float:
+        """Degrees of freedom: calibration links minus fitted unknowns; below 1 the noise cannot be estimated."""
+        return self.objective.num_counted - len(self.parameters) - self.objective.fitted
 
     @cached_property
     def differentiable(self) -> bool:

@@ -59,7 +59,7 @@ def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...
     starts = minima[:BASINS]
     links = least_squares(_weighted(problem, 1 / DOMINANT), CONFLICT_STARTS, starts).best.x
     further = least_squares(_weighted(problem, DOMINANT), CONFLICT_STARTS, starts).best.x
-    freedom = objective.num_counted - problem.unknowns
+    freedom = problem.freedom
     of_further = sum(each.freedom(objective.weight) for each in problem.observed) - width
     if freedom < 1 or of_further < 1:
         return ()

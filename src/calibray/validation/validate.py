@@ -185,12 +185,13 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
             link_labels = links.table.labels(by)
         names, block[counted] = np.unique(link_labels[counted], return_inverse=True)
         labels = tuple(map(str, names))
-    # What is left when the largest block is held out.
+    # What is left when the largest block is held out, and what is fitted to it.
     fewest = int(counted.sum()) - int(np.bincount(block[counted]).max())
-    if len(labels) < 2 or counted.sum() < len(labels) or fewest <= problem.unknowns:
+    unknowns = counted.sum() - problem.freedom
+    if len(labels) < 2 or counted.sum() < len(labels) or fewest <= unknowns:
         raise InputError(
             f"{links.source}: {int(counted.sum())} links in {len(labels)} blocks leave {fewest} links to calibrate "
-            f"{problem.unknowns} unknowns; use at least two blocks with fewer links each, or remove [holdout]"
+            f"{unknowns:.0f} unknowns; use at least two blocks with fewer links each, or remove [holdout]"
         )
     return block, labels
 
