@@ -10,7 +10,7 @@ import pytest
 import planted
 from calibray.calibration.calibrate import calibrate
 from calibray.errors import InputError
-from calibray.fitting.nuisance import Nuisance, random_effect
+from calibray.fitting.nuisance import UNKNOWN_DB, Nuisance, random_effect
 from calibray.fitting.objective import make_objective
 from calibray.fitting.preliminary_fits import estimate_noise, group_spread
 from calibray.fitting.problem import Problem
@@ -55,18 +55,7 @@ def test_groups_that_do_not_differ_have_no_spread():
 def test_spread_noise_and_shrinkage_follow_from_the_data():
     shift, errors = shifted(3)
     way = np.random.default_rng(4).uniform(0.0, 10.0, len(GROUP))
-    place = np.column_stack([way, np.zeros((len(way), 2))])
-    links = Measurements(tx=place + 1.0, rx=place, path_loss_db=80.0 + 5.0 * way + 4.0 + errors)
-    nuisance = Nuisance(
-        len(way), random_effect(links, "street", "constant", [f"{each:02d}" for each in GROUP])
-    )
-    every = np.ones(len(way), dtype=bool)
-    engine = Ramp(way)
-    before = engine.path_loss(engine.parameters.start[None])[0]
-    study = SimpleNamespace(noise=SimpleNamespace(std_db=None), links=SimpleNamespace(std=None))
-    setup = SimpleNamespace(links=links, study=study)
-    objective = make_objective(links, every, every, nuisance=nuisance, noise_db=1.0)
-    fitted = estimate_noise(Problem(setup, engine, objective, before))  # type: ignore[arg-type]
+    fitted = estimate_noise(along(way, 4.0 + errors, street=GROUP))
     spread = fitted.objective.nuisance.terms[1].prior
     assert spread == pytest.approx(shift.std(), rel=0.12)
     assert fitted.objective.noise_db == pytest.approx(NOISE_DB, rel=0.12)
@@ -88,21 +77,29 @@ def test_spread_noise_and_shrinkage_follow_from_the_data():
     assert not fitted.objective.nuisance.new_group_spread(split).any()
 
 
+def along(way: np.ndarray, errors: np.ndarray, **effects: np.ndarray) -> Problem:
+    """A problem along a route with errors and random effects, given by the number of every link's group."""
+    place = np.column_stack([way, np.zeros((len(way), 2))])
+    links = Measurements(tx=place + 1.0, rx=place, path_loss_db=80.0 + 5.0 * way + errors)
+    terms = [
+        random_effect(links, name, "constant", [f"{each:03d}" for each in group])
+        for name, group in effects.items()
+    ]
+    every, engine = np.ones(len(way), dtype=bool), Ramp(way)
+    nuisance = Nuisance(len(way), tuple(term for pair in terms for term in pair))
+    objective = make_objective(links, every, every, nuisance=nuisance, noise_db=1.0)
+    study = SimpleNamespace(noise=SimpleNamespace(std_db=None), links=SimpleNamespace(std=None))
+    setup = SimpleNamespace(links=links, study=study)
+    return Problem(setup, engine, objective, engine.path_loss(engine.parameters.start[None])[0])  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("spread_db", [0.0, 6.0])
 def test_groups_of_few_links_do_not_raise_the_noise(spread_db):
     """Two links in each group: a coefficient of each that its prior keeps small explains none of their errors."""
     random, group = np.random.default_rng(3), np.repeat(np.arange(150), 2)
     way = random.uniform(0.0, 10.0, len(group))
     errors = 4.0 * random.standard_normal(len(group)) + spread_db * random.standard_normal(150)[group]
-    place = np.column_stack([way, np.zeros((len(way), 2))])
-    links = Measurements(tx=place + 1.0, rx=place, path_loss_db=80.0 + 5.0 * way + errors)
-    effect = random_effect(links, "street", "constant", [f"{each:03d}" for each in group])
-    every, engine = np.ones(len(way), dtype=bool), Ramp(way)
-    study = SimpleNamespace(noise=SimpleNamespace(std_db=None), links=SimpleNamespace(std=None))
-    objective = make_objective(links, every, every, nuisance=Nuisance(len(way), effect), noise_db=1.0)
-    setup = SimpleNamespace(links=links, study=study)
-    before = engine.path_loss(engine.parameters.start[None])[0]
-    fitted = estimate_noise(Problem(setup, engine, objective, before))  # type: ignore[arg-type]
+    fitted = estimate_noise(along(way, errors, street=group))
     best = least_squares(fitted, 4, np.zeros((0, 1))).best.x
     optimum = fitted.squares(best[None])
     noise_db = optimum.rmse_db[0] * np.sqrt(len(way) / fitted.freedom)
@@ -110,6 +107,28 @@ def test_groups_of_few_links_do_not_raise_the_noise(spread_db):
     assert noise_db == pytest.approx(fitted.objective.noise_db, rel=0.03)
     prior = variants(fitted, best)[Model.PRIOR].objective
     assert prior.noise_db == pytest.approx(noise_db)
+
+
+def test_the_spread_of_streets_does_not_count_as_that_of_places_within_them():
+    random, street = np.random.default_rng(5), np.repeat(np.arange(30), 12)
+    place = street * 3 + np.tile(np.arange(3), 120)
+    shift = SPREAD_DB * random.standard_normal(30)
+    errors = shift[street] + 2.0 * random.standard_normal(90)[place]
+    errors += NOISE_DB * random.standard_normal(len(street))
+    way = random.uniform(0.0, 10.0, len(street))
+    fitted = estimate_noise(along(way, errors, street=street, place=place))
+    spread = {term.around: term.prior for term in fitted.objective.nuisance.terms if term.around}
+    assert spread == pytest.approx({"street": shift.std(), "place": 2.0}, rel=0.2)
+    assert fitted.objective.noise_db == pytest.approx(NOISE_DB, rel=0.1)
+
+
+def test_one_group_does_not_show_a_spread():
+    random = np.random.default_rng(6)
+    fitted = estimate_noise(
+        along(random.uniform(0.0, 10.0, 60), 2.0 * random.standard_normal(60), street=np.zeros(60, int))
+    )
+    assert fitted.objective.nuisance.terms[1].prior == UNKNOWN_DB
+    assert fitted.objective.noise_db == pytest.approx(2.0, rel=0.2)
 
 
 def test_a_new_street_is_predicted_with_the_mean_and_the_spread(tmp_path):

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.fitting.nuisance import Nuisance
+from calibray.fitting.nuisance import UNKNOWN_DB, Nuisance
 from calibray.fitting.objective import Objective
 from calibray.fitting.observed import with_errors
 from calibray.fitting.problem import Problem
@@ -208,14 +208,18 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
         others = Nuisance(len(objective.weight), (*terms[:index], *terms[index + 1 :]))
         without = replace(problem, objective=replace(objective, nuisance=others))
         evaluation = without.evaluate(point[None], derivatives=problem.differentiable)
-        columns = [others.design[counted].toarray() * scale[:, None]]
+        # Rows of priors follow those of the links, so that other effects are random, not fixed: streets would otherwise
+        # be explained by the places within them.
+        ridge = objective.noise_db / others.prior
+        priors = np.diag(ridge)[ridge > 0]
+        columns = [np.vstack([others.design[counted].toarray() * scale[:, None], priors])]
         if evaluation.jacobian is not None:
-            columns.append(evaluation.jacobian[0][: len(counted)])
+            columns.append(evaluation.jacobian[0][: len(columns[0])])
         between, within_db = group_spread(
-            evaluation.residuals[0][: len(counted)],
+            evaluation.residuals[0][: len(columns[0])],
             np.hstack(columns),
-            term.value[counted] * scale,
-            term.group[counted],
+            np.append(term.value[counted] * scale, np.zeros(len(priors))),
+            np.append(term.group[counted], np.zeros(len(priors), dtype=np.int64)),
         )
         terms[index] = replace(term, prior=max(between, LEAST_SPREAD_DB))
     nuisance = Nuisance(len(objective.weight), tuple(terms))
@@ -246,7 +250,8 @@ class GroupSpread(NamedTuple):
     """Standard deviations.
 
     Attributes:
-        between: Between groups, in the unit of the residuals per unit of the column; 0 if no group differs.
+        between: Between groups, in the unit of the residuals per unit of the column; 0 if no group differs, and
+            `UNKNOWN_DB` if the links cannot show it.
         within: Of a single link, in the unit of the residuals.
     """
 
@@ -269,7 +274,7 @@ def group_spread(
         group: Group of every link [n], from 0.
 
     Returns:
-        The standard deviations; the one between groups is 0 if there are too few links.
+        The standard deviations.
 
     Example:
         >>> shift = np.repeat([3.0, -2.0, 0.0, -1.0], 5)
@@ -282,11 +287,14 @@ def group_spread(
     basis = left[:, size > SINGULAR * max(size.max(initial=0.0), 1e-300)]
     freedom = len(residuals) - basis.shape[1]
     if freedom < 2:
-        return GroupSpread(0.0, float(np.std(residuals)))
+        return GroupSpread(UNKNOWN_DB, float(np.std(residuals)))
     all_columns = np.column_stack([basis, residuals])
     products, groups = all_columns.T @ all_columns, int(group.max()) + 1
     sums = np.stack([np.bincount(group, column * values, groups) for values in all_columns.T])
     square = np.bincount(group, column**2, groups)
+    # The design explains a single group's column completely, so any ratio is equally likely.
+    explained = np.sum(sums[:-1] ** 2, axis=0)
+    shown = (square - explained).max() > SINGULAR * square.max()
     best, spread = np.inf, GroupSpread(0.0, 0.0)
     for ratio in RATIOS:
         # V = I + ratio Z Z' is a block per group, so that its inverse is a rank-one update (Sherman and Morrison).
@@ -298,7 +306,7 @@ def group_spread(
         deviance = freedom * np.log(variance) + np.log1p(ratio * square).sum() + np.linalg.slogdet(inner)[1]
         if deviance < best:
             best, spread = deviance, GroupSpread(float(np.sqrt(ratio * variance)), float(np.sqrt(variance)))
-    return spread
+    return spread if shown else GroupSpread(UNKNOWN_DB, spread.within)
 
 
 ROUNDS: Final = 20
