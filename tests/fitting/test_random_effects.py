@@ -5,9 +5,11 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import planted
+import programs
 from calibray.calibration.calibrate import calibrate
 from calibray.errors import InputError
 from calibray.fitting.nuisance import UNKNOWN_DB, Nuisance, random_effect
@@ -17,6 +19,7 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import least_squares
 from calibray.measurements import Measurements
 from calibray.result.held_out import Model
+from calibray.study import Study
 from calibray.validation.models import variants
 from fitting.test_preliminary_fits import Ramp
 
@@ -178,6 +181,24 @@ def test_clusters_of_receivers_are_groups_without_a_column(tmp_path):
     assert result.predict(far) == pytest.approx(wide.path_loss_db.to_numpy())
     assert np.ptp(wide[["lower_db", "upper_db"]].to_numpy()) > 2 * 1.6 * term.spread_db
     assert np.ptp(known[["lower_db", "upper_db"]].to_numpy()) < term.spread_db
+
+
+def test_on_an_external_program_the_spread_takes_no_further_call(tmp_path):
+    content = programs.content(tmp_path) | {
+        "nuisance": {"side": {"by": "constant", "per": "half", "prior": "auto"}},
+        "method": {"name": "random", "options": {"budget": 4}},
+    }
+    content["noise"] |= {"std_db": 1.0}
+    table = pd.read_csv(tmp_path / "links.csv")
+    noise_db = np.random.default_rng(0).standard_normal(len(table))
+    shifted = table.path_loss_db + noise_db + np.where(table.half == "west", 6.0, 0.0)
+    table.assign(path_loss_db=shifted).to_csv(tmp_path / "links.csv", index=False)
+    result = calibrate(Study.from_content(content, tmp_path / "study.toml"))
+    assert len(programs.calls(tmp_path)) == 1 + 4
+    side = result.nuisance.coefficients["side"]
+    assert side["west"] - side["east"] == pytest.approx(6.0, abs=2.5)
+    (term,) = result.prediction.model.terms
+    assert 2.0 < term.spread_db < 10.0
 
 
 def test_squares_of_a_side_need_clusters_and_one_side(tmp_path):

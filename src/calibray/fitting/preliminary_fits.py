@@ -140,7 +140,8 @@ def _warn_of_bias(problem: Problem, selected: Objective, faint: NDArray[np.bool_
 def estimate_noise(problem: Problem, progress: Progress | None = None) -> Problem:
     """Estimate the noise level that scales the priors, unless the study declares it, and the spread of random effects.
 
-    The problem is unchanged without priors. The stage of `progress` is "estimating noise".
+    The problem is unchanged without priors. On an engine without derivatives, whose calls are expensive, the spread is
+    that at the initial values. The stage of `progress` is "estimating noise".
 
     Raises:
         InputError: The noise is not declared and cannot be estimated.
@@ -160,6 +161,8 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
             "noise; give the standard deviation of a link's error [dB]"
         )
     starts = problem.parameters.to_search(problem.parameters.start)[None]
+    if not problem.differentiable:
+        return with_estimated_spreads(problem, starts[0])[0]
     noise_db = problem.objective.noise_db if stated else float(problem.squares(starts).rmse_db[0])
     if progress is not None:
         progress("estimating noise", 0, NOISE_ESTIMATES)
@@ -195,7 +198,8 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
 def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tuple[Problem, float]:
     """The problem with the spreads of its random effects, estimated at a point of the search space [d].
 
-    Also the standard deviation of a link's error within the groups of the last effect [dB].
+    Also the standard deviation of a link's error within the groups of the last effect [dB]. On an engine without
+    derivatives, the estimates are those at the initial values, whose path loss is known.
     """
     objective = problem.objective
     counted = np.flatnonzero(objective.weight > 0)
@@ -207,16 +211,21 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
         # Without the deviations, their scatter is in the residuals.
         others = Nuisance(len(objective.weight), (*terms[:index], *terms[index + 1 :]))
         without = replace(problem, objective=replace(objective, nuisance=others))
-        evaluation = without.evaluate(point[None], derivatives=problem.differentiable)
+        jacobian = None
+        if problem.differentiable:
+            evaluation = without.evaluate(point[None], derivatives=True)
+            residuals, jacobian = evaluation.residuals[0], evaluation.slopes[0]
+        else:
+            residuals = without.objective.residuals(problem.before[None])[0]
         # Rows of priors follow those of the links, so that other effects are random, not fixed: streets would otherwise
         # be explained by the places within them.
         ridge = objective.noise_db / others.prior
         priors = np.diag(ridge)[ridge > 0]
         columns = [np.vstack([others.design[counted].toarray() * scale[:, None], priors])]
-        if evaluation.jacobian is not None:
-            columns.append(evaluation.jacobian[0][: len(columns[0])])
+        if jacobian is not None:
+            columns.append(jacobian[: len(columns[0])])
         between, within_db = group_spread(
-            evaluation.residuals[0][: len(columns[0])],
+            residuals[: len(columns[0])],
             np.hstack(columns),
             np.append(term.value[counted] * scale, np.zeros(len(priors))),
             np.append(term.group[counted], np.zeros(len(priors), dtype=np.int64)),
