@@ -29,6 +29,7 @@ from calibray.scenes import Triangles
 from calibray.scenes.checks.positions import locate
 from calibray.uncertainty.residual_correlation import shared_errors
 from calibray.validation.held_out_statistics import FEWEST_FOR_RANKS, interval_half_width, two_levels
+from calibray.validation.models import TX_OFFSET
 from changed import changed
 from link_tables import links_from_frame
 
@@ -309,6 +310,18 @@ def test_the_draws_of_a_random_effect_are_its_mean_plus_the_deviations():
     draws = {"street": [3.0, 4.0], "street, deviation[a]": [2.5, 1.0], "street, deviation[b]": [-1.0, -2.0]}
     shift = nuisance_shift(iter([term]), links, draws)
     assert shift.value_db.tolist() == [[5.0, 1.0], [5.5, 2.0], [5.0, 2.0]]
+
+
+def test_a_new_transmitter_gets_the_mean_offset_without_a_request():
+    """Its label is its position, which no user misspells; a new label of a study's column is refused."""
+    links = links_from_frame(planted.links().iloc[:1])
+    own, other = {"0.00,0.00,9.00": 3.0, "9.00,0.00,9.00": 5.0}, "0.00,0.00,3.00"
+    term = TermAtLinks(TX_OFFSET, np.ones(1), np.array([other]), own, spread_db=None)
+    shift = nuisance_shift(iter([term]), links)
+    assert shift.value_db.tolist() == [[4.0]]
+    assert shift.spread_db == pytest.approx(np.sqrt(2.0) * np.sqrt(1.5))
+    with pytest.raises(InputError, match="has no calibrated street"):
+        nuisance_shift(iter([replace(term, name="street")]), links)
 
 
 @pytest.mark.parametrize("prior", [None, "auto"])

@@ -30,7 +30,7 @@ from calibray.result.held_out import NEW_GROUP, NO_PATH, PredictionModel, Residu
 from calibray.result.record import Prediction
 from calibray.study.model import StudyModel
 from calibray.validation.held_out_statistics import interval_half_width
-from calibray.validation.models import without_scene
+from calibray.validation.models import TX_OFFSET, without_scene
 
 TRANSMITTER: Final = "transmitter"
 """`FittedTerm.per` of a term with one coefficient per transmitter, which needs no column."""
@@ -108,7 +108,7 @@ def nuisance_shift(
 
     A group without a coefficient gets the mean of the other coefficients. Its spread is their standard deviation s,
     enlarged by the uncertainty of a mean of n values: s sqrt(1 + 1 / n). With `new_groups`, such groups are allowed
-    also in terms whose spread is not estimated.
+    also in terms whose spread is not estimated; new transmitters, which no column names, always are.
 
     Raises:
         InputError: A group has no coefficient, and `new_groups` is False.
@@ -131,7 +131,7 @@ def nuisance_shift(
         labels = np.full(len(links), "") if term.labels is None else term.labels
         position = {label: index for index, label in enumerate(term.coefficients)}
         group = np.array([position.get(str(label), -1) for label in labels])
-        if (group < 0).any() and term.spread_db is None and not new_groups:
+        if (group < 0).any() and term.spread_db is None and not new_groups and term.name != TX_OFFSET:
             new_label = str(labels[int(np.argmax(group < 0))])
             raise InputError(
                 f"{links.source}: group {new_label!r} has no calibrated {term.name}; the calibrated groups are "
