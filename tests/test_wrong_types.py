@@ -98,6 +98,10 @@ def test_what_is_no_study_no_links_and_no_material(study: cb.Study, paths: cb.Pa
     table = pd.DataFrame({"rx_x": [1.0]})
     for value in (None, "study.toml"):
         refused("study: is a .*, must be a Study; read a file", lambda value=value: cb.validate(value))
+    for blocks in (2.5, "3", True):
+        refused(
+            "blocks = .*; must be 2 to 100, a whole number", lambda b=blocks: cb.validate(study, blocks=b)
+        )
     refused("study.toml: is a list, must be a dictionary", lambda: cb.Study.from_content([1]))
     refused(
         r"links: is a pandas\.DataFrame, must have positions",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import replace
+from numbers import Integral
 from typing import Final, cast
 
 import numpy as np
@@ -75,9 +76,9 @@ def validate(
     setup = study if isinstance(study, Setup) else Setup.open(study, tracer)
     if blocks is not None and by is not None:
         raise InputError("validate: give blocks or by, not both")
-    if blocks is not None and not 2 <= blocks <= MOST_BLOCKS:
+    if blocks is not None and not (isinstance(blocks, Integral) and 2 <= blocks <= MOST_BLOCKS):
         raise InputError(
-            f"validate: blocks = {blocks}; must be 2 to {MOST_BLOCKS}, because each needs a calibration"
+            f"validate: blocks = {blocks!r}; must be 2 to {MOST_BLOCKS}, a whole number; each needs a calibration"
         )
     # Links that the study holds out are held out in turn like all others.
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
