@@ -141,3 +141,17 @@ def test_without_such_parameters_there_is_no_effect(
 ) -> None:
     region = Parameter("region:trees.specific_attenuation", 0.0, 3.0, 0.4)
     assert pose_error(paths, mounting, labels, [region], from_north=True) is None
+
+
+def test_errors_of_antennas_that_no_link_has_have_no_slope(paths: Paths) -> None:
+    """In a chunk of links, or at candidates of another transmitter, every parameter has its derivative."""
+    materials = planted.engine().parameters
+    foreign = (Parameter("tx:c.azimuth", -40.0, 40.0, 0.0), Parameter("tx:c.gain", -10.0, 10.0, 0.0))
+    loss, jacobian = Replay(paths, materials).path_loss_and_jacobian(materials.start[None])
+    for items, columns in (((foreign[0], *materials.items, foreign[1]), [1, 2, 3]), (foreign, [])):
+        parameters = Parameters(items, materials.frequency)
+        answer = Replay(paths, parameters).path_loss_and_jacobian(parameters.start[None])
+        expected = np.zeros((*loss.shape, len(items)))
+        expected[..., columns] = jacobian[..., : len(columns)]
+        np.testing.assert_allclose(answer[0], loss, rtol=1e-12)
+        np.testing.assert_allclose(answer[1], expected, rtol=1e-12)

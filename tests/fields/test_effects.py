@@ -7,6 +7,7 @@ import planted
 from calibray import fields
 from calibray.engines import Replay
 from calibray.parameters import Parameter, Parameters
+from calibray.paths import take
 
 LENGTH_SEED = 5
 TREES, HEDGE = "region:trees.specific_attenuation", "region:hedge.specific_attenuation"
@@ -80,3 +81,12 @@ def test_without_attenuation_nothing_changes(paths, lengths):
     loss, jacobian = fixed.path_loss_and_jacobian(value)
     assert jacobian.shape == (1, paths.num_links, 3)
     assert loss == pytest.approx(fixed.path_loss(value), abs=1e-9)
+
+
+def test_links_that_no_path_reaches_have_no_slope(paths, parameters):
+    """Also if that is true of all links, as in a chunk of links behind a building."""
+    none = take(paths, np.zeros(0, dtype=np.int64))
+    effects = (fields.ExtraLoss(np.zeros(0), 30.0, 0), fields.ExtraLoss(np.zeros(0), 60.0, 1))
+    loss, jacobian = Replay(none, parameters, effects=effects).path_loss_and_jacobian(candidates(parameters))
+    assert np.isposinf(loss).all()
+    np.testing.assert_array_equal(jacobian, np.zeros((3, paths.num_links, len(parameters))))

@@ -12,6 +12,7 @@ import pytest
 
 import calibray as cb
 import two_ray
+from calibray import engines
 from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.measurements import SourceTable
@@ -153,6 +154,19 @@ def test_a_sector_that_points_elsewhere_than_stated_is_named(
     assert remark.values["transmitters"] == ["east"]
     assert abs(values["azimuth_deg"] - turned) < 3 * values["azimuth_error_deg"] < turned
     assert "'east': add to its azimuth +1" in remark_text(remark)
+
+
+def test_chunks_without_a_turned_antenna_have_the_slopes_of_all_links(planted: Study) -> None:
+    content = mounted(planted).content()
+    content["parameters"]["tx:east.azimuth"] = {"bounds": [-20.0, 20.0]}
+    jacobians = []
+    for engine in ({}, {"chunk_links": 12}):
+        study = Study.from_content(content | {"engine": {"name": "replay", **engine}}, planted.path)
+        replay = engines.make(Setup.open(study, tracer=TwoRay))
+        jacobians.append(replay.path_loss_and_jacobian(replay.parameters.start[None])[1])
+    np.testing.assert_allclose(jacobians[1], jacobians[0], rtol=1e-9, atol=1e-12)
+    # Links of the two other transmitters do not depend on it.
+    assert (jacobians[0][0, :, 1] == 0).sum() == 24
 
 
 def test_traces_are_shared_by_all_directions(planted: Study, monkeypatch: pytest.MonkeyPatch) -> None:

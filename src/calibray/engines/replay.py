@@ -217,7 +217,9 @@ class Replay:
         loss, slope, error = fields.path_losses_and_slopes(
             self._program, tables, self._used_columns, self._combining, count
         )
-        return loss, slope[:, :, self._rows, self._used_column], error
+        # Parameters of effects that none of these links has change nothing.
+        by_effect = np.zeros((*loss.shape, len(self.parameters.of_effects)), slope.dtype)
+        return loss, self._by_parameter(slope, by_effect), error
 
     def _run(self, function: Callable, candidates: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         values = check_candidates(candidates, len(self.parameters)).astype(self._dtype)

@@ -261,6 +261,8 @@ def contract(
     grow with their number. `slope` has the derivatives of the quantity with respect to the response at every step, and
     `derivatives` those of the response with respect to the constants of each column.
     """
+    if not derivatives:
+        return jnp.zeros((program.num_links, num_materials, 0), program.wavelength.dtype)
     by_column = []
     for derivative in derivatives:
         products = ([], [])  # of coefficients, of diffuse amplitudes
@@ -293,12 +295,16 @@ def _loss_slope(power: jax.Array) -> jax.Array:
     return -10 / np.log(10) * jnp.where(power > 0, 1 / jnp.where(power > 0, power, 1.0), 0.0)
 
 
-def _by_path(by_field: list[AntennaFields], tangents: list[AntennaFields]) -> jax.Array:
-    """Derivatives of the power of every path with respect to effect parameters [P, e], through the antenna fields."""
-    groups = []
+def _by_path(by_field: list[AntennaFields], tangents: list[AntennaFields], blank: jax.Array) -> jax.Array:
+    """Derivatives of the power of every path with respect to effect parameters [P, e], through the antenna fields.
+
+    `blank` is what no path gives [0, e].
+    """
+    groups = [blank]
     for outer, inner in zip(by_field, tangents, strict=True):
         # Fields are [2 or 1, ports, 2, n], their tangents [..., n, e].
-        groups.append(sum(jnp.einsum("abcn,abcne->ne", a, b) for a, b in zip(outer, inner, strict=True)))
+        products = (jnp.einsum("abcn,abcne->ne", a, b) for a, b in zip(outer, inner, strict=True))
+        groups.append(reduce(add, products))
     return jnp.concatenate(groups)
 
 
@@ -409,10 +415,9 @@ def _slopes_with_effects(
         )
         by_step, by_field = stored(pull(jnp.ones_like(power)))
         tangents = jax.vmap(push, out_axes=-1)(jnp.eye(values.shape[1], dtype=values.dtype))
-        by_effect = jax.vmap(partial(segment_sums, program.by_link), -1, -1)(_by_path(by_field, tangents))
-        slope = jnp.zeros((program.num_links, tables.shape[1], 0))
-        if columns:
-            slope = _contract(changed, power, by_step, derivatives, tables.shape[1])
+        by_path = _by_path(by_field, tangents, jnp.zeros((0, values.shape[1]), values.dtype))
+        by_effect = jax.vmap(partial(segment_sums, program.by_link), -1, -1)(by_path)
+        slope = _contract(changed, power, by_step, derivatives, tables.shape[1])
         answers = decibel(power), slope, _loss_slope(power)[:, None] * by_effect
         return tuple(
             result.at[index].set(answer.astype(result.dtype))
