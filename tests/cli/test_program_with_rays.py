@@ -184,9 +184,20 @@ def test_rays_that_do_not_fit_the_scene_are_refused_with_the_reason(tmp_path: Pa
         program.write_text(correct.replace(right, wrong))
         with pytest.raises(EngineError, match=message):
             cb.calibrate(cb.Study.load(study))
+    program.write_text(correct.replace("json.dump", "(lambda *answer: None)"))
+    with pytest.raises(EngineError, match="its response: not a ray table"):
+        cb.engines.make(cb.Study.load(study)).path_loss(np.array([[TRUTH]]))
     content = cb.Study.load(study).content()
     with pytest.raises(InputError, match=r"engine\.rays = true.*combining = 'coherent'"):
         cb.Study.from_content(content | {"objective": {"combining": "coherent"}}, study)
+
+
+def test_rays_without_power_are_links_without_a_path(tmp_path: Path) -> None:
+    study = write_study(tmp_path / "study")
+    program = study.parent / "program.py"
+    program.write_text(program.read_text().replace("*point, level]", "*point, -math.inf]"))
+    loss = cb.engines.make(cb.Study.load(study)).path_loss(np.array([[TRUTH]]))
+    assert np.isposinf(loss).all()
 
 
 def _rows(frame: pd.DataFrame) -> object:

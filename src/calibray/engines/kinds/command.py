@@ -150,7 +150,7 @@ class Command:
             self._sequential(requests, stop) if executor is None else self._parallel(requests, stop, executor)
         )
         for done, (index, raw) in enumerate(outcomes, start=1):
-            outcome = self._with_path_loss(raw) if raw.rays and self._program.rays else raw
+            outcome = self._with_path_loss(raw) if self._program.rays and not raw.failure else raw
             self.calls += 1
             if self._progress is not None:
                 self._progress("running", done, len(requests))

@@ -284,7 +284,8 @@ def _assign_links(
 
 def _check_repeats(table: RayTable, link: NDArray[np.int64]) -> None:
     """Refuse two paths of a link with the same types and points, as in merged exports: their powers would add up."""
-    rows = np.column_stack([link, table.kind, np.round(table.vertex, 3).reshape(len(link), -1)])
+    point = np.round(table.vertex, 3).reshape(len(link), 3 * table.kind.shape[1])
+    rows = np.column_stack([link, table.kind, point])
     _, first, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     original = first[group.reshape(-1)]
     if (repeated := original != np.arange(len(link))).any():
