@@ -115,6 +115,23 @@ def test_materials_are_those_of_the_faces_unless_stated(yard: Tracer, rows: pd.D
         cb.read_rays(reflected.assign(object="c"), scene, frequency=FREQUENCY)
 
 
+@pytest.mark.parametrize("ending", ["csv", "json", "h5", "parquet"])
+def test_the_name_of_a_material_may_be_a_number(tmp_path: Path, ending: str) -> None:
+    ground = [[(-40.0, -40.0, 0.0), (40.0, -40.0, 0.0), (40.0, 40.0, 0.0), (-40.0, 40.0, 0.0)]]
+    file = write_scene(tmp_path, {"a": ground, "b": [[(x, y, 50.0) for x, y, _ in ground[0]]]})
+    scene = read_scene(file, FREQUENCY, split={"7": "a"})
+    reflected = pd.DataFrame(
+        {
+            "path": 1, "point": [0, 1, 2], "type": ["transmitter", "reflection", "receiver"], "x": [0.0, 5, 10],
+            "y": 0.0, "z": [10.0, 0, 10],
+        }
+    )  # fmt: skip
+    paths = cb.read_rays(reflected, scene, frequency=FREQUENCY)
+    cb.write_rays(paths, tmp_path / f"rays.{ending}")
+    read_back = cb.read_rays(tmp_path / f"rays.{ending}", scene, frequency=FREQUENCY)
+    assert list(scene.materials)[read_back.material[0]] == "7"
+
+
 def test_an_edge_where_two_houses_meet_has_the_stated_material(tmp_path: Path) -> None:
     """The eaves of two houses of different materials continue each other; the ray bends where they meet."""
     houses = {"a": block((0, 0, 0), (10, 10, 8)), "b": block((0, 10, 0), (10, 20, 8))}
@@ -321,6 +338,23 @@ def test_paths_of_a_study_belong_to_its_links(tmp_path: Path) -> None:
     moved = rows.assign(z=rows.z + 0.5 * (rows.type == "receiver"))
     with pytest.raises(InputError, match=r"connect other positions than the links.* 0\.5 m away"):
         cb.read_rays(moved[moved.path % 2 == 0].assign(delay=np.nan).drop(columns="delay"), study)
+
+
+@pytest.mark.parametrize("form", ["whole numbers", "floats", "one number per path"])
+def test_links_are_in_the_order_of_their_numbers(yard: Tracer, form: str) -> None:
+    """MATLAB writes numbers as doubles, and pandas reads a column with empty cells as such."""
+    number = np.arange(1, 13)
+    link = np.repeat(number, 2)
+    rows = pd.DataFrame(
+        {
+            "path": link, "point": np.tile([0, 1], 12), "type": ["transmitter", "receiver"] * 12, "x": -30.0,
+            "y": np.stack([0 * number, number], axis=1).ravel(), "z": 20.0,
+            "link": np.where(np.arange(24) % 2, link, np.nan) if form == "one number per path" else link,
+        }
+    )  # fmt: skip
+    rows = rows.astype({"path": float, "link": float}) if form == "floats" else rows
+    paths = read(rows, yard, antennas=(Antenna(), Antenna()))
+    np.testing.assert_allclose(np.linalg.norm(paths.rx_position - paths.tx_position, axis=1), number)
 
 
 def test_a_path_that_comes_twice_is_refused(yard: Tracer, rows: pd.DataFrame) -> None:

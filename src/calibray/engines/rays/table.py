@@ -257,7 +257,11 @@ def _optional_labels(table: SourceTable, name: str) -> NDArray:
     """Labels of a column; empty if a label or the column is missing [rows]."""
     if name not in table.frame:
         return np.full(len(table), "", dtype=object)
-    return table.frame[name].astype(object).where(table.frame[name].notna(), "").astype(str).to_numpy(object)
+    column = table.frame[name]
+    # In a CSV file, a column of names such as "7" with empty cells is one of floats.
+    if pd.api.types.is_float_dtype(column) and (column.dropna() % 1 == 0).all():
+        column = column.astype("Int64")
+    return column.astype(object).where(column.notna(), "").astype(str).to_numpy(object)
 
 
 def _link(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray | None:
@@ -269,7 +273,10 @@ def _link(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray | None:
 
 def _names(table: SourceTable, name: str) -> NDArray:
     """Numbers, which sort as numbers, or otherwise labels [rows]."""
-    if pd.api.types.is_integer_dtype(table.column(name)):
+    column = table.column(name)
+    # Whole numbers are floats in MATLAB, and in pandas if any row has a gap.
+    whole = pd.api.types.is_float_dtype(column) and (column % 1 == 0).all()
+    if whole or pd.api.types.is_integer_dtype(column):
         return table.numbers(name).astype(np.int64)
     return table.labels(name)
 
