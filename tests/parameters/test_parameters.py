@@ -219,6 +219,25 @@ def test_members_of_a_population_scatter_around_their_common_value(scale):
     assert (drawn[:, 0] == 0.5).all()
 
 
+@pytest.mark.parametrize("scale", ["linear", "log"])
+def test_members_far_from_their_common_value_are_near_a_bound(scale):
+    """Bounds of a member that lie many standard deviations above or below the common value."""
+    items = Parameter("walls.thickness", 0.01, 10.0, 0.3), Parameter("shops.thickness", 0.3, 0.5, 0.4, scale)
+    parameters, prior = Parameters(items), LogNormal((1,), (1.0,), (0.1,), like=((1, 0),))
+    wall = np.array([0.05, 0.1, 0.12, 0.4, 1.5, 4.0])
+    values = np.column_stack([wall, np.full(6, 0.4)])
+    unit = (np.arange(100_000) + 0.5) / 100_000
+    line = parameters.from_unit(np.column_stack([unit, unit]))[:, 1]
+    exponent = -0.5 * (np.log(line / wall[:, None]) / 0.1) ** 2
+    expected = np.log(np.exp(exponent - exponent.max(axis=1)[:, None]).mean(axis=1)) + exponent.max(axis=1)
+    found = prior.log_normalization(values, parameters)
+    assert found - found[3] == pytest.approx(expected - expected[3], abs=1e-4)
+    drawn = prior.draw_like(np.tile(values, (4000, 1)), parameters, np.random.default_rng(1))[:, 1]
+    mean = (np.exp(exponent - exponent.max(axis=1)[:, None]) * line).sum(axis=1)
+    mean /= np.exp(exponent - exponent.max(axis=1)[:, None]).sum(axis=1)
+    assert drawn.reshape(-1, 6).mean(axis=0) == pytest.approx(mean, rel=1e-3)
+
+
 def test_further_priors_extend_those_of_a_study():
     prior = LogNormal((0, 2), (4.0, 1.0), (0.3, 5.0), linear=(2,), like=((0, 1),))
     more = prior.extended([3], [2.0], 0.1)

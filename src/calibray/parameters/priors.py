@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
+from scipy.special import log_ndtr, ndtr, ndtri
 
 from calibray.parameters.parameter import SCATTERING_SPREAD
 from calibray.parameters.space import Parameters
@@ -91,7 +91,9 @@ class LogNormal:
             middle, low, high, tilt = self._interval(row, candidates[:, reference], parameters)
             # Integral over x of exp(-(log x - m)^2 / 2 s^2): exp(m + s^2 / 2) times a probability about m + s^2.
             total += tilt * (middle - tilt * self.spread[row] ** 2 / 2)
-            total += np.log(np.maximum(ndtr(high) - ndtr(low), 1e-300))
+            # The normal distribution is symmetric; below its mean, differences of probabilities keep their digits.
+            below, above = np.where(low > 0, [-high, -low], [low, high])
+            total += log_ndtr(above) + np.log1p(-np.exp(log_ndtr(below) - log_ndtr(above)))
         return total
 
     def draw_like(
@@ -101,9 +103,10 @@ class LogNormal:
         drawn = candidates.copy()
         for row, reference in self._pairs:
             middle, low, high, _ = self._interval(row, candidates[:, reference], parameters)
-            # Inverse transform sampling between the bounds.
-            level = ndtr(low) + random.random(len(drawn)) * (ndtr(high) - ndtr(low))
-            logarithm = middle + self.spread[row] * ndtri(np.clip(level, 1e-300, 1 - 1e-16))
+            # Inverse transform sampling between the bounds, below the mean as in `log_normalization`.
+            side = np.where(low > 0, -1.0, 1.0)
+            level = ndtr(side * low) + random.random(len(drawn)) * (ndtr(side * high) - ndtr(side * low))
+            logarithm = middle + self.spread[row] * side * ndtri(np.clip(level, 1e-300, 1 - 1e-16))
             item = parameters.items[self.index[row]]
             drawn[:, self.index[row]] = np.clip(np.exp(logarithm), item.lower, item.upper)
         return drawn
