@@ -86,6 +86,12 @@ def test_materials_and_settings_keep_their_types(paths: Paths, tmp_path: Path) -
     }
 
 
+def test_a_trace_whose_last_round_reached_a_new_link_is_loaded(paths: Paths, tmp_path: Path) -> None:
+    changed_without_limit = replace(paths, settings={"last_round_db": np.inf})
+    changed_without_limit.save(tmp_path / "paths.h5")
+    assert Paths.load(tmp_path / "paths.h5").settings == {"last_round_db": np.inf}
+
+
 def test_saving_again_replaces_the_file_and_leaves_no_other(paths: Paths, tmp_path: Path) -> None:
     file = tmp_path / "paths.h5"
     paths.save(file)

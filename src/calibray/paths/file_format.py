@@ -16,7 +16,7 @@ import hashlib
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from math import inf, isfinite, pi
+from math import inf, isnan, pi
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, BinaryIO, Final
@@ -167,10 +167,10 @@ def _damaged(fault: str) -> InputError:
 def _attribute(file: h5py.File, name: str) -> Any:
     value = file.attrs[name]
     if isinstance(value, str | np.bool_) or (
-        isinstance(value, np.number) and value.dtype.kind in "iuf" and isfinite(value)
+        isinstance(value, np.number) and value.dtype.kind in "iuf" and not isnan(value)
     ):
         return value
-    raise _damaged(f"attribute {name} is neither text nor a finite number")
+    raise _damaged(f"attribute {name} is neither text nor a number")
 
 
 def _settings(file: h5py.File) -> Iterator[tuple[str, object]]:
