@@ -167,6 +167,15 @@ def test_values_at_the_ends_of_what_a_receiver_states_are_no_measurements(tmp_pa
     assert reasons["links.where"] == f"{share} of the values equal the highest one: the receiver is saturated"
 
 
+def test_saturated_values_in_single_precision_are_no_measurements(tmp_path, scene):
+    """-43.9 in single precision is -43.900002, which a filter must not round up."""
+    power = np.random.default_rng(7).normal(-55.0, 15.0, 200).round(1).clip(None, -43.9)
+    power = np.float32(power).astype(float).round(6)
+    file = table(tmp_path, x=np.linspace(-40, 40, 200), y=-15.0, rsrp_dbm=power)
+    found = draft(scene, file, tmp_path / "study.toml", frequency=3.5e9, tx=[-30.0, 0.0, 9.0])
+    assert sorted(-found.study.measurements().path_loss_db) == sorted(power[power < power.max()])
+
+
 @pytest.mark.parametrize("step", [1.0, 2.0, 5.0])
 @pytest.mark.parametrize("count", [20, 300, 5000])
 def test_rounded_powers_are_not_taken_for_clipped_ones(step, count):

@@ -177,7 +177,7 @@ def _leave_out_saturated(draft: LinksDraft, value: ValueColumn, column: pd.Serie
     share = _share_at_lowest(-column)
     if share > 0:
         name, highest = value.column, float(column.max())
-        draft.add_filter(f"(`{name}` < {highest:g} or `{name}`.isna())")
+        draft.add_filter(f"(`{name}` < {highest} or `{name}`.isna())")
         reason = f"{share:.0%} of the values equal the highest one: the receiver is saturated"
         draft.assume("links.where", draft.section["where"], reason)
 
