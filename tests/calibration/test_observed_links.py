@@ -208,6 +208,16 @@ def test_every_bin_of_a_profile_is_an_observable(tmp_path, table, engine):
     assert early.std() > 0.3
 
 
+def test_a_single_column_may_be_in_a_list(tmp_path, table):
+    sections = {
+        "late": {**PROFILE, "columns": ["late"], "edges": [2e-8, 2e-7]},
+        "spread": {"kind": "rms_delay_spread", "columns": ["spread_ns"], "unit": "ns"},
+    }
+    study = planted.study(tmp_path, table, **(PLAN | {"observables": sections}))
+    assert [section.column for section in study.observables.values()] == ["late", "spread_ns"]
+    assert Study.from_content(study.content(), study.path).observables == study.observables
+
+
 def test_values_are_computed_from_a_file_of_components(tmp_path, table, engine):
     """The paths themselves as components: no residual is left at the truth, but that of the smooth limit."""
     paths = engine.paths

@@ -152,6 +152,8 @@ def by_column(sections: Mapping[str, ObservableSection]) -> dict[str, Observable
     """
     split: dict[str, ObservableSection] = {}
     for name, section in sections.items():
+        if len(section.columns) == 1:
+            section = section.model_copy(update={"column": section.columns[0], "columns": ()})
         parts = {name: section}
         bins = max(len(section.edges), len(section.edges_deg)) - 1
         if bins > 1:
