@@ -90,6 +90,13 @@ def test_a_gap_in_a_row_that_is_left_out_does_not_rename_numeric_groups(tmp_path
     assert read(tmp_path, text, group="spread", where="y < 45").group_names == ("1", "2", "4")
 
 
+def test_a_number_is_one_label_beside_fractions_and_alone():
+    """Carriers of 0.9 and 26 GHz, and a table of new links at 26 GHz only."""
+    every, one = (SourceTable(pd.DataFrame({"carrier [GHz]": values})) for values in ([0.9, 26.0], [26]))
+    assert every.labels("carrier [GHz]").tolist() == ["0.9", "26"]
+    assert one.labels("carrier [GHz]").tolist() == ["26"]
+
+
 def test_filters_see_all_columns_and_keep_the_lines(tmp_path):
     links = read(tmp_path, where="set == 'NLOS' and spread > 3")
     assert links.row.tolist() == [4, 5]

@@ -143,9 +143,9 @@ class SourceTable:
             raise InputError(
                 f"{self.cell(first, names)}: the label is missing ({missing.sum()} in all); give one"
             )
-        if pd.api.types.is_float_dtype(column) and (column % 1 == 0).all():
-            # pandas stores whole numbers as floats if any row had a gap: label 5 must not become "5.0".
-            column = column.astype(np.int64)
+        if pd.api.types.is_float_dtype(column):
+            # A label must not depend on other rows: beside gaps or 0.9, pandas stores the whole number 26 as 26.0.
+            return column.astype(str).str.removesuffix(".0").to_numpy(dtype=np.str_)
         return column.astype(str).to_numpy(dtype=np.str_)
 
     def positions(self, end: str, coordinates: Coordinates) -> NDArray[np.float64]:
