@@ -236,6 +236,7 @@ TRACE = "max_depth = 4"
         ('combining = "band"', 'combining = "sum"', "objective.combining = 'sum': must be one of 'power', "),
         ("bandwidth = 2e8", "", "objective.combining = 'band' needs scene.bandwidth"),
         ("ceiling_db = 150", "", "objective: no_path = 'censor' needs ceiling_db"),
+        ('"received_power"', '"rsrp"', "with links.quantity = 'rsrp': the transmitted power is unknown"),
         ('no_path = "censor"', "", "ceiling_db = 150 has no effect"),
         ("bounds = [-10, 10]", "bounds = [10, -10]", "offset.bounds = [10, -10]: the lower bound"),
         ("seed = 7", "seed = -7", "method.seed = -7: must be at least 0"),

@@ -87,6 +87,11 @@ class StudyContent(Section, ABC):
             raise InputError(
                 "links.quantity = 'rsrp' needs [offset]: the transmitted power is unknown, and is part of the offset"
             )
+        if self.links.quantity == "rsrp" and self.objective.ceiling_db is not None:
+            raise InputError(
+                "objective.no_path = 'censor' with links.quantity = 'rsrp': the transmitted power is unknown, and "
+                "therefore the largest path loss too; state the power (links.tx_power_dbm), or leave these links out"
+            )
         if self.links.below_floor == "censor" and self.noise.range_m not in ("auto", 0):
             raise InputError(
                 f"links.below_floor = 'censor' with noise.range_m = {self.noise.range_m:g}: censored links are counted "
