@@ -176,6 +176,10 @@ def test_a_study_with_errors_is_calibrated(exact: Study) -> None:
         ({"objective": {"combining": "coherent"}}, r"does not go with objective.combining = 'coherent'"),
         ({"engine": {"name": "retrace"}}, r"does not go with engine.name = 'retrace'"),
         ({"parameters": {"ground.itu_a": {"bounds": [2, 9]}}}, r"does not go with coefficients of laws"),
+        (
+            {"observables": {"k": {"kind": "k_factor", "column": "k", "unit": "dB"}}},
+            r"does not go with \[observables\]",
+        ),
     ],
 )
 def test_studies_that_errors_do_not_suit_are_refused(

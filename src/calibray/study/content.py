@@ -217,7 +217,8 @@ class StudyContent(Section, ABC):
         links = self.links
         if links.position_error_m is None:
             return
-        key = _first_stated({"links.weight": links.weight is not None} | self._without_replay())
+        stated = {"links.weight": links.weight is not None, "[observables]": bool(self.observables)}
+        key = _first_stated(stated | self._without_replay())
         if key is not None:
             raise InputError(
                 f"links.position_error_m: powers at displaced receivers are averaged on replay, at one carrier; it "
