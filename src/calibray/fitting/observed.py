@@ -25,7 +25,7 @@ from calibray.measurements.multipath import (
     read_impulse_responses,
     read_multipath,
 )
-from calibray.measurements.observables import SIGNED, Statistic
+from calibray.measurements.observables import PROFILES, SIGNED, Statistic
 from calibray.study import Setup
 
 LEAST: Final = 1e-6
@@ -124,6 +124,8 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
                     f"{links.table.cell(int(wrong[0]), str(section.column))}: {measured[wrong[0]]:g}: a {section.kind} "
                     f"must be at least 0 {section.unit}; correct it, or leave the cell empty"
                 )
+            if section.kind in PROFILES:
+                measured = section.statistic.limited(measured)
         else:
             path = setup.study.observable_paths[name]
             labels = tuple(links.table.labels(section.id).tolist())

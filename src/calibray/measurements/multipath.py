@@ -213,10 +213,9 @@ def _value(
         low, high = statistic.edges
         # Angles are turned into the full turn that begins at the sector's lower edge.
         values = delay - first if angle is None else (angle - low) % (2 * np.pi) + low
-        range_db = kinds.SHARE_RANGE_DB if statistic.dynamic_range_db is None else statistic.dynamic_range_db
-        share = float(weight[(values >= low) & (values < high)].sum())
-        # The range as a floor: an empty bin has a finite value, which the model's bins have too.
-        return 10 * float(np.log10(share + 10 ** (-range_db / 10)))
+        with np.errstate(divide="ignore"):
+            share_db = 10 * np.log10(weight[(values >= low) & (values < high)].sum())
+        return float(statistic.limited(share_db))
     # Circular angular spread of 3GPP TR 38.901, Annex A.1; the bounds keep the logarithm finite and the root real.
     resultant = float(np.clip(abs(np.sum(weight * np.exp(1j * np.asarray(angle)))), 1e-300, 1.0))
     return float(np.sqrt(-2 * np.log(resultant)))

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Final
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 DELAY_SPREAD: Final = "rms_delay_spread"
 EXCESS_DELAY: Final = "mean_excess_delay"
 TIME_OF_FLIGHT: Final = "time_of_flight"
@@ -81,6 +84,18 @@ class Statistic:
         if self.edges is None:
             raise ValueError(f"{self.kind}: needs edges, the ends of its bin")
         return self.edges
+
+    def limited(self, share_db: ArrayLike) -> NDArray[np.float64]:
+        """Shares of power in the bin of one of `PROFILES` [dB], limited from below by the dynamic range.
+
+        An empty bin has a finite value, in the model and in measurements.
+
+        Example:
+            >>> Statistic(DELAY_BIN).limited([-np.inf, -30.0, 0.0]).round(2).tolist()
+            [-30.0, -26.99, 0.0]
+        """
+        range_db = SHARE_RANGE_DB if self.dynamic_range_db is None else self.dynamic_range_db
+        return 10 * np.log10(10 ** (np.asarray(share_db) / 10) + 10 ** (-range_db / 10))
 
 
 @dataclass(frozen=True)
