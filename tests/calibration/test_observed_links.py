@@ -260,6 +260,18 @@ def test_values_are_computed_from_a_file_of_components(tmp_path, table, engine):
         Problem.of(Setup.open(study), engine)
 
 
+def test_averages_have_means_of_a_column_and_stay_apart_by_the_labels_of_a_file(tmp_path, table):
+    links = planted.content("links.csv")["links"] | {"average": "place"}
+    twice = pd.concat([table.assign(name="a"), table.assign(spread_ns=table.spread_ns + 2.0, name="b")])
+    observables = {"spread": SPREAD}
+    study = planted.study(tmp_path, twice, **(PLAN | {"links": links, "observables": observables}))
+    averages = study.measurements()
+    assert averages.frame["spread_ns"].tolist() == pytest.approx((table.spread_ns + 1.0).tolist())
+    observables = {"spread": {"kind": "rms_delay_spread", "file": "links.csv", "id": "name", "unit": "ns"}}
+    study = planted.study(tmp_path, twice, **(PLAN | {"links": links, "observables": observables}))
+    assert len(study.measurements()) == 2 * planted.LINKS
+
+
 def test_a_calibration_that_does_not_fit_from_link_to_link_is_a_conflict(tmp_path, table, engine):
     """Spreads that are small where the model's are large belong to other links."""
 

@@ -572,6 +572,10 @@ def test_round_trip_times_become_an_observable_with_a_bias_per_access_point(scen
     assert (section.kind, section.column, section.unit) == ("round_trip_time", "rtt_ns", "ns")
     assert (section.bias, section.path) == ("ap", "first")
     assert "observables.flight" in assumed(found)
+    scans = {name: values * 3 if isinstance(values, list) else values for name, values in columns.items()}
+    found = draft(scene, table(tmp_path, **scans), tmp_path / "study.toml", frequency=5.5e9)
+    assert found.study.links.average is not None
+    assert found.study.observables["flight"] == section
     metres = columns | {"rtt_ns": None, "ftm_distance_m": [3.0, 4, 5, 6]}
     del metres["rtt_ns"]
     found = draft(scene, table(tmp_path, **metres), tmp_path / "study.toml", frequency=5.5e9)

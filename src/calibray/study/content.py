@@ -163,13 +163,6 @@ class StudyContent(Section, ABC):
                 "engine.compress_db: few weighted paths keep path loss, not the delays and angles of [observables]; "
                 "remove one of them"
             )
-        if self.links.average is not None and any(
-            section.file is None for section in self.observables.values()
-        ):
-            raise InputError(
-                "links.average with [observables]: averages keep only the columns of the first sample; average the "
-                "table itself, or remove one of them"
-            )
         if self.engine.name == "retrace":
             raise InputError("[observables] with engine.name = 'retrace': use 'replay' or 'command'")
         unstated = [name for name, section in self.observables.items() if section.std is None]

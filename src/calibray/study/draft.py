@@ -222,8 +222,8 @@ def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
 
 def _add_flight_times(draft: LinksDraft) -> None:
     flight_time = column_names.find_flight_time(draft.table.frame)
-    # Averages of samples keep the observables of the first one.
-    if flight_time is None or "average" in draft.section or "wide" in draft.section:
+    # A wide table has powers of several transmitters in a row, but one time.
+    if flight_time is None or "wide" in draft.section:
         return
     column, kind, unit = flight_time
     transmitter = draft.section.get("transmitter")

@@ -68,6 +68,8 @@ def row_steps(study: StudyModel) -> Preparation:
     inside = None if links.inside == "keep" else links.inside
     groups = [label for term in study.nuisance_terms.values() for label in term.per]
     groups += [item.bias for item in study.observables.values() if item.bias not in (None, "all")]
+    # A file names its links by this label.
+    groups += [item.id for item in study.observables.values() if item.file is not None]
     # Columns that follow from the scene are added later, to the links.
     keep = [label for label in groups if label not in (*OBSTRUCTION, CLUSTER)]
     keep += [links.frequency] if links.frequency else []
