@@ -40,9 +40,10 @@ if TYPE_CHECKING:
     from calibray.study.trace import trace as trace
     from calibray.study.trace import write_rays as write_rays
     from calibray.validation.validate import validate as validate
-    from calibray.version import __version__ as __version__
 
-__all__, __getattr__, __dir__ = lazy_attributes(
+__version__ = "0.1.0"
+
+_lazy, __getattr__, __dir__ = lazy_attributes(
     __name__,
     {
         "engines": "",
@@ -61,6 +62,6 @@ __all__, __getattr__, __dir__ = lazy_attributes(
         "study": "Setup Study",
         "study.trace": "read_rays trace write_rays",
         "validation.validate": "validate",
-        "version": "__version__",
     },
 )
+__all__ = [*_lazy, "__version__"]
