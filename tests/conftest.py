@@ -165,3 +165,9 @@ def _no_further_paths(request: pytest.FixtureRequest) -> Iterator[None]:
 def all_draws() -> Iterator[None]:
     """As many draws as in the tests that judge intervals, for a test in another file."""
     yield from _draw(MANY)
+
+
+@pytest.fixture
+def few_draws() -> Iterator[None]:
+    """As few draws as in other files, for a test that judges no interval in a file of tests that do."""
+    yield from _draw(FEW)

@@ -433,6 +433,7 @@ def thicker_wood() -> pd.DataFrame:
     return planted.links().assign(path_loss_db=loss + noise)
 
 
+@pytest.mark.usefixtures("few_draws")
 def test_draws_of_chunks_are_those_of_all_links_even_if_a_worker_dies(tmp_path, monkeypatch):
     """Constants and buildings vary in chunks as well, so that the interval covers the truth if a thickness is wrong."""
     monkeypatch.setenv("CALIBRAY_CACHE", str(tmp_path / "cache"))
