@@ -21,6 +21,7 @@ from calibray.validation.choice import fitted_terms, with_prior_mean
 from calibray.validation.models import (
     OUT_OF_SIGHT_DB,
     has_obstruction,
+    kriging,
     log_distance,
     obstructed,
     without_scene,
@@ -164,6 +165,23 @@ def test_a_prior_of_the_study_does_not_draw_the_law_towards_zero(by):
     term = make_term(links, "narrow", by, labels=labels, prior=0.01)
     grouped = log_distance(links, replace(objective(links, term), noise_db=5.0), NOTHING)
     assert grouped.path_loss_db() == pytest.approx(plain, abs=0.01)
+
+
+def test_receivers_on_a_circle_determine_no_slope_and_are_kriged():
+    """Their distances are equal up to rounding, as on a turntable."""
+    random, angle = np.random.default_rng(2), np.linspace(0.0, 6.0, 20)
+    tx = np.array([123.4, 56.7, 10.0])
+    rx = tx + np.stack([47.3 * np.cos(angle), 47.3 * np.sin(angle), np.full(20, -8.5)], axis=1)
+    loss = 90.0 + 4.0 * np.sin(angle) + random.standard_normal(20)
+    links = Measurements(tx=np.tile(tx, (20, 1)), rx=rx, path_loss_db=loss)
+    assert 0 < np.ptp(links.distance) < 1e-12
+    model, known_db = log_distance(links, objective(links), NOTHING)
+    assert model.coefficients(known_db[None])[0] == pytest.approx([loss.mean(), 0.0])
+    trend_db = model.with_nuisance(known_db)
+    kriged = kriging(links, model.reweighted(np.where(np.arange(20) % 2, 1.0, 0.0)), trend_db)
+    held_out = np.arange(20) % 2 == 0
+    error_db = [np.std((each - loss)[held_out]) for each in (kriged, trend_db)]
+    assert error_db[0] < 0.6 * error_db[1]
 
 
 def test_a_further_nuisance_keeps_its_bounds():

@@ -35,6 +35,9 @@ one group contains no information about the spread."""
 START_SPREAD: Final = 6.0
 """Standard deviation between the groups of a random effect before it is estimated [dB per unit of the column]."""
 
+ROUNDING: Final = 1e-9
+"""Difference of distances, in decades, that is rounding."""
+
 UNBOUNDED: Final = (-np.inf, np.inf)
 
 
@@ -133,6 +136,8 @@ def make_term(
         raise InputError(f"nuisance {name!r}: prior = {prior:g}; a standard deviation must be greater than 0")
     value = column(links, by)
     centre = float(value.mean()) if by == LOG_DISTANCE else 0.0
+    if by == LOG_DISTANCE and np.allclose(value, centre, rtol=0.0, atol=ROUNDING):
+        value = np.full(len(links), centre)  # equal distances determine no slope
     if labels is None:
         groups, group = ("",), np.zeros(len(links), dtype=np.int64)
     else:

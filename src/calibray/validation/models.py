@@ -24,6 +24,7 @@ from calibray.errors import EngineError, InputError
 from calibray.fitting.nuisance import (
     CONSTANT,
     LOG_DISTANCE,
+    ROUNDING,
     UNBOUNDED,
     Nuisance,
     Term,
@@ -170,10 +171,12 @@ def kriging(links: Measurements, objective: Objective, trend_db: NDArray[np.floa
         raise InputError(f"kriging: {count} links, at most {MOST_KRIGED}")
     position = np.hstack([links.rx, links.tx])
     measured, residual = position[counted], (objective.measured - trend_db)[counted]
-    # The fit removed an intercept and, unless all distances are equal, a slope.
-    design = np.stack([np.ones(count), np.log10(links.distance[counted])], axis=1)
-    if np.ptp(design[:, 1]) == 0:
-        design = design[:, :1]
+    # The fit removed an intercept and, unless all distances are equal up to rounding, a slope.
+    decades = np.log10(links.distance[counted])
+    decades -= decades.mean()
+    design = np.ones((count, 1))
+    if not np.allclose(decades, 0.0, atol=ROUNDING):
+        design = np.column_stack([design, decades / np.abs(decades).max()])
     field = fit_correlation(residual, measured, design=design)
     # Simple kriging: far from all links, the expected residual is 0.
     weights = np.linalg.solve(field.covariance(measured), residual)
