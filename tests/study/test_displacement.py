@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -140,6 +141,9 @@ def test_the_error_between_the_traced_displacements_is_that_of_a_line_in_place_o
     none = np.zeros((0, 0))
     loss = DisplacementLoss(np.zeros(0, int), (), (none,), none, knots, cubics(knots[0], change_db)[None])
     np.testing.assert_allclose(loss.error_db, [0.0, 6 / np.sqrt(6), 0.0], atol=1e-12)
+    change_db[:, 2] = 6.0 * (knots[0, :, 0] > 1.5)
+    loss = replace(loss, coefficients=cubics(knots[0], change_db)[None])
+    np.testing.assert_allclose(loss.error_db[2], 6 / np.sqrt(12))
     uniform = np.random.default_rng(1).uniform(size=(2, 200_000))  # where the step and the link are
     line = 6.0 * uniform[0] - 6.0 * (uniform[0] > uniform[1])
     assert np.sqrt(np.mean(line**2)) == pytest.approx(6 / np.sqrt(6), rel=0.01)

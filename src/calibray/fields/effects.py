@@ -154,8 +154,9 @@ class DisplacementLoss:
     def error_db(self) -> NDArray[np.float64]:
         """Error of path loss between the five middle knots, summed over the axes [L], [dB]; 0 with fewer than seven.
 
-        It is the RMS of what lines between its two neighbours miss at each of the three inner knots. A step of J dB in
-        one of the four intervals gives J / sqrt(6), which is the RMS error of a line in place of a step somewhere.
+        It is the RMS of what lines between its two neighbours miss at each of the three inner knots. A step of J dB
+        next to the middle knot gives J / sqrt(6), which is the RMS error of a line in place of a step somewhere; a step
+        in one of the two outer intervals gives J / sqrt(12).
         """
         middle = self.coefficients.shape[2] // 2
         if middle < 3:
