@@ -23,6 +23,27 @@ from calibray.support.messages import did_you_mean
 FREQUENCIES: Final = (1e6, 1e12)
 """Range of carriers [Hz]; a value outside was probably stated in MHz or GHz."""
 
+
+def check_frequency(frequency: object) -> float:
+    """A carrier frequency [Hz] as a number.
+
+    Raises:
+        InputError: It is not a number within `FREQUENCIES`.
+
+    Example:
+        >>> check_frequency(28_500_000_000)
+        28500000000.0
+    """
+    lowest, highest = FREQUENCIES
+    if isinstance(frequency, bool) or not (
+        isinstance(frequency, Real) and lowest <= float(frequency) <= highest
+    ):
+        raise InputError(
+            f"frequency = {frequency!r}: must be in {lowest:g} to {highest:g} Hz; 28.5 GHz is written 28.5e9"
+        )
+    return float(frequency)
+
+
 FIELDS: Final = (
     "relative_permittivity",
     "conductivity",

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from html import escape
-from numbers import Real
 from pathlib import Path
 from textwrap import shorten
 from typing import Any, Final, TypeVar
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.materials import FIELDS, Material, constants_matrix
+from calibray.materials import FIELDS, Material, check_frequency, constants_matrix
 from calibray.paths import file_format
 from calibray.paths.interactions import Diffraction, Diffuse, Kind
 from calibray.support.messages import first_line
@@ -130,11 +129,9 @@ class Paths:
             The program at that carrier.
 
         Raises:
-            InputError: The frequency is not a positive number, or a material is not among the paths'.
+            InputError: The frequency is not in `calibray.materials.FREQUENCIES`, or a material is not among the paths'.
         """
-        if not (isinstance(frequency, Real) and np.isfinite(frequency) and frequency > 0):
-            raise InputError(f"frequency = {frequency!r}: must be a finite number of Hz greater than 0")
-        return replace(self, frequency=float(frequency), materials=self._with_materials(materials))
+        return replace(self, frequency=check_frequency(frequency), materials=self._with_materials(materials))
 
     def material_table(self, materials: Mapping[str, Material] | None = None) -> NDArray[np.float64]:
         """Constants of the materials as a matrix [M, 8]; materials that are not named keep the constants of the trace.

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from numbers import Real
 from pathlib import Path
 from typing import Any, overload
 
-import numpy as np
 import pandas as pd
 
 from calibray.engines.rays.compile import RaySetting, compile_rays, rays_of
 from calibray.engines.rays.other_programs import check_carrier, ray_rows
 from calibray.engines.rays.table import RayTable, write_ray_file
 from calibray.errors import InputError
-from calibray.materials import Material
+from calibray.materials import Material, check_frequency
 from calibray.measurements import Measurements
 from calibray.paths import Paths
 from calibray.scenes import Scene, read_scene
@@ -93,6 +91,7 @@ def trace(
     if measurements is None or frequency is None:
         missing = "measurements, the links" if measurements is None else "frequency, the carrier in Hz"
         raise InputError(f"trace: without a study, give {missing}")
+    check_frequency(frequency)
     scene = scene if isinstance(scene, Scene) else read_scene(scene, frequency, materials)
     antennas = as_antenna(tx_antenna), as_antenna(rx_antenna)
     names = TraceSettings().record()
@@ -154,10 +153,8 @@ def read_rays(
         >>> study = Study.load(demo_study_path())
         >>> read_rays("rays.csv", study)  # doctest: +SKIP
     """
-    if frequency is not None and not (isinstance(frequency, Real) and 0 < frequency < np.inf):
-        raise InputError(
-            f"read_rays: frequency = {frequency!r}: must be a positive number of Hz, such as 3.5e9"
-        )
+    if frequency is not None:
+        check_frequency(frequency)
     if antennas is not None and not (
         len(antennas) == 2 and all(isinstance(each, Antenna) for each in antennas)
     ):

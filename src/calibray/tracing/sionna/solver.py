@@ -27,8 +27,8 @@ from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
 
-from calibray.errors import EngineError, InputError
-from calibray.materials import SCALAR_CONSTANTS, Material
+from calibray.errors import EngineError
+from calibray.materials import SCALAR_CONSTANTS, Material, check_frequency
 from calibray.paths import Paths
 from calibray.paths.chains import Chains
 from calibray.scenes import Scene, check_material_name
@@ -88,9 +88,7 @@ class Solver:
         tx_antenna: Antenna,
         rx_antenna: Antenna,
     ) -> None:
-        if not (np.isfinite(frequency) and frequency > 0):
-            raise InputError(f"frequency = {frequency!r}: must be a finite number of Hz greater than 0")
-        self.scene, self.frequency, self.settings = scene, float(frequency), settings
+        self.scene, self.frequency, self.settings = scene, check_frequency(frequency), settings
         self.tx_antenna, self.rx_antenna = tx_antenna, rx_antenna
         self._patterns = AntennaPattern.of(tx_antenna), AntennaPattern.of(rx_antenna)
         self._tx_functions, self._rx_functions = antenna_patterns(tx_antenna), antenna_patterns(rx_antenna)

@@ -111,8 +111,8 @@ class Tracer:
         rx_antenna: Receive antenna.
 
     Raises:
-        InputError: Sionna cannot load the scene, the frequency is not a positive number, or an antenna's gain table
-            cannot be used.
+        InputError: Sionna cannot load the scene, the frequency is no carrier, or an antenna's gain table cannot be
+            used.
     """
 
     def __init__(
