@@ -427,6 +427,14 @@ def test_all_paths_taken_are_the_program_itself(paths: Paths) -> None:
     assert_equal(take(paths, np.arange(paths.num_paths)), paths)
 
 
+def test_a_mask_takes_what_its_numbers_take(paths: Paths) -> None:
+    deep = np.diff(paths.first) > 1
+    assert 0 < deep.sum() < len(deep)
+    assert_equal(take(paths, deep), take(paths, np.flatnonzero(deep)))
+    last = np.arange(paths.num_links) > 0
+    assert_equal(take_links(paths, last), take_links(paths, np.flatnonzero(last)))
+
+
 def test_links_taken_in_another_order_keep_their_paths(paths: Paths) -> None:
     order = np.array([1, 0, 1])
     taken = take_links(paths, order)

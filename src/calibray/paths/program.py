@@ -232,9 +232,14 @@ _PATH_ARRAYS = ("link", "delay", "spreading", "departure", "arrival", "tx_field"
 _INTERACTION_ARRAYS = ("kind", "material", "cos_incidence", "rotation", "vertex")
 
 
-def take(paths: Paths, index: NDArray[np.int64]) -> Paths:
-    """The program of some of its paths [n], in a given order, over the same links."""
-    index = np.asarray(index, dtype=np.int64)
+def _numbers(index: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Numbers [n], given as such or as a mask."""
+    return np.flatnonzero(index) if np.asarray(index).dtype == np.bool_ else np.asarray(index, dtype=np.int64)
+
+
+def take(paths: Paths, index: NDArray[np.int64] | NDArray[np.bool_]) -> Paths:
+    """The program of some of its paths [n], in a given order or by a mask, over the same links."""
+    index = _numbers(index)
     depth = np.diff(paths.first)[index]
     first = np.concatenate([[0], np.cumsum(depth)]).astype(np.int64)
     # Consecutive numbers from the first interaction of each taken path on.
@@ -250,9 +255,9 @@ def take(paths: Paths, index: NDArray[np.int64]) -> Paths:
     )
 
 
-def take_links(paths: Paths, links: NDArray[np.int64]) -> Paths:
-    """The program of some links [n], in a given order; a link may be used more than once."""
-    links = np.asarray(links, dtype=np.int64)
+def take_links(paths: Paths, links: NDArray[np.int64] | NDArray[np.bool_]) -> Paths:
+    """The program of some links [n], in a given order or by a mask; a link may be used more than once."""
+    links = _numbers(links)
     start = np.searchsorted(paths.link, np.arange(paths.num_links + 1))
     count = np.diff(start)[links]
     end = np.cumsum(count)
