@@ -11,6 +11,7 @@ import pytest
 import planted
 import programs
 from calibray.calibration.calibrate import calibrate
+from calibray.calibration.link_diagnostics import diagnose_links
 from calibray.errors import InputError
 from calibray.fitting.nuisance import UNKNOWN_DB, Nuisance, random_effect
 from calibray.fitting.objective import make_objective
@@ -110,6 +111,16 @@ def test_groups_of_few_links_do_not_raise_the_noise(spread_db):
     assert noise_db == pytest.approx(fitted.objective.noise_db, rel=0.03)
     prior = variants(fitted, best)[Model.PRIOR].objective
     assert prior.noise_db == pytest.approx(noise_db)
+
+
+def test_a_link_alone_in_its_group_has_little_leverage_if_groups_hardly_differ():
+    random, group = np.random.default_rng(3), np.append(np.repeat(np.arange(40), 2), 40)
+    way = random.uniform(0.0, 10.0, len(group))
+    fitted = estimate_noise(along(way, 4.0 * random.standard_normal(len(group)), street=group))
+    best = least_squares(fitted, 4, np.zeros((0, 1))).best.x
+    leverage = diagnose_links(fitted, best, None).columns["leverage"]
+    assert leverage[-1] < 0.2
+    assert leverage.sum() == pytest.approx(len(group) - fitted.freedom, abs=0.5)
 
 
 def test_the_spread_of_streets_does_not_count_as_that_of_places_within_them():

@@ -101,13 +101,16 @@ def _leverage(problem: Problem, best: NDArray[np.float64]) -> NDArray[np.float64
     optimum = problem.evaluate(problem.parameters.to_search(best)[None], derivatives=True)
     counted = np.flatnonzero(objective.weight > 0)
     root = np.sqrt(objective.weight[counted] * count / objective.weight.sum())
-    columns = len(objective.nuisance.columns)
+    rows, columns = optimum.slopes[0], len(objective.nuisance.columns)
     result = np.full(len(objective.weight), np.nan)
-    if count * columns <= DENSE:
-        design = (
-            objective.nuisance.design[counted].toarray() * root[:, None] if columns else np.zeros((count, 0))
-        )
-        result[counted] = leverage(optimum.slopes[0, :count], design)
+    if len(rows) * columns <= DENSE:
+        design = np.zeros((len(rows), columns))
+        if columns:
+            design[:count] = objective.nuisance.design[counted].toarray() * root[:, None]
+            # The rows of priors follow; they hold the coefficients in part.
+            ridge = objective.noise_db / objective.nuisance.prior
+            design[count : objective.num_rows] = np.diag(ridge)[ridge > 0]
+        result[counted] = leverage(rows, design)[:count]
     return result
 
 
@@ -116,7 +119,7 @@ def leverage(jacobian: NDArray[np.float64], design: NDArray[np.float64]) -> NDAr
 
     It is the diagonal of the projection onto the derivatives of the residuals, with the nuisance eliminated [m, d], and
     the columns of the nuisance, scaled like the residuals [m, q]: 0 for a link without influence, 1 for a link that
-    alone determines an unknown. The sum is the number of unknowns that the links determine.
+    alone determines an unknown. The sum is the number of unknowns that the rows determine, also those of priors.
 
     Example:
         >>> leverage(np.array([[1.0], [1.0], [0.0]]), np.zeros((3, 0))).round(2).tolist()
