@@ -173,6 +173,31 @@ def test_a_new_street_is_predicted_with_the_mean_and_the_spread(tmp_path):
     assert loaded.prediction.model.terms == result.prediction.model.terms
 
 
+def test_streets_that_a_filter_holds_out_have_the_mean_and_their_spread_counts_once(tmp_path):
+    street = np.array([f"s{number // 2}" for number in range(planted.LINKS)])
+    shift = dict(zip(sorted(set(street)), [3.0, -2.0, 1.0, 5.0, 0.0, -4.0], strict=True))
+    table = planted.campaign(noise_db=0.5).assign(street=street)
+    table["path_loss_db"] += table.street.map(shift)
+    beside = table.assign(rx_x=table.rx_x + 0.7)
+    study = planted.study(
+        tmp_path,
+        pd.concat([table, beside], ignore_index=True),
+        nuisance={"street": {"by": "constant", "per": "street", "prior": "auto"}},
+        parameters={"marble.relative_permittivity": {"bounds": [1.5, 12.0]}},
+        holdout={"where": "street == 's1' or street == 's3'"},
+    )
+    result = calibrate(study)
+    known = result.nuisance.coefficients["street"]
+    assert list(known) == ["s0", "s2", "s4", "s5"]
+    rows = result.links[result.links.held_out]
+    excess_db = (rows.measured_db - rows.after_db).to_numpy().reshape(2, 2, 2).mean(axis=(0, 2))
+    mean_db = np.mean([shift[name] for name in known])
+    assert excess_db == pytest.approx([shift["s1"] - mean_db, shift["s3"] - mean_db], abs=1.5)
+    model = result.prediction.model
+    assert model.blocks is not None
+    assert model.blocks.groups_db == pytest.approx(model.terms[0].spread_db)
+
+
 def test_clusters_of_receivers_are_groups_without_a_column(tmp_path):
     table = planted.campaign(noise_db=0.2)
     side = float(np.ptp(table.rx_x)) / 3

@@ -136,7 +136,13 @@ def _choice(
         levels = two_levels(errors[name], block, ends[judged][finite], ends[objective.weight > 0])
         if levels is not None:
             kept = np.flatnonzero(judged)[finite]
-            levels = replace(levels, out_of_sight=_out_of_sight(problem, errors[name], kept))
+            sets = np.where(objective.weight > 0, 0, -1)
+            sets[kept] = 1
+            levels = replace(
+                levels,
+                groups_db=_groups_db(problem, sets, kept),
+                out_of_sight=_out_of_sight(problem, errors[name], kept),
+            )
         return name, HeldOutResiduals(rms_db, basis, count, errors[name], levels)
     rms_db = None
     if problem.freedom >= 1:
@@ -167,9 +173,9 @@ def on_blocks(
     name, judged = validation.chosen, validation.judged
     levels = validation.levels(name, problem.setup.links)
     if levels is not None:
-        spread_db = problem.objective.nuisance.new_group_spread(validation.block)[judged]
         ratio = _out_of_sight(problem, validation.errors[name][judged], np.flatnonzero(judged))
-        levels = replace(levels, groups_db=float(np.sqrt(np.mean(spread_db**2))), out_of_sight=ratio)
+        groups_db = _groups_db(problem, validation.block, np.flatnonzero(judged))
+        levels = replace(levels, groups_db=groups_db, out_of_sight=ratio)
     residuals = HeldOutResiduals(
         validation.scale(name),
         f"{name}, errors on {len(validation.labels)} blocks held out in turn",
@@ -186,6 +192,11 @@ def on_blocks(
         observables=validation.observables,
     )
     return accuracy, name, residuals
+
+
+def _groups_db(problem: Problem, block: NDArray[np.int64], links: NDArray[np.int64]) -> float:
+    """Root mean square of the random effects of groups that are in one block only [L], at some links [n], [dB]."""
+    return float(np.sqrt(np.mean(problem.objective.nuisance.new_group_spread(block)[links] ** 2)))
 
 
 def _out_of_sight(problem: Problem, errors: NDArray[np.float64], links: NDArray[np.int64]) -> float:

@@ -197,8 +197,13 @@ class Objective:
 
     @property
     def supported(self) -> NDArray[np.bool_]:
-        """Mask of the links whose columns are all determined; the model of other links is incomplete [L]."""
-        return ~((self.nuisance.design != 0) @ ~self.determined)
+        """Mask of the links whose columns are all determined; the model of other links is incomplete [L].
+
+        Deviations of a random effect are 0 unless links determine them.
+        """
+        terms = self.nuisance.terms
+        deviates = np.repeat([bool(term.around) for term in terms], [len(term.labels) for term in terms])
+        return ~((self.nuisance.design != 0) @ ~(self.determined | deviates.astype(bool)))
 
     def model(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """The full model [n, L], [dB]: path loss [n, L], limited to the ceiling, plus the best nuisance."""
