@@ -108,7 +108,7 @@ def angular_spread(power: jax.Array, angle: jax.Array, link: jax.Array, num_link
     cosine, sine = (link_mean(power, part(angle), link, num_links) for part in (jnp.cos, jnp.sin))
     resultant = jnp.hypot(cosine, sine)
     # Equal powers from opposite directions have the resultant 0, whose logarithm is infinite.
-    spread = safe_sqrt(jnp.maximum(-2 * jnp.log(jnp.clip(resultant, 1e-300, 1.0)), 0.0))
+    spread = safe_sqrt(-2 * jnp.log(jnp.clip(resultant, 1e-300, 1.0)))
     return jnp.where(jnp.isfinite(cosine), spread, jnp.nan)
 
 

@@ -232,7 +232,7 @@ def find_repeats(
     cell = np.where(present[..., None], vertex[rows], 0) / POINT_TOLERANCE
     head = np.hstack([link[rows, None], kind[rows], np.where(present, shape[rows], 0)])
     # Points are compared by their grid cells. A second grid, shifted by half a cell, joins those that a cell boundary
-    # of the first one separates.
+    # of the first one separates, unless a boundary of the second one separates them along another axis.
     for offset in (0.0, 0.5):
         grid = np.floor(cell + offset).astype(np.int64).reshape(len(rows), -1)
         _, first, group = np.unique(np.hstack([head, grid]), axis=0, return_index=True, return_inverse=True)
