@@ -137,7 +137,7 @@ class RayModel:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Power of every path [n, P], [dB], and its derivatives by the values [n, P, k].
 
-        They are of n candidates, given by their constants [n, M, 8], all with the same values [k].
+        The n candidates are given by their constants [n, M, 8]. The assumed values [k] are the same for all of them.
         """
         (program, polarized), names, count = self._by_path, list(self.paths.materials), len(self.assumed)
         rows = [names.index(name) for name, _ in self.assumed]

@@ -44,7 +44,8 @@ AVERAGES: Final[dict[str, tuple[Model, Model]]] = {
     Model.AVERAGE_CALIBRATED: (Model.CALIBRATED, Model.PRIOR),
     Model.AVERAGE_OFFSETS: (Model.CALIBRATED, Model.OFFSETS),
 }
-"""The two models whose path loss each average takes. An exported scene has the materials of the first."""
+"""The two models that each average takes path loss from. If it is chosen, an exported scene has the materials of the
+first one."""
 
 AVERAGE_OF: Final[dict[str, Model]] = {
     Model.INITIAL: Model.AVERAGE_INITIAL,
