@@ -260,6 +260,14 @@ def test_values_are_computed_from_a_file_of_components(tmp_path, table, engine):
         Problem.of(Setup.open(study), engine)
 
 
+def test_a_number_for_a_missing_time_of_flight_is_no_time(tmp_path, table):
+    rtt_ns = table.rtt_ns.where(table.index != 3, -200.0)
+    study = planted.study(tmp_path, table.assign(rtt_ns=rtt_ns), **(PLAN | {"observables": {"rtt": FLIGHT}}))
+    links = study.measurements()
+    assert np.flatnonzero(links.frame["rtt_ns"].isna()).tolist() == [3]
+    assert links.prepared == {"values of rtt_ns that mean not measured (-200)": 1}
+
+
 def test_averages_have_means_of_a_column_and_stay_apart_by_the_labels_of_a_file(tmp_path, table):
     links = planted.content("links.csv")["links"] | {"average": "place"}
     twice = pd.concat([table.assign(name="a"), table.assign(spread_ns=table.spread_ns + 2.0, name="b")])

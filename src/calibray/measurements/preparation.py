@@ -133,6 +133,7 @@ class Preparation:
         keep: Columns whose groups averages keep apart, in addition to the transmitter's.
         held_out: Labels of the parts that are held out separately, which averages and merged rows keep apart as well.
         observables: Columns of further measured values, which are averaged over rows that repeat a link.
+        flights: Those of them that contain times of flight, in which numbers can mean a missing value.
         computed: Further columns by name, computed from the rows with the columns of their transmitters. A function
             returns None if a column that it needs is missing and optional.
         inside: What to do with receivers inside buildings; nothing if None.
@@ -155,6 +156,7 @@ class Preparation:
     keep: Sequence[str] = ()
     held_out: Divide | None = None
     observables: Sequence[str] = ()
+    flights: Sequence[str] = ()
     computed: Mapping[str, Compute] = field(default_factory=dict)
     inside: Literal["drop", "move"] | None = None
     outside: MoveOutside | None = None

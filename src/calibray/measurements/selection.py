@@ -21,10 +21,10 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
     """Select the rows that become links.
 
     The steps run in the order of the code, so that a filter can use the columns of the track but not those of the
-    transmitters. The steps `wide`, `track`, `where`, `missing`, `transmitters`, `computed`, `noise_floor_dbm` and
-    `censored` are used here. `value` is the column of the measured values; with `wide`, it is the name of the new
-    column. The remaining rows contain no numbers that mean a missing value (`missing_codes`). Values at or below the
-    noise floor, and missing values, are set to the floor.
+    transmitters. The steps `wide`, `track`, `where`, `missing`, `flights`, `transmitters`, `computed`,
+    `noise_floor_dbm` and `censored` are used here. `value` is the column of the measured values; with `wide`, it is
+    the name of the new column. The remaining rows contain no numbers that mean a missing value (`missing_codes`).
+    Values at or below the noise floor, and missing values, are set to the floor.
 
     Raises:
         InputError: A column is missing or malformed, a transmitter is unknown, or no row remains.
@@ -60,6 +60,11 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
                     f"{table.source}: column {value!r} contains no measured value; check links.missing"
                 )
             table = table.select(~coded)
+    for name in steps.flights:
+        if name in table.frame and (codes := find_codes(_numbers(table.frame[name]), np.inf)):
+            coded = table.frame[name].isin(codes)
+            cause = f"values of {name} that mean not measured ({', '.join(f'{code:g}' for code in codes)})"
+            table = table.assign(**{name: table.frame[name].mask(coded)}).note(cause, int(coded.sum()))
     if steps.transmitters is not None:
         table = _join_transmitters(table, steps.transmitters, steps.transmitter)
     for name, compute in steps.computed.items():
@@ -196,11 +201,11 @@ LARGEST_LEVEL: Final = 190.0
 """Magnitude above which a code with the sign of the other values cannot be a power [dBm] or gain [dB]."""
 
 
-def find_codes(values: ArrayLike) -> tuple[float, ...]:
-    """Find the numbers that mark a missing value among values [n], [dB] or [dBm]; ascending.
+def find_codes(values: ArrayLike, largest: float = LARGEST_LEVEL) -> tuple[float, ...]:
+    """Find the numbers that mark a missing value among values [n], such as powers [dBm]; ascending.
 
     A number counts as a code if it is in `CODES`, is far from all other values, and has the other sign or an impossible
-    magnitude: 100 is a code among powers, and a value among path losses.
+    magnitude, above `largest`: 100 is a code among powers, and a value among path losses.
 
     Example:
         >>> find_codes([-70.0, 100.0, -200.0]), find_codes([70.0, 100.0, 130.0])
@@ -218,8 +223,7 @@ def find_codes(values: ArrayLike) -> tuple[float, ...]:
     return tuple(
         float(code)
         for code in distinct[is_candidate]
-        if (np.sign(code) != sign or abs(code) > LARGEST_LEVEL)
-        and np.min(np.abs(measured - code)) >= MIN_GAP_DB
+        if (np.sign(code) != sign or abs(code) > largest) and np.min(np.abs(measured - code)) >= MIN_GAP_DB
     )
 
 

@@ -21,6 +21,7 @@ from calibray.measurements import (
     measured_links,
     read_table,
 )
+from calibray.measurements.observables import FLIGHTS
 from calibray.scenes.obstruction import CLUSTER
 from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study.calibration_sections import HoldoutSection
@@ -87,6 +88,7 @@ def row_steps(study: StudyModel) -> Preparation:
         ),
         held_out=None if study.holdout is None else partial(_held_out_parts, study.holdout, links.value),
         observables=[item.column for item in study.observables.values() if item.column is not None],
+        flights=[item.column for item in study.observables.values() if item.column and item.kind in FLIGHTS],
         computed={PORT_POWER: partial(port_power, study)} if states_port_power(study) else {},
         inside=inside,
         outside=None if inside is None else _move_outside(study),
