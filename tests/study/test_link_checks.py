@@ -107,6 +107,11 @@ def test_receivers_indoors_of_a_transmitter_outdoors_are_no_mistake(town):
     assert named in suspicions(town, inside)
     assert named not in suspicions(town, inside, trace={"refraction": True})
     assert "receivers are" not in suspicions(town, inside, trace={"refraction": True})
+    # Half of the receivers outdoors, and the transmitter in a building.
+    some = pd.concat([frame.iloc[:30], inside.iloc[30:]])
+    indoors = {"tx": [10.0, 20.0, 5.0]}
+    assert "30 of 60 receivers are inside buildings" in suspicions(town, some)
+    assert "inside buildings" not in suspicions(town, some, links=indoors, trace={"refraction": True})
 
 
 @pytest.mark.parametrize(("unit", "is_named"), [("ns", False), ("us", True), ("m", False)])

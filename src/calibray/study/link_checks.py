@@ -215,6 +215,8 @@ def _positions(
             f"buildings, the first in row {row}",
             "leave out wrong positions with links.where, or make a larger scene",
         )
+    if through_walls:
+        return  # some antennas may be indoors
     inside = roofed & ~overhead.underground(rx)
     if inside.any():
         problem = f"{int(inside.sum())} of {len(rx)} receivers are inside buildings"
