@@ -276,7 +276,7 @@ def _assign_links(
         )
         if lost.all():
             raise InputError(
-                f"{fault}; check units [m], export the rays of the study's links, or correct the argument axes"
+                f"{fault}; check units [m], export the rays of these links, or correct the argument axes"
             )
         _LOG.warning("%s; they are left out", fault)
     return LinkPositions(ends[:, :3], ends[:, 3:]), np.where(lost, -1, link), chosen.reshape(-1)
