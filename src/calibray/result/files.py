@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -81,10 +82,14 @@ class LinkCounts(Section):
 
 
 class Stored(Section):
-    """The content of `result.json`: the sections of a `Record`."""
+    """The content of `result.json`: the sections of a `Record`.
+
+    `study_from_here` is the path of the study file from the result's folder: both may have moved together.
+    """
 
     version: Literal[1]
     study_file: str
+    study_from_here: str = ""
     study: dict[str, Any]
     links: LinkCounts
     fit: Fit
@@ -153,7 +158,9 @@ def write(
         if record.held_out is not None:
             _write_validation(record.held_out, study, target, validation or {})
         digests = {name: file_digest(target / name) for name in SIGNED_FILES}
-        write_text(target / RESULT_FILE, json.dumps(content(record, sentences, digests), indent=2) + "\n")
+        stored = content(record, sentences, digests)
+        stored["study_from_here"] = os.path.relpath(study.path.resolve(), target.resolve())
+        write_text(target / RESULT_FILE, json.dumps(stored, indent=2) + "\n")
     except OSError as error:
         raise InputError(
             f"output folder {target}: cannot be written ({error.strerror}); name another"
@@ -224,7 +231,9 @@ def _read_stored(source: Path) -> tuple[Stored, Study]:
     except ValidationError as error:
         refusal = explain(error, Stored, values, str(source))
         raise refusal from None
-    study = Study.from_content(stored.study, stored.study_file)
+    moved = source.parent / stored.study_from_here
+    is_moved = stored.study_from_here and not exists(stored.study_file) and exists(moved)
+    study = Study.from_content(stored.study, moved if is_moved else stored.study_file)
     _check_consistent(stored, study, source)
     return stored, study
 
