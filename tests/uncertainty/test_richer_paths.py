@@ -58,19 +58,28 @@ def measured(folder: Path, noise_db: float, *, refraction: bool) -> np.ndarray:
 @pytest.fixture(scope="module", params=[True, False], ids=["with refraction", "without"])
 def calibrated(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[bool, Result]:
-    """A calibration without paths through the screen of measurements with or without them."""
-    folder = tmp_path_factory.mktemp("screen")
-    return request.param, cb.calibrate(study(folder, measured(folder, 1.0, refraction=request.param)))
+) -> tuple[bool, Result, list[str]]:
+    """A calibration without paths through the screen of measurements with or without them, and its stages."""
+    folder, stages = tmp_path_factory.mktemp("screen"), list[str]()
+
+    def seen(stage: str, *_: int | None) -> None:
+        if stages[-1:] != [stage]:
+            stages.append(stage)
+
+    plan = study(folder, measured(folder, 1.0, refraction=request.param))
+    return request.param, cb.calibrate(plan, progress=seen), stages
 
 
-def test_measurements_decide_whether_paths_are_missing(calibrated: tuple[bool, Result]) -> None:
-    refracted, result = calibrated
+def test_measurements_decide_whether_paths_are_missing(calibrated: tuple[bool, Result, list[str]]) -> None:
+    refracted, result, stages = calibrated
     remarks = [each for each in result.uncertainty.remarks if each.kind == RemarkKind.RICHER_PATHS]
     interval = result.intervals[STONE]
     assert interval.contains(TRUTH)
     assert len(remarks) == refracted
+    # No stage seems to run twice.
+    assert stages.count("drawing") == 1
     if refracted:
+        assert "drawing with more paths" in stages
         values = remarks[0].values
         assert values["settings"] == SETTINGS
         assert values["probability"] > 0.99
@@ -80,9 +89,9 @@ def test_measurements_decide_whether_paths_are_missing(calibrated: tuple[bool, R
 
 
 def test_a_stated_noise_model_or_no_further_traces_rule_the_check_out(
-    calibrated: tuple[bool, Result], tmp_path: Path
+    calibrated: tuple[bool, Result, list[str]], tmp_path: Path
 ) -> None:
-    _, result = calibrated
+    _, result, _ = calibrated
     values = result.links.measured_db.to_numpy()
     for number, sections in enumerate([{"noise": {"kind": "gaussian"}}, {"fidelity": {"rounds": 0}}]):
         folder = tmp_path / str(number)

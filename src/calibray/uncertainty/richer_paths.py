@@ -46,7 +46,7 @@ def assess_richer_paths(
     """The uncertainty on richer paths, with a remark, if the measurements favour these; otherwise the given one.
 
     Nothing is traced if the study states the noise, if its `fidelity.rounds` are 0, or if no link is out of sight. The
-    stage of `progress` is "tracing more paths".
+    stages of `progress` are "tracing more paths" and "drawing with more paths".
 
     Args:
         problem: The problem.
@@ -78,7 +78,7 @@ def assess_richer_paths(
         < LIKELY_LOG_ODDS
     ):
         return assessed
-    other = certainty(richer, fitted, progress)
+    other = certainty(richer, fitted, with_stage(progress, "drawing with more paths"))
     calls, seconds = assessed.calls + other.calls, assessed.seconds + other.seconds
     # No draws are needed if the richer paths explain the measurements exactly.
     log_odds = np.inf
