@@ -129,10 +129,14 @@ def test_the_report_shows_the_validation(validation):
     assert "calibray validate STUDY" in page(replace(result, held_out=None), shown, {})
 
 
-def test_saving_a_result_removes_an_earlier_validation(validation, tmp_path: Path):
+def test_saving_a_result_removes_an_earlier_validation_and_says_so(validation, tmp_path: Path, caplog):
     write_validation(validation, STUDY, tmp_path, validation.content())
     result, _ = made_up(LINKS, 12)
     replace(result, held_out=None).save(tmp_path)
     assert not (tmp_path / VALIDATION_FILE).exists()
+    assert f"{VALIDATION_FILE}: removed" in caplog.text
+    caplog.clear()
+    replace(result, held_out=None).save(tmp_path)
     replace(result, held_out=validation).save(tmp_path)
+    assert not caplog.text
     assert (tmp_path / VALIDATION_FILE).exists()

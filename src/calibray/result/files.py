@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -53,6 +54,8 @@ FILES: Final = ("result.json", "result-links.csv", "result-history.csv", "result
 RESULT_FILE, LINKS_FILE, HISTORY_FILE, SCENE_FILE = FILES
 SIGNED_FILES: Final = (LINKS_FILE, HISTORY_FILE, SCENE_FILE)
 """The files whose digests `result.json` contains."""
+
+_LOG: Final = logging.getLogger(__name__)
 
 VALIDATION_FILE: Final = "result-validation.json"
 
@@ -153,7 +156,10 @@ def write(
         export_scene(scene, record.scene_materials, target / SCENE_FILE)
         write_text(target / LINKS_FILE, csv_text(record.links, "%.10g"))
         write_text(target / HISTORY_FILE, csv_text(record.history, "%.9g"))
-        # A validation of an earlier calibration does not belong to this result.
+        if record.held_out is None and (target / VALIDATION_FILE).exists():
+            _LOG.warning(
+                "%s: removed, because it was of an earlier result; validate again", target / VALIDATION_FILE
+            )
         (target / VALIDATION_FILE).unlink(missing_ok=True)
         if record.held_out is not None:
             _write_validation(record.held_out, study, target, validation or {})
