@@ -25,6 +25,7 @@ from calibray.engines.external.program import OWNER_FILE, PREFIX, ExternalProgra
 from calibray.engines.process_owner import ProcessOwner
 from calibray.engines.section import RadioSettings
 from calibray.errors import EngineError, InputError
+from calibray.materials import Material
 from calibray.tracing.settings import Antenna
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="orphans are taken in on Linux alone")
@@ -36,6 +37,18 @@ def request() -> Request:
     places = np.zeros((2, 3))
     radio = RadioSettings(3.5e9, None, "power", (Antenna(), Antenna()))
     return Request(radio, places, places + 5, parameters={"a": 1.0})
+
+
+def test_materials_of_any_name_are_in_an_hdf5_request(tmp_path: Path) -> None:
+    """Groups of HDF5 cannot have all of them as names, so each group states the name of its material."""
+    names = ["a/b", "a_b", ".", "", "/"]
+    materials = {name: Material(float(number + 1), 0.1, 0.2) for number, name in enumerate(names)}
+    replace(request(), materials=materials).write(tmp_path / "request.h5", "hdf5")
+    with h5py.File(tmp_path / "request.h5") as file:
+        written = {
+            each.attrs["name"]: each.attrs["relative_permittivity"] for each in file["materials"].values()
+        }
+    assert written == {name: float(number + 1) for number, name in enumerate(names)}
 
 
 def shell(folder: Path, script: str, timeout: float = 20.0, retries: int = 0) -> ExternalProgram:

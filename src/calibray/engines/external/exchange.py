@@ -125,8 +125,11 @@ def _list_materials(materials: Mapping[str, Material]) -> list[dict[str, Any]]:
 
 
 def _write_materials(group: h5py.Group, materials: Mapping[str, Material]) -> None:
-    for name, material in materials.items():
-        group.create_group(name.replace("/", "_")).attrs.update({"name": name, **asdict(material)})
+    for number, (name, material) in enumerate(materials.items()):
+        key = name.replace("/", "_")
+        if key in ("", ".") or key in group:
+            key = f"{key}{number}"  # no name of a group, or that of another material
+        group.create_group(key).attrs.update({"name": name, **asdict(material)})
 
 
 def read_answer(
