@@ -117,6 +117,27 @@ def test_positions_to_predict_at_are_read_as_measured_ones(folder, monkeypatch):
         plan.places(SourceTable(log[["phone"]], source="new.csv"))
 
 
+def test_the_study_s_own_table_is_not_taken_for_one_in_metres_without_a_word(folder, monkeypatch, caplog):
+    """Its columns have the names of positions in the scene's frame, but other units or heights."""
+    monkeypatch.setattr(row_steps, "_ground", lambda _: lambda x, y: 0.1 * x)
+    content = json.loads(json.dumps(STUDY))
+    content["links"] |= {"position": "scene", "tx": [0.0, 0.0, 20.0], "rx": ["rx_x", "rx_y", "rx_z"]}
+    content["links"] |= {"transmitters": None, "transmitter": "transmitter"}
+    table = pd.DataFrame({name: [k + 1.0] for k, name in enumerate(POSITION_COLUMNS)})
+    table = table.assign(site="a", phone="p1")
+    for changed, values, warned in (
+        ({"heights": "ground"}, {"rsrp": -80.0}, True),
+        ({"position_unit": 0.01}, {"rsrp": -80.0}, True),
+        ({}, {"rsrp": -80.0}, False),
+        ({"heights": "ground"}, {"path_loss_db": 80.0}, False),  # a table that Calibray wrote
+    ):
+        caplog.clear()
+        links = {name: value for name, value in content["links"].items() if value is not None} | changed
+        plan = Study.from_content(content | {"links": links}, folder / "study.toml")
+        plan.places(SourceTable(table.assign(**values)))
+        assert ("rename rx_x, rx_y, rx_z in both tables" in caplog.text) == warned
+
+
 @pytest.mark.parametrize(
     ("inside", "left", "counts"),
     [

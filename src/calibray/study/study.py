@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from numbers import Real
@@ -38,6 +39,8 @@ from calibray.tables import Column, Table, hertz, numbers, short_html, short_tex
 
 if TYPE_CHECKING:
     from calibray.tracing.sionna.live_scene import LiveScene
+
+_LOG: Final = logging.getLogger(__name__)
 
 
 @final
@@ -145,6 +148,13 @@ class Study(StudyModel):
             if "group" in columns and not columns & {*self.offset_groups}:
                 group = "group"
             carrier = "frequency" if links.frequency not in columns else links.frequency
+            own = {*POSITION_COLUMNS} & {*links.tx, *links.rx}
+            if own and links.value in columns and (links.heights is not None or links.position_unit != 1):
+                _LOG.warning(
+                    "%s: columns tx_x to rx_z are read as metres in the scene's frame, without links.heights and "
+                    "links.position_unit of the study; for a table like the study's, rename %s in both tables and in "
+                    "the study", table.source, ", ".join(sorted(own)),
+                )  # fmt: skip
             return links_from_table(table, group, carrier if links.frequency else None)
         wide = {column: name for column, name in links.wide.items() if column in columns}
         if wide and links.transmitter not in columns:
