@@ -133,6 +133,9 @@ def test_finished_runs_are_not_repeated(small, monkeypatch):
     monkeypatch.setattr(module, "_search_optimum", refuse)
     again = compare(STREET, parse_methods(["random", "sgwo-im"], 45), seeds=2, out=out)
     assert again.runs == {name: finished.runs[name][:2] for name in ("random", "sgwo-im")}
+    # A method that stops by itself has the same run at every budget.
+    other = compare(STREET, parse_methods(["least-squares"], 60), seeds=2, out=out)
+    assert other.runs == {"least-squares": finished.runs["least-squares"][:2]}
     assert (out / "runs.jsonl").read_text() == text
 
 

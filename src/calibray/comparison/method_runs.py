@@ -159,8 +159,8 @@ class BudgetedMethod:
         return BudgetedMethod(name, method, budget)
 
     def key(self, seed: int) -> RunKey:
-        """The key of a run from a seed."""
-        return self.method, self.budget, seed
+        """The key of a run from a seed, with the budget 0 if the method stops by itself."""
+        return self.method, 0 if self.stops_by_itself else self.budget, seed
 
     def optimizer(self, problem: ComparisonProblem, seed: int) -> Optimizer:
         """Make the optimizer of a run, which respects the budget or stops by itself.
