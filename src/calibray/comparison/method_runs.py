@@ -190,7 +190,7 @@ class MethodRun:
 
     Attributes:
         method: The method.
-        budget: Number of RT calls that it was allowed.
+        budget: Number of RT calls that it was allowed; 0 if it stops by itself.
         seed: Its seed.
         evaluations: RT calls that it used.
         calls: Numbers of the RT calls that improved on all earlier ones.

@@ -255,13 +255,11 @@ def _positions(table: SourceTable, axes: str) -> NDArray[np.float64]:
 
 def _optional_labels(table: SourceTable, name: str) -> NDArray:
     """Labels of a column; empty if a label or the column is missing [rows]."""
-    if name not in table.frame:
-        return np.full(len(table), "", dtype=object)
-    column = table.frame[name]
-    # In a CSV file, a column of names such as "7" with empty cells is one of floats.
-    if pd.api.types.is_float_dtype(column) and (column.dropna() % 1 == 0).all():
-        column = column.astype("Int64")
-    return column.astype(object).where(column.notna(), "").astype(str).to_numpy(object)
+    labels = np.full(len(table), "", dtype=object)
+    if name in table.frame:
+        present = table.frame[name].notna().to_numpy()
+        labels[present] = table.select(present).labels(name)
+    return labels
 
 
 def _link(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray | None:
