@@ -60,6 +60,21 @@ def test_they_start_at_the_best_earlier_point(method):
         assert np.abs(first - earlier[1]).max(axis=1).min() < 1e-12
 
 
+def test_differential_evolution_starts_on_a_face_of_the_box():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        lower = rng.uniform(-10.0, 10.0, 2)
+        upper = lower + rng.uniform(0.1, 10.0, 2)
+        optimizer = DifferentialEvolution(lower, upper)
+        optimizer.tell([upper], [1.0])
+        assert np.array_equal(optimizer.ask().max(axis=0), upper)
+
+
+def test_a_first_region_of_dfo_ls_that_is_the_last_one_is_refused():
+    with pytest.raises(InputError, match=r"tolerance = 0.01; it must be a finite number from 1e-12 to 0.005"):
+        DFOLS([0.0], [1.0], radius=0.01, tolerance=0.01)
+
+
 def test_earlier_points_replace_the_design_of_the_gaussian_process():
     land = rosenbrock()
     optimizer = GaussianProcess(land.lower, land.upper, seed=2)

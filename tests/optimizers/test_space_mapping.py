@@ -333,6 +333,22 @@ def test_batches_hold_different_candidates_and_keep_to_the_budget():
     assert optimizer.best.y - MINIMUM < 5e-3
 
 
+def test_a_constant_in_the_value_does_not_change_the_search():
+    """A negative log likelihood may be negative; steps that gain nothing lead to an exploration all the same."""
+    shift, rng = 10.0, np.random.default_rng(8)
+
+    def searching(objective):
+        return SpaceMapping(LOWER, UPPER, cheap_model=cheap(1.1), budget=8, noisy=True, objective=objective)
+
+    plain, shifted = searching(value), searching(lambda residuals: value(residuals) - shift)
+    while not plain.done:
+        x = plain.ask()
+        assert np.array_equal(shifted.ask(), x)
+        residuals = engine(x) + 0.05 * rng.standard_normal((1, 25))
+        plain.tell(x, value(residuals), residuals=residuals)
+        shifted.tell(x, value(residuals) - shift, residuals=residuals)
+
+
 def test_failed_calls_are_ignored():
     optimizer = SpaceMapping(LOWER, UPPER, cheap_model=cheap(1.4), budget=9)
     for call in range(9):

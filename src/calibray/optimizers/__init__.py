@@ -76,7 +76,7 @@ LABELS: Final = {
     "auto": "auto (least squares)",
 }
 
-_NO_OPTIONS: Final = {"lower", "upper", "seed", "objective", "cheap_model"}
+NO_OPTIONS: Final = {"lower", "upper", "seed", "objective", "cheap_model"}
 """Constructor arguments that the study sets, so that users cannot set them."""
 
 
@@ -152,7 +152,7 @@ def make(
         settings["objective"] = objective
     if cheap_model is not None and "cheap_model" in parameters:
         settings["cheap_model"] = cheap_model
-    options, allowed = dict(options or {}), sorted(parameters - _NO_OPTIONS)
+    options, allowed = dict(options or {}), sorted(parameters - NO_OPTIONS)
     for key in sorted(options.keys() - set(allowed)):
         raise InputError(
             f"method.options of {name!r}: there is no setting {key!r}; {did_you_mean(key, allowed)}"

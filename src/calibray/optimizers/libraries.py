@@ -161,7 +161,8 @@ class DFOLS(Optimizer):
         self.box = Box.between(lower, upper)
         self._budget = whole("budget", budget, at_least=1)
         self.radius = real("radius", radius, at_least=1e-6, at_most=0.5)
-        self.tolerance = real("tolerance", tolerance, at_least=1e-12, at_most=self.radius)
+        # DFO-LS needs a first region above the last one.
+        self.tolerance = real("tolerance", tolerance, at_least=1e-12, at_most=0.5 * self.radius)
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
         self._dfols = library("dfols", "optimizers")
         self._session = Session(self.box, self.uses, self._search, objective)
@@ -238,14 +239,15 @@ def _evolve(population: int, archive: Archive, rng: np.random.Generator, evaluat
     """Minimise with one population after the other, without end."""
     box = archive.box
 
-    def objective(x: NDArray[np.float64]) -> NDArray[np.float64]:  # [d, n], SciPy's vectorized form
-        return archive.imputed(evaluate(box.clip(x.T))).y
+    def objective(unit: NDArray[np.float64]) -> NDArray[np.float64]:  # [d, n], SciPy's vectorized form
+        return archive.imputed(evaluate(box.from_unit(unit.T))).y
 
-    start = archive.best.x if len(archive) else None
+    # In other bounds, SciPy's rounding may place a start on a face outside them.
+    start = box.to_unit(archive.best.x) if len(archive) else None
     while True:
         differential_evolution(
             objective,
-            list(zip(box.lower, box.upper, strict=True)),
+            [(0.0, 1.0)] * box.dimension,
             popsize=population,
             x0=start,
             tol=0.0,

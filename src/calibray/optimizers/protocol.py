@@ -42,7 +42,7 @@ class Session:
         objective: Converts residuals to the value, if residuals are used.
 
     Attributes:
-        minima: Distinct minima of the algorithm other than the best [k, d]; empty until it sets them.
+        minima: Distinct minima that the algorithm keeps, the lowest first [k, d]; empty until it sets them.
     """
 
     def __init__(
@@ -225,7 +225,7 @@ class Optimizer(ABC):
 
     @property
     def minima(self) -> NDArray[np.float64]:
-        """The best point, then every other minimum that the method keeps [k, d].
+        """The best point, then the distinct minima that the method keeps, of which it may be the first [k, d].
 
         Raises:
             InputError: Nothing has been told yet.

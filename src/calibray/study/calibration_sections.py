@@ -304,7 +304,6 @@ LARGEST: Final = 10**6
 LONGEST: Final = 10**4
 """Largest number of entries of a list, and of characters of a text."""
 
-_NOT_SETTINGS: Final = ("lower", "upper", "seed", "objective", "model")
 _TYPES: Final[Mapping[str, tuple[tuple[type, ...], str]]] = {
     "bool": ((bool,), "true or false"),
     "int": ((int,), "a whole number"),
@@ -324,12 +323,12 @@ def check_options(name: str, options: Mapping[str, Any]) -> None:
     if not options:
         return
     # Optimizers import SciPy; a study without options is read without them.
-    from calibray.optimizers import METHODS
+    from calibray.optimizers import METHODS, NO_OPTIONS
 
     settings = None
     if name in METHODS:
         arguments = signature(METHODS[name]).parameters
-        settings = {key: argument for key, argument in arguments.items() if key not in _NOT_SETTINGS}
+        settings = {key: argument for key, argument in arguments.items() if key not in NO_OPTIONS}
     for key, value in options.items():
         prefix = f"method.options.{shortened(key)}"
         if settings is not None and key not in settings:

@@ -91,7 +91,7 @@ REACHES: Final = (0.02, 1.0)
 """Smallest and largest half width of the trust region."""
 
 GAINED: Final = 1e-3
-"""Share of the objective that an exploitation must gain for another one to follow."""
+"""Share of the root mean square that an exploitation must gain for another one to follow."""
 
 JUDGED: Final = 3
 """Number of calls from which the cheap model is judged."""
@@ -183,9 +183,9 @@ class SpaceMapping(Optimizer):
                     return
                 self._compare(unit, residuals)
                 chosen = self._choose(self._averaged(self._corrected), archive, count)
-            before = archive.best.y if len(archive) else np.inf
+            before = lowest(archive)
             yield self.box.from_unit(chosen)
-            self._resize(archive.best.y, before)
+            self._resize(lowest(archive), before)
             left, turn = left - count, turn + count
 
     def _without(self, archive: Archive, left: int) -> Search:
@@ -234,7 +234,7 @@ class SpaceMapping(Optimizer):
         """The next batch [count, d]."""
         evaluated, d = archive.all(), self.box.dimension
         taken = self.box.to_unit(evaluated.x)[np.argsort(evaluated.y, kind="stable")]
-        best = float(root_mean_square(archive.leading.errors)[0])
+        best = lowest(archive)
         # The best evaluated point is the first one.
         near = np.clip(taken[0] + self._reach * self._rng.uniform(-1.0, 1.0, (KEPT, d)), 0.0, 1.0)
         starts = np.vstack([taken[:KEPT], near, self._minima[:KEPT], design("sobol", SEARCHES, d, self._rng)])
@@ -300,9 +300,15 @@ def error_ratio(corrected: Corrected, *, noisy: bool = False) -> float:
     return float(np.median(with_it / np.maximum(without, 1e-300)))
 
 
+def lowest(archive: Archive) -> float:
+    """Root mean square of the best residuals so far, +inf before a success; the value may have another scale."""
+    succeeded = len(archive) and np.isfinite(archive.best.y)
+    return float(root_mean_square(archive.leading.errors)[0]) if succeeded else np.inf
+
+
 def _successful(archive: Archive) -> Evaluations | None:
     """The evaluations that did not fail; None if there are none."""
-    if not len(archive) or not np.isfinite(archive.leading.y[0]):
+    if not np.isfinite(lowest(archive)):
         return None
     evaluated = archive.all()
     return evaluated.rows(np.flatnonzero(np.isfinite(evaluated.y)))
