@@ -19,6 +19,7 @@ from calibray import engines
 from calibray.calibration.calibrate import calibrate
 from calibray.engines import Engine, Ledger
 from calibray.engines.external.exchange import Unusable, read_answer
+from calibray.engines.ledger.database import LedgerEntry, key
 from calibray.errors import EngineError, InputError
 from calibray.study import Study
 
@@ -287,6 +288,23 @@ else: sys.exit("alone")
     with engines.open_workers(4) as workers:
         engine = engines.make(programs.study(tmp_path, wait, timeout=60.0), workers=workers)
         assert engine.path_loss(candidates) == pytest.approx(programs.expected(candidates, planted.links()))
+
+
+def test_parallel_calls_wait_for_the_answer_that_another_run_pays_for(tmp_path):
+    study, file = programs.study(tmp_path), tmp_path / "ledger.sqlite"
+    problem, wanted = engines.fingerprint(study.opened()), programs.expected(CANDIDATES, planted.links())
+    with closing(Ledger(file)) as other:
+        other.describe(problem, "command", planted.TRUTH)
+        assert other.claim(problem, [key(CANDIDATES[2])], planted.LINKS)
+
+        def progress(stage, done, total):
+            if stage == "waiting":
+                other.commit(problem, key(CANDIDATES[2]), LedgerEntry(wanted[2], 1.0))
+
+        with engines.open_workers(2) as workers:
+            engine = engines.make(study, ledger=file, workers=workers, progress=progress)
+            assert engine.path_loss(CANDIDATES) == pytest.approx(wanted)
+    assert (engine.calls, engine.hits) == (2, 1)
 
 
 def test_a_failure_does_not_lose_the_others(tmp_path):

@@ -199,7 +199,9 @@ class Command:
         except (Exception, KeyboardInterrupt) as error:
             interruption = error
         finally:
-            stop.set()
+            # After the last answer the caller may go on, and waits for the answers of another run.
+            if pending:
+                stop.set()
             for future in pending:
                 future.cancel()
         # Calls that have ended by now were paid for: their answers are given before the run ends.
