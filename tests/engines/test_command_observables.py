@@ -90,6 +90,17 @@ def test_answers_without_usable_observables_are_refused(tmp_path, observables, m
         read_answer(file, "json", 2, 1)
 
 
+def test_two_observables_of_one_link_may_be_a_list_of_numbers(tmp_path):
+    """As MATLAB writes a column."""
+    file = tmp_path / "response.json"
+    file.write_text('{"path_loss_db": 70, "observables": [1, 2]}')
+    _, observed = read_answer(file, "json", 1, 2)
+    assert observed.tolist() == [[1.0], [2.0]]
+    file.write_text('{"path_loss_db": 70, "observables": []}')
+    with pytest.raises(Unusable, match=r"shape \(0,\), must be \(2, 1\)"):
+        read_answer(file, "json", 1, 2)
+
+
 def test_observables_in_hdf5(tmp_path):
     file = tmp_path / "response.h5"
     with h5py.File(file, "w") as response:

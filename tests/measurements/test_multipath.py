@@ -104,10 +104,14 @@ def test_angles_are_those_of_the_end(tmp_path):
 
 
 @pytest.mark.parametrize("unit", ["{}_{}", "{} [{}]", "{} ({})", "{}\n{}"])
-def test_units_may_be_in_brackets_or_in_a_row_below_the_names(tmp_path, unit):
+@pytest.mark.parametrize(
+    ("time", "scale", "angle"),
+    [("ns", 1.0, "rad"), ("us", 1e-3, "rad"), ("\u00b5s", 1e-3, "rad"), ("\u03bcs", 1e-5, "radians")],
+)
+def test_units_may_be_in_brackets_or_in_a_row_below_the_names(tmp_path, unit, time, scale, angle):
     """In radians and of one end, however the unit is written."""
-    radians = TABLE.assign(azimuth_deg=np.radians(TABLE["azimuth_deg"]))
-    units = {"delay": "ns", "azimuth_arrival": "rad", "PL": "dB"}
+    radians = TABLE.assign(azimuth_deg=np.radians(TABLE["azimuth_deg"]), delay_ns=TABLE["delay_ns"] * scale)
+    units = {"delay": time, "azimuth_arrival": angle, "PL": "dB"}
     names = [unit.format(*each).partition("\n") for each in units.items()]
     header = ["id,rotation," + ",".join(name for name, _, _ in names)]
     header += [",," + ",".join(below for _, _, below in names)] if names[0][2] else []
@@ -118,6 +122,7 @@ def test_units_may_be_in_brackets_or_in_a_row_below_the_names(tmp_path, unit):
     # sqrt(-2 ln cos 45 degrees)
     assert values(paths, "azimuth_spread_arrival")["7"] == pytest.approx(np.sqrt(np.log(2)))
     assert paths.level_db.max() == -80.0
+    assert paths.delay.min() == pytest.approx(50.0 * scale * (1e-9 if time == "ns" else 1e-6))
 
 
 def test_an_angle_of_arrival_may_be_an_elevation(tmp_path):
@@ -185,6 +190,15 @@ def test_impulse_responses_of_every_format(tmp_path, responses, ending):
     multipath = read_impulse_responses(write(tmp_path, ending, responses), ["a", "b"], rate, margin_db=15.0)
     assert multipath.delay == pytest.approx([2e-7, 5e-7, 3e-7])
     assert values(multipath, "rms_delay_spread") == pytest.approx({"a": 150e-9, "b": 0.0}, rel=0.02)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.int16, np.uint16, np.float32])
+def test_amplitudes_may_be_small_integers(tmp_path, responses, kind):
+    amplitudes = np.abs(responses[:1]) / np.abs(responses[0]).max()
+    file = write(tmp_path, ".npy", np.round(amplitudes * np.iinfo(np.uint8).max).astype(kind))
+    multipath = read_impulse_responses(file, ["a"], RATE, margin_db=15.0)
+    assert multipath.delay == pytest.approx([2e-7, 5e-7])
+    assert multipath.level_db == pytest.approx(20 * np.log10(255), abs=0.3)
 
 
 @pytest.mark.parametrize("ending", [".npz", ".mat", "v7.3.mat"])

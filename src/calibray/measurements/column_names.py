@@ -140,9 +140,11 @@ def words(name: object) -> frozenset[str]:
         ['bs', 'bslatitude', 'deg', 'latitude']
         >>> sorted(words("Time of Flight [ns]")), sorted(words("round_trip_time_us"))
         (['ns', 'tof'], ['rtt', 'us'])
+        >>> sorted(words("delay (\u00b5s)"))
+        ['delay', 'us']
     """
     # A time of flight is no time of day.
-    text = re.sub(r"(?i)time[ _-]*of[ _-]*flight", "tof", without_accents(name))
+    text = re.sub(r"(?i)time[ _-]*of[ _-]*flight", "tof", without_accents(name).replace("\u03bc", "u"))
     text = re.sub(r"(?i)round[ _-]*trip[ _-]*time", "rtt", text)
     # Units keep their capitals together: "dBm" is one word.
     text = re.sub(r"[dD][bB][mM]|dB|[kMG]?Hz", lambda unit: f" {unit[0].lower()} ", text)

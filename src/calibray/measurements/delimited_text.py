@@ -27,8 +27,9 @@ PLACEHOLDERS: Final = frozenset({"-", "--", "---", "\u2013", "\u2014", "?", "*"}
 
 UNITS: Final = frozenset({
     "m", "cm", "mm", "km", "ft", "feet", "foot", "in", "inch", "inches", "db", "dbm", "dbi", "hz", "khz",
-    "mhz", "ghz", "deg", "degree", "degrees", "\u00b0", "rad", "s", "ms", "us", "ns", "min", "h", "%", "v",
-    "w", "mw", "m/s", "km/h", "mph", "bit", "kbps", "mbps", "bool", "string", "text", "int", "float",
+    "mhz", "ghz", "deg", "degree", "degrees", "\u00b0", "rad", "radian", "radians", "s", "ms", "us", "\u00b5s",
+    "\u03bcs", "ns", "min", "h", "%", "v", "w", "mw", "m/s", "km/h", "mph", "bit", "kbps", "mbps", "bool", "string",
+    "text", "int", "float",
 })  # fmt: skip
 """Units, in lower case, that a row of units below the header may contain."""
 

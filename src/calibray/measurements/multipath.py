@@ -41,6 +41,9 @@ ANGLES: Final = (*(kind for kind, unit in kinds.KINDS.items() if unit == "rad"),
 
 SECONDS: Final = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 
+RADIANS: Final = frozenset({"rad", "radian", "radians"})
+"""Words of names of angles that are not in degrees."""
+
 LONGEST: Final = 0.01
 """Largest delay [s]: light travels 3,000 km in it."""
 
@@ -133,7 +136,7 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
             ]
             if len(own) == 1:
                 values = table.numbers(own[0])
-                values = values if "rad" in words(own[0]) else np.radians(values)
+                values = values if words(own[0]) & RADIANS else np.radians(values)
                 # A compass counts from north clockwise, the scene from east counter-clockwise.
                 angles[plane, end] = np.pi / 2 - values if compass and plane == "azimuth" else values
     return Multipath(
@@ -284,7 +287,8 @@ def _above_noise(
     label: str, response: NDArray[Any], delay: NDArray[np.float64], margin_db: float
 ) -> tuple[NDArray[Any], ...]:
     """Link, snapshot, delay and level of the samples of a link's responses [snapshots, samples] above the noise."""
-    power = np.abs(response) ** 2
+    # Squares of small integers, as of a converter, would wrap around.
+    power = np.abs(response).astype(np.float64) ** 2
     noise = np.median(power, axis=1, keepdims=True) / np.log(2)
     snapshot, sample = np.nonzero(power > noise * 10 ** (margin_db / 10))
     level_db = 10 * np.log10(power[snapshot, sample])

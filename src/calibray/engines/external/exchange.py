@@ -170,7 +170,7 @@ def read_answer(
     if not num_observables:
         return values, np.empty(shape)
     observed = read(response, OBSERVABLES, num_observables * num_links)
-    if num_observables == 1 and observed.size == num_links:
+    if 1 in shape and observed.size == num_observables * num_links:
         observed = observed.reshape(shape)
     if observed.shape != shape:
         raise Unusable(
@@ -224,7 +224,7 @@ def _read_json(response: bytes, name: str, _: int) -> NDArray[np.float64]:
     entries = entries if isinstance(entries, list) else [entries]
     if name == OBSERVABLES and all(isinstance(entry, list) for entry in entries):
         rows = [[_number(entry, name) for entry in row] for row in entries]
-        if len({len(row) for row in rows}) != 1:
+        if len({len(row) for row in rows}) > 1:
             raise Unusable(
                 f"its response contains {name} with lists of different lengths; must be one value per link"
             )
