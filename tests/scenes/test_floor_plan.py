@@ -231,6 +231,12 @@ def test_a_door_of_any_name_replaces_the_wall(tmp_path, first):
     assert mesh(tmp_path, "brick_wall").area == pytest.approx(32 * 3 - 2.1)
 
 
+def test_a_type_may_be_a_number(tmp_path):
+    plan = tmp_path / "plan.csv"
+    plan.write_text("x0,y0,x1,y1,type\n0,0,4,0,1\n4,0,4,3,2\n")
+    assert [segment.kind for segment in read_plan(plan)] == ["1", "2"]
+
+
 def test_types_become_materials(tmp_path):
     plan = [*OUTER, line(3, 0, 3, 6, "drywall"), line(5, 0, 5, 6, "brick", thickness=0.1)]
     types = {"drywall": SurfaceMaterial("drywall", "plasterboard", 0.09)}

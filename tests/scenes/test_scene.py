@@ -14,7 +14,7 @@ import sionna.rt
 
 import calibray as cb
 from calibray.errors import InputError
-from calibray.materials import ITU_MATERIALS, SCALAR_CONSTANTS, Material, itu_material
+from calibray.materials import ITU_MATERIALS, SCALAR_CONSTANTS, Material, itu_law, itu_material
 from calibray.scenes import export_scene, read_scene
 from calibray.support.output_files import SIGNATURES
 from small_scenes import CONCRETE, block, write_scene
@@ -99,6 +99,14 @@ def test_overrides_replace_constants(tmp_path: Path) -> None:
     )
     assert stone(Material(2.0, 0.0, 0.1)) == Material(2.0, 0.0, 0.1)
     assert stone({"scattering_pattern": "directive", "alpha_r": 3}).scattering_pattern == "directive"
+
+
+def test_a_revision_alone_applies_to_the_material_of_the_file(tmp_path: Path) -> None:
+    file = write_scene(tmp_path, FLOOR, ITU.format("concrete"))
+    name = next(iter(read_scene(file, 2e9).materials))
+    scene = read_scene(file, 2e9, {name: {"revision": "P.2040-1"}})
+    assert scene.materials[name] == itu_material("concrete", 2e9, thickness=0.1, revision="P.2040-1")
+    assert scene.laws[name] == itu_law("concrete", 2e9, "P.2040-1")
 
 
 # Faults

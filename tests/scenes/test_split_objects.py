@@ -42,6 +42,17 @@ def test_constants_of_the_whole_material_apply_unless_the_split_material_has_its
     assert (north.thickness, north.relative_permittivity) == (0.2, 9.0)
 
 
+@pytest.mark.parametrize("pattern", ["wall[1]?", "wall[*", "*]?"])
+def test_brackets_in_names_of_objects_have_no_meaning(tmp_path, pattern):
+    """As exporters write them."""
+    shape = '<shape type="rectangle" id="mesh-{}"><ref id="mat-itu_brick" name="bsdf"/></shape>'
+    shapes = "".join(map(shape.format, ["wall[1]?", "wall1x"]))
+    file = tmp_path / "scene.xml"
+    file.write_text(f'<scene version="2.1.0"><bsdf type="diffuse" id="mat-itu_brick"/>{shapes}</scene>')
+    split = read_scene(file, FREQUENCY, split={"north": pattern})
+    assert material_names(split) == {"wall[1]?": "north", "wall1x": "itu_brick"}
+
+
 @pytest.mark.parametrize(
     ("split", "message"),
     [

@@ -13,6 +13,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from fnmatch import fnmatchcase
+from glob import escape
 from pathlib import Path
 from shutil import copyfile
 from typing import Final
@@ -108,7 +109,7 @@ def read_scene(
         source: Path of the XML file, or `sionna:NAME` for a scene bundled with Sionna RT.
         frequency: Carrier frequency [Hz], at which ITU materials are evaluated.
         overrides: Constants that replace the file's, by material name: a `Material`, or a mapping with any of its
-            fields, or with `itu` (and `revision`) naming an ITU-R P.2040 material.
+            fields, with `itu` naming an ITU-R P.2040 material, or with the `revision` of that or of the file's.
         split: Separate materials for some objects: by name of the new material, a pattern of object names in which `*`
             matches any text. If the name ends in `*`, each object gets its own material, with `*` replaced by the
             object's name.
@@ -153,7 +154,7 @@ def read_scene(
         raise InputError(f"{path}: the scene has no <shape>; export the scene with its meshes")
     object_names = [entry.name for entry in objects]
     for name, pattern in split.items():
-        if not any(fnmatchcase(object_name, pattern) for object_name in object_names):
+        if not any(_matches(object_name, pattern) for object_name in object_names):
             raise InputError(
                 f"[objects] {name} = {pattern!r}: matches no object; {did_you_mean(pattern, object_names)}"
             )
@@ -236,11 +237,16 @@ def _file_material_name(
     return material
 
 
+def _matches(object_name: str, pattern: str) -> bool:
+    # Only `*` has a meaning: names of objects contain brackets and question marks.
+    return fnmatchcase(object_name, escape(pattern).replace("[*]", "*"))
+
+
 def _split_name(
     object_name: str, split: Mapping[str, str], definitions: Mapping[str, ElementTree.Element]
 ) -> str | None:
     """The separate material of an object: that of the first matching pattern; None if no pattern matches."""
-    name = next((name for name, pattern in split.items() if fnmatchcase(object_name, pattern)), None)
+    name = next((name for name, pattern in split.items() if _matches(object_name, pattern)), None)
     if name is None:
         return None
     name = name[:-1] + object_name if name.endswith("*") else name
@@ -288,7 +294,7 @@ def _material(
         elif bulk_given:
             material = Material(**{"thickness": DEFAULT_THICKNESS, **_slab(bsdf), **constants})
         else:
-            material = replace(_file_material(original, bsdf, frequency), **constants)
+            material = replace(_file_material(original, bsdf, frequency, str(revision)), **constants)
     except InputError as error:
         raise InputError(f"{path}: material {name!r}: {error}") from None
     itu = _itu_type(original, bsdf) if itu is None else itu
@@ -297,12 +303,11 @@ def _material(
     return material, law_with_stated(itu_law(str(itu), frequency, str(revision)), material, constants)
 
 
-def _file_material(name: str, bsdf: ElementTree.Element | None, frequency: float) -> Material:
+def _file_material(name: str, bsdf: ElementTree.Element | None, frequency: float, revision: str) -> Material:
     kind = bsdf.get("type") if bsdf is not None else None
     itu_type = _itu_type(name, bsdf)
     if itu_type is not None:
-        base = itu_material(itu_type, frequency, _floats(bsdf).get("thickness", DEFAULT_THICKNESS))
-        return replace(base, **_slab(bsdf))
+        return replace(itu_material(itu_type, frequency, DEFAULT_THICKNESS, revision), **_slab(bsdf))
     if kind == "radio-material":
         return replace(Material(1.0, 0.0, DEFAULT_THICKNESS), **_floats(bsdf))
     raise InputError(

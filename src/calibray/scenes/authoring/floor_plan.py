@@ -125,7 +125,7 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
         thickness, bottom, extent = (float(values[index]) for values in numbers.values())
         row = f"floor plan {path}, {frame.index[index]}"
         points = np.concatenate(parts) * unit if parts else np.empty((0, 2))
-        if not isinstance(kind, str) or not len(points) or not np.isfinite(points).all():
+        if pd.isna(kind) or not len(points) or not np.isfinite(points).all():
             raise InputError(f"{row}: lacks its type or a coordinate; complete or remove it")
         bottom = 0.0 if np.isnan(bottom) else bottom
         extent = height - bottom if np.isnan(extent) else extent
@@ -148,7 +148,9 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
                 "in the name of the column, such as thickness_cm, or the plan's unit (--unit 0.01 for cm)"
             )
         stated = None if np.isnan(thickness) else thickness
-        segments += [Segment(a, b, kind.strip().lower(), bottom, bottom + extent, stated) for a, b in sides]
+        segments += [
+            Segment(a, b, str(kind).strip().lower(), bottom, bottom + extent, stated) for a, b in sides
+        ]
     if not segments:
         raise InputError(f"floor plan {path}: contains no segment; give at least one wall")
     widest = float(
