@@ -38,6 +38,17 @@ def test_two_separate_ranges_are_ambiguous():
     assert "2 separate ranges" in reason_text(verdict.reason)
 
 
+@pytest.mark.parametrize(("second", "verdict", "pieces"), [(2.02, "identified", 1), (2.6, "ambiguous", 2)])
+def test_ranges_that_differ_by_little_are_one(second, verdict, pieces):
+    """Precise data can leave two minima at 2.00 and 2.02, which no user would tell apart."""
+    value = np.concatenate([normal_draws([2.0], [0.001]).point, normal_draws([second], [0.001]).point])
+    draws = Draws(value, np.zeros(len(value)), np.full(len(value), 1 / len(value)))
+    (judged,) = verdicts(draws, lambda x: x, Axes(NAMES[:1], np.zeros(1), np.full(1, 10.0)), 1.0)
+    assert judged.name == verdict
+    assert len(judged.pieces) == pieces
+    assert (judged.lower, judged.upper) == pytest.approx((2.0, second), abs=0.01)
+
+
 def test_an_undetermined_parameter_covers_its_bounds():
     lower, upper = np.zeros(2), np.full(2, 10.0)
     draws = normal_draws([3.0, None], [0.2, None])

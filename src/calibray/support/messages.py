@@ -112,10 +112,10 @@ def percent(share: float) -> str:
     """Write a share as a whole number of per cent.
 
     Example:
-        >>> percent(0.954)
-        '95 %'
+        >>> percent(0.954), percent(0.001)
+        ('95 %', 'less than 1 %')
     """
-    return f"{100 * share:.0f} %"
+    return "less than 1 %" if 0 < share < 0.005 else f"{100 * share:.0f} %"
 
 
 def duration(seconds: float) -> str:

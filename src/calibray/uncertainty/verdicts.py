@@ -154,7 +154,8 @@ REACH: Final = 8.5
 """Kernel widths beyond which a Gaussian is zero in double precision."""
 
 LEAST_GAP: Final = 0.03
-"""A gap between pieces is chance if it is narrower than this share of the range and than the wider piece."""
+"""A gap between pieces is chance if it is narrower than this share of the range and than the wider piece. Pieces that
+all lie within this share are one value for a user."""
 
 
 Modelled = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -421,7 +422,10 @@ def _pieces(
         if mass[low : high + 1].sum() < LEAST_SHARE:
             continue
         start, end = float(edges[low]), float(edges[high + 1])
-        if kept and start - kept[-1][1] < min(LEAST_GAP, max(end - start, kept[-1][1] - kept[-1][0])):
+        if kept and (
+            end - kept[0][0] < LEAST_GAP
+            or start - kept[-1][1] < min(LEAST_GAP, max(end - start, kept[-1][1] - kept[-1][0]))
+        ):
             start = kept.pop()[0]
         kept.append((start, end))
     return kept
