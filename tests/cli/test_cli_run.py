@@ -240,6 +240,7 @@ def test_predict_takes_the_measured_table_and_the_results_own(folder, ran, tmp_p
         (("trace", "{study}", "-o", "{folder}/absent/paths.h5"), "there is no folder"),
         (("trace", "{study}", "-o", "{folder}"), "is a folder; name a file in it"),
         (("trace", "{study}"), "trace: give -o FILE to store the paths, --check to check them, or both"),
+        (("validate", "{study}", "--out", "{damaged}"), "result.json: is not a result"),
         (("predict", "{folder}", "{file}"), "is not a result of `calibray run`"),
         (("predict", "{result}", "{twice}"), "has the columns 'path_loss_db' and 'input_path_loss_db'"),
         (("predict", "{result}", "{folder}/absent.csv"), "absent.csv: no such file"),
@@ -251,7 +252,10 @@ def test_bad_arguments_are_one_message_and_leave_nothing(folder, ran, tmp_path, 
     planted.links().assign(path_loss_db=80.0, input_path_loss_db=80.0).to_csv(
         tmp_path / "twice.csv", index=False
     )
+    (tmp_path / "damaged").mkdir()
+    (tmp_path / "damaged" / "result.json").write_text("{")
     paths = {
+        "damaged": tmp_path / "damaged",
         "study": folder / "study.toml",
         "file": folder / "links.csv",
         "folder": folder,

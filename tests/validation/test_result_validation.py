@@ -89,8 +89,11 @@ def test_a_validation_of_other_links_is_refused_before_it_replaces_that_of_a_res
     twice = replace(validation, measured_db=np.tile(validation.measured_db, 2))
     content = result.study.content()
     content["scene"]["frequency"] = 7e9
-    for other, study in ((twice, result.study), (validation, Study.from_content(content))):
-        with pytest.raises(InputError, match=r"another study or other links \(12"):
+    for other, study, words in (
+        (twice, result.study, r"of other links \(12"),
+        (validation, Study.from_content(content), "of another study"),
+    ):
+        with pytest.raises(InputError, match=words):
             write_validation(other, study, tmp_path, {})
     assert (tmp_path / VALIDATION_FILE).read_text() == written
 

@@ -55,7 +55,7 @@ def validate(
     """Calibrate without each block of links in turn, and compare models on the held-out block."""
     with progress_bars(log()) as progress:
         from calibray.engines import open_workers
-        from calibray.result.files import RESULT_FILE, VALIDATION_FILE, write_validation
+        from calibray.result.files import RESULT_FILE, VALIDATION_FILE, check_same_study, write_validation
         from calibray.study import Study
         from calibray.support.output_files import check_outputs
         from calibray.tables import render
@@ -64,6 +64,7 @@ def validate(
         study = Study.load(study_file)
         if out is not None:
             check_outputs(out, (VALIDATION_FILE,), study.files(), overwrite)
+            check_same_study(study, out)
         with open_workers(pool.workers, pool.scheduler) as workers:
             validation = run_validation(
                 study, blocks=division.blocks, by=division.by, workers=workers, progress=progress

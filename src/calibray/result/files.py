@@ -292,19 +292,32 @@ def _check_consistent(stored: Stored, study: Study, source: Path) -> None:
         )
 
 
+def check_same_study(study: Study, folder: Path) -> None:
+    """Refuse a folder whose result cannot be read or is of another study; one without a result suits every study.
+
+    Raises:
+        InputError: It is such a folder.
+    """
+    if (folder / RESULT_FILE).is_file():
+        _, calibrated = _read_stored(folder / RESULT_FILE)
+        if _problem_digest(study) != _problem_digest(calibrated):
+            raise InputError(
+                f"{folder}: its result is of another study; give another folder, or run the study again"
+            )
+
+
 def write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figures: dict[str, Any]) -> None:
     """Write held-out errors of a study into a folder; the figures are for readers of the file.
 
     Raises:
         InputError: The folder contains a result of another study or of other links, or one that cannot be read.
     """
+    check_same_study(study, folder)
     if (folder / RESULT_FILE).is_file():
-        _, calibrated = _read_stored(folder / RESULT_FILE)
         measured_db = read_rows(folder, LINKS_FILE, LINKS)["measured_db"].to_numpy()
-        same_study = _problem_digest(study) == _problem_digest(calibrated)
-        if not same_study or not _same(held_out.measured_db, measured_db):
+        if not _same(held_out.measured_db, measured_db):
             raise InputError(
-                f"{folder}: its result is of another study or other links ({len(measured_db)}, but the validation has "
+                f"{folder}: its result is of other links ({len(measured_db)}, but the validation has "
                 f"{len(held_out.measured_db)}); give another folder, or run the study again, with [holdout] by if --by "
                 "separates rows of one link"
             )
