@@ -234,6 +234,14 @@ def test_impulse_responses_that_fit_no_links_are_refused(tmp_path, responses):
         read_impulse_responses(tmp_path, ["x"], RATE)
 
 
+def test_delays_in_another_unit_are_refused(tmp_path, responses):
+    np.savez(tmp_path / "cir.npz", cir=responses, delay=np.arange(SAMPLES) / RATE * 1e9)
+    np.save(tmp_path / "cir.npy", responses)
+    for file, rate in (("cir.npz", None), ("cir.npy", RATE / 1e6)):
+        with pytest.raises(InputError, match=r"has a delay of .* s, must be at most 0.01 s; give delays in"):
+            read_impulse_responses(tmp_path / file, ["a", "b"], rate)
+
+
 def test_responses_in_several_arrays_or_in_decibels_are_refused(tmp_path, responses):
     np.savez(tmp_path / "parts.npz", re=responses.real, im=responses.imag)
     with pytest.raises(InputError, match="several arrays"):

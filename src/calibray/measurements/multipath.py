@@ -323,10 +323,16 @@ def _read(file: Path, sample_rate: float | None) -> tuple[NDArray[Any], NDArray[
         delay = np.asarray(delays, dtype=float).reshape(-1)
         if len(delay) != count:
             raise InputError(f"{file}: {len(delay)} delays for {count} samples of {shortened(name)!r}")
-        return response, delay
-    if sample_rate is None:
+    elif sample_rate is None:
         raise InputError(f"{file}: states no delays ({', '.join(DELAYS)}); give the sample rate [Hz]")
-    return response, np.arange(count) / sample_rate
+    else:
+        delay = np.arange(count) / sample_rate
+    if not delay.max(initial=0.0) <= LONGEST:
+        raise InputError(
+            f"{file}: has a delay of {delay.max():g} s, must be at most {LONGEST:g} s; give delays in seconds, or the "
+            "sample rate in Hz"
+        )
+    return response, delay
 
 
 def _arrays(file: Path) -> dict[str, NDArray[Any]]:
