@@ -124,6 +124,12 @@ class Archive:
             raise InputError("no best point: there are no evaluations yet; call tell() first")
         return self._leading
 
+    @property
+    def lowest(self) -> float:
+        """Root mean square of the residuals of `leading`, +inf before a success; the value may have another scale."""
+        succeeded = self._leading is not None and np.isfinite(self._leading.y[0])
+        return float(root_mean_square(self.leading.errors)[0]) if succeeded else np.inf
+
     def all(self) -> Evaluations:
         """Every evaluation so far in the order of `tell`, without Jacobians.
 

@@ -129,9 +129,7 @@ class VectorSurrogate(Optimizer):
             else:
                 self._model = self._fitted(points, residuals)
                 best_first = unit[np.argsort(evaluated.y, kind="stable")]
-                # The improvement refers to residuals; the value may have another scale.
-                best = float(root_mean_square(archive.leading.errors)[0])
-                chosen = self._choose(self._model, best_first, best, turn, count)
+                chosen = self._choose(self._model, best_first, archive.lowest, turn, count)
             yield box.from_unit(chosen)
             left, turn = left - count, turn + count
 

@@ -183,9 +183,9 @@ class SpaceMapping(Optimizer):
                     return
                 self._compare(unit, residuals)
                 chosen = self._choose(self._averaged(self._corrected), archive, count)
-            before = lowest(archive)
+            before = archive.lowest
             yield self.box.from_unit(chosen)
-            self._resize(lowest(archive), before)
+            self._resize(archive.lowest, before)
             left, turn = left - count, turn + count
 
     def _without(self, archive: Archive, left: int) -> Search:
@@ -234,7 +234,7 @@ class SpaceMapping(Optimizer):
         """The next batch [count, d]."""
         evaluated, d = archive.all(), self.box.dimension
         taken = self.box.to_unit(evaluated.x)[np.argsort(evaluated.y, kind="stable")]
-        best = lowest(archive)
+        best = archive.lowest
         # The best evaluated point is the first one.
         near = np.clip(taken[0] + self._reach * self._rng.uniform(-1.0, 1.0, (KEPT, d)), 0.0, 1.0)
         starts = np.vstack([taken[:KEPT], near, self._minima[:KEPT], design("sobol", SEARCHES, d, self._rng)])
@@ -300,15 +300,9 @@ def error_ratio(corrected: Corrected, *, noisy: bool = False) -> float:
     return float(np.median(with_it / np.maximum(without, 1e-300)))
 
 
-def lowest(archive: Archive) -> float:
-    """Root mean square of the best residuals so far, +inf before a success; the value may have another scale."""
-    succeeded = len(archive) and np.isfinite(archive.best.y)
-    return float(root_mean_square(archive.leading.errors)[0]) if succeeded else np.inf
-
-
 def _successful(archive: Archive) -> Evaluations | None:
     """The evaluations that did not fail; None if there are none."""
-    if not np.isfinite(lowest(archive)):
+    if not np.isfinite(archive.lowest):
         return None
     evaluated = archive.all()
     return evaluated.rows(np.flatnonzero(np.isfinite(evaluated.y)))
