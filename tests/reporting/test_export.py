@@ -25,7 +25,7 @@ from calibray.calibration.result import Result
 from calibray.cli.app import app
 from calibray.errors import InputError
 from calibray.materials import Material
-from calibray.reporting.export import FILES, export, matlab
+from calibray.reporting.export import FILES, _rows, export, matlab
 from calibray.reporting.wording import sampling_text
 from calibray.scenes import export_scene, read_scene
 from calibray.tracing.protocol import LinkPositions
@@ -132,6 +132,12 @@ def test_tables_hold_the_calibrated_constants_and_intervals(folder, tmp_path):
         assert content[material][f"{constant}_verdict"] == interval.verdict
     scene = read_scene(tmp_path / "scene.xml", result.study.scene.frequency)
     assert scene.materials[table.loc["wood", "scene_name"]] == result.materials["wood"]
+
+
+def test_tables_of_materials_have_no_columns_of_antennas():
+    result = shown.result()
+    turned = changed(result, parameters={**result.parameters, "tx:mast.azimuth": 3.0})
+    assert [list(row) for row in _rows(turned)] == [list(row) for row in _rows(result)]
 
 
 def test_coefficients_over_frequency_are_exported(folder, tmp_path):

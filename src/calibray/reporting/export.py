@@ -148,6 +148,8 @@ def _rows(result: Record) -> Iterator[dict[str, Any]]:
         row["scattering_pattern"] = material.scattering_pattern
         for parameter in result.parameters:
             owner, _, constant = parameter.rpartition(".")
+            if owner not in names:
+                continue  # that of an antenna or a region, which no material has
             interval = result.intervals.get(parameter) if owner == name else None
             # All rows have the columns of all calibrated constants.
             row.setdefault(f"{constant}_lower", math.nan)
