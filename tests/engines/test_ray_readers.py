@@ -293,6 +293,26 @@ def test_a_wrong_file_is_refused(lines: list[Polyline], tmp_path: Path, fault: s
         read(source, **arguments)
 
 
+@pytest.mark.parametrize(
+    ("table", "column", "value"),
+    [
+        ("cirs", "cir_re", None), ("cirs", "cir_im", 0.1), ("cirs", "cir_delay", "[1e-8]"),
+        ("raypaths", "interaction_types", None), ("raypaths", "interaction_types", "emission"),
+        ("raypaths", "points", None), ("raypaths", "points", "0 0 1"),
+    ],
+)  # fmt: skip
+def test_a_cell_that_is_no_list_is_refused(
+    lines: list[Polyline], tmp_path: Path, table: str, column: str, value: object
+) -> None:
+    file = write_aodt(lines, tmp_path) / f"{table}.parquet"
+    frame = pd.read_parquet(file)
+    frame.assign(**{column: [value] * len(frame)}).to_parquet(file)
+    with pytest.raises(
+        InputError, match=r"must be (a list of (numbers|names)|triples).*export the table again"
+    ):
+        read(tmp_path)
+
+
 def test_paths_of_sionna_at_another_carrier_are_refused(paths: rt.Paths) -> None:
     check_carrier(paths, FREQUENCY)
     check_carrier("rays.csv", 28e9)

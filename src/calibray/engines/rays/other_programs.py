@@ -234,7 +234,8 @@ def _aodt_response(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Power and delay of every path of a pair."""
     lists = [
-        [np.asarray(value, dtype=float) for value in rows[name]] for name in ("cir_re", "cir_im", "cir_delay")
+        [_aodt_numbers(source, name, value) for value in rows[name]]
+        for name in ("cir_re", "cir_im", "cir_delay")
     ]
     if wrong := [len(values) for column in lists for values in column if len(values) != count]:
         raise InputError(
@@ -244,6 +245,20 @@ def _aodt_response(
     real, imaginary, delay = (np.array(column) for column in lists)
     transmitting = len({_aodt_element(item) for item in rows[AODT_ELEMENT]}) if AODT_ELEMENT in rows else 1
     return (real**2 + imaginary**2).sum(axis=0) / transmitting, delay[0]
+
+
+def _aodt_numbers(source: str, name: str, values: Any) -> NDArray[np.float64]:
+    """The numbers of a list with one entry for each path."""
+    try:
+        numbers = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        numbers = np.zeros(())
+    if numbers.ndim != 1:
+        raise InputError(
+            f"{source}: {name} = {shortened(repr(values))}: must be a list of numbers, one for each path; export the "
+            "table again"
+        )
+    return numbers
 
 
 def _aodt_element(element: Any) -> Any:
@@ -267,6 +282,11 @@ def _aodt_points(points: Any) -> NDArray[np.float64]:
 
 
 def _aodt_types(table: SourceTable, types: Any) -> list[str]:
+    if np.ndim(types) != 1:
+        raise InputError(
+            f"{table.source}: interaction_types = {shortened(repr(types))}: must be a list of names; export the table "
+            "again"
+        )
     names = [str(item).lower() for item in types][1:-1]
     if unknown := [name for name in names if name not in AODT_TYPES]:
         raise InputError(
