@@ -49,6 +49,24 @@ def test_a_linear_model_narrows_by_bayes_rule():
         assert outlook.narrowed[0] == pytest.approx((1 + variance * square / own**2) ** -0.5, rel=0.03)
 
 
+@pytest.mark.parametrize("seed", [5, 6, 7])
+def test_further_measurements_never_widen_what_is_expected(seed: int):
+    """Of few draws some lie in a second range; whichever neighbours keep their weight, nothing is lost."""
+    random = np.random.default_rng(seed)
+    for _ in range(60):
+        place, other = (
+            random.standard_normal((DRAWS, 1)),
+            random.uniform(size=(DRAWS, 1)) < random.uniform(0.05, 0.5),
+        )
+        point = np.hstack([0.5 + 0.1 * place, np.where(other, 0.8, 0.2)])
+        predicted = place * random.uniform(0.3, 4.0, 3) + other * random.uniform(-1, 1, 3)
+        predicted += 0.5 * random.standard_normal((DRAWS, 3))
+        piece = np.zeros((DRAWS, 2), int)
+        start = Beliefs(point, np.tile(1e6 * np.eye(2), (DRAWS, 1, 1)), piece, np.zeros(DRAWS))
+        outlooks = choose_candidates(start, predicted, np.zeros((DRAWS, 3, 2)), independent(1.0, 3), 3)
+        assert (np.diff([outlook.narrowed for outlook in outlooks], axis=0) <= 0).all()
+
+
 def test_a_candidate_that_distinguishes_minima_precedes_one_that_narrows_each():
     random = np.random.default_rng(1)
     piece = np.repeat([0, 1], DRAWS // 2)[:, None]

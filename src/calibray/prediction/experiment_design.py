@@ -147,6 +147,7 @@ def choose_candidates(
     before = np.maximum(np.std(beliefs.point, axis=0), np.sqrt(LEAST_VARIANCE))
     # Draws that scatter less than the curvature allows have a prior that the information lacks.
     scale = np.minimum(before / _by_curvature(beliefs.information), 1.0)
+    narrowed = np.ones(len(before))
     for _ in range(min(count, len(variance))):
         deviation = np.sqrt(variance)
         rank = _rank_by_scatter(beliefs.point, squares[:, :draws], predicted[:draws] / deviation)
@@ -172,7 +173,8 @@ def choose_candidates(
         left = np.maximum(
             _scatter(beliefs.point, squares[:, :draws]), scale * _by_curvature(beliefs.information)
         )
-        narrowed = np.minimum(left / before, 1.0)
+        # A measurement takes nothing away; the scatter of a hundred draws can grow nevertheless.
+        narrowed = np.minimum(left / before, narrowed)
         probability = _range_probability(beliefs.piece[:draws], squares[:, :draws])
         outlooks.append(Outlook(best, narrowed, probability, beliefs.information))
     return outlooks

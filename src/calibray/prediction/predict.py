@@ -119,12 +119,17 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
 def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs: bool = False) -> Setup:
     """Open the study of a calibration for new links.
 
-    A warning names the assumed carrier if the study has a column of carriers and the links have none, and carriers
-    outside the range of the measured ones.
-
     Raises:
         InputError: The scene or the parameters cannot be used, or one of these files has changed.
     """
+    warn_of_carriers(result, links)
+    setup = Setup.open(result.study, links=links).placed_at(result.parameters, NEIGHBOURS)
+    check_inputs(result, setup, allow_changed_inputs)
+    return setup
+
+
+def warn_of_carriers(result: Record, links: Measurements) -> None:
+    """Warn if links lack the study's column of carriers, or have carriers without measurements."""
     column = result.study.links.frequency
     if column is not None and links.frequency is None:
         _LOG.warning(
@@ -140,9 +145,6 @@ def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs:
                 "%s: %d of %d links have carriers %s, where links were measured; materials are extrapolated, which "
                 "the intervals do not include", links.source, beyond.sum(), len(links), where,
             )  # fmt: skip
-    setup = Setup.open(result.study, links=links).placed_at(result.parameters, NEIGHBOURS)
-    check_inputs(result, setup, allow_changed_inputs)
-    return setup
 
 
 def refuse_far_links(result: Record, links: Measurements, triangles: Triangles) -> None:

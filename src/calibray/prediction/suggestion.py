@@ -34,6 +34,7 @@ from calibray.prediction.predict import (
     check_inputs,
     refuse_far_links,
     traced_materials,
+    warn_of_carriers,
     with_constants,
 )
 from calibray.result.record import Record
@@ -104,6 +105,7 @@ def suggest(
             "links than unknowns"
         )
     links = as_links(result, candidates)
+    warn_of_carriers(result, links)
     calibrated = Setup.open(study).placed_at(result.parameters, NEIGHBOURS)
     # Both share one loaded tracer.
     setup = calibrated.at(links)
