@@ -190,11 +190,12 @@ def test_footprints_of_geojson_are_projected(tmp_path):
         "geometry": {"type": "Polygon", "coordinates": [corners]},
     }
     path = tmp_path / "town.geojson"
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature, feature]}))
+    unnamed = feature | {"properties": {"h": "12,5 m", "name": None}}
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature, feature, unnamed]}))
     buildings, frame = read_footprints(path, "h", FootprintColumns(name="name"))
-    assert buildings.name == ("Hall", "Hall-2")
-    assert buildings.top == pytest.approx([12.5, 12.5])
-    assert shapely.area(buildings.polygon) == pytest.approx([400, 400], rel=1e-3)
+    assert buildings.name == ("Hall", "Hall-2", "building-3")
+    assert buildings.top == pytest.approx([12.5] * 3)
+    assert shapely.area(buildings.polygon) == pytest.approx([400] * 3, rel=1e-3)
     assert frame.crs.startswith("+proj=aeqd")
 
 

@@ -287,7 +287,7 @@ class FootprintColumns:
 
     Attributes:
         bottom: Column with the heights at which the buildings begin [m], or one height for all.
-        name: Column with their names; by default they are numbered.
+        name: Column with their names; by default, and where a name is missing, they are numbered.
         levels: Column with the numbers of storeys, for buildings without a height.
     """
 
@@ -337,12 +337,16 @@ def read_footprints(
     storeys = np.full(count, np.nan) if named.levels is None else _numbers(path, table, named.levels, count)
     has_height = np.isfinite(tops) & (tops > bottoms)
     has_levels = ~has_height & (storeys * rule.storey > bottoms)
-    names = range(1, count + 1) if named.name is None else _column(path, table, named.name)
+    labels = [None] * count if named.name is None else _column(path, table, named.name)
     raw = Footprints(
         polygon=project(outlines, frame, crs),
         bottom=bottoms,
         top=np.select([has_height, has_levels], [tops, storeys * rule.storey], bottoms + rule.default),
-        name=tuple(f"building-{label}" if named.name is None else str(label) for label in names),
+        # None and NaN are missing names, as is an empty text.
+        name=tuple(
+            f"building-{number}" if label in (None, "") or label != label else str(label)
+            for number, label in enumerate(labels, start=1)
+        ),
         height_from=tuple(_SOURCES[code] for code in 2 * has_height + has_levels),
         part=np.zeros(count, dtype=bool),
         repairs={},
