@@ -387,3 +387,16 @@ def test_constants_that_depend_on_frequency_keep_their_law_at_other_carriers(tmp
     assert "12 of 12 links have carriers other than 3.5 GHz, where links were measured" in caplog.text
     suggest(result, new.drop(columns="carrier_hz"), 1)
     assert "lacks the column of carriers 'carrier_hz'" in caplog.text
+
+
+def test_labels_that_read_as_numbers_alone_are_those_of_the_measured_links(tmp_path):
+    """Beside 2b3 the label 1e5 is a text; in a table without other labels, it reads as 100000."""
+    table = planted.campaign(noise_db=0.3).assign(
+        cell=lambda rows: rows.half.map({"west": "1e5", "east": "2b3"})
+    )
+    table["path_loss_db"] += np.where(table.cell == "1e5", 5.0, -4.0)
+    result = calibrate(planted.study(tmp_path, table, offset={"per": "cell"}))
+    one = table[table.cell == "1e5"].drop(columns="path_loss_db")
+    together = result.predict(table.drop(columns="path_loss_db"))[(table.cell == "1e5").to_numpy()]
+    assert result.predict(one.assign(cell=100_000.0)) == pytest.approx(together)
+    assert (suggest(result, one.assign(cell=100_000.0), 1).group == "1e5").all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Container, Mapping
 from dataclasses import replace
 from numbers import Real
 from pathlib import Path
@@ -17,6 +18,7 @@ from scipy.special import stdtrit
 from calibray.engines.kinds.replay import replay
 from calibray.engines.protocol import Answering, Engine
 from calibray.errors import EngineError, InputError
+from calibray.fitting.nuisance import OFFSET
 from calibray.materials import Material
 from calibray.measurements import Measurements, SourceTable
 from calibray.parameters import fixed_constant, split_name
@@ -113,7 +115,40 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
             f"links: is a {type_name(links)}, must be a pandas DataFrame, such as pandas.read_csv(file) for a file, or "
             "table.to_pandas() for a table of another package"
         )
-    return result.study.places(links)
+    return _with_measured_spellings(result.prediction.model, result.study.places(links))
+
+
+def _with_measured_spellings(model: PredictionModel, links: Measurements) -> Measurements:
+    """The links with the measured spelling of labels such as 007, which a column without texts reads as 7."""
+    for term in model.terms:
+        spelling: dict[str, set[str]] = {}
+        for label in term.coefficients:
+            spelling.setdefault(_as_number(label), set()).add(label)
+        known = {read: labels.pop() for read, labels in spelling.items() if len(labels) == 1}
+        if term.per == OFFSET and links.group is not None:
+            links = replace(links, group=_spelled(links.group, term.coefficients, known))
+        elif term.per in links.frame:
+            labels = _spelled(links.table.labels(term.per), term.coefficients, known)
+            links = replace(links, table=links.table.assign(**{term.per: labels}))
+    return links
+
+
+def _spelled(
+    labels: NDArray[np.str_], measured: Container[str], known: Mapping[str, str]
+) -> NDArray[np.str_]:
+    return np.array([label if label in measured else known.get(label, label) for label in labels.tolist()])
+
+
+def _as_number(label: str) -> str:
+    """A label, possibly of several columns, as it reads if its columns contain numbers only."""
+    parts = []
+    for part in label.split(" "):
+        try:
+            # Python reads 1_2 as 12, but tables keep it as text.
+            parts.append(part if "_" in part else str(float(part)).removesuffix(".0"))
+        except ValueError:
+            parts.append(part)
+    return " ".join(parts)
 
 
 def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs: bool = False) -> Setup:
