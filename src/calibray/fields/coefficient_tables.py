@@ -33,10 +33,10 @@ Intervals = int | NDArray[np.integer]
 """Number of intervals of every row, or by material and mode [M, 3]."""
 
 FINEST: Final = 65536
-"""Largest number of intervals of a row."""
+"""Largest number of intervals in a row of the tables."""
 
 COARSEST: Final = 16
-"""Smallest number of intervals of a row."""
+"""Smallest number of intervals in a row."""
 
 _STAGES: Final = (1024, 8192, FINEST)
 """Successive limits of the search for a number of intervals; the next one is only tried if the one before fails."""

@@ -427,9 +427,9 @@ def _note_steps(
     usable: NDArray[np.bool_],
     apart: Sequence[str],
 ) -> SourceTable:
-    """Note columns of texts, such as days, between whose labels the power of a link differs although they are averaged.
+    """Note columns of texts, such as days, on whose labels the power of a link depends although they are averaged.
 
-    Every link is one observation of the difference, because its rows can share errors.
+    Every link is one observation of this difference, because its rows can share errors.
 
     Args:
         table: The rows.

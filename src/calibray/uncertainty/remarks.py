@@ -45,8 +45,8 @@ CONFLICT_STARTS: Final = 32
 """Number of local searches of the fits to one kind of data."""
 
 DOMINANT: Final = 1e3
-"""Weight of the further observables' rows, relative to path loss, in a fit to them alone; its inverse in a fit to path
-loss alone. All fits can then use the same compiled program."""
+"""Factor by which the further observables count more than path loss in a fit that is meant to use only them, and less
+in a fit to path loss alone. All fits can then use the same compiled program."""
 
 
 def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...]:
