@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from calibray.fitting.ray_fit import understand
 from calibray.fitting.ray_mapping import RayMap, map_rays
 from calibray.fitting.ray_model import ANGLES, BATCH, HALF_SPACE, LEAST_DB, Call, Ends, RayModel
 from calibray.materials import Material
+from calibray.optimizers.evaluations import Best
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Kind, Paths
 from calibray.paths.chains import spherical_basis
@@ -338,6 +340,31 @@ def test_calls_go_on_while_the_minimum_is_not_at_the_best_call(
     assert first.moved_db == pytest.approx(np.sqrt(np.mean((moved - best) ** 2)))
     assert len(last.calls) == 4
     assert len(mapped.calls) == 3
+
+
+def test_a_lower_minimum_that_one_search_missed_leads_to_a_further_call(
+    foreign: Foreign, mapped: RayMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first search ends at a bound. The second one starts from other points, the third one from what it found."""
+    parameters, search = foreign.problem.parameters, ray_mapping.least_squares
+    seeds: list[int] = []
+    found: list[np.ndarray] = []
+
+    def missing(problem: Problem, starts: int, points: np.ndarray, *, seed: int) -> object:
+        seeds.append(seed)
+        if len(seeds) == 1:
+            return SimpleNamespace(best=Best(parameters.search_bounds[1], np.inf))
+        assert len(seeds) < 3 or np.any(np.all(points == found[0], axis=1))
+        result = search(problem, starts, points, seed=seed)
+        found.append(result.best.x)
+        return result
+
+    monkeypatch.setattr(ray_mapping, "least_squares", missing)
+    again = map_rays(foreign.problem, foreign)
+    assert len(again.calls) == 4
+    assert again.reached
+    assert again.best.candidate == pytest.approx(mapped.best.candidate, rel=1e-4)
+    assert len(set(seeds[:2])) == 2
 
 
 def test_the_optimum_is_reached_without_understanding(mapped: RayMap) -> None:
