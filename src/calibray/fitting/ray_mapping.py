@@ -65,9 +65,9 @@ CHANGED_DB: Final = 0.5
 appear between calls may be missing at the optimum of their replay."""
 
 SEARCHES: Final = 4
-"""Number of local searches over that of a calibration on replay: a call costs more than many searches. In a district
-with 557 interactions, 512 and 1,024 searches missed a minimum that is 0.076 dB lower with two of five seeds, 2,048
-searches with none."""
+"""Factor by which local searches are more than in a calibration on replay: a call costs more than many of them. In a
+district with 557 interactions, 512 and 1,024 searches missed a minimum that is 0.076 dB lower with two of five seeds,
+2,048 searches with none."""
 
 LEAST_CALLS: Final = 3
 """Number of calls of the shortest ray mapping: two that show the assumptions, and one at the minimum."""
@@ -186,7 +186,7 @@ def map_rays(
         understanding = understand(parameters, ordered, known, understanding)
         replay = understanding.replay(parameters, ordered[-1])
         starts = parameters.to_search(np.array([candidate for candidate, _ in calls]))
-        minimum = _searched(problem, replay, np.vstack([starts, further]), len(calls)).best.x
+        minimum = _search_replay(problem, replay, np.vstack([starts, further]), len(calls)).best.x
         calls = [*calls, call(parameters.from_search(minimum))]
         ordered = calls
         gap = _gap(replay, calls[-1])
@@ -200,7 +200,7 @@ def map_rays(
         further = mapped.minima[:1]
 
 
-def _searched(problem: Problem, replay: Replay, starts: NDArray[np.float64], calls: int) -> LeastSquares:
+def _search_replay(problem: Problem, replay: Replay, starts: NDArray[np.float64], calls: int) -> LeastSquares:
     """Search the replay from many points, other ones after each call, and from given ones [k, d].
 
     A search can miss the lowest minimum. The search after the last call, from other points, can then find it.
@@ -217,7 +217,7 @@ def _finish(
     final, best = understand(parameters, ordered, known, understanding), ordered[-1]
     replay = final.replay(parameters, best)
     replayed, point = with_engine(problem, replay), parameters.to_search(best.candidate)[None]
-    found = _searched(problem, replay, point, len(calls))
+    found = _search_replay(problem, replay, point, len(calls))
     remaining = float(replayed.squares(point).value[0]) - found.best.y
     changed, changed_db, lost = _changes(ordered)
     answered = best.export.path_loss_db
