@@ -170,6 +170,26 @@ def test_the_profile_of_a_narrow_receiver_is_that_of_its_pulses(replay):
         assert first[link] == pytest.approx(np.sum(late * seen) / seen.sum(), rel=0.02)
 
 
+def test_taps_at_the_end_of_a_bin_or_window_are_on_it_in_spite_of_rounding(replay):
+    paths, power, step = replay.paths, powers(replay), 1 / BANDWIDTH
+    *shares, mean = observed(
+        replay,
+        *(Statistic(DELAY_BIN, bandwidth=BANDWIDTH, edges=(n * step, (n + 1) * step)) for n in (1, 2, 3)),
+        Statistic("mean_excess_delay", bandwidth=BANDWIDTH, window=2 * step),
+    )
+    for link in range(paths.num_links):
+        mine = paths.link == link
+        number = np.floor(paths.delay[mine] * BANDWIDTH).astype(int)
+        first = number.min() - 1
+        pulse = hann_pulse(
+            first + np.arange(number.max() + 4 - first)[:, None] - paths.delay[mine] * BANDWIDTH
+        )
+        profile = (pulse / pulse.sum(axis=0)) @ power[mine]
+        for n, share in zip((1, 2, 3), shares, strict=True):
+            assert share[link] == pytest.approx(10 * np.log10(profile[n] / profile.sum() + 1e-3))
+        assert mean[link] == pytest.approx(np.arange(3) * step @ profile[:3] / profile[:3].sum())
+
+
 def test_a_path_that_is_not_resolved_shifts_the_time_of_flight(replay):
     wide, narrow, mean = observed(
         replay,

@@ -9,7 +9,7 @@ import pytest
 import scipy.io
 
 from calibray.errors import InputError
-from calibray.measurements.multipath import measure, read_impulse_responses, read_multipath
+from calibray.measurements.multipath import Multipath, measure, read_impulse_responses, read_multipath
 from calibray.measurements.observables import Statistic
 
 TABLE = pd.DataFrame(
@@ -62,6 +62,21 @@ def test_limits_bins_and_sectors(tmp_path):
     assert east["7"] == pytest.approx((half + full) / 2)
     north = values(paths, "azimuth_power_arrival", edges=(np.pi / 4, 3 * np.pi / 4), **limits)
     assert north["7"] == pytest.approx((half - 30) / 2)
+
+
+def test_components_at_the_end_of_a_bin_or_window_are_on_it_in_spite_of_rounding():
+    # Samples at multiples of 10 ns, and azimuths in steps of 10 degrees.
+    for first in range(1, 60):
+        delay, azimuth = (first + np.arange(3)) / 1e8, np.radians(10.0 * (first + np.arange(3)))
+        angles = {("azimuth", "arrival"): azimuth}
+        paths = Multipath(np.full(3, "a"), np.full(3, ""), delay, np.zeros(3), angles)
+        third = 10 * np.log10(1 / 3 + 1e-3)
+        for n in range(3):
+            share = values(paths, "power_delay_profile", edges=(n * 1e-8, (n + 1) * 1e-8))["a"]
+            assert share == pytest.approx(third)
+            edges = tuple(np.radians([10.0 * (first + n), 10.0 * (first + n + 1)]))
+            assert values(paths, "azimuth_power_arrival", edges=edges)["a"] == pytest.approx(third)
+        assert values(paths, "mean_excess_delay", window=1e-8)["a"] == pytest.approx(5e-9)
 
 
 @pytest.mark.parametrize("name", ["delay_ns", "Delay (ns)", "TOA [ns]", "delayNs"])

@@ -216,7 +216,7 @@ def _statistic(channel: Channel, power: jax.Array, wanted: Statistic) -> jax.Arr
     detected = jnp.where((tap_power > 0) & (seen >= 0.5), tap_delay, jnp.inf)
     first = jax.ops.segment_min(detected, tap_link, num_links)
     if wanted.window is not None:
-        seen = jnp.where(tap_delay - first[tap_link] <= wanted.window, seen, 0.0)
+        seen = jnp.where(tap_delay - first[tap_link] <= wanted.window + kinds.ROUNDING, seen, 0.0)
     weight = tap_power * seen
     if wanted.kind == kinds.DELAY_SPREAD:
         return delay_spread(weight, tap_delay, tap_link, num_links)

@@ -190,7 +190,7 @@ def _seen(multipath: Multipath, index: NDArray[np.int64], statistic: Statistic) 
     if statistic.dynamic_range_db is not None and seen.any():
         seen &= level_db > level_db[seen].max() - statistic.dynamic_range_db
     if statistic.window is not None and seen.any():
-        seen &= delay - delay[seen].min() <= statistic.window
+        seen &= delay - delay[seen].min() <= statistic.window + kinds.ROUNDING
     return index[seen]
 
 
@@ -213,7 +213,7 @@ def _value(
         # Strongest component over the sum of all others; with a single component it is infinite.
         return 10 * float(np.log10(strongest / (1 - strongest))) if strongest < 1 else np.nan
     if statistic.edges is not None:
-        low, high = statistic.edges
+        low, high = statistic.bin
         # Angles are turned into the full turn that begins at the sector's lower edge.
         values = delay - first if angle is None else (angle - low) % (2 * np.pi) + low
         with np.errstate(divide="ignore"):

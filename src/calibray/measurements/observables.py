@@ -50,6 +50,10 @@ SIGNED: Final = (K_FACTOR, *FLIGHTS, *PROFILES)
 SHARE_RANGE_DB: Final = 30.0
 """Dynamic range of the share of power in a bin, unless a study states one [dB]."""
 
+ROUNDING: Final = 1e-12
+"""Delays [s] and azimuths [rad] this close to a limit are on it, as samples at multiples of 1 / bandwidth can be. It is
+more than their differences are rounded by, and less than any receiver resolves."""
+
 
 @dataclass(frozen=True)
 class Statistic:
@@ -76,14 +80,15 @@ class Statistic:
 
     @property
     def bin(self) -> tuple[float, float]:
-        """Ends of the bin.
+        """Ends of the bin, each less by `ROUNDING`: a value at the lower end is inside, one at the upper end is not.
 
         Raises:
             ValueError: It has none.
         """
         if self.edges is None:
             raise ValueError(f"{self.kind}: needs edges, the ends of its bin")
-        return self.edges
+        low, high = self.edges
+        return low - ROUNDING, high - ROUNDING
 
     def limited(self, share_db: ArrayLike) -> NDArray[np.float64]:
         """Shares of power in the bin of one of `PROFILES` [dB], limited from below by the dynamic range.
