@@ -122,6 +122,23 @@ def test_neighbours_stay_within_the_bounds_and_beyond_them_path_loss_is_constant
     assert np.abs(jacobian[..., 1]).max() > 1e-3
 
 
+def test_aimed_antennas_point_from_where_their_mast_is_placed(folder: Path) -> None:
+    def aimed(bounds: dict[str, list[float]]) -> Study:
+        links = study(folder, "stated.csv").content()["links"] | {"tx_antenna": {"aim": "other end"}}
+        antennas = {"tx": {"pattern": "tr38901"}, "rx": {"pattern": "dipole"}}
+        return study(folder, "stated.csv", bounds, links=links, antennas=antennas)
+
+    height, material = "tx:A.height", {GROUND: 5.0}
+    setup = Setup.open(aimed({height: [-8, 8]}), tracer=TwoRay).placed_at(material | {height: 5.0}, (0.5,))
+    engine = engines.make(setup)
+    mast = setup.links.table.labels("transmitter") == "A"
+    for placed in (5.0, 1.0, 8.0):
+        there = replace(setup.links, tx=setup.links.tx + np.where(mast, placed, 0.0)[:, None] * [0, 0, 1])
+        direct = Setup.open(aimed({}), TwoRay, there)
+        expected = path_loss(direct.trace(), direct.parameters.materials([5.0], direct.scene.materials))
+        np.testing.assert_allclose(engine.path_loss(np.array([[5.0, placed]]))[0], expected, atol=1e-9)
+
+
 def test_a_displacement_without_a_path_has_the_path_loss_of_the_next_one_inwards() -> None:
     change_db = np.array(
         [[np.inf, -np.inf, np.inf], [2.0, np.inf, np.nan], [0.0, 0.0, np.nan], [1.0, 4.0, np.nan]]

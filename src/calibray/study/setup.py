@@ -214,8 +214,10 @@ class Setup:
         if not self._displacements or not self.neighbours:
             return ()
 
+        in_place = {item.name: 0.0 for item in self.parameters if displaces(item.name)}
+
         def traced(links: Measurements) -> tuple[Paths, Effects]:
-            moved = self._with_tracer(replace(self, links=links))
+            moved = self._with_tracer(replace(self, links=links, placed=in_place))
             paths = moved._mounted(moved._trace_links(links, self.scene, None), self.scene)
             return paths, moved._pose_and_region_effects(paths)
 
@@ -416,7 +418,7 @@ class Setup:
         Raises:
             InputError: A column is missing or malformed, or names an unknown antenna.
         """
-        return link_mountings(self.study, self.links)
+        return link_mountings(self.study, self._links_in_place)
 
     def _trace(self, links: Measurements, scene: Scene, progress: Progress | None) -> Paths:
         study, scene = self.study, without_facade_materials(scene, self.study.facades)
