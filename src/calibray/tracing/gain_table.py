@@ -110,13 +110,13 @@ def read_two_cuts(path: str | Path) -> TwoCuts:
 
 
 def _gain_dbi(place: str, words: list[str]) -> float:
-    joined = re.fullmatch(rf"({_NUMBER.pattern})\s*(dbi|dbd)?(?:\s.*)?", " ".join(words), re.IGNORECASE)
+    text = " ".join(words)
+    joined = re.fullmatch(rf"({_NUMBER.pattern})\s*(dbi|dbd)?(?:\s.*)?", text, re.IGNORECASE)
     if joined is None:
-        raise InputError(
-            f"{place}: GAIN {shortened(' '.join(words))!r}: must be a number, such as 'GAIN 17.5 dBi'"
-        )
+        raise InputError(f"{place}: GAIN {shortened(text)!r}: must be a number, such as 'GAIN 17.5 dBi'")
     value = float(joined.group(1).replace(",", "."))
-    unit = (joined.groups()[-1] or "dbd").lower()
+    # The unit after the number counts before one in a comment, and may be in brackets.
+    unit = (joined.groups()[-1] or ("dbi" if "dbi" in text.lower() else "dbd")).lower()
     return _cut_in_range(place, "GAIN", value if unit == "dbi" else value + DIPOLE_GAIN_DBI)
 
 
