@@ -197,7 +197,12 @@ def _array(file: h5py.File, name: str, dataset: Dataset) -> NDArray[Any]:
         return np.array(item.asstr()[()], dtype=object)
     if item.dtype.kind not in {"i": "iu", "f": "f"}[dataset.kind]:
         raise _damaged(f"dataset {name} has the type {item.dtype}")
-    return item[()]
+    # Other programs write other sizes and byte orders: some do not mix, and single precision is too coarse for wedges.
+    native = item.dtype.newbyteorder("=")
+    if dataset.kind == "i":
+        return item[()].astype(native if native.itemsize < 8 else np.int64, copy=False)
+    kept = name == "interactions/vertex" and native == np.float32
+    return item[()].astype(native if kept else np.float64, copy=False)
 
 
 def _datasets(arrays: Mapping[str, NDArray[Any]]) -> list[tuple[str, Dataset]]:
