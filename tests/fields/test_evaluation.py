@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,21 @@ def test_a_path_of_more_than_sixteen_interactions_has_the_gain_that_it_has_alone
     sequences = [(Kind.DIFFUSE,), (Kind.DIFFUSE, Kind.DIFFUSE), (Kind.REFRACTION,) * 16 + (Kind.DIFFUSE,), ()]
     paths = synthetic.program(sequences, seed=3, materials=synthetic.LAMBERTIAN)
     np.testing.assert_allclose(path_gains(paths), reference_fields.gains(paths)[:, 0, 0], rtol=1e-11)
+
+
+@pytest.mark.parametrize("name", ["cos_specular", "cos_backward"])
+def test_cosines_rounded_below_minus_one_have_the_loss_of_minus_one(name: str) -> None:
+    paths = synthetic.program([[Kind.DIFFUSE]])
+    ground = list(paths.materials).index("ground")  # backscattering, with exponents that are no whole numbers
+    exact, rounded = (
+        replace(
+            paths, material=np.array([ground]), diffuse=replace(paths.diffuse, **{name: np.array([cosine])})
+        )
+        for cosine in (-1.0, -1.0000001)
+    )
+    loss = path_loss(exact)
+    assert np.isfinite(loss[paths.link]).all()
+    np.testing.assert_array_equal(path_loss(rounded), loss)
 
 
 def test_padding_is_not_evaluated_at_the_end_of_a_run() -> None:

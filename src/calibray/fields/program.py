@@ -305,8 +305,9 @@ def _diffuse(
         solid_angle=column(table.solid_angle[row]),
         cos_scattered=column(table.cos_scattered[row]),
         cos_incidence=column(paths.cos_incidence[interaction][lobes]),
-        cos_specular=column(table.cos_specular[row][lobes]),
-        cos_backward=column(table.cos_backward[row][lobes]),
+        # Rounded below -1, they would be the negative base of a power, which is not a number.
+        cos_specular=column(np.maximum(table.cos_specular[row][lobes], -1.0)),
+        cos_backward=column(np.maximum(table.cos_backward[row][lobes], -1.0)),
         patterns=patterns,
     )
 
