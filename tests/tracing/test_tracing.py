@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -281,6 +281,22 @@ def test_direct_paths_alone_and_excluded(house: Tracer) -> None:
     )
     assert (np.diff(indirect.first) == 1).all()
     assert indirect.num_paths > 0
+
+
+def test_materials_replace_those_of_a_scene_already_read(house: Tracer) -> None:
+    ends = links([-20, 0, 3], [[-10, 3, 2]])
+    options = {"frequency": FREQUENCY, "max_depth": 1, "samples": 20_000}
+    stone = replace(house.scene.materials["stone"], relative_permittivity=12.0)
+    read, named = (
+        cb.trace(scene, ends, materials={"stone": stone}, **options)
+        for scene in (house.scene, house.scene.path)
+    )
+    assert read.materials["stone"] == named.materials["stone"] == stone
+    np.testing.assert_array_equal(path_loss(read), path_loss(named))
+    with pytest.raises(InputError, match="the scene has no material 'glass'"):
+        cb.trace(house.scene, ends, materials={"glass": stone}, **options)
+    with pytest.raises(InputError, match="a scene already read: 'stone' is not a Material"):
+        cb.trace(house.scene, ends, materials={"stone": {"thickness": 0.3}}, **options)
 
 
 # Refused input

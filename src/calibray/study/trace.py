@@ -69,8 +69,8 @@ def trace(
         frequency: Carrier frequency [Hz].
         tx_antenna: Transmit antenna, as `Antenna` or a mapping with its attributes.
         rx_antenna: Receive antenna.
-        materials: Constants by material name, which replace the scene's; with a study, each is a `Material` that
-            replaces the start values.
+        materials: Constants by material name, which replace the scene's; with a study, whose start values they replace,
+            or with a scene already read, each is a `Material`.
         progress: Called with ("tracing", receivers traced, receivers in all) after every launch.
         **settings: The attributes of `TraceSettings`.
 
@@ -92,12 +92,18 @@ def trace(
         missing = "measurements, the links" if measurements is None else "frequency, the carrier in Hz"
         raise InputError(f"trace: without a study, give {missing}")
     check_frequency(frequency)
-    scene = scene if isinstance(scene, Scene) else read_scene(scene, frequency, materials)
+    complete: dict[str, Material] = {}
+    if isinstance(scene, Scene):
+        complete = _complete(materials or {}, "a scene already read")
+    else:
+        scene = read_scene(scene, frequency, materials)
     antennas = as_antenna(tx_antenna), as_antenna(rx_antenna)
     names = TraceSettings().record()
     if unknown := set(settings) - set(names):
         raise InputError(f"trace: unknown setting {sorted(unknown)[0]!r}; known: {', '.join(names)}")
-    return SIONNA(scene, frequency, TraceSettings(**settings), *antennas).trace(measurements, progress)
+    return SIONNA(scene, frequency, TraceSettings(**settings), *antennas).trace(
+        measurements, progress, complete
+    )
 
 
 def _trace_study(study: Study, links: Links | None, materials: Constants, progress: Progress | None) -> Paths:
@@ -106,14 +112,18 @@ def _trace_study(study: Study, links: Links | None, materials: Constants, progre
             f"trace: the links of a study must be Measurements, not a {type_name(links)}; read_measurements reads a "
             "file, Measurements(tx, rx, path_loss_db) takes arrays"
         )
+    return Setup.open(study, links=links).trace(_complete(materials, "a study"), progress)
+
+
+def _complete(materials: Constants, source: str) -> dict[str, Material]:
     complete: dict[str, Material] = {}
     for name, constants in materials.items():
         if not isinstance(constants, Material):
             raise InputError(
-                f"trace: materials of a study: {name!r} is not a Material; give all its constants as a Material"
+                f"trace: materials of {source}: {name!r} is not a Material; give all its constants as a Material"
             )
         complete[name] = constants
-    return Setup.open(study, links=links).trace(complete, progress)
+    return complete
 
 
 def read_rays(
