@@ -90,6 +90,16 @@ def test_only_scattering_that_a_scene_states_is_stated_by_its_study(
     assert study.opened().scene.materials["concrete"].scattering_coefficient == 0.0
 
 
+def test_wet_ground_starts_within_its_default_bounds(measured: np.ndarray, tmp_path: Path) -> None:
+    scene = street()
+    scene.radio_materials["concrete"].relative_permittivity = 18.2
+    study = cb.Study.from_sionna(scene, measured, tmp_path)
+    start = dict(zip(study.parameters, study.opened().parameters.start, strict=True))
+    assert start["concrete.relative_permittivity"] == pytest.approx(18.2)
+    assert study.parameters["concrete.relative_permittivity"].bounds == (1.5, 36.0)
+    assert study.parameters["marble.relative_permittivity"].bounds == (1.5, 15.0)
+
+
 def test_materials_of_another_carrier_cause_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     scene = street()
     marble = {"marble": cb.itu_material("marble", 28e9, thickness=0.1)}

@@ -28,7 +28,7 @@ from calibray.study.content import BUNDLED, VERSION
 from calibray.study.draft_links import Assumption, Given, LinksDraft
 from calibray.study.link_checks import CELL_SHARE, LINKS_PER_UNKNOWN, count_unknowns
 from calibray.study.regions import Place, RegionSection, dense_trees
-from calibray.study.study import LARGEST_PERMITTIVITY, Study
+from calibray.study.study import Study, permittivity_bounds
 from calibray.study.toml_file import study_text
 from calibray.support.messages import shortened
 from calibray.support.output_files import exists
@@ -391,8 +391,7 @@ def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dic
     entries: dict[str, dict[str, Any]] = {}
     for name in names:
         permittivity, conductivity = materials[name].relative_permittivity, materials[name].conductivity
-        bounds = [1.5, max(LARGEST_PERMITTIVITY, round(2 * permittivity))]
-        entries[f"{name}.relative_permittivity"] = {"bounds": bounds}
+        entries[f"{name}.relative_permittivity"] = {"bounds": permittivity_bounds(permittivity)}
         if indoors and conductivity > 0:
             bounds = [min(1e-3, float(f"{conductivity / 10:.0e}")), 3.0]
             entries[f"{name}.conductivity"] = {"bounds": bounds, "scale": "log"}

@@ -215,6 +215,11 @@ LARGEST_PERMITTIVITY: Final = 15.0
 """Upper bound of a permittivity that is calibrated by default, twice that of any building material of ITU-R P.2040."""
 
 
+def permittivity_bounds(start: float) -> list[float]:
+    """Bounds of a permittivity that is calibrated by default; that of wet ground is far above those of buildings."""
+    return [1.5, max(LARGEST_PERMITTIVITY, round(2 * start))]
+
+
 def _write_live_study(
     scene: object, measured: Any, folder: Path, sections: Mapping[str, Any], overwrite: bool
 ) -> dict[str, Any]:
@@ -260,7 +265,7 @@ def _write_live_study(
         },
         # The permittivity of every material but air and metal.
         "parameters": {
-            f"{name}.relative_permittivity": {"bounds": [1.5, LARGEST_PERMITTIVITY]}
+            f"{name}.relative_permittivity": {"bounds": permittivity_bounds(item.relative_permittivity)}
             for name, item in live.materials.items()
             if item.relative_permittivity > 1.5
         },
