@@ -18,7 +18,7 @@ from calibray.errors import InputError
 from calibray.scenes.authoring import Footprints, make_plan_scene, make_scene, read_plan
 from calibray.scenes.checks import SceneSurfaces, building_outlines
 from calibray.study import Setup, Study
-from calibray.study.link_checks import examine
+from calibray.study.link_checks import count_unknowns, examine
 
 MAST = np.array([-5.0, 3.0, 25.0])
 BEARING = np.radians(30.0)  # where the mast's sector looks, clockwise from north
@@ -74,6 +74,20 @@ def suspicions(town: Path, frame: pd.DataFrame, **changes: object) -> str:
 
 def test_sound_links_raise_no_suspicion(town):
     assert suspicions(town, links()) == ""
+
+
+def test_a_study_without_an_offset_has_no_unknown_for_it(town):
+    links().head(7).to_csv(town / "few.csv", index=False)
+    content = {
+        "version": 1,
+        "scene": {"file": "scene.xml", "frequency": 3.5e9},
+        "links": {"file": "few.csv", "tx": MAST.tolist(), "rx": ["x", "y", "z"], "value": "loss"},
+        "parameters": {"walls.relative_permittivity": {"bounds": [1.5, 12.0]}},
+    }
+    without, one = (Study.from_content(content | more, town / "study.toml") for more in ({}, {"offset": {}}))
+    assert count_unknowns(without, without.measurements()) == ()
+    (finding,) = count_unknowns(one, one.measurements())
+    assert "7 links for 2 unknowns" in finding.problem
 
 
 @pytest.mark.parametrize(

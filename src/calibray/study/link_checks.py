@@ -109,7 +109,8 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
 
 def count_unknowns(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
     """The suspicion and its remedy if there are fewer than `LINKS_PER_UNKNOWN` links per unknown."""
-    offsets = len(links.group_names) if links.group is not None else 1
+    grouped = len(links.group_names) if links.group is not None else 1
+    offsets = 0 if study.offset is None else grouped
     unknowns = len(study.parameters) + offsets
     if len(links) >= LINKS_PER_UNKNOWN * unknowns:
         return ()
