@@ -187,6 +187,27 @@ def test_the_keyboard_alone_saves_bounds_and_chooses_a_place(walked):
     assert study["scene"]["frequency"] == 2.45e9
 
 
+def test_what_an_editor_changed_in_the_study_is_shown_and_not_undone(walked):
+    folder, _, browser, address = walked
+    page = opened(browser, address)
+    page.locator("#plan[data-links='84']").wait_for()
+    lowest = step(page, "Parameters").get_by_label("Lowest").first
+    lowest.wait_for()
+    text = (folder / "study.toml").read_text()
+    before = f"{lowest.input_value()}, "
+    (folder / "study.toml").write_text(text.replace(f"bounds = [{before}", "bounds = [1.25, ", 1))
+    for _ in range(100):
+        if lowest.input_value() == "1.25":
+            break
+        page.wait_for_timeout(100)
+    step(page, "Parameters").get_by_role("button", name="Save parameters").click()
+    page.get_by_text("Saved").first.wait_for()
+    study = tomllib.loads((folder / "study.toml").read_text())
+    assert next(iter(study["parameters"].values()))["bounds"][0] == 1.25
+    (folder / "study.toml").write_text(text)
+    page.context.close()
+
+
 def test_a_hostile_upload_is_refused(walked, tmp_path):
     folder, page, _, _ = walked
     bad = tmp_path / "<b>x.csv"

@@ -11,7 +11,7 @@ import pytest
 
 from calibray.errors import InputError
 from calibray.result.held_out import HeldOutErrors
-from calibray.window.result_steps import better, changes, predicted_text
+from calibray.window.result_steps import _facts, better, changes, predicted_text
 
 LINKS, BLOCKS = 200, 4
 
@@ -103,3 +103,26 @@ def test_a_prediction_is_stated_in_the_measured_quantity():
     assert predicted_text(pd.concat([row, pd.Series(power)])) == (
         "At x 1.0 m, y 2.0 m: RSRP -38.5 dBm, 90 % interval -45.5 to -31.5 dBm (calibrated)"
     )
+
+
+def test_a_prediction_beyond_the_scene_says_so():
+    row = pd.Series(
+        {
+            "rx_x": 1.0,
+            "rx_y": 2.0,
+            "path_loss_db": 77.2,
+            "lower_db": 76.1,
+            "upper_db": 78.3,
+            "basis": "calibrated",
+        }
+    )
+    said = predicted_text(pd.concat([row, pd.Series({"remark": "receiver beyond the scene"})]))
+    assert said.endswith("(calibrated); receiver beyond the scene")
+    # Of a table without remarks, the column is read as numbers.
+    assert predicted_text(pd.concat([row, pd.Series({"remark": np.nan})])).endswith("(calibrated)")
+
+
+def test_numbers_of_links_are_exact():
+    record = {"links": {"calibrated_on": 12_345}}
+    desk = SimpleNamespace(folder=SimpleNamespace(result=lambda name: record))
+    assert _facts(desk, "result")["Links"] == "12,345"

@@ -199,6 +199,20 @@ def test_what_a_parameter_states_is_kept():
         assert slider.props["min"] <= slider.value <= slider.props["max"]
 
 
+@pytest.mark.parametrize("centre", [{"value": 5.0}, {"like": "walls.relative_permittivity"}])
+def test_the_spread_of_a_prior_without_a_material_can_be_changed(centre):
+    with Client(page("/")) as client:
+        read = _entry(
+            "floor.relative_permittivity", {"bounds": [1.5, 12.0], "prior": {**centre, "spread": 0.2}}
+        )
+    spread = next(
+        part for part in client.elements.values() if part.props.get("label") == "Spread of the prior"
+    )
+    assert read()["prior"] == {**centre, "spread": 0.2}
+    spread.value = 0.5
+    assert read()["prior"] == {**centre, "spread": 0.5}
+
+
 def test_the_map_has_the_materials_of_the_study(tmp_path):
     """P.2040 has no brick at 60 GHz, so the scene alone could not be read there; the study states its constants."""
     bsdf = '<bsdf type="itu-radio-material" id="mat-stone"><string name="type" value="brick"/></bsdf>'

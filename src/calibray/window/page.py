@@ -165,8 +165,8 @@ def _follow_changes(
         elif job != before:
             progress.refresh(job)
         watched["job"] = job
-        # A command that has ended may have written files.
-        if before is not None and job is None:
+        # A command that has ended may have written files, and an editor the study.
+        if (before is not None and job is None) or desk.folder.text() != shown["Parameters"]:
             refresh()
 
     desk.show_again[ui.context.client.id] = refresh

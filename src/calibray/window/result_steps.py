@@ -208,7 +208,9 @@ def _shown(record: Any, *keys: str) -> str:
 
 
 def _number(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, int | float) else NONE
+    if isinstance(value, int):
+        return f"{value:,}"
+    return f"{value:.4g}" if isinstance(value, float) else NONE
 
 
 def settings(study: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -424,9 +426,11 @@ def predicted_text(row: pd.Series) -> str:
             # The table has these columns only if the study measured this quantity.
             value, name, unit = column, quantity.name, quantity.unit
             lower, upper = (f"{key}_{end}_{unit.lower()}" for end in ("lower", "upper"))
+    remark = row.get("remark")
     return (
         f"At x {row['rx_x']:.1f} m, y {row['rx_y']:.1f} m: {name} {row[value]:.1f} {unit}, 90 % interval "
         f"{row[lower]:.1f} to {row[upper]:.1f} {unit} ({row['basis']})"
+        + (f"; {remark}" if isinstance(remark, str) and remark else "")
     )
 
 

@@ -358,6 +358,8 @@ def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | No
             changed["prior"] = {"itu": itu.value, "spread": number(spread)}
         elif "itu" in prior:
             del changed["prior"]
+        elif "spread" in prior:
+            changed["prior"] = {**prior, "spread": number(spread)}
         return changed
 
     return read
