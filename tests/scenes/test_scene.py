@@ -402,3 +402,20 @@ def test_unsupported_scenes_are_refused(tmp_path: Path, old: str, new: str, mess
 def test_impossible_file_names_are_refused(name: str) -> None:
     with pytest.raises(InputError, match=r"does not exist|bundles no such scene"):
         read_scene(name, 2e9)
+
+
+def test_a_scene_is_used_at_the_carrier_of_its_constants_only(tmp_path: Path) -> None:
+    """Concrete conducts three times as well at 4 GHz as at 1 GHz; constants without a law hold at any carrier."""
+    ends = cb.Measurements([[0.0, 0.0, 2.0]], [[30.0, 5.0, 2.0]], [90.0])
+    concrete = read_scene("sionna:simple_wedge", 1e9)
+    assert concrete.materials["concrete"].conductivity == itu_material("concrete", 1e9).conductivity
+    cb.write_rays(cb.trace(concrete, ends, frequency=1e9, samples=10_000), tmp_path / "rays.csv")
+    for use in (
+        lambda scene: cb.trace(scene, ends, frequency=4e9, samples=10_000),
+        lambda scene: cb.read_rays(tmp_path / "rays.csv", scene, frequency=4e9),
+    ):
+        with pytest.raises(InputError, match="constants are those at 1 GHz; read it at 4 GHz"):
+            use(concrete)
+    free = read_scene("sionna:simple_wedge", 1e9, {"concrete": Material(5.0, 0.1, 0.2)})
+    assert free.frequency is None
+    free.check_frequency(4e9)

@@ -47,6 +47,7 @@ from calibray.scenes.scene_file import (
 from calibray.scenes.shapes import SurfaceSize, local_origin, read_surface, write_local_shape
 from calibray.support.messages import did_you_mean, shortened
 from calibray.support.output_files import check_outputs, replacing, write_text
+from calibray.tables import hertz
 
 DEFAULT_THICKNESS: Final = 0.1
 """Sionna's default thickness of a material [m]."""
@@ -81,6 +82,7 @@ class Scene:
         xml: The scene for the tracer; the id of material k of `materials` is `mat-calibray-k`.
         laws: How the constants of each material depend on frequency: ITU-R's law for ITU materials, otherwise constant.
         sizes: Size of every object.
+        frequency: The frequency for which the scene was read [Hz]; None if its constants hold at all frequencies.
     """
 
     source: str
@@ -90,11 +92,24 @@ class Scene:
     xml: str
     laws: dict[str, ItuLaw] = field(default_factory=dict)
     sizes: tuple[SurfaceSize, ...] = ()
+    frequency: float | None = None
 
     @property
     def local_origin(self) -> NDArray[np.float64]:
         """Origin of the frame in which the scene is traced [3], [m]; zero unless the scene lies far from its origin."""
         return local_origin(self.sizes)
+
+    def check_frequency(self, frequency: float) -> None:
+        """Refuse another frequency [Hz] than that of the constants.
+
+        Raises:
+            InputError: The scene was read for another frequency, and its constants depend on it.
+        """
+        if self.frequency is not None and frequency != self.frequency:
+            raise InputError(
+                f"scene {self.source}: its constants are those at {hertz(self.frequency)}; read it at "
+                f"{hertz(frequency)} with read_scene"
+            )
 
 
 def read_scene(
@@ -165,7 +180,8 @@ def read_scene(
     for number, material in enumerate(materials.values()):
         root.insert(number, material_element(f"{TRACED}{number}", material))
     xml = ElementTree.tostring(root, encoding="unicode")
-    return Scene(str(source), path, materials, tuple(objects), xml, laws, tuple(sizes))
+    valid_at = frequency if any(law.b or law.d for law in laws.values()) else None
+    return Scene(str(source), path, materials, tuple(objects), xml, laws, tuple(sizes), valid_at)
 
 
 def has_copied_meshes(scene: Scene) -> bool:

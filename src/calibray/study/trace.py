@@ -94,6 +94,7 @@ def trace(
     check_frequency(frequency)
     complete: dict[str, Material] = {}
     if isinstance(scene, Scene):
+        scene.check_frequency(frequency)
         complete = _complete(materials or {}, "a scene already read")
     else:
         scene = read_scene(scene, frequency, materials)
@@ -184,6 +185,7 @@ def read_rays(
         raise InputError("read_rays: without a study, give frequency, the carrier in Hz")
     else:
         scene = scene if isinstance(scene, Scene) else read_scene(scene, frequency)
+        scene.check_frequency(frequency)
         setting = RaySetting(scene, frequency, antennas)
     check_carrier(rays, setting.frequency)
     return compile_rays(RayTable.of(rows, axes), setting)
