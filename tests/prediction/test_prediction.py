@@ -324,6 +324,16 @@ def test_a_new_transmitter_gets_the_mean_offset_without_a_request():
         nuisance_shift(iter([replace(term, name="street")]), links)
 
 
+@pytest.mark.parametrize("column", ["transmitter", "offset"])
+def test_a_column_of_groups_may_have_any_name(tmp_path, column):
+    table = planted.campaign(noise_db=0.3).assign(**{column: list("aabbccddaabb")})
+    table["path_loss_db"] += 8 + table[column].map({"a": -4, "b": 1, "c": 5, "d": -2})
+    nuisance = {"shift": {"by": "constant", "per": column}}
+    result = calibrate(planted.study(tmp_path, table, nuisance=nuisance), engine=planted.engine())
+    assert result.predict(table) == pytest.approx(result.links.predicted_db.to_numpy())
+    assert set(result.predict_interval(table).basis) == {"errors of 12 calibration links"}
+
+
 @pytest.mark.parametrize("prior", [None, "auto"])
 def test_offsets_that_compensate_the_parameters_do_not_widen_intervals(tmp_path, prior):
     """Without links held out: Student's t has the degrees of freedom that all unknowns leave."""

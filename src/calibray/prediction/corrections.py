@@ -32,9 +32,6 @@ from calibray.study.model import StudyModel
 from calibray.validation.held_out_statistics import interval_half_width
 from calibray.validation.models import TX_OFFSET, without_scene
 
-TRANSMITTER: Final = "transmitter"
-"""`FittedTerm.per` of a term with one coefficient per transmitter, which needs no column."""
-
 MOST_EXACT: Final = 1000
 """Number of measured links up to which all of them are used at every new link; with more, only the nearest ones are
 used."""
@@ -87,12 +84,13 @@ def model_terms(model: PredictionModel, links: Measurements) -> Iterator[TermAtL
         InputError: The links lack a column.
     """
     for term in model.terms:
-        if term.per == TRANSMITTER:
+        # By the name of the term: a column of the study may be called "transmitter" or "offset".
+        if not term.per:
+            labels = None
+        elif term.name == TX_OFFSET:
             labels = transmitters(links)
-        elif term.per == OFFSET:
-            labels = links.group
         else:
-            labels = links.table.labels(term.per) if term.per else None
+            labels = links.group if term.name == OFFSET else links.table.labels(term.per)
         values = column(links, term.by) - term.centre
         yield TermAtLinks(term.name, values, labels, term.coefficients, term.spread_db)
 

@@ -125,7 +125,7 @@ def _with_measured_spellings(model: PredictionModel, links: Measurements) -> Mea
         for label in term.coefficients:
             spelling.setdefault(_as_number(label), set()).add(label)
         known = {read: labels.pop() for read, labels in spelling.items() if len(labels) == 1}
-        if term.per == OFFSET and links.group is not None:
+        if term.name == OFFSET and links.group is not None:
             links = replace(links, group=_spelled(links.group, term.coefficients, known))
         elif term.per in links.frame:
             labels = _spelled(links.table.labels(term.per), term.coefficients, known)
