@@ -199,7 +199,9 @@ def test_a_group_whose_links_do_not_determine_its_slope_has_that_of_the_others(b
     labels[[4, 7]] = "c"
     shift_db = np.select([labels == "a", labels == "b"], [2.0, -3.0], 7.0)
     links = measured(
-        90.0 + shift_db + 12.0 * np.log10(DISTANCE), table=SourceTable(pd.DataFrame({"set": labels}))
+        90.0 + shift_db + 12.0 * np.log10(DISTANCE),
+        group=labels,
+        table=SourceTable(pd.DataFrame({"set": labels})),
     )
     terms = (
         make_term(links, "offset", labels=labels),
@@ -212,9 +214,7 @@ def test_a_group_whose_links_do_not_determine_its_slope_has_that_of_the_others(b
         "links.csv", offset={"per": "set"}, nuisance={"clutter": {"by": "log_distance", "per": "set"}}
     )
     every = fitted_terms(fitted, scene_db, Study.from_content(content))
-    predicting = PredictionModel(
-        Model.CALIBRATED, {}, tuple(replace(term, per="set") for term in every), 1.0, "", 15
-    )
+    predicting = PredictionModel(Model.CALIBRATED, {}, every, 1.0, "", 15)
     added_db = nuisance_shift(model_terms(predicting, links), links).value_db[0]
     assert scene_db + added_db == pytest.approx(links.path_loss_db)
 
