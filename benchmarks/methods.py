@@ -78,7 +78,7 @@ def main() -> None:
         write(figure(finished), chosen.out / f"{name}.png")
         sections.append(
             f"## {title}\n\nOptimum {finished.optimum:.6g} dB, found by {finished.found_by}.\n\n"
-            f"{render_markdown(table(finished))}\n\n![Excess RMSE over RT calls]({name}.png)"
+            f"{render_markdown(table(finished))}\n\n![Excess RMSE versus RT calls]({name}.png)"
         )
         print(sections[-1], flush=True)
     write_text(chosen.out / "tables.md", "\n\n".join(sections) + "\n")

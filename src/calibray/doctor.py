@@ -119,7 +119,7 @@ class Diagnosis:
 
 
 def examine() -> Diagnosis:
-    """Check this machine, which takes some seconds; an unusable machine raises no exception."""
+    """Check this machine, which takes a few seconds; an unusable machine raises no exception."""
     variant = llvm.mitsuba_variant()
     return Diagnosis(
         versions=versions(),

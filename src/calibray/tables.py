@@ -1,4 +1,4 @@
-"""Tables as data, and their rendering, with sentences, as plain text and HTML.
+"""Tables as data; rendering of tables and sentences as plain text and HTML.
 
 Control characters and markup are escaped, because names come from files. Short forms are for the Python prompt and
 notebooks.

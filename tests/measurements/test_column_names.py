@@ -346,7 +346,7 @@ def test_flight_times_are_found_by_their_full_name_and_are_no_times_of_day(name,
 def test_values_are_judged_without_the_codes_of_missing_ones():
     table = SourceTable(pd.DataFrame({"x": 1.0, "rssi": [100.0, 100.0, 100.0, -71.0, -80.0]}))
     guess = column_names.find_value(table)
-    assert (guess.column, guess.reason) == ("rssi", "its name, and values about -76")
+    assert (guess.column, guess.reason) == ("rssi", "its name, and values of about -76")
     assert np.isfinite(table.frame["rssi"]).all()
 
 

@@ -108,7 +108,7 @@ def test_rows_get_positions_between_the_points_of_a_track(join):
     joined = join(track, times)
     # Between 10 s and 40 s the gap is longer than the 10 s allowed; the last row has no time.
     assert joined.row.tolist() == [1, 2]
-    assert joined.changes == {"rows at no time of the track, left out": 2}
+    assert joined.changes == {"rows without a position on the track, left out": 2}
     np.testing.assert_allclose(
         joined.frame[["track_longitude", "track_latitude"]], [[11.0, 48.0], [11.1, 48.05]]
     )
@@ -159,7 +159,7 @@ def test_a_time_zone_with_which_more_rows_lie_on_the_track_is_named(join):
             for k, minute in enumerate(minutes)
         )
     )
-    note = "rows at no time of the track, left out"
+    note = "rows without a position on the track, left out"
     local = [str(minute + pd.Timedelta(minutes=45)) for minute in minutes]
     joined = join(track, local, longest_gap=60.0)
     assert joined.changes == {f"{note}, which links.track.clock = 2700 would keep": 45}

@@ -42,11 +42,11 @@ def test_a_trend_with_distance_is_reported_only_if_planted(result):
     decades = np.log10(np.linalg.norm(ends[1] - ends[0], axis=1))
     noise = np.random.default_rng(0).standard_normal(len(decades))
     steep = planted(result, 8.0 * (decades - decades.mean()) + noise)
-    assert finding(steep, "over distance").startswith("a trend: the residuals change by +")
+    assert finding(steep, "by distance").startswith("a trend: the residuals change by +")
     table = steep.diagnostics["distance"]
     assert table["links"].sum() == len(decades)
     assert (np.diff(table["mean_db"]) > 0).all()
-    assert finding(planted(result, noise), "over distance").startswith("no trend")
+    assert finding(planted(result, noise), "by distance").startswith("no trend")
 
 
 def test_the_group_with_the_largest_mean_residual_is_named(result):

@@ -264,7 +264,7 @@ def test_an_export_that_sionna_loads_otherwise_is_refused(tmp_path):
         (
             "</shape>",
             '<transform name="to_world"><scale value="2"/></transform></shape>',
-            "contains another surface of material 'stone'",
+            "contains a different surface of material 'stone'",
         ),
         # The same bounds and area, with the wall on the other side.
         (

@@ -105,10 +105,10 @@ def test_the_mean_of_each_group_is_mentioned_only_with_groups():
     result = shown.result()
     grouped = replace(result, links=result.links.assign(group=["east", "west"] * 6))
     alone = replace(result, links=result.links.drop(columns="group", errors="ignore"))
-    assert "dB without the mean of each group)" in scene_alone_text(grouped)
-    assert "dB without their mean)" in scene_alone_text(alone)
+    assert "dB after subtracting the mean of each group)" in scene_alone_text(grouped)
+    assert "dB after subtracting their mean)" in scene_alone_text(alone)
     single = replace(alone, links=alone.links.iloc[:1].assign(scene_db=80.0, predicted_db=90.0))
-    assert "by 10.00 dB (RMS over 1 link; 0.00 dB without their mean)" in scene_alone_text(single)
+    assert "by 10.00 dB (RMS over 1 link; 0.00 dB after subtracting their mean)" in scene_alone_text(single)
 
 
 def test_one_interaction_is_singular():

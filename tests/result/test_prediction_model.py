@@ -87,7 +87,7 @@ def test_the_exported_scene_is_the_one_that_predictions_use(tmp_path: Path) -> N
 
 def test_an_offset_is_named_as_the_difference_between_scene_and_predictions(other: Result) -> None:
     assert "differs from the predictions by 3.00 dB" in scene_alone_text(other)
-    assert "0.00 dB without their mean" in scene_alone_text(other)
+    assert "0.00 dB after subtracting their mean" in scene_alone_text(other)
     assert "cannot contain the offset." in scene_alone_text(other)
     same = replace(other, links=other.links.assign(predicted_db=other.links.scene_db))
     assert scene_alone_text(same) == ""

@@ -321,7 +321,7 @@ def test_a_run_killed_between_two_files_leaves_no_mixture(result, folder, monkey
         assert Result.load(folder).links.measured_db.to_numpy() == pytest.approx(result.links.measured_db)
     else:
         for allow in (False, True):
-            with pytest.raises(InputError, match=r"another run than result\.json.*run the study again"):
+            with pytest.raises(InputError, match=r"a different run from result\.json.*run the study again"):
                 Result.load(folder, allow_changed_inputs=allow)
     second.save(folder)
     assert Result.load(folder).links.measured_db.to_numpy() == pytest.approx(links.measured_db)

@@ -153,7 +153,7 @@ def test_a_sector_that_points_elsewhere_than_stated_is_named(
     values = {name: value[0] for name, value in remark.values.items() if isinstance(value, list)}
     assert remark.values["transmitters"] == ["east"]
     assert abs(values["azimuth_deg"] - turned) < 3 * values["azimuth_error_deg"] < turned
-    assert "'east': add to its azimuth +1" in remark_text(remark)
+    assert "'east': add +1" in remark_text(remark)
 
 
 def test_chunks_without_a_turned_antenna_have_the_slopes_of_all_links(planted: Study) -> None:

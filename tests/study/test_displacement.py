@@ -198,7 +198,7 @@ def test_links_that_change_when_traced_again_are_counted_in_a_remark(folder: Pat
     assert f"by up to {gap.max():.2f} dB" in remark_text(found)
     values = {"links": 0, "lost": 1, "of": 160, "tolerance_db": 0.3, "largest_db": 0.1}
     text = remark_text(Remark(RemarkKind.RETRACED, values))
-    assert "values, 1 of 160 links has a path in one of the traces only. Values" in text
+    assert "values, 1 of 160 links has a path in only one of the traces. Values" in text
 
 
 def test_predictions_have_the_calibrated_height_at_exact_receivers(folder: Path, result: cb.Result) -> None:

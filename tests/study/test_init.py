@@ -126,7 +126,9 @@ def test_the_noise_floor_is_that_of_the_least_sensitive_receiver(scene, tmp_path
     file = table(tmp_path, **rows, receiver=np.repeat(["A", "B", "C"], 60))
     found = draft(scene, file, tmp_path / "study.toml", frequency=3.5e9, tx=[-30.0, 0.0, 9.0])
     assert found.study.links.noise_floor_dbm == np.floor(power[power > -80].min())
-    assert any("none of receiver B is lower" in each.reason for each in found.assumptions)
+    assert any(
+        "none of receiver B, the least sensitive, is lower" in each.reason for each in found.assumptions
+    )
 
 
 def test_receivers_with_numbers_are_devices_and_the_directions_of_their_antennas_are_none(scene, tmp_path):
@@ -137,7 +139,7 @@ def test_receivers_with_numbers_are_devices_and_the_directions_of_their_antennas
     found = draft(scene, file, tmp_path / "study.toml", frequency=60e9, tx=[-30.0, 0.0, 9.0])
     assert found.study.offset.per == ("rx_id",)
     reasons = {each.what: each.reason for each in found.assumptions}
-    assert reasons["links.noise_floor_dbm"].endswith("none of rx_id 1 is lower, the least sensitive")
+    assert reasons["links.noise_floor_dbm"].endswith("none of rx_id 1, the least sensitive, is lower")
     assert reasons["links.rx_antenna.azimuth_deg"].startswith("column rx_azimuth_deg may be")
 
 
@@ -149,7 +151,10 @@ def test_the_noise_floor_is_that_of_the_least_sensitive_receiver_that_states_it(
     file = table(tmp_path, **rows, receiver=np.repeat(["A", "B", "C"], 60))
     found = draft(scene, file, tmp_path / "study.toml", frequency=3.5e9, tx=[-30.0, 0.0, 9.0])
     assert found.study.links.noise_floor_dbm == -80.0
-    assert any("of receiver B equal its lowest one" in each.reason for each in found.assumptions)
+    assert any(
+        "of receiver B, the least sensitive, equal its lowest one" in each.reason
+        for each in found.assumptions
+    )
     # The received powers of all receivers are above it, and none of them is a floor.
     assert sorted(-found.study.measurements().path_loss_db) == sorted(power[power > -80.0])
 
@@ -341,7 +346,7 @@ def test_a_track_and_a_hill(tmp_path):
     assert links.rx[:, 0] == pytest.approx([-20, -10, 0, 10, 20], abs=0.01)
     assert links.rx[:, 2] == pytest.approx(5.0 + 0.1 * (links.rx[:, 0] + 50) + 1.5, abs=0.01)
     assert links.tx[0] == pytest.approx([0, -30, 22.0], abs=0.01)
-    assert links.prepared == {"rows at no time of the track, left out": 1, "samples averaged": 5}
+    assert links.prepared == {"rows without a position on the track, left out": 1, "samples averaged": 5}
     assert found.study.files()[2:4] == (tmp_path / "sites.csv", tmp_path / "walk.gpx")
     assert assumed(found)["links.heights"] == "ground"
     assert assumed(found)["links.track"] == "walk.gpx by time"
@@ -393,11 +398,11 @@ def test_what_cannot_be_told_is_asked_for(scene, tmp_path, columns, message):
             {"Lat": "50.01N", "Lon": 9.99, "RSRP": -80.0},
             "'Lat' contains text such as '50.01N': write numbers",
         ),
-        ({"lat": 5000.6, "lon": 959.4, "RSRP": -80.0}, "'lat' has values about 5001, not degrees"),
+        ({"lat": 5000.6, "lon": 959.4, "RSRP": -80.0}, "'lat' has values of about 5001, not degrees"),
         ({"x": 0.0, "y": 30.0, "RSRP": ["<-110"] + ["-80"] * 9}, "'RSRP' contains text such as '<-110'"),
         (
             {"x": 0.0, "y": 30.0, "Signal": 84.0},
-            "'Signal' has values about 84, and received powers .* negative",
+            "'Signal' has values of about 84, and received powers .* negative",
         ),
     ],
 )

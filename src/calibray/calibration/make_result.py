@@ -63,7 +63,7 @@ FAINT: Final = "predicted too near the noise floor, left out"
 
 @dataclass(frozen=True)
 class Timing:
-    """Time of the search by the method, without tracing, and of tracing and loading before it [s]."""
+    """Times of the search, without tracing, and of the loading and tracing before it [s]."""
 
     search: float
     trace: float

@@ -1,6 +1,6 @@
 """Comparison of methods at equal budgets: every method from many seeds on one problem.
 
-The result is the excess of every method over RT calls, as numbers, tables, files and a figure: the best objective so
+The result is the excess of every method versus RT calls, as numbers, tables, files and a figure: the best objective so
 far minus the global optimum of the same data. The optimum comes from least squares with many starts, or from a run that
 reached a lower value.
 """
@@ -228,7 +228,7 @@ def write(comparison: Comparison, folder: Path) -> None:
 
 @styled()
 def figure(comparison: Comparison) -> Figure:
-    """Excess over RT calls: the median of each method and the band between its quartiles."""
+    """Excess versus RT calls: the median of each method and the band between its quartiles."""
     drawing, axes = plain_figure("RT calls", "Excess RMSE [dB]", width=8.0)
     last = max(method.budget for method in comparison.methods)
     colors = iter(PALETTE * (1 + len(comparison.methods) // len(PALETTE)))

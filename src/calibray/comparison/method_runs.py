@@ -1,4 +1,4 @@
-"""A problem for the comparison of methods; runs of methods with a budget, their records, and a file that keeps them."""
+"""Runs of methods on one problem with equal budgets, their records, and a file that stores the records."""
 
 from __future__ import annotations
 

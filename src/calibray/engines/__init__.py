@@ -5,7 +5,7 @@
 - `ChunkedReplay` replays chunks of links in this process or on workers, which return only sums.
 - `Retrace` runs the ray tracer again for every candidate, as the paper does.
 - `Command` calls an external program.
-- `Recorded` adds a `Ledger` to the last two, so that no RT call is paid for twice.
+- `Recorded` adds a `Ledger` to the last two, so that no RT call is repeated.
 
 One RT call is a run of one candidate over all links. Calls are counted here, where the engine runs. `engines.kinds`
 defines the engine sections of a study file and is imported with the study; what needs JAX is loaded when used.

@@ -17,7 +17,7 @@ FIELD_COLUMN: Final = {name: column for column, name in enumerate(FIELDS)}
 
 _SELECTED_MATERIALS: Final = 12
 """Up to this number of materials, a constant is selected by comparing indices; beyond it, it is gathered. XLA gathers
-numbers one after the other, but vectorizes comparisons."""
+one number at a time, but vectorizes comparisons."""
 
 
 class Mode(IntEnum):

@@ -43,7 +43,7 @@ DRAWS: Final = 3
 """Sets of assumed constants over which the information is averaged."""
 
 DRAWN: Final = 3.0
-"""Largest ratio between one of them and the study's constant."""
+"""Largest ratio of an assumed constant to the study's, or of the study's to it."""
 
 SIGMA_DB: Final = 0.1
 """Error of a ratio in the information [dB]."""
@@ -65,7 +65,7 @@ CHANGED_DB: Final = 0.5
 appear between calls may be missing at the optimum of their replay."""
 
 SEARCHES: Final = 4
-"""Factor by which local searches are more than in a calibration on replay: a call costs more than many of them. In a
+"""Ratio of the number of local searches to that of a calibration on replay: a call costs more than many searches. In a
 district with 557 interactions, 512 and 1,024 searches missed a minimum that is 0.076 dB lower with two of five seeds,
 2,048 searches with none."""
 

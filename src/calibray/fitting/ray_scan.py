@@ -40,7 +40,7 @@ THICKEST: Final = 0.6
 """Largest thickness of a scan [m], unless the study's is more than half of it."""
 
 RESOLUTION: Final = 20.0
-"""Number of points of a scan per wavelength in the slab, which has two resonances."""
+"""Number of points of a scan per wavelength in the slab; a slab has two resonances per wavelength of thickness."""
 
 ROBUST_DB: Final = 1.5
 """Error of a ratio beyond which it gets less weight [dB]: near a resonance, where a ray has almost no power, one step
@@ -74,7 +74,7 @@ FINE_SLANTS: Final = np.pi * (np.arange(80) / 80 - 0.5)
 
 
 def robust(square: Any) -> Any:
-    """Geman and McClure's loss of squared errors of ratios [...], [dB^2], of NumPy or JAX."""
+    """Geman-McClure loss [dB^2] of squared errors of ratios [...], [dB^2], a NumPy or JAX array."""
     return square / (1 + square / ROBUST_DB**2)
 
 

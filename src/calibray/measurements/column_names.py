@@ -216,13 +216,13 @@ def no_degrees(frame: pd.DataFrame) -> str:
 
     Example:
         >>> no_degrees(pd.DataFrame({"lat": [4734.12], "lon": [1041.84]}))
-        "; column 'lat' has values about 4734, not degrees: write 47.5687 for 4734.12 (NMEA), and name metres x, y"
+        "; column 'lat' has values of about 4734, not degrees: write 47.5687 for 4734.12 (NMEA), and name metres x, y"
     """
     for name in numeric_columns(frame):
         largest = 90 if matches(name, "latitude") else 180
         if matches(name, "latitude", "longitude") and (median := abs(frame[name].median())) > largest:
             return (
-                f"; column {shortened(name)!r} has values about {median:.0f}, not degrees: write 47.5687 for "
+                f"; column {shortened(name)!r} has values of about {median:.0f}, not degrees: write 47.5687 for "
                 "4734.12 (NMEA), and name metres x, y"
             )
     return ""
@@ -292,7 +292,7 @@ def find_value(table: SourceTable) -> ValueColumn:
         elif table.frame[name].notna().any():
             median = float(table.frame[name].median())
             unlikely = (
-                f"; column {name!r} has values about {median:.0f}, and received powers in dBm are negative"
+                f"; column {name!r} has values of about {median:.0f}, and received powers in dBm are negative"
             )
     if not candidates:
         raise InputError(
@@ -304,7 +304,7 @@ def find_value(table: SourceTable) -> ValueColumn:
     candidates.sort(key=lambda candidate: candidate[:3])
     *_, name, quantity = candidates[0]
     median = float(np.nanmedian(without_codes(table.frame[name])))
-    reason = f"its name, and values about {median:.0f}"
+    reason = f"its name, and values of about {median:.0f}"
     if quantity == "path_loss" and median < 0:
         quantity, reason = "path_gain", f"named a loss, but values are negative, about {median:.0f}: a gain"
     elif quantity == "path_gain" and median > 0:
@@ -347,7 +347,7 @@ def find_length_unit(names: Iterable[str]) -> float:
 
 
 def find_frequency_unit(name: str, default: str = "hz") -> float:
-    """The unit of carriers that a column's name states [Hz]; that of `default` if it states none.
+    """The unit of carrier frequency that a column's name states, in hertz; `default` if it states none.
 
     Example:
         >>> find_frequency_unit("Downlink [MHz]"), find_frequency_unit("carrier")

@@ -81,8 +81,8 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
         compass: Whether azimuths are compass bearings, clockwise from north.
 
     Raises:
-        InputError: The table cannot be read, or lacks links, delays or powers; or its delays or powers have another
-            unit or sign than their names state.
+        InputError: The table cannot be read, or lacks links, delays or powers; or its delays or powers do not have
+            the unit or sign that their names state.
     """
     table = read_table(path)
     # Words of the names, as in delay_ns for "Delay [ns]".
@@ -116,8 +116,8 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
     # A received power of a receiver that is not calibrated can be positive, in decibels.
     if (median < 0) if is_loss else (median > 0 and not is_level):
         raise InputError(
-            f"{path}: column {power!r} has values about {median:g}; losses must be positive, gains and powers "
-            "negative, in dB: name it path_loss_db or path_gain_db"
+            f"{path}: column {power!r} has values of about {median:g} dB; losses must be positive, gains and "
+            "powers negative: name it path_loss_db or path_gain_db"
         )
 
     angles = {}

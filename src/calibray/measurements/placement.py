@@ -18,7 +18,7 @@ from calibray.support.messages import first_line
 TRACK_COLUMNS: Final = ("track_longitude", "track_latitude")
 """The columns of a row's position on a track [deg]."""
 
-NOT_ON_TRACK: Final = "rows at no time of the track, left out"
+NOT_ON_TRACK: Final = "rows without a position on the track, left out"
 """The entry in `changes` of rows outside the times of a track; more follows if another clock fits clearly better."""
 
 MAX_FILE_SIZE: Final = 200_000_000
@@ -84,8 +84,8 @@ def _row_times(table: SourceTable, track: Track) -> NDArray[np.float64]:
     days = seconds[np.isfinite(seconds)] / 86_400
     if len(days) and (days % 1 == 0).all() and not column.astype(str).str.contains(":").any():
         raise InputError(
-            f"{table.source}, column {track.time!r}: contains dates without times; join both in one column, such as "
-            "2026-05-31T14:05:09.2Z"
+            f"{table.source}, column {track.time!r}: contains dates without times; write date and time in one "
+            "column, such as 2026-05-31T14:05:09.2Z"
         )
     return seconds
 
@@ -111,7 +111,7 @@ def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], long
     seconds = seconds[:: 1 + len(seconds) // 10_000]
     if not len(seconds) or (kept := _covered(times, seconds, longest_gap).mean()) > 0.9:
         return 0.0
-    # Time zones are quarters of an hour, up to 14 h, from UTC.
+    # Time zones differ from UTC by multiples of a quarter of an hour, up to 14 h.
     zones = sorted(900.0 * np.arange(-56, 57), key=abs)
     shares = [_covered(times, seconds - zone, longest_gap).mean() for zone in zones]
     return float(zones[int(np.argmax(shares))]) if max(shares) > (1.0 + kept) / 2 else 0.0

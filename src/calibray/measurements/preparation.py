@@ -38,7 +38,7 @@ class LinkColumns:
         rx: Receiver position, likewise.
         value: Column of the measured values.
         quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm]: a received power with
-            unknown transmitted power. The path loss is then minus the received power, and an offset absorbs the
+            unknown transmitted power. The path loss is then minus the received power, and an offset contains the
             transmitted power.
         group: Column of group labels, or several columns whose labels are joined.
         weight: Column of relative weights [1], greater than 0.

@@ -138,8 +138,8 @@ class DFOLS(Optimizer):
     Args:
         seed: Seed of the random points of restarts.
         budget: Number of evaluations.
-        radius: First trust region, as a share of the box.
-        tolerance: Trust region at which a search has converged, as a share of the box.
+        radius: Initial trust-region radius, as a share of the box.
+        tolerance: Trust-region radius at which a search has converged, as a share of the box.
 
     Raises:
         InputError: An argument is out of range, or `DFO-LS` is not installed.

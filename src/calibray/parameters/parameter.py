@@ -89,7 +89,7 @@ class Parameter:
     Attributes:
         name: Material and field, joined by the last dot: "walls.relative_permittivity". Fields are the constants of a
             material, its `roughness_mm`, and `itu_a` to `itu_d` of ITU-R P.2040's law: eps_r = a f^b, sigma = c f^d
-            [S/m], f in GHz. Another effect has its kind before a colon: "region:trees.specific_attenuation".
+            [S/m], f in GHz. For other effects, the kind precedes a colon: "region:trees.specific_attenuation".
         lower: Lower bound, in the field's unit.
         upper: Upper bound, in the field's unit.
         start: Value before calibration, within the bounds, in the field's unit.

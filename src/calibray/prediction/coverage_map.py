@@ -68,7 +68,7 @@ def coverage_map(
         level: Probability that the interval contains a measurement; None for no interval.
         power_dbm: Transmitted power for a map of received power [dBm]; a map of path loss if None. After a calibration
             on RSRP, the default is 0, because the offset contains the power.
-        samples: Number of rays, in place of the study's; the time is proportional to it, and too few rays miss paths.
+        samples: Number of rays; that of the study if None. Time is proportional to it, and too few rays miss paths.
             "auto" adds rays until path loss has converged, which takes less time than a large number.
         columns: Values of the study's columns of groups, carriers or nuisances for this transmitter, by name. The group
             of an offset comes from the links measured at this transmitter, if they share one.

@@ -41,7 +41,7 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
         by neighbouring receivers. "missing_region": the rectangle whose extra loss would explain most of the residuals.
         "leverage": leverage and residual of every calibration link. "power": share of the
         links' power by material and type of interaction. "trade_offs": correlation of the draws of every two unknowns.
-        "neighbours": semivariance of the residuals over the distance between links, both ends counted. "moved": value
+        "neighbours": semivariance of the residuals by distance between links, both ends counted. "moved": value
         of every parameter before and after, the change and the 95 % interval as shares of its range.
     """
     tables = {

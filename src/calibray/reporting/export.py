@@ -65,7 +65,7 @@ def export(
 
     Raises:
         InputError: The folder cannot be written, a file in it must not be replaced, the scene or the links can no
-            longer be read, or Sionna RT loads another scene than the calibrated one.
+            longer be read, or Sionna RT loads a scene that differs from the calibrated one.
     """
     study = result.study
     target = check_outputs(folder, FILES, study.files(), overwrite)

@@ -37,7 +37,7 @@ GROUPS: Final = 24
 
 @style.styled()
 def cumulative_cost(results: Mapping[str, Record]) -> Figure:
-    """Draw RT calls and time over iterations (the paper's figure of cumulative cost)."""
+    """Draw RT calls and time versus iterations (the paper's figure of cumulative cost)."""
     figure = Figure(figsize=(6.4, 4.2), dpi=150, layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
     for axes, column, y in zip(
@@ -64,7 +64,7 @@ def cumulative_cost(results: Mapping[str, Record]) -> Figure:
 
 @style.styled()
 def convergence(results: Mapping[str, Record], optimum_db: float | None = None) -> Figure:
-    """Draw the best RMSE so far over RT calls, and if known the RMSE of the global optimum [dB]."""
+    """Draw the best RMSE so far versus RT calls, and if known the RMSE of the global optimum [dB]."""
     figure, axes = style.plain_figure("RT calls", "RMSE of the best so far [dB]")
     for method, result in results.items():
         history = result.history
@@ -121,7 +121,7 @@ def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
 
 @style.styled()
 def residual_over_distance(survey: Survey) -> Figure:
-    """Draw the residual of each link over the distance between its antennas."""
+    """Draw the residual of each link versus distance between its antennas."""
     figure, axes = style.residual_figure("Distance [m]")
     residuals, held_out = survey.residual_db, survey.table["held_out"].to_numpy(bool)
     for mask, color, marker, name in (
@@ -197,7 +197,7 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 @style.styled()
 def measured_over_modelled(result: Record) -> Figure | None:
-    """Draw measured over modelled values of the first observables, without biases of devices; None without any."""
+    """Draw measured versus modelled values of the first observables, without biases of devices; None without any."""
     fits = dict(list(result.fit.observables.items())[:PANELS])
     if not fits:
         return None

@@ -48,26 +48,26 @@ WORST: Final = 10
 """Number of links with the largest residuals that are listed."""
 
 CAPTIONS: Final = {
-    "convergence": "RMSE of the best candidate so far over RT calls (runs of the ray tracer over all links). It can "
+    "convergence": "RMSE of the best candidate so far versus RT calls (runs of the ray tracer over all links). It can "
     "rise if the objective is not the RMSE alone.",
-    "cumulative-cost": "RT calls and time over the iterations of the method.",
+    "cumulative-cost": "RT calls and time versus iterations of the method.",
     "path-loss": "Every link: measured, before and after calibration.",
-    "residual-over-distance": "Residual (predicted minus measured) over the distance between the antennas.",
+    "residual-over-distance": "Residual (predicted minus measured) versus distance between the antennas.",
     "possible-values": "Posterior of every parameter over its bounds. Wide line: 95 % interval. Dashed: value before "
     "calibration. Solid: calibrated value.",
-    "held-out-errors": "Share of held-out links with an error up to the value on the axis, by model. The best model is "
-    "drawn bold.",
+    "held-out-errors": "Cumulative distribution of the absolute errors of held-out links, by model. The best model is "
+    "drawn in bold.",
     "held-out-blocks": "RMSE on each held-out block, by model.",
     "power": "Power by material and type of interaction: share of the links' power on paths that interact with the "
     "material. A path counts for each of its interactions.",
-    "neighbours": "Semivariance of the residuals over the distance between links (both ends counted). Where it rises, "
+    "neighbours": "Semivariance of the residuals versus distance between links (both ends counted). Where it rises, "
     "neighbouring links share part of their errors.",
-    "leverage": "Residual over leverage. A link with a leverage near 1 determines an unknown almost alone, so its "
+    "leverage": "Residual versus leverage. A link with a leverage near 1 determines an unknown almost alone, so its "
     "residual contains no information about its error.",
     "residual-by-depth": "Mean residual by the number of interactions of the strongest path, with two standard errors. "
     "Number of links in brackets.",
-    "observables": "Measured over modelled values of further observables, link by link, without biases of devices: the "
-    "line marks equal values.",
+    "observables": "Measured versus modelled values of further observables, link by link, without biases of devices. "
+    "The line marks equal values.",
     "residual-by-direction": "Predicted minus measured path loss around each transmitter, by compass direction: points "
     "outside the black circle received more power than predicted. Orange: the stated pattern on the horizon, from its "
     "maximum at the rim to 30 dB less at the centre.",

@@ -165,7 +165,7 @@ def power(table: pd.DataFrame) -> Figure:
 
 @style.styled()
 def neighbours(table: pd.DataFrame) -> Figure:
-    """Draw the semivariance of residuals over the distance between links."""
+    """Draw the semivariance of residuals versus distance between links."""
     figure, axes = style.plain_figure("Distance between links [m]", "Semivariance of residuals [dB²]")
     axes.plot(table["distance_m"], table["semivariance_db2"], "o-", color=style.BLUE)
     axes.set(xlim=(0, None), ylim=(0, None))
@@ -174,7 +174,7 @@ def neighbours(table: pd.DataFrame) -> Figure:
 
 @style.styled()
 def leverage(table: pd.DataFrame) -> Figure:
-    """Draw the residual of every link over its leverage."""
+    """Draw the residual of every link versus its leverage."""
     figure, axes = style.residual_figure("Leverage")
     size = 40 if len(table) <= 100 else 16 if len(table) <= 1000 else 5
     axes.scatter(table["leverage"], table["residual_db"], s=size, c=style.BLUE, alpha=0.7, lw=0,

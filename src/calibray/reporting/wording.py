@@ -95,8 +95,8 @@ def scene_alone_text(record: Record) -> str:
     )
     if record.study.engine.external and model.parameters is not None:
         return (
-            "Predictions at new links and maps call the program. The exported scene contains materials alone: another "
-            f"ray tracer gives other path loss with it, as far as antennas and physics differ.{near}"
+            "Predictions at new links and maps call the program. The exported scene contains only the materials: "
+            f"another ray tracer gives a different path loss if its antennas or physics differ.{near}"
         )
     if rms_db < 0.05:
         return near.lstrip()
@@ -123,8 +123,8 @@ def scene_alone_text(record: Record) -> str:
     means = pd.Series(difference).groupby(group, dropna=False).transform("mean").to_numpy()
     spread_db = float(np.sqrt(np.mean((difference - means) ** 2)))
     return (
-        f"The exported scene alone differs from the predictions by {rms}; {spread_db:.2f} dB without {mean}): a scene "
-        f"cannot contain {cause}.{near}"
+        f"The exported scene alone differs from the predictions by {rms}; {spread_db:.2f} dB after subtracting "
+        f"{mean}): a scene cannot contain {cause}.{near}"
     )
 
 
@@ -138,7 +138,7 @@ def method_text(record: Record, name: str) -> str:
 
 
 def sampling_text(record: Record) -> str:
-    """The reason why the exported scene can give another path loss than the reported one; empty if it cannot."""
+    """The reason why the exported scene can give a path loss that differs from the reported one; empty if it cannot."""
     trace, model = record.study.trace, record.prediction.model
     calibrated = model.parameters is None or model.parameters == record.parameters
     causes = []
@@ -152,7 +152,7 @@ def sampling_text(record: Record) -> str:
     if sampled and not (calibrated and record.fit.retrace_gap_db is not None):
         causes.append(
             "The traced set of refracted and diffuse paths depends on the materials. The reported path loss was "
-            "computed on paths that may have been traced with other materials than those of the exported scene."
+            "computed on paths that may have been traced with materials other than those of the exported scene."
         )
     return " ".join([*causes, "load_scene.py prints the difference of every link."]) if causes else ""
 
@@ -187,7 +187,7 @@ def diagnostics_table(result: Record) -> Table:
 
     findings = {
         "power": text("power", _power_text),
-        "over distance": _distance_text(result),
+        "by distance": _distance_text(result),
         "by depth": _class_text(
             tables, "depth", lambda depth: f"paths of {counted(int(depth), 'interaction')}"
         ),

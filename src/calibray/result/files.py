@@ -206,8 +206,8 @@ def _check_one_run(folder: Path, digests: dict[str, str], allow_edits: bool) -> 
             continue
         if is_unchanged_output(file):
             raise InputError(
-                f"{file}: belongs to another run than {RESULT_FILE}, because a run into this folder was interrupted or "
-                "files were copied; run the study again"
+                f"{file}: belongs to a different run from {RESULT_FILE}, because a run into this folder was "
+                "interrupted or files were copied; run the study again"
             )
         if not allow_edits:
             raise InputError(
@@ -385,7 +385,7 @@ def read_validation(folder: Path, study: Study, measured_db: NDArray[np.float64]
         ) from None
     if not belongs or not _same(held_out.measured_db, measured_db):
         raise InputError(
-            f"{file}: belongs to another study or other measurements than {RESULT_FILE}; run the study again, or "
+            f"{file}: belongs to a different study or measurements from {RESULT_FILE}; run the study again, or "
             "remove the file and validate again"
         )
     return held_out

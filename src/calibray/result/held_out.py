@@ -193,7 +193,7 @@ class PredictionModel:
         residual_db: Root mean square of its residuals on new links [dB]; None if there are too few links.
         basis: Description of the links on which these residuals were computed.
         links: Number of these links, or degrees of freedom if they are calibration links.
-        sizes_db: Absolute held-out residuals, ascending, at most 400 quantiles of them [dB].
+        sizes_db: Absolute held-out residuals, ascending, or 400 quantiles of them if there are more [dB].
         blocks: These residuals in two levels; None if no links, or too few, were held out.
         averaged: Further values of the parameters, if path loss is the average over both; otherwise None.
     """

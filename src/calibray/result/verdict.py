@@ -109,7 +109,7 @@ class RemarkKind(StrEnum):
     HEAVY_TAILS = "heavy tails"  # weight, gaussian_weight
     # weight, gaussian_weight; lacking, settings of [trace] that would find further paths
     ERRORS_OUT_OF_SIGHT = "errors out of sight"
-    # observables, names, path_loss, further, standard_errors; slope and slope_error of measured over modelled values
+    # observables, names, path_loss, further, standard_errors; slope and slope_error of measured versus modelled values
     CONFLICT = "conflict"
     # probability; settings of [trace] with which the paths were traced; rmse_db with these paths, rmse_without_db;
     # outside, names of the parameters whose values lie outside their intervals

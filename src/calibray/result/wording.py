@@ -244,14 +244,14 @@ def _antenna_directions(values: dict[str, Any]) -> str:
     sentences = []
     for number, name in enumerate(values["transmitters"]):
         angles = [
-            f"its {angle} {values[f'{angle}_deg'][number]:+z.1f} deg (standard error {error:.1f} deg)"
+            f"{values[f'{angle}_deg'][number]:+z.1f} deg (standard error {error:.1f} deg) to its {angle}"
             for angle in ("azimuth", "downtilt")
             if (error := values[f"{angle}_error_deg"][number]) > 0
         ]
-        sentences.append(f"{name!r}: add to {' and to '.join(angles)}")
+        sentences.append(f"{name!r}: add {' and '.join(angles)}")
     first = values["transmitters"][0]
     return (
-        "Residuals depend on direction, as if antennas pointed in other directions than stated. These corrections "
+        "Residuals depend on direction, as if antennas did not point in the stated directions. These corrections "
         f"would explain them: {'; '.join(sentences)}. Check the mounting of the antennas, or calibrate parameters such "
         f'as "tx:{first}.azimuth".'
     )
@@ -291,9 +291,9 @@ def _missing_region(values: dict[str, Any]) -> str:
         f"Losses of {values['attenuation']:.2g} dB/m within x = {values['west']:.0f} to {values['east']:.0f} m, "
         f"y = {values['south']:.0f} to {values['north']:.0f} m, up to z = {values['height']:.0f} m, on the straight "
         f"line of {values['links']} links, would explain {percent(values['share'])} of the mean square of the "
-        f"residuals (chance alone {percent(values['chance'])}). The materials may have absorbed part of these losses, "
+        f"residuals (chance alone {percent(values['chance'])}). The materials may compensate for part of these losses, "
         "and the verdicts assume that nothing is missing there. Check whether there are trees, or furniture indoors, "
-        "and state them under [regions]; a wrong direction of an antenna can look like this, too."
+        "and state them under [regions]; a wrong antenna direction can have the same effect."
     )
 
 
@@ -307,7 +307,7 @@ def _differing_groups(values: dict[str, Any]) -> str:
     others = f" The same holds for the columns {', '.join(values['others'])}." if values["others"] else ""
     per = ", ".join(f'"{name}"' for name in values["per"])
     return (
-        f"Residuals of links in the same place depend on the column {values['column']!r}, more than by chance. "
+        f"Residuals of links in the same place depend on the column {values['column']!r} more than chance explains. "
         f"Measured minus modelled path loss, compared with neighbouring links: {groups}{more}.{others} If the column "
         f"names devices, antennas, carriers or days, give each an offset: [offset] per = "
         f"{f'[{per}]' if len(values['per']) > 1 else per}."
@@ -324,7 +324,7 @@ def _retraced(values: dict[str, Any]) -> str:
         )
     if lost:
         changes.append(
-            f"{lost:,} of {total} {'has' if lost == 1 else 'have'} a path in one of the traces only"
+            f"{lost:,} of {total} {'has' if lost == 1 else 'have'} a path in only one of the traces"
         )
     return (
         f"When the scene is traced again with the calibrated values, {', and '.join(changes)}. Values and intervals "

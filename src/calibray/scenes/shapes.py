@@ -113,7 +113,7 @@ def place_mesh(shape: ElementTree.Element, path: Path) -> Mesh:
         raise InputError(
             f"{path}: the transform of shape {shape.get('id')!r} moves vertices to infinity; export the scene again"
         )
-    # Mitsuba shears a shape that rotates about a vector of another length than 1.
+    # Mitsuba shears a shape that rotates about a vector whose length is not 1.
     sheared = any(
         abs(np.linalg.norm(_axes(turn, 0.0)) - 1) > 1e-6 for turn in shape.findall("transform/rotate")
     )

@@ -162,10 +162,10 @@ def _add_noise_floor(draft: LinksDraft, value: ValueColumn) -> None:
             lowest, which = float(values.min()), f"{name} {shortened(str(device))}"
             if (share := _share_at_lowest(values)) and lowest > floor:
                 floor = lowest
-                reason = f"{share:.0%} of the values of {which} equal its lowest one, the least sensitive"
+                reason = f"{share:.0%} of the values of {which}, the least sensitive, equal its lowest one"
             elif some_missing and values.isna().mean() > MISSING_SHARE and np.floor(lowest) > floor:
                 floor = float(np.floor(lowest))
-                reason = f"{missing}, and none of {which} is lower, the least sensitive"
+                reason = f"{missing}, and none of {which}, the least sensitive, is lower"
     if not reason:
         return
     draft.section["noise_floor_dbm"] = floor

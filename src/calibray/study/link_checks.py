@@ -338,8 +338,8 @@ def _delays(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> 
         length = float(np.nanmedian(measured)) * speed_of_light if np.isfinite(measured).any() else 0.0
         if length > longest:
             yield (
-                f"the median of column {section.column!r} [{section.unit}] is the time of light over {length:.0f} m, "
-                f"more than {FAR:g} times the size of the scene",
+                f"the median of column {section.column!r} [{section.unit}] is as long as light takes for {length:.0f} "
+                f"m, more than {FAR:g} times the size of the scene",
                 f"check observables.{name}.unit",
             )
 
@@ -360,7 +360,7 @@ def _angles(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str]]
         if spread_compass < 0.7 * spread:
             yield (
                 f"the values fit antennas.{name} better with a yaw of {compass:.2f} rad: {spread_compass:.1f} dB "
-                f"around a line over distance, compared with {spread:.1f} dB",
+                f"from a log-distance line (standard deviation) instead of {spread:.1f} dB",
                 "yaw is measured from x (east) towards y (north); a compass bearing b is pi/2 - b",
             )
 
@@ -405,7 +405,7 @@ def _spread(
     other: NDArray[np.float64],
     yaw: float,
 ) -> float:
-    """Spread of path loss without the antenna's gain around a line over the logarithm of distance [dB]."""
+    """Standard deviation of path loss without the antenna's gain from a log-distance line [dB]."""
     away = other - own
     azimuth = (np.arctan2(away[:, 1], away[:, 0]) - yaw + np.pi) % (2 * np.pi) - np.pi
     # Measured losses contain the antenna's gain; adding it leaves what does not depend on the azimuth.

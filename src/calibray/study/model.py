@@ -131,7 +131,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def observable_paths(self) -> dict[str, Path]:
-        """The file of every observable that is computed from one, by name."""
+        """The files of the observables that are computed from files, by name."""
         return {
             name: self._resolve(f"observables.{name}.file", section.file)
             for name, section in self.observables.items()

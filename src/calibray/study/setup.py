@@ -195,8 +195,8 @@ class Setup:
     def placed_at(self, values: Mapping[str, float], neighbours: tuple[float, ...] = ()) -> Setup:
         """The same, traced with antennas at the positions that values of the parameters state.
 
-        Itself if no parameter displaces antennas. Path loss is interpolated between `neighbours` on each side of these
-        positions, shares of the largest displacement; without any, it does not depend on displacements.
+        Unchanged if no parameter displaces antennas. Path loss is interpolated between `neighbours` on each side of
+        these positions, shares of the largest displacement; without any, it does not depend on displacements.
         """
         if not any(displaces(item.name) for item in self.parameters):
             return self

@@ -192,7 +192,7 @@ def read_rays(
 
 
 def write_rays(paths: Paths, file: str | Path, *, overwrite: bool = False) -> None:
-    """Write paths as a ray table, for other engines and programs; powers are those for the program's materials.
+    """Write paths as a ray table, for other engines and programs; powers are computed with its materials.
 
     The file ends in .csv, .parquet, .json or .h5; `overwrite` replaces one that Calibray did not write.
 

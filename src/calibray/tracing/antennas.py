@@ -5,7 +5,7 @@ slant angle in every direction of the antenna's frame (3GPP TR 38.901, eq. 7.3-4
 the gain.
 
 Paths do not depend on the antennas. Paths traced with isotropic vertical antennas store the frame of their first and
-last interaction, so any pattern in any direction gives their fields without a new trace.
+last interaction. Their fields with any pattern and orientation therefore need no new trace.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ offset may be undeclared. Larger errors out of sight are a discrepancy of the tw
 Royal Statistical Society B 63, 2001): paths that it lacks change the path loss of its weak links (`excess_db`).
 The right model is unknown, and choosing the best-fitting one ignores others that fit nearly as well. Every model
 therefore gets a prior weight, and results are averages over all models (Bayesian model averaging). A discrepancy that
-the data do not need thus has almost no weight, and does not absorb what the parameters explain.
+the data do not need thus has almost no weight, and does not take over what the parameters explain.
 
 The noise level has the prior 1/level, and nuisances have their own priors, flat unless declared. For Gaussian noise
 with covariance C times an unknown variance, both integrals are closed (D. A. Harville, Biometrika 61, 1974): with

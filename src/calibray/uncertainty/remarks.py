@@ -95,7 +95,7 @@ def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...
 
 
 class Slope(NamedTuple):
-    """Slope of measured over modelled values of an observable.
+    """Slope of the line of measured versus modelled values of an observable.
 
     Attributes:
         name: The observable.

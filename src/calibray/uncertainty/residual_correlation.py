@@ -162,7 +162,7 @@ def shared_errors(errors: NDArray[np.float64], position: NDArray[np.float64]) ->
 def variogram(
     errors: NDArray[np.float64], position: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Empirical variogram: half the mean squared difference of errors over the distance between links.
+    """Empirical variogram: half the mean squared difference of errors versus distance between links.
 
     A rising variogram indicates correlated errors [m], [dB], and a flat one indicates independent errors. Positions
     [m, k], [m], are those of the receivers or of both ends. The result is the mean distance [8], [m], the semivariance

@@ -4,7 +4,7 @@ The interval is conformal: among n + 1 exchangeable errors, a new one has any ra
 therefore lies within the ((n + 1) p)-th smallest of the n observed absolute errors with probability p, whatever their
 distribution (V. Vovk, A. Gammerman, G. Shafer, Algorithmic Learning in a Random World, 2005; R. J. Barber et al., Ann.
 Statist. 49, 2021, for held-out links). Errors of links have heavier tails than a Gaussian, so an interval from their
-root mean square would be too wide at 90 %. With few errors the largest ones are too uncertain, and Student's t is used
+root mean square would be too wide at 90 %. With few errors, the largest are too uncertain, and Student's t is used
 instead.
 
 The law of distance is linear in the distance for times of flight, and linear in its logarithm for all others. Models

@@ -35,7 +35,7 @@ WIDTH: Final = "80"
 """Characters per line of a command's tables."""
 
 TAIL: Final = 16_384
-"""Number of bytes of a log that are shown: some screens full."""
+"""Number of bytes that are shown from the end of a log: a few screens."""
 
 
 _LINE: Final = re.compile(
@@ -213,7 +213,7 @@ class Stage:
 
 
 def stages(log: str) -> list[Stage]:
-    r"""The stages that a log shows, in order; stages of less than some seconds print no line.
+    r"""The stages that a log shows, in order; stages of less than a few seconds print no line.
 
     Example:
         >>> stages("tracing 3/4, 75 %, 1/s, 3 s, about 1 s left\nWritten to result")

@@ -204,7 +204,7 @@ class Command:
                 stop.set()
             for future in pending:
                 future.cancel()
-        # Calls that have ended by now were paid for: their answers are given before the run ends.
+        # Answers of calls that have ended by now are given before the run ends, so that they are not lost.
         for future in wait(pending, None if local_stop else 0).done:
             if not future.cancelled() and not future.exception():
                 yield futures[future], future.result()

@@ -1,1 +1,1 @@
-"""The ledger: a file that stores every RT call that was paid for."""
+"""The ledger: a file that stores every completed RT call."""

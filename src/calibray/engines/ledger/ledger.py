@@ -1,4 +1,4 @@
-"""The ledger stores every RT call that was paid for, in one SQLite file.
+"""The ledger stores every completed RT call in one SQLite file.
 
 An answer is committed before the optimizer sees it, so a killed run finds its answers when it is started again. Several
 runs may write to one ledger at the same time. The ledger must be on a local disk, because SQLite's write-ahead log

@@ -27,7 +27,7 @@ LONGEST_WAIT: Final = 1.0
 
 @final
 class Recorded:
-    """An engine behind a ledger, which does not run a candidate again that any run has paid for.
+    """An engine behind a ledger, which does not repeat a candidate that any run has completed.
 
     Args:
         engine: The engine.
@@ -144,7 +144,7 @@ class Recorded:
                 try:
                     entry = self._ledger.commit(self._problem, candidate, entry)
                 except (EngineError, KeyboardInterrupt) as error:
-                    # Calls that are running were paid for: collect their answers before the run ends.
+                    # Collect the answers of calls in progress before the run ends, so that they are not lost.
                     stop.set()
                     unsaved = [(candidate, entry)]
                     with suppress(EngineError):

@@ -391,7 +391,7 @@ def is_sionna_paths(value: object) -> bool:
 
 
 def check_carrier(rays: Any, frequency: float) -> None:
-    """Refuse paths of Sionna RT that were solved at another carrier than `frequency` [Hz]; other rays state none.
+    """Refuse paths of Sionna RT that were solved at a carrier other than `frequency` [Hz]; other rays state none.
 
     Raises:
         InputError: The carriers differ.

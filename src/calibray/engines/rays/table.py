@@ -52,7 +52,7 @@ MISSPELT: Final = 0.8
 """Smallest similarity at which an unknown column counts as a misspelt one: `line` is not `link`."""
 
 MOST_POINTS: Final = RANGES["max_depth"][1] + 2
-"""Largest number of points of a path: the most interactions of a trace, and both ends."""
+"""Largest number of points of a path: the largest number of interactions of a trace, plus both ends."""
 
 NO_POWER: Final = {"power_db": "-inf", "gain_real": "0", "gain_imag": "0"}
 """What columns state for a path without power."""

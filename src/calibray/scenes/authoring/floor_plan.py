@@ -30,7 +30,7 @@ OPENINGS: Final = frozenset({"door", "window"})
 """Types that replace the wall on which they are drawn."""
 
 THICKNESS: Final = (0.0005, 3.0)
-"""Smallest and largest thickness of a wall [m]; beyond it, the column has another unit than the coordinates."""
+"""Smallest and largest thickness of a wall [m]; beyond it, the column and the coordinates have different units."""
 
 USUAL_EXTENT: Final = (2.0, 300.0)
 """Extent of a plan [m] beyond which a warning asks for its unit; large halls are 300 m long."""

@@ -152,7 +152,7 @@ def clean_footprints(raw: Footprints) -> Footprints:
     """Repair outlines so that buildings can be raised on them: on a grid, without self-crossings, not too small.
 
     Corners are rounded to multiples of `GRID`; outlines of less area than `SMALLEST` are left out. Repairs
-    are counted, and names are unique.
+    are counted. Repeated names are made unique.
 
     Raises:
         InputError: A height is not a number or above `HIGHEST`, or the buildings are farther apart than `WIDEST`.

@@ -132,8 +132,9 @@ def reverse(buffer: PathsBuffer, sources: mi.Point3f) -> PathsBuffer:
 
     Mirror images, straight lines through walls and the shortest path over an edge are the same in both directions, so
     candidates of one direction are candidates of the other. They are reversed before their geometry is computed, so
-    that the paths are equal digit by digit for both ends. Three things depend on the direction: the order of the
-    interactions, the two ends, and the faces of an edge, because Sionna calls the illuminated face the 0-face.
+    that paths searched from either end are identical to the last digit. Three things depend on the direction: the
+    order of the interactions, the two ends, and the faces of an edge, because Sionna calls the illuminated face the
+    0-face.
     """
     if not buffer.buffer_size:
         return buffer

@@ -46,7 +46,7 @@ class LiveScene:
 
     Attributes:
         frequency: Carrier frequency [Hz].
-        objects: The meshes; surfaces that are not connected are separate objects, because Sionna merges objects.
+        objects: One mesh per connected surface, because Sionna merges objects.
         materials: The materials that objects use, by name.
         antennas: Transmit and receive antenna.
         tx: Positions by name of the transmitters [3], [m].
@@ -258,7 +258,7 @@ def verify_export(tracer: Tracer, materials: Mapping[str, Material], target: Pat
             size for size, item in zip(scene.sizes, scene.objects, strict=True) if item.material == name
         ]
         if not surfaces_agree(by_material.get(names[name], []), stored, np.zeros(3)):
-            fault = f"Sionna RT contains another surface of material {shortened(repr(names[name]))}"
+            fault = f"Sionna RT contains a different surface of material {shortened(repr(names[name]))}"
             raise InputError(_failed(target, fault))
     if scene.local_origin.any():
         _LOG.warning(

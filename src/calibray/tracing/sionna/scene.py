@@ -37,7 +37,7 @@ def load_scene(scene: Scene) -> rt.Scene:
     """Load a scene into Sionna RT, in its local frame; its mesh files are found relative to the scene file.
 
     Raises:
-        InputError: Sionna cannot load the scene, or has another surface than its files.
+        InputError: Sionna cannot load the scene, or its surfaces differ from those in the files.
     """
     if has_copied_meshes(scene):
         with _temporary_folder(scene.path) as folder:
@@ -94,7 +94,7 @@ def _check_surfaces(mitsuba_scene: Any, scene: Scene) -> None:
         traced = held.get(number, [])
         if not surfaces_agree(traced, stored, scene.local_origin):
             raise InputError(
-                f"{scene.path}: Mitsuba contains another surface of material {material!r} than the mesh files "
+                f"{scene.path}: the surface of material {material!r} in Mitsuba differs from that of the mesh files "
                 f"({sum(size.area for size in traced):.6g} m^2 instead of {sum(size.area for size in stored):.6g} "
                 "m^2); export the meshes again, as binary PLY with coordinates of type float"
             )

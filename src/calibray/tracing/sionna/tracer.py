@@ -234,9 +234,9 @@ class Tracer:
     def enclosed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether points [n, 3], [m], lie inside closed bodies of the scene, such as buildings [n].
 
-        A ray from inside a closed body crosses its surface an odd number of times. Rays in several directions vote,
-        because scenes have gaps. All of them point upwards, because buildings often lack a floor. A room is a body as
-        well.
+        A ray from inside a closed body crosses its surface an odd number of times. Scenes have gaps, so the
+        majority of rays in several directions decides. All of them point upwards, because buildings often lack a floor.
+        A room is a body as well.
         """
         azimuth, elevation = np.meshgrid(np.linspace(0.1, 2 * np.pi, 6), np.radians([25.0, 50.0, 75.0]))
         directions = np.stack(
