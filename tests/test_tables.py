@@ -26,7 +26,7 @@ def test_text_is_aligned_and_without_markup():
 
 
 def test_texts_of_the_last_column_are_folded_to_the_width_of_a_terminal(monkeypatch):
-    reason = "columns named as degrees; no height: 1.5 m"
+    reason = "column names indicate degrees; no height: 1.5 m"
     table = Table("", (Column("what"), numbers("links"), Column("reason")), (("links.rx", "330", reason),))
     sentences = Table("", (Column(),), ((reason,), (reason,)))
     monkeypatch.setenv("COLUMNS", "40")

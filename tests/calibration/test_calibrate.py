@@ -379,7 +379,7 @@ def test_a_single_link_is_refused_before_the_search(tmp_path):
     study = two_ray.study(tmp_path, holdout={"where": "rx_x > 3.1"})
     setup = Setup.open(study, two_ray.TwoRay)
     engine = Replay(setup.trace(), setup.parameters, "coherent")
-    with pytest.raises(InputError, match=r"links\.csv: 1 calibration link has a path; at least 2 must"):
+    with pytest.raises(InputError, match=r"links\.csv: 1 calibration link has a path; at least 2 are needed"):
         calibrate(setup, engine=engine)
     assert engine.calls == 1
 

@@ -22,5 +22,5 @@ def test_the_pages_describe_the_commands():
 
 def test_help_contains_no_sections_for_python():
     helps = {name: command.help for name, command in typer.main.get_command(app).commands.items()}
-    assert "Open a study's folder in the browser" in helps["open"]
+    assert "Work on a study in the browser" in helps["open"]
     assert [name for name, text in helps.items() if "Raises" in text] == []

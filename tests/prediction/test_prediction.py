@@ -134,9 +134,9 @@ def test_the_command_adds_columns_and_warns_of_implausible_positions(received, t
     predictions = pd.read_csv(io.StringIO(run.stdout), keep_default_na=False)
     added = ["basis", "received_power_dbm", "received_power_lower_dbm", "received_power_upper_dbm", "remark"]
     assert predictions.columns.tolist() == [*table.columns, "path_loss_db", "lower_db", "upper_db", *added]
-    assert predictions.remark.tolist() == ["", "receiver under the ground", "receiver beyond the scene"]
+    assert predictions.remark.tolist() == ["", "receiver under the ground", "receiver outside the scene"]
     assert "receiver under the ground: 1 of 3 links, row 3" in run.stderr
-    assert "receiver beyond the scene: 1 of 3 links, row 4" in run.stderr
+    assert "receiver outside the scene: 1 of 3 links, row 4" in run.stderr
 
 
 def test_places_far_from_the_scene_are_refused(tmp_path):
@@ -162,7 +162,7 @@ def test_places_far_from_the_scene_are_refused(tmp_path):
     with pytest.raises(InputError, match="relative to the scene's origin"):
         result.predict(far)
     mixed = result.predict_interval(pd.concat([places, places.head(1) + 0.1]))
-    assert mixed.remark.tolist() == [*[""] * len(places), "receiver beyond the scene"]
+    assert mixed.remark.tolist() == [*[""] * len(places), "receiver outside the scene"]
     result.save(tmp_path / "out")
     swapped.to_csv(tmp_path / "swapped.csv", index=False)
     run = CliRunner().invoke(app, ["predict", str(tmp_path / "out"), str(tmp_path / "swapped.csv")])
@@ -187,7 +187,7 @@ def test_points_are_located():
         [[0, 0, 1.5], [0, 0, 12], [20, 0, 1.5], [20, 0, 5.5], [30, 0, 1.5], [30, 0, -1], [90, 0, 1.5]]
     )
     assert locate(scene, points).tolist() == [
-        "inside a building", "", "", "inside a building", "", "under the ground", "beyond the scene"
+        "inside a building", "", "", "inside a building", "", "under the ground", "outside the scene"
     ]  # fmt: skip
 
 

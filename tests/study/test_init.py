@@ -264,7 +264,7 @@ def test_a_column_of_altitudes_that_is_not_used_is_named(scene, tmp_path, column
     found = draft(scene, file, tmp_path / "study.toml", tmp_path / "masts.csv", 2.4e9)
     (reason,) = [each.reason for each in found.assumptions if each.what == "links.rx"]
     assert found.study.links.rx == ("lon", "lat", height)
-    assert ("alt may count from sea level" in reason) == (column == "alt")
+    assert ("alt may be above sea level" in reason) == (column == "alt")
 
 
 @pytest.mark.parametrize(("places", "height"), [(12, 1.5), (2, 10.0)])
@@ -353,7 +353,7 @@ def test_a_track_and_a_hill(tmp_path):
     with pytest.raises(InputError, match="no column of times"):
         draft(scene, table(tmp_path, rsrp_dbm=[-80.0]), tmp_path / "study.toml", sites, 3.5e9,
               track=tmp_path / "walk.gpx")  # fmt: skip
-    # Beyond the scene there is no ground to count from.
+    # Outside the scene there is no ground to count from.
     far = links.frame.assign(time=clock[:5])
     with pytest.raises(InputError, match=r"no ground at 5 of 5 positions"):
         SceneSurfaces.read(scene).ground_height(far["rx_x"] + 500.0, far["rx_y"])

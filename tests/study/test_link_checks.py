@@ -95,8 +95,8 @@ def test_a_study_without_an_offset_has_no_unknown_for_it(town):
     [
         (lambda t: t.assign(x=t.y, y=t.x), "if x and y are swapped"),
         (lambda t: t.assign(x=-t.y, y=t.x), "if they are turned by 90 degrees"),
-        (lambda t: t.assign(x=t.x + 200), "are beyond the scene; their centre is"),
-        (lambda t: t.assign(x=t.x + 900 * (t.index == 7)), "1 of 60 receivers are beyond the scene"),
+        (lambda t: t.assign(x=t.x + 200), "are outside the scene; their centre is"),
+        (lambda t: t.assign(x=t.x + 900 * (t.index == 7)), "1 of 60 receivers are outside the scene"),
         (lambda t: t.assign(z=t.z - 4), "60 of 60 receivers are below the ground"),
         (lambda t: t.assign(z=t.z + 540), "60 of 60 receivers are more than 300 m above the whole scene"),
         (lambda t: t.assign(y=np.where(t.index < 5, 20.0, t.y), x=np.where(t.index < 5, 10.0 + t.index, t.x)),
@@ -200,13 +200,13 @@ def test_a_planted_mistake_of_the_study_is_named(town, changes, named):
         (
             {"z": "height_ft"},
             {"rx": ["x", "y", "height_ft"]},
-            "'height_ft' is named like lengths of 0.3048 m",
+            "'height_ft' implies a unit of 0.3048 m",
         ),
         ({"z": "z_m"}, {"rx": ["x", "y", "z_m"]}, ""),
         (
             {"loss": "rx_dbm"},
             {"value": "rx_dbm", "quantity": "received_power", "tx_power_dbm": "power_w"},
-            "like watts",
+            "implies watts",
         ),
     ],
 )
@@ -249,12 +249,12 @@ def test_upward_tilts_and_relative_gains_are_named(town):
     )
     gain = -np.minimum(12 * (azimuth / 65) ** 2 + 12 * (elevation / 65) ** 2, 30)
     grid = pd.DataFrame({"azimuth_deg": azimuth, "elevation_deg": elevation, "gain_dbi": gain})
-    for largest, tilt, named in ((0.0, 6.0, ("relative",)), (9.8, -6.0, ("look up",)), (9.8, 6.0, ())):
+    for largest, tilt, named in ((0.0, 6.0, ("relative",)), (9.8, -6.0, ("point upwards",)), (9.8, 6.0, ())):
         grid.assign(gain_dbi=gain + largest).to_csv(town / f"{largest}.csv", index=False)
         mounted = {"tx_antenna": {"azimuth_deg": 30.0, "downtilt_deg": "tilt"}}
         antenna = {"pattern": f"{largest}.csv", "orientation": [0.0, 0.0, 0.0]}
         found = suspicions(town, links().assign(tilt=tilt), links=mounted, antenna=antenna)
-        assert [word for word in ("relative", "look up") if word in found] == list(named)
+        assert [word for word in ("relative", "point upwards") if word in found] == list(named)
 
 
 @pytest.mark.parametrize(
@@ -324,7 +324,7 @@ def test_a_scene_in_millimetres_is_named(tmp_path, town):
     text = (town / "scene.xml").read_text().replace('value="meshes/', f'value="{town}/meshes/')
     scale = '<transform name="to_world"><scale value="1000"/></transform>'
     scene.write_text(text.replace('<boolean name="face_normals"', f'{scale}<boolean name="face_normals"'))
-    assert "large, as if in millimetres" in suspicions(
+    assert "m, as if in millimetres" in suspicions(
         town, links(), scene={"file": str(scene), "frequency": 3.5e9}
     )
 

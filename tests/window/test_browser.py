@@ -87,7 +87,7 @@ def test_the_links_are_on_the_map_with_their_reasons_beside(walked):
     assert page.locator("#plan").get_attribute("data-links") == "84"
     assert (
         step(page, "Measurements")
-        .get_by_text("columns named as metres; no height: 1.5 m", exact=True)
+        .get_by_text("column names indicate metres; no height: 1.5 m", exact=True)
         .count()
         == 1
     )

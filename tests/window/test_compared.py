@@ -116,8 +116,8 @@ def test_a_prediction_beyond_the_scene_says_so():
             "basis": "calibrated",
         }
     )
-    said = predicted_text(pd.concat([row, pd.Series({"remark": "receiver beyond the scene"})]))
-    assert said.endswith("(calibrated); receiver beyond the scene")
+    said = predicted_text(pd.concat([row, pd.Series({"remark": "receiver outside the scene"})]))
+    assert said.endswith("(calibrated); receiver outside the scene")
     # Of a table without remarks, the column is read as numbers.
     assert predicted_text(pd.concat([row, pd.Series({"remark": np.nan})])).endswith("(calibrated)")
 

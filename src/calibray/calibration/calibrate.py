@@ -126,7 +126,8 @@ def calibrate(
     problem = Problem.of(setup, engine)
     if problem.objective.num_counted < 2:
         raise InputError(
-            f"{setup.links.source}: 1 calibration link has a path; at least 2 must: measure more, or change [holdout]"
+            f"{setup.links.source}: 1 calibration link has a path; at least 2 are needed: measure more, "
+            "or change [holdout]"
         )
     # With a given engine, this machine may have no ray tracer, which the check for enclosed antennas needs.
     enclosed = setup.enclosed if can_trace else None

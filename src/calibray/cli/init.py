@@ -18,7 +18,9 @@ class Known:
     """Options that state what the table of links lacks."""
 
     transmitters: Annotated[Path | None, option("FILE", "Table of transmitter positions.")] = None
-    track: Annotated[Path | None, option("FILE", "GPX track with the position of each row over time.")] = None
+    track: Annotated[
+        Path | None, option("FILE", "GPX track that gives each row the position at its time.")
+    ] = None
     antennas: Annotated[Path | None, option("DIR", "Folder of MSI files named after the antennas.")] = None
     tx: Annotated[str | None, option("X,Y,Z", "Transmitter position in the scene frame [m].")] = None
     frequency: Annotated[float | None, option("HZ", "Carrier frequency [Hz].")] = None
@@ -120,7 +122,7 @@ def open(
     port: Annotated[int, option("N", "Port; 0 for a free one.", min=0, max=65535)] = 0,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Only print the address.")] = False,
 ) -> None:
-    """Open a study's folder in the browser, from a map and measurements to predictions without a terminal.
+    """Work on a study in the browser instead of a terminal, from a map and measurements to predictions.
 
     The page is served on this machine only, at an address with a token. Ctrl-C ends the server, but not commands in
     progress.

@@ -55,7 +55,7 @@ def predict(
         ),
     ],
     out: Annotated[
-        Path | None, option("FILE", "CSV or Parquet file to write, in place of CSV on stdout.", "--out", "-o")
+        Path | None, option("FILE", "CSV or Parquet file to write instead of CSV on stdout.", "--out", "-o")
     ] = None,
     level: Annotated[
         float | None,
@@ -290,7 +290,7 @@ class Area:
     cell: Annotated[float, option("M", "Width of the cells [m].")] = 5.0
     bounds: Annotated[
         tuple[float, float, float, float] | None,
-        option("W S E N", "West, south, east and north end of the area [m]; by default the whole scene."),
+        option("W S E N", "West, south, east and north limits of the area [m]; by default the whole scene."),
     ] = None
 
 
@@ -308,7 +308,7 @@ class Values:
         str | None,
         option(
             "N|auto",
-            "Number of rays, in place of the study's. The time grows with this number; too few rays miss paths.",
+            "Number of rays instead of the study's. The time grows with this number; too few rays miss paths.",
         ),
     ] = None
     column: Annotated[

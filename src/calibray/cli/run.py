@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Changes:
-    """Options in place of the study's own."""
+    """Options that replace the study's own."""
 
     method: Annotated[
         str | None, option("NAME", "Method instead of the study's: auto, sgwo-im, gwo, ...")

@@ -62,11 +62,11 @@ class MapOptions:
         float, option("SHARE", "Share of windows in every wall, at least 0 and below 1.")
     ] = 0.0
     storey: Annotated[
-        float, option("M", "Height of a storey [m], for buildings with only the number of storeys.")
+        float, option("M", "Height of a storey [m], for buildings that state only their number of storeys.")
     ] = 3.0
-    default_height: Annotated[float, option("M", "Height of a building without height and storeys [m].")] = (
-        9.0
-    )
+    default_height: Annotated[
+        float, option("M", "Height of a building that states neither height nor storeys [m].")
+    ] = 9.0
     margin: Annotated[float, option("M", "Width of the ground around the buildings [m].")] = 50.0
     per_building: Annotated[
         bool,
@@ -111,7 +111,7 @@ class ColumnOptions:
         ),
     ] = None
     bottom: Annotated[
-        str, option("COLUMN", "Column with the heights of the lower ends, or a number [m].")
+        str, option("COLUMN", "Column with the heights of the undersides above the ground, or a number [m].")
     ] = "0"
     levels: Annotated[str | None, option("COLUMN", "Column with the numbers of storeys.")] = None
     name: Annotated[str | None, option("COLUMN", "Column with the names.")] = None

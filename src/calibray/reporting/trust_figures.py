@@ -263,7 +263,7 @@ def _pattern_db(mounting: Mounting, link: int, bearing: NDArray[np.float64]) -> 
     """Gain on the horizon of the antenna of one link, relative to its largest there [n], [dB]."""
     on_link = mounting.of_paths(np.full(len(bearing), link))
     pose = Pose(*on_link.pose)
-    # On the horizon; azimuths count from the east anticlockwise, bearings from the north clockwise.
+    # On the horizon; azimuths are measured anticlockwise from the east, bearings clockwise from the north.
     angles = np.stack([np.full(len(bearing), np.pi / 2), np.pi / 2 - bearing], axis=1)
     jones = jones_vectors(AntennaPattern.of(mounting.antennas[on_link.index[0]]), wave_basis(angles), pose)
     power = (np.abs(jones) ** 2).sum(axis=(1, 2))

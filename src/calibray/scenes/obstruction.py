@@ -37,8 +37,8 @@ class Region:
         outline: Shapely polygons [n] in the scene's frame [m].
         bottom: Height at which each begins [n], [m].
         top: Height at which each ends [n], [m].
-        ground: Height of the ground [k], [m], from which heights count, at x and y [k], [m], NaN where there is none;
-            if None, they count from z = 0.
+        ground: Height of the ground [k], [m], from which heights are measured, at x and y [k], [m], NaN where there is
+            none; if None, they are measured from z = 0.
     """
 
     outline: NDArray[Any]

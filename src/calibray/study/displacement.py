@@ -59,7 +59,7 @@ class Displacement:
         weights: 1 where a parameter displaces a group of links [G, parameters].
         group: Group of every link [L].
         reach: Largest displacement of every group by one of its parameters [G], [m]; sums count up to it.
-        ground: The ground that receivers follow; None if their heights do not count from it.
+        ground: The ground that receivers follow; None if their heights are not measured from it.
     """
 
     field: str

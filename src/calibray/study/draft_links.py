@@ -38,7 +38,7 @@ RECEIVER_HEIGHT: Final = 1.5
 """Height of a receiver without a column of heights [m]: a phone in the hand."""
 
 ALTITUDES: Final = frozenset({"alt", "altitude", "altitud", "amsl", "asl", "msl", "nhn"})
-"""Words of columns of altitudes, which satellite receivers count from sea level and drones also from the ground."""
+"""Words of columns of altitudes, which satellite receivers measure from sea level and drones also from the ground."""
 
 TRANSMITTER_HEIGHT: Final = 10.0
 """Height of a transmitter without a column of heights [m]: a small cell on a mast."""
@@ -364,14 +364,14 @@ class LinksDraft:
         unit = "degrees" if rx.position == "geographic" else "metres"
         unit = "metres of a projection" if "crs" in self.section else unit
         self._add_position_unit(tx, rx)
-        reason = f"columns named as {unit}" if "position_unit" not in self.section else "by their names"
+        reason = f"column names indicate {unit}" if "position_unit" not in self.section else "by their names"
         if unit == "degrees" and not column_names.matches(rx.x, "longitude"):
             reason = "its numbers are on the scene as degrees"
         if rx.height is None:
             reason += f"; no height: {RECEIVER_HEIGHT} m"
             unused = [str(name) for name in self.table.frame if column_names.words(name) & ALTITUDES]
             if unused:
-                reason += f" ({unused[0]} may count from sea level; name a height above the ground 'height')"
+                reason += f" ({unused[0]} may be above sea level; name a height above the ground 'height')"
         self.assume("links.rx", ", ".join(map(str, self.section["rx"])), reason)
         if rx.position != "geographic":
             return
@@ -487,8 +487,10 @@ class LinksDraft:
         try:
             ground = self.overhead.ground_height(*np.concatenate([links.tx, links.rx])[:, :2].T)
         except InputError:
-            return  # a link is beyond the scene, or there is no ground
+            return  # a link is outside the scene, or there is no ground
         if np.abs(ground).max() > 0.5:
             self.section["heights"] = "ground"
-            reason = f"the ground is at {ground.min():.0f} to {ground.max():.0f} m; heights count from there"
+            reason = (
+                f"the ground is at {ground.min():.0f} to {ground.max():.0f} m; heights are measured from it"
+            )
             self.assume("links.heights", "ground", reason)

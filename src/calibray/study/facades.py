@@ -162,7 +162,7 @@ def _applies(
     applies = np.ones(len(point), dtype=bool)
     if section.storeys is not None:
         height = point[:, 2] - surfaces.ground_height(point[:, 0], point[:, 1])
-        # Storeys count from 1, the ground floor.
+        # Storeys are numbered from 1, the ground floor.
         storey = np.floor(height / section.storey_height) + 1
         applies &= (storey >= section.storeys[0]) & (storey <= section.storeys[1])
         # The ground is no storey, even if it has the material of the walls.

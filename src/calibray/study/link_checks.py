@@ -179,7 +179,7 @@ def _positions(
             )
             yield (
                 problem,
-                "check heights and their datum: links.heights = 'ground' counts them from the ground",
+                "check heights and their datum: links.heights = 'ground' measures them from the ground",
             )
         touching = overhead.touching(points)
         if touching.any():
@@ -196,7 +196,7 @@ def _positions(
     if turn is not None:
         name, fewer = turn
         yield (
-            f"{wrong} of {len(rx)} receivers are inside buildings or beyond the scene; {fewer or 'none'} of {len(rx)} "
+            f"{wrong} of {len(rx)} receivers are inside buildings or outside the scene; {fewer or 'none'} of {len(rx)} "
             f"if {name}",
             "check the order and the directions of the axes: x to the east, y to the north",
         )
@@ -205,14 +205,14 @@ def _positions(
     if beyond.mean() > 0.25:
         shift = rx[:, :2].mean(axis=0) - (overhead.bounds[:2] + overhead.bounds[3:5]) / 2
         yield (
-            f"{int(beyond.sum())} of {len(rx)} receivers are beyond the scene; their centre is {shift[0]:.0f} m east "
+            f"{int(beyond.sum())} of {len(rx)} receivers are outside the scene; their centre is {shift[0]:.0f} m east "
             f"and {shift[1]:.0f} m north of the scene's centre",
             "check the origin of the positions",
         )
     elif beyond.any():
         row = links.row[int(np.argmax(overhead.outside(links.rx)))]
         yield (
-            f"{int(beyond.sum())} of {len(rx)} receivers are beyond the scene, where it has no ground and no "
+            f"{int(beyond.sum())} of {len(rx)} receivers are outside the scene, where it has no ground and no "
             f"buildings, the first in row {row}",
             "leave out wrong positions with links.where, or make a larger scene",
         )
@@ -259,7 +259,7 @@ def refuse_far_receivers(
 
 
 def _misplaced(overhead: SceneSurfaces, rx: NDArray[np.float64]) -> int:
-    """Number of receivers beyond the scene or below a roof."""
+    """Number of receivers outside the scene or below a roof."""
     return int((overhead.outside(rx) | overhead.under_roof(rx)).sum())
 
 
@@ -280,7 +280,7 @@ def _units(study: StudyModel) -> Iterator[tuple[str, str]]:
     for name in dict.fromkeys(name for name in (*links.tx, *links.rx) if isinstance(name, str)):
         if words(name) & {*LENGTH_UNITS, "m"} and (stated := find_length_unit([name])) != unit:
             yield (
-                f"column {name!r} is named like lengths of {stated:g} m, and is read as lengths of {unit:g} m",
+                f"the name of column {name!r} implies a unit of {stated:g} m, but it is read in units of {unit:g} m",
                 # Degrees have no length, so that positions on the globe have no unit to state.
                 "convert it"
                 if links.position == "geographic"
@@ -289,7 +289,7 @@ def _units(study: StudyModel) -> Iterator[tuple[str, str]]:
     for key in ("tx_power_dbm", "eirp_dbm"):
         name = getattr(links, key)
         if isinstance(name, str) and words(name) & WATTS:
-            yield f"column {name!r} of links.{key} is named like watts or dBW", "convert it to dBm"
+            yield f"the name of column {name!r} of links.{key} implies watts or dBW", "convert it to dBm"
 
 
 def _levels(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> Iterator[tuple[str, str]]:
@@ -372,8 +372,8 @@ def _antennas(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str
         # A lossless antenna has a mean gain of 1, so that its largest gain is above 0 dBi.
         if table.gain_dbi.max() == 0 and table.efficiency < LOSSY:
             yield (
-                f"the largest gain in {file} is 0 dBi and the mean {table.efficiency:.0%}, as of levels relative to "
-                "the main direction",
+                f"the largest gain in {file} is 0 dBi and the mean {table.efficiency:.0%}, as if gains were "
+                "relative to the main direction",
                 "give absolute gains [dBi]",
             )
     if study.links.tx_antenna is not None and study.links.tx_antenna.aim is None:
@@ -382,7 +382,7 @@ def _antennas(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str
         if tilt.max() < 0:
             yield (
                 f"all downtilts of links.tx_antenna are negative, {tilt.min():g} to {tilt.max():g} degrees: the "
-                "antennas look up",
+                "antennas point upwards",
                 "give the angles below the horizon, which are positive",
             )
 

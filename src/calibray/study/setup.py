@@ -364,7 +364,7 @@ class Setup:
 
     @cached_property
     def _ground(self) -> Ground | None:
-        """Heights of the lowest surfaces, +inf where there is none; None if heights do not count from the ground."""
+        """Heights of the lowest surfaces, +inf where there is none; None if heights are not relative to the ground."""
         return None if self.study.links.heights is None else scene_place(self.study).surfaces().lowest_surface
 
     @cached_property

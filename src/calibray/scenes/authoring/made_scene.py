@@ -276,7 +276,7 @@ def _base_heights(footprints: Footprints, terrain: Terrain | None) -> NDArray[np
     )
     lowest = np.full(len(footprints), np.inf)
     np.minimum.at(lowest, building, terrain.heights(*corners.T))
-    # The heights of a building's parts count from the ground of the whole building, so that they stand on each other.
+    # The heights of parts are measured from the ground of the whole building, so that they stand on each other.
     parts, wholes = np.flatnonzero(footprints.part), np.flatnonzero(~footprints.part)
     inside = shapely.point_on_surface(footprints.polygon[parts])
     part, whole = shapely.STRtree(footprints.polygon[wholes]).query(inside, predicate="within")

@@ -28,7 +28,7 @@ CONTACT: Final = 0.01
 """An antenna nearer to a level surface touches it [m]. At 1 mm, Sionna RT misses the reflections of this surface on all
 links, at 3 mm on most, and at 10 mm on none."""
 
-BEYOND: Final = "beyond the scene"
+BEYOND: Final = "outside the scene"
 UNDER: Final = "under the ground"
 INSIDE: Final = "inside a building"
 

@@ -202,14 +202,14 @@ def scale_findings(low: NDArray[np.float64], high: NDArray[np.float64]) -> Itera
     width = float(extent[:2].max())
     size = f"{extent[0]:.4g} x {extent[1]:.4g} x {extent[2]:.4g}"
     if width < 1 and np.abs([*low[:2], *high[:2]]).max() <= 180:
-        problem = f"the scene is {size} large, as if in degrees of longitude and latitude"
+        problem = f"the scene measures {size}, as if in degrees of longitude and latitude"
         yield Finding("error", "", problem, "project it to metres (calibray scene does)")
         return
     if width > WIDEST:
-        problem = f"the scene is {size} m large, as if in millimetres"
+        problem = f"the scene measures {size} m, as if in millimetres"
         yield Finding("error", "", problem, "scale it by 0.001 to metres")
     if 0 < extent[2] < 0.005 * width and extent[2] < 1:
-        problem = f"the scene is {size} m large, flat as a sheet"
+        problem = f"the scene measures {size} m and is almost flat"
         yield Finding("note", "", problem, "check that heights were exported")
 
 
