@@ -368,6 +368,22 @@ def test_an_offset_of_few_links_is_uncertain(tmp_path):
     assert half_width[1:].mean() == pytest.approx(np.sqrt(1 + 2 / 11) * of_links * error_db, rel=0.1)
 
 
+def test_intervals_cover_new_links_though_stated_errors_differ(tmp_path):
+    """A few exact links say much of the parameters and nothing of the errors of others."""
+    std, random = np.tile([0.1, 4.0], planted.LINKS // 2), np.random.default_rng(1)
+    truth = planted.campaign().assign(std=std)
+    table = truth.assign(path_loss_db=truth.path_loss_db + std * random.standard_normal(planted.LINKS))
+    links = planted.content("links.csv")["links"] | {"std": "std"}
+    result = calibrate(planted.study(tmp_path, table, links=links), engine=planted.engine())
+    error_db = result.links.measured_db - result.links.after_db
+    freedom = planted.LINKS - len(planted.TRUTH)
+    assert result.prediction.model.residual_db == pytest.approx(np.sqrt(np.sum(error_db**2) / freedom))
+    ends = result.predict_interval(truth)
+    new_db = truth.path_loss_db.to_numpy() + std * random.standard_normal((1000, planted.LINKS))
+    inside = (ends.lower_db.to_numpy() <= new_db) & (new_db <= ends.upper_db.to_numpy())
+    assert 0.85 < inside.mean() < 0.99
+
+
 def test_the_reach_of_links_held_out_by_a_filter_is_their_distance_from_the_calibration_links(tmp_path):
     table, marble = planted.campaign(noise_db=1.0), "marble.relative_permittivity"
     sections = {"holdout": {"where": "rx_x > -9"}, "parameters": {marble: {"bounds": planted.BOUNDS}}}

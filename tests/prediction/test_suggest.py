@@ -129,6 +129,16 @@ def test_devices_of_a_random_effect_that_do_not_differ_promise_the_same(folder, 
     assert new == pytest.approx(known, rel=0.2)
 
 
+def test_a_further_link_is_not_expected_to_have_the_error_of_a_few_exact_ones(folder, table):
+    content = study(folder).content()
+    rows = pd.read_csv(folder / "links.csv").assign(std=np.append([1e-3, 1e-3], np.full(12, 0.5)))
+    rows.to_csv(folder / "exact.csv", index=False, float_format="%.17g")
+    content["links"] |= {"file": "exact.csv", "std": "std"}
+    found = cb.calibrate(Study.from_content(content, folder / "exact.toml"))
+    before = found.intervals[NAME].upper - found.intervals[NAME].lower
+    assert cb.suggest(found, table, 1)[f"{NAME}_width"][0] > 0.5 * before
+
+
 def test_constants_of_the_scene_take_no_degrees_of_freedom(folder, table):
     """Four links, a parameter, an offset, and two constants that vary in the draws."""
     content = study(folder).content()

@@ -144,9 +144,10 @@ def _choice(
                 out_of_sight=_out_of_sight(problem, errors[name], kept),
             )
         return name, HeldOutResiduals(rms_db, basis, count, errors[name], levels)
-    rms_db = None
+    rms_db, errors_db = None, objective.model(trail.best_modelled[None])[0] - objective.measured
     if problem.freedom >= 1:
-        rms_db = float(trail.best_rmse_db * np.sqrt(objective.num_counted / problem.freedom))
+        # A new link has no weight, so these count equally, as held-out ones do.
+        rms_db = float(np.sqrt(np.sum(errors_db[objective.weight > 0] ** 2) / problem.freedom))
     basis = f"errors of {objective.num_counted} calibration links"
     return Model.CALIBRATED, HeldOutResiduals(rms_db, basis, max(round(problem.freedom), 1), np.zeros(0))
 

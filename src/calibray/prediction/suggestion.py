@@ -14,7 +14,7 @@ from calibray.engines.kinds.replay import ReplaySection, replay
 from calibray.engines.protocol import Differentiable, Observing
 from calibray.errors import InputError
 from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, Term
-from calibray.fitting.preliminary_fits import with_estimated_errors, with_estimated_spreads
+from calibray.fitting.preliminary_fits import LEAST_NOISE_DB, with_estimated_errors, with_estimated_spreads
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.measurements import Measurements
 from calibray.measurements.placement import POSITION_COLUMNS
@@ -43,7 +43,7 @@ from calibray.study import Setup
 from calibray.support.messages import percent
 from calibray.support.progress import Progress
 from calibray.uncertainty.draws import evenly_spaced
-from calibray.uncertainty.residual_correlation import Correlation, shared_errors
+from calibray.uncertainty.residual_correlation import shared_errors
 
 MOST_DRAWS: Final = 96
 """Largest number of posterior draws by which the candidates are ranked."""
@@ -189,7 +189,8 @@ class _ReplayedDraws:
                 f"{result.study.path}: {objective.num_counted} links are too few to estimate the size of residuals; "
                 "measure more, or calibrate fewer parameters"
             )
-        self.noise_db = max(result.rmse_db * float(np.sqrt(objective.num_counted / freedom)), 1e-3)
+        self.inflation = float(np.sqrt(objective.num_counted / freedom))
+        self.noise_db = max(result.rmse_db * self.inflation, LEAST_NOISE_DB)
         self.problem = replace(problem, objective=replace(objective, noise_db=self.noise_db))
         self.lower, upper = parameters.search_bounds
         self.width = upper - self.lower
@@ -220,10 +221,7 @@ class _ReplayedDraws:
             loss = objective.capped(loss)
         design, common = self._nuisance(links)
         coefficients = objective.completed(self.evaluation.modelled)
-        position, correlation = np.hstack([links.rx, links.tx]), self._correlation()
-        errors = Errors(self.noise_db, common, position)
-        if correlation is not None:
-            errors = Errors(correlation.own_db, common, position, correlation.shared_db, correlation.range_m)
+        errors = self._errors(links, common)
         coefficient_slopes = objective.coefficient_slopes(*self._replay(self.engine))
         path_loss_db = loss + coefficients @ design.T
         return path_loss_db, (slope + design @ coefficient_slopes)[: self.num_draws], errors
@@ -326,13 +324,20 @@ class _ReplayedDraws:
         unknown[new, group] = at_links.value[new] * (term.prior if term.around else spread)
         return share * at_links.value[:, None], unknown
 
-    def _correlation(self) -> Correlation | None:
-        """Correlation of the residuals of neighbouring links; None if there is none."""
-        problem, objective = self.problem, self.problem.objective
-        evaluation = problem.evaluate(_calibrated_point(self.result, problem)[None])
-        residuals = evaluation.residuals[0, : objective.num_counted]
-        links = problem.setup.links
-        return shared_errors(residuals, np.hstack([links.rx, links.tx])[objective.weight > 0])
+    def _errors(self, candidates: Measurements, common: NDArray[np.float64]) -> Errors:
+        """Expected errors of candidates, which have no weight: calibration links count equally.
+
+        `common` is as for `Errors`. Residuals of neighbouring links may be correlated.
+        """
+        problem, objective, links = self.problem, self.problem.objective, self.problem.setup.links
+        counted, point = objective.weight > 0, _calibrated_point(self.result, problem)
+        residuals = (objective.model(problem.modelled(point[None]))[0] - objective.measured)[counted]
+        position = np.hstack([candidates.rx, candidates.tx])
+        correlation = shared_errors(residuals, np.hstack([links.rx, links.tx])[counted])
+        if correlation is None:
+            own_db = float(np.sqrt(np.mean(residuals**2))) * self.inflation
+            return Errors(max(own_db, LEAST_NOISE_DB), common, position)
+        return Errors(correlation.own_db, common, position, correlation.shared_db, correlation.range_m)
 
 
 def _as_calibrated(result: Record, problem: Problem) -> Problem:
