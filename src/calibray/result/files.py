@@ -302,7 +302,7 @@ def check_same_study(study: Study, folder: Path) -> None:
         _, calibrated = _read_stored(folder / RESULT_FILE)
         if _problem_digest(study) != _problem_digest(calibrated):
             raise InputError(
-                f"{folder}: its result is of another study; give another folder, or run the study again"
+                f"{folder}: its result belongs to another study; give another folder, or run the study again"
             )
 
 

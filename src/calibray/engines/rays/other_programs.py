@@ -155,7 +155,7 @@ def _insite_paths(file: Path, rest: Iterator[tuple[int, str]], tx_power_dbm: flo
             if unknown := [name for name in names if name not in INSITE_TYPES]:
                 raise InputError(
                     f"{file}, line {number}: {shortened(text)!r} has the interaction {shortened(unknown[0])!r}; "
-                    f"Calibray knows {', '.join(INSITE_TYPES)}, so export without foliage"
+                    f"Calibray reads {', '.join(INSITE_TYPES)}, so export without foliage"
                 )
             points = np.array([_insite_numbers(file, next(rest), 3) for _ in range(int(depth) + 2)])
             paths.append(

@@ -201,7 +201,7 @@ def _antenna(end: str, array: Any, devices: Mapping[str, Any]) -> Antenna:
             yaw, pitch, roll = orientation[0].tolist()
             return Antenna(pattern, polarization, (yaw, pitch, roll))
     raise InputError(
-        f"scene.{end}_array has a pattern of its own; a study knows {', '.join(PATTERNS)} with polarization "
+        f"scene.{end}_array has a pattern of its own; a study supports {', '.join(PATTERNS)} with polarization "
         f"{', '.join(POLARIZATIONS)}: give its gain as a table (antennas.{end}.pattern) in a study file"
     )
 
