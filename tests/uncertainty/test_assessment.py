@@ -78,6 +78,18 @@ def test_draws_fit_the_links_about_as_well_as_the_optimum(tmp_path, noisy):
     assert np.median(np.std(points, axis=0)) > 1e-3
 
 
+def test_as_many_unknowns_as_links_leave_the_whole_range(tmp_path, noisy):
+    """Each link has its offset, so that all residuals are 0, which says nothing about errors."""
+    devices = {"device": {"by": "constant", "per": "rx_x"}}
+    found = run(tmp_path, noisy, nuisance=devices)
+    assert found.rmse_db < 1e-9
+    for interval in found.intervals.values():
+        assert [interval.lower, interval.upper] == planted.BOUNDS
+        assert interval.standard_error == pytest.approx(np.ptp(planted.BOUNDS) / np.sqrt(12.0))
+        assert interval.label == "not identifiable"
+        assert reason_text(interval.reason) == "12 links are too few for this number of unknowns"
+
+
 def test_an_undeclared_offset_gives_a_warning(tmp_path, noisy, result):
     offset = 8.0  # 4 dB can be put on the materials: 0.66 instead of 0.58 dB is no evidence of an offset
     shifted = run(tmp_path, noisy.assign(path_loss_db=noisy.path_loss_db + offset))

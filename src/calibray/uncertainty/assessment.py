@@ -123,7 +123,8 @@ def _assess_emulated(
     ensemble, name = emulate(problem, trail, model), problem.setup.study.engine.name
     if ensemble is None:
         reason = Reason(ReasonKind.TOO_FEW_CALLS, {"calls": len(trail.candidates)})
-        return Certainty(Uncertainty(_full_ranges(problem.parameters, reason))), 0
+        intervals = _full_ranges(problem.parameters, reason)
+        return Certainty(Uncertainty(_approximate(intervals))), 0
     mean, *drawn = (
         replace(problem, engine=engine, observable=PATH_LOSS) for engine in (ensemble.mean, *ensemble.drawn)
     )
@@ -139,8 +140,7 @@ def _assess_emulated(
         },
     )
     record = assessment.record
-    intervals = {name: replace(interval, approximate=True) for name, interval in record.intervals.items()}
-    record = replace(record, intervals=intervals, remarks=(remark, *record.remarks))
+    record = replace(record, intervals=_approximate(record.intervals), remarks=(remark, *record.remarks))
     return replace(assessment, record=record), 0 if ensemble.replayed is None else ensemble.replayed.calls
 
 
@@ -153,10 +153,13 @@ def _full_ranges(parameters: Parameters, reason: Reason) -> dict[str, Interval]:
             parameter.upper,
             Verdict.NOT_IDENTIFIABLE,
             reason=reason,
-            approximate=True,
         )
         for parameter in parameters
     }
+
+
+def _approximate(intervals: dict[str, Interval]) -> dict[str, Interval]:
+    return {name: replace(interval, approximate=True) for name, interval in intervals.items()}
 
 
 def _assess(
@@ -164,14 +167,12 @@ def _assess(
 ) -> Certainty:
     """Uncertainty of a problem; draws come from problems with equally likely engines."""
     optimum = problem.squares(problem.parameters.to_search(trail.best)[None], derivatives=True)
-    local = local_intervals(problem, trail, optimum)
     freedom = optimum.num_rows - problem.unknowns
     if freedom < 1:
+        # Residuals that as many unknowns explain say nothing about errors.
         reason = Reason(ReasonKind.TOO_FEW_LINKS, {"links": optimum.num_rows})
-        unknown = {
-            name: replace(interval, verdict=Verdict.NOT_IDENTIFIABLE) for name, interval in local.items()
-        }
-        return Certainty(Uncertainty(with_reason(unknown, reason)))
+        return Certainty(Uncertainty(_full_ranges(problem.parameters, reason)))
+    local = local_intervals(problem, trail, optimum)
     if optimum.value[0] < EXACT_DB:
         return Certainty(Uncertainty(with_reason(local, Reason(ReasonKind.NO_NOISE))))
     minima, squares = find_minima(problem, trail)
