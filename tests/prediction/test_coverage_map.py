@@ -184,6 +184,19 @@ def test_received_power_is_transmitted_power_minus_path_loss(coverage):
     )
 
 
+def test_a_power_in_addition_to_that_in_the_offset_of_rsrp_is_announced(result, caplog):
+    content = result.study.content()
+    content["links"] |= {"quantity": "rsrp"}
+    rsrp = changed(result, study=cb.Study.from_content(content, result.study.path))
+    arguments = {"tx": TX, "cell": 30.0, "bounds": AREA, "columns": WEST, "level": None}
+    shown = cb.coverage_map(rsrp, **arguments)
+    assert "RSRP" not in caplog.text
+    raised = cb.coverage_map(rsrp, power_dbm=17.0, **arguments)
+    assert "so the map is +17 dB from RSRP; leave the power out" in caplog.text
+    higher = raised.layers["received_power_dbm"] - shown.layers["received_power_dbm"]
+    assert higher[np.isfinite(higher)] == pytest.approx(17.0)
+
+
 def test_the_command_writes_a_map(folder, coverage, tmp_path):
     options = ["--bounds", *AREA, "--cell", 30, "--level", 0, "--power", 30, "--column", "half=west"]
     run = CliRunner().invoke(app, ["map", str(folder), *map(str, ["--tx", *TX, *options, "--out", tmp_path])])

@@ -94,6 +94,11 @@ def coverage_map(
         power_dbm = 0.0
     if power_dbm is not None:
         _check_number("power_dbm", power_dbm, -np.inf)
+    if power_dbm and study.links.quantity == "rsrp":
+        _LOG.warning(
+            "power %g dBm: after a calibration on RSRP the offset contains the transmitted power, so the map is %+g dB "
+            "from RSRP; leave the power out for RSRP", power_dbm, power_dbm,
+        )  # fmt: skip
     frame = known_frame(study)
     # The study is opened with one link, 1 m above the transmitter, before the grid is known.
     one_link = pd.DataFrame({**position_columns(transmitter, transmitter[None] + np.eye(3)[2]), **constants})
