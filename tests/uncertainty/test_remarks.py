@@ -73,6 +73,20 @@ def test_noise_that_the_data_favour_is_reported():
 
 
 @pytest.mark.parametrize(
+    ("stated", "kind"),
+    [
+        ({"kind": "student-t"}, "student-t"),
+        ({"range_m": 20}, "correlated"),
+        ({"heterogeneity": 0.2}, "heterogeneous"),
+    ],
+)
+def test_what_the_study_states_is_no_finding(stated, kind):
+    free, study = (Study.from_content(planted.content("links.csv", noise=noise)) for noise in (None, stated))
+    assert len(departures({kind: 1.0}, free)) == 1
+    assert departures({kind: 1.0}, study) == ()
+
+
+@pytest.mark.parametrize(
     ("trace", "advice"),
     [
         ({"max_depth": 2}, "set in [trace]: refraction = true, diffraction = true, max_depth = 3."),

@@ -175,10 +175,17 @@ CAUSES: Final = (CORRELATED, OUT_OF_SIGHT, HEAVY, DIFFERING, GAUSSIAN)
 def departures(noise: Mapping[str, float], study: StudyModel) -> tuple[Remark, ...]:
     """A remark for each noise model that the data favour over independent Gaussian noise, from their weights.
 
-    The study shows which paths the model may lack.
+    What the study states has no rival. The study also shows which paths the model may lack.
     """
     gaussian, remarks = float(noise.get(GAUSSIAN, 0.0)), []
+    stated = {
+        HEAVY: study.noise.kind == HEAVY,
+        CORRELATED: study.noise.range_m not in ("auto", 0),
+        DIFFERING: study.noise.heterogeneity not in ("auto", 0),
+    }
     for kind, remark in DEPARTURES.items():
+        if stated.get(kind, False):
+            continue
         weight = float(noise.get(kind, 0.0))
         # Buildings are equal or differ; noise models compete with Gaussian noise.
         rival = 1.0 - weight if kind == DIFFERING else gaussian
