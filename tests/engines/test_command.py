@@ -19,6 +19,7 @@ from calibray import engines
 from calibray.calibration.calibrate import calibrate
 from calibray.engines import Engine, Ledger
 from calibray.engines.external.exchange import Unusable, read_answer
+from calibray.engines.external.program import ExternalProgram, Outcome
 from calibray.engines.ledger.database import LedgerEntry, key
 from calibray.errors import EngineError, InputError
 from calibray.study import Study
@@ -288,6 +289,24 @@ else: sys.exit("alone")
     with engines.open_workers(4) as workers:
         engine = engines.make(programs.study(tmp_path, wait, timeout=60.0), workers=workers)
         assert engine.path_loss(candidates) == pytest.approx(programs.expected(candidates, planted.links()))
+
+
+def test_no_call_starts_before_an_answer_is_taken(tmp_path, monkeypatch):
+    """Who takes it has stored the one before, so that a run that is killed repeats one call per worker at most."""
+    started = []
+
+    def run(program, request, stop=None):
+        started.append(request)
+        return Outcome(np.zeros(planted.LINKS), 0.0)
+
+    monkeypatch.setattr(ExternalProgram, "run", run)
+    with engines.open_workers(2) as workers:
+        engine = engines.make(programs.study(tmp_path), workers=workers)
+        answers = engine.answers(np.vstack([CANDIDATES, CANDIDATES + 0.1]))
+        for taken in range(6):
+            next(answers)
+            time.sleep(0.05)
+            assert len(started) == min(2 + taken, 6)
 
 
 def test_parallel_calls_wait_for_the_answer_that_another_run_pays_for(tmp_path):

@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import replace
+from itertools import islice
 from threading import Event
 from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal, Self, final
 
@@ -184,18 +185,24 @@ class Command:
         self, requests: list[Request], stop: Event, executor: Executor
     ) -> Iterator[tuple[int, Outcome]]:
         # An event reaches threads only; programs on other machines run until they end or exceed their time limit.
-        local_stop = stop if isinstance(executor, ThreadPoolExecutor) else None
-        futures = {
-            executor.submit(self._program.run, request, local_stop): index
-            for index, request in enumerate(requests)
-        }
-        pending, interruption = set(futures), None
+        threads = executor if isinstance(executor, ThreadPoolExecutor) else None
+        local_stop = None if threads is None else stop
+        waiting, interruption = iter(enumerate(requests)), None
+        pending: dict[Future[Outcome], int] = {}
+
+        def start(count: int | None) -> None:
+            for index, request in islice(waiting, count):
+                pending[executor.submit(self._program.run, request, local_stop)] = index
+
         try:
+            start(None if threads is None else threads._max_workers)
             while pending and not stop.is_set():
                 for future in wait(pending, POLL, FIRST_COMPLETED).done:
                     outcome = self._outcome(future)
-                    pending.remove(future)
-                    yield futures[future], outcome
+                    yield pending.pop(future), outcome
+                    # A run that is killed repeats calls whose answers are not stored: no more than there are threads.
+                    if not stop.is_set():
+                        start(1)
         except (Exception, KeyboardInterrupt) as error:
             interruption = error
         finally:
@@ -207,7 +214,7 @@ class Command:
         # Answers of calls that have ended by now are given before the run ends, so that they are not lost.
         for future in wait(pending, None if local_stop else 0).done:
             if not future.cancelled() and not future.exception():
-                yield futures[future], future.result()
+                yield pending[future], future.result()
         if interruption is not None:
             raise interruption
 
