@@ -197,6 +197,24 @@ def test_a_power_in_addition_to_that_in_the_offset_of_rsrp_is_announced(result, 
     assert higher[np.isfinite(higher)] == pytest.approx(17.0)
 
 
+def test_cells_outside_the_scene_are_announced(result, caplog):
+    arguments = {"tx": TX, "cell": 5.0, "columns": WEST, "level": None}
+    cb.coverage_map(result, bounds=(-57.0, -57.0, -47.0, -52.0), **arguments)
+    assert "outside the scene" not in caplog.text
+    cb.coverage_map(result, bounds=(500.0, 0.0, 510.0, 10.0), **arguments)
+    assert "4 of 4 cells are outside the scene" in caplog.text
+
+
+def test_a_column_that_the_links_do_not_have_is_refused(result):
+    study = result.study
+    assert _column_values(result, np.array(TX), {"half": "west"}) == {"half": "west"}
+    with pytest.raises(InputError, match="--column Half: the links have no such column; did you mean 'half'"):
+        _column_values(result, np.array(TX), {"half": "west", "Half": "east"})
+    # Of the table, but not needed: such as the name of a sector.
+    free = str(next(name for name in study.measurements().frame if name not in study.offset_groups))
+    assert _column_values(result, np.array(TX), {"half": "west", free: 1.0})["half"] == "west"
+
+
 def test_the_command_writes_a_map(folder, coverage, tmp_path):
     options = ["--bounds", *AREA, "--cell", 30, "--level", 0, "--power", 30, "--column", "half=west"]
     run = CliRunner().invoke(app, ["map", str(folder), *map(str, ["--tx", *TX, *options, "--out", tmp_path])])

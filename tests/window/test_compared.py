@@ -105,7 +105,7 @@ def test_a_prediction_is_stated_in_the_measured_quantity():
     )
 
 
-def test_a_prediction_beyond_the_scene_says_so():
+def test_a_prediction_outside_the_scene_says_so():
     row = pd.Series(
         {
             "rx_x": 1.0,

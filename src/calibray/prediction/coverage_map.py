@@ -34,6 +34,7 @@ from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Study
 from calibray.study.mounting import mounting_columns
 from calibray.study.row_steps import known_frame
+from calibray.support.messages import did_you_mean
 from calibray.support.progress import Progress, with_total
 
 _LOG: Final = logging.getLogger(__name__)
@@ -108,6 +109,14 @@ def coverage_map(
     z = ground_heights(triangles, x, y) + height
     east, north = np.meshgrid(x, y)
     rx = np.stack([east, north, z], axis=-1).reshape(-1, 3)
+    if bounds is not None and len(triangles.face) and not triangles.left_out:
+        low, high = triangles.vertex.min(axis=0)[:2], triangles.vertex.max(axis=0)[:2]
+        if beyond := int(((rx[:, :2] < low) | (rx[:, :2] > high)).any(axis=1).sum()):
+            _LOG.warning(
+                "%d of %d cells are outside the scene, which has no buildings there; give smaller bounds",
+                beyond,
+                len(rx),
+            )
     # Cells at the transmitter itself have no path loss.
     cells = np.flatnonzero(np.linalg.norm(rx - transmitter, axis=1) > MIN_DISTANCE)
     names = ("path_loss_db",) if level is None else ("path_loss_db", "lower_db", "upper_db")
@@ -187,6 +196,13 @@ def _column_values(
                 f"{study.path}: the map needs the links' column {name!r}; give its value for this transmitter: "
                 f"--column {name}=VALUE (columns={{{name!r}: value}})"
             )
+    if unknown := [name for name in columns if name not in needed]:
+        known = [str(name) for name in study.measurements().frame]
+        for name in unknown:
+            if name not in known:
+                raise InputError(
+                    f"--column {name}: the links have no such column; {did_you_mean(name, known)}"
+                )
     return values
 
 
