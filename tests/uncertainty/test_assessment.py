@@ -78,6 +78,24 @@ def test_draws_fit_the_links_about_as_well_as_the_optimum(tmp_path, noisy):
     assert np.median(np.std(points, axis=0)) > 1e-3
 
 
+@pytest.mark.parametrize(
+    ("stated", "kind"),
+    [
+        ({}, "gaussian"),
+        ({"kind": "student-t"}, "student-t"),
+        ({"range_m": 20.0}, "correlated"),
+        ({"heterogeneity": 0.5}, "heterogeneous"),
+    ],
+)
+def test_few_links_follow_the_noise_that_the_study_states(tmp_path, noisy, stated, kind):
+    """Seven links cannot show which noise they have."""
+    parameters = {MARBLE: {"bounds": planted.BOUNDS}}
+    found = calibrate(planted.study(tmp_path, noisy.iloc[:7], parameters=parameters, noise=stated))
+    assert found.uncertainty.noise[kind] == pytest.approx(1.0)
+    others = found.uncertainty.noise.keys() - {kind, "offset"}
+    assert others <= ({"gaussian"} if kind == "heterogeneous" else set())
+
+
 def test_as_many_unknowns_as_links_leave_the_whole_range(tmp_path, noisy):
     """Each link has its offset, so that all residuals are 0, which says nothing about errors."""
     devices = {"device": {"by": "constant", "per": "rx_x"}}

@@ -246,14 +246,14 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
     at_bound = (coefficients <= nuisance.lower) | (coefficients >= nuisance.upper)
     design = nuisance.design[counted].toarray() if nuisance.terms else np.zeros((len(counted), 0))
     used = objective.determined & ~at_bound
-    # Few links distinguish neither noise models nor buildings.
+    # Few links distinguish neither noise models nor buildings; what the study states they need not distinguish.
     few = len(counted) < FEW
     # With correlated errors, the probability of censoring is an integral over all censored links.
-    uncorrelated = few or bool(censored.any())
+    uncorrelated = bool(censored.any()) or (few and section.range_m == "auto")
     out_of_sight = not uncorrelated and section.range_m == "auto"
     models = noise_models(
         position,
-        kind="gaussian" if few else None if section.kind == "auto" else section.kind,
+        kind=section.kind if section.kind != "auto" else "gaussian" if few else None,
         range_m=0.0 if uncorrelated else None if section.range_m == "auto" else float(section.range_m),
         offset=not has_offset(problem),
         censored=bool(censored.any()),
@@ -278,7 +278,7 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
     if len(counted) > MAX_LINKS:
         marginal = marginal.without_improbable(gap(loss_of(problem.parameters.from_search(best[None]))))
     none = np.zeros(0, dtype=np.int64)
-    spread = 0.0 if few else None if section.heterogeneity == "auto" else float(section.heterogeneity)
+    spread = float(section.heterogeneity) if section.heterogeneity != "auto" else 0.0 if few else None
     model = JointModel(
         problem.parameters,
         problem.parameters,
