@@ -1,8 +1,8 @@
-"""Ask/tell optimizers over a box: NumPy arrays in and out, seeded, independent of radio.
+"""Ask/tell optimizers over a box: NumPy arrays in and out, seeded, independent of the radio model.
 
-Every class is an `Optimizer` and states what it uses, how it keeps to a budget and whether it takes starting points.
-`METHODS` lists them by the names of a study file, and `make` makes one. Optional libraries are imported only when their
-class is constructed.
+Every class is an `Optimizer`. It states which parts of an evaluation it uses, how it respects a budget and whether it
+takes starting points. `METHODS` lists the classes by their names in study files, and `make` constructs one. Optional
+libraries are imported only when a class that needs them is constructed.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ NO_OPTIONS: Final = {"lower", "upper", "seed", "objective", "cheap_model"}
 
 
 def method(name: str) -> type[Optimizer]:
-    """The class of a method, which states what it uses, its schedule, and whether it takes starting points.
+    """The class of a method, which states the parts of an evaluation and the schedule that the method uses.
 
     Raises:
         InputError: There is no such method.
@@ -96,7 +96,7 @@ def method(name: str) -> type[Optimizer]:
 
 
 def label(name: str) -> str:
-    """The name in tables and figures of a method, or of `METHOD@CALLS` with its budget.
+    """The name of a method, or of `METHOD@CALLS` with a budget, in tables and figures.
 
     Example:
         >>> label("gwo@600")
@@ -120,24 +120,25 @@ def make(
     cheap_model: CheapModel | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> Optimizer:
-    """Make an optimizer by its method's name; each method receives the arguments that it accepts.
+    """Construct the optimizer of a named method, which receives only the arguments that it accepts.
 
     Args:
         name: A method of `METHODS`.
         lower: Lower bounds [d].
         upper: Upper bounds [d].
         seed: Seed.
-        budget: Number of evaluations in the budget; the method's default if None. The budget is ignored if the method
-            stops by itself.
+        budget: Number of evaluations; the method's default if None. The budget is ignored if the method stops by
+            itself.
         start: Starting points, [d] or [k, d], for methods that use them.
-        starts: Number of further starting points, for the same methods; their default if None.
-        objective: Converts residuals to the value, for methods that use residuals; their root mean square if None.
+        starts: Number of further starting points, for the same methods; the method's default if None.
+        objective: Function that converts residuals to the value, for methods that use residuals; root mean square if
+            None.
         cheap_model: A cheap model of the engine, for methods that use one.
-        options: Settings of the method, which override all of these.
+        options: Settings of the method, which override the arguments above.
 
     Raises:
-        InputError: The method does not exist, it has no such setting or refuses a value, the budget is too small, or
-            its library is not installed.
+        InputError: The method does not exist, a setting is unknown or invalid, the budget is too small, or a required
+            library is not installed.
 
     Example:
         >>> make("gwo", [0.0], [1.0], budget=90, start=[0.5]).budget
@@ -157,6 +158,6 @@ def make(
         raise InputError(
             f"method.options of {name!r}: there is no setting {key!r}; {did_you_mean(key, allowed)}"
         )
-    # The constructors differ in their settings, which were looked up above.
+    # The constructors take different settings, which were checked above.
     construct = cast(Callable[..., Optimizer], kind)
     return construct(np.asarray(lower), np.asarray(upper), seed=seed, **{**settings, **options})

@@ -17,7 +17,7 @@ def whole(name: str, value: int, at_least: int, at_most: float = inf) -> int:
     """The whole number `value` of the argument `name`, if it is within its bounds.
 
     Raises:
-        InputError: It is not a whole number, or outside its range.
+        InputError: The value is not a whole number, or is out of range.
     """
     try:
         number = index(value)
@@ -33,7 +33,7 @@ def real(name: str, value: float, at_least: float, at_most: float = inf) -> floa
     """The finite number `value` of the argument `name`, if it is within its bounds.
 
     Raises:
-        InputError: It is not a finite number, or outside its range.
+        InputError: The value is not a finite number, or is out of range.
     """
     number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
     if number is None or not isfinite(number) or not at_least <= number <= at_most:
@@ -66,7 +66,7 @@ class Box:
         """Build a box from lower and upper bounds [d], which are copied.
 
         Raises:
-            InputError: The bounds are not two finite vectors of one length >= 1 with lower below upper.
+            InputError: The bounds are not two finite vectors of equal length >= 1 with lower below upper.
 
         Example:
             >>> Box.between([1.0, 0.0], [9.0, 1.0]).to_unit([[5.0, 0.25]])
@@ -99,7 +99,7 @@ class Box:
         return self.upper - self.lower
 
     def clip(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Move points outside the box to its nearest face [..., d]."""
+        """Clip points [..., d] to the box."""
         return np.clip(x, self.lower, self.upper)
 
     def to_unit(self, x: ArrayLike) -> NDArray[np.float64]:

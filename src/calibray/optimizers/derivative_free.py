@@ -1,17 +1,17 @@
 """Derivative-free least squares: POUNDERS, and Gauss-Newton with finite differences.
 
-Both are local methods: they start in the middle of the box (or at the best point passed to `tell` before), and restart
-at random points if they have converged before their budget is used.
+Both are local methods. They start in the middle of the box, or at the best point already passed to `tell`. They restart
+at random points if they converge before their budget is used up.
 
 POUNDERS: S. M. Wild, "Solving Derivative-Free Nonlinear Least Squares Problems with POUNDERS", in Advances and Trends
 in Optimization with Engineering Applications, SIAM (2017), ch. 40. The authors' package IBCDFO needs a solver (MINQ)
-that no package index provides. Every residual has the quadratic model of least curvature through evaluated points near
-the best one. The sum of their squares, to second order, is minimised in a trust region, a box. Points for which the
-models are at least fully linear come first: they span all directions within the region. If a direction is missing and
-the step failed, that direction is evaluated before the region shrinks.
+that no package index provides. Each residual is modelled by the quadratic of least curvature through evaluated points
+near the best one. The sum of squares of these models, to second order, is minimised in a box-shaped trust region.
+Points that span all directions within the region are used first: they make the models at least fully linear. If a
+direction is missing and the step failed, a point along this direction is evaluated before the region shrinks.
 
-Gauss-Newton is the approach of a user with a least squares solver and no derivatives. Every accepted point takes one
-evaluation for each parameter, all in one batch. Steps are those of `descent.py`.
+Gauss-Newton is the approach of a user with a least squares solver but no derivatives. Every accepted point requires one
+further evaluation per parameter, all in one batch. `descent.py` computes the steps.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ from calibray.optimizers.evaluations import Archive, Evaluations, Objective, roo
 from calibray.optimizers.protocol import Optimizer, Search, Session, first_start, limited
 
 SPANNING: Final = (1.75, 10.0)
-"""Distances, in trust regions, within which points may span the directions: for a fully linear model, and at all."""
+"""Largest distance / sqrt(d), in trust-region radii, of spanning points: for a fully linear model, and for any."""
 
 NEW_DIRECTION: Final = 1e-3
-"""Smallest part of a point, in trust regions, along directions that earlier points lack (theta_1)."""
+"""Smallest component along new directions, relative to the larger of the point's distance and the radius (theta_1)."""
 
 INDEPENDENT: Final = 1e-3
-"""Smallest pivot that a further point adds to the curvature (theta_2)."""
+"""Smallest pivot with which a further point may determine curvature (theta_2)."""
 
 ACCEPTED: Final = 0.05
-"""Share of the predicted decrease above which a step enlarges the trust region."""
+"""Share of the predicted decrease that a successful step reaches; the trust region then does not shrink."""
 
 LARGEST: Final = 0.5
-"""Largest trust region, as a share of the box."""
+"""Largest trust-region radius, as a share of the box."""
 
 
 @final
 class POUNDERS(Optimizer):
-    """Derivative-free least squares with curvature. Uses residuals; budget as set.
+    """Derivative-free least squares with curvature. Uses residuals, with the given budget.
 
     Args:
         seed: Seed of the random points of restarts.
         budget: Number of evaluations.
-        radius: First trust region, as a share of the box.
-        tolerance: Trust region at which a search has converged, as a share of the box.
+        radius: Initial trust-region radius, as a share of the box.
+        tolerance: Trust-region radius at which a search has converged, as a share of the box.
 
     Raises:
         InputError: An argument is out of range.
@@ -82,7 +82,7 @@ class POUNDERS(Optimizer):
 def _searches(
     local: Callable[..., Search], seed: int, budget: int, *settings: float
 ) -> Callable[[Archive], Search]:
-    """A local search from one starting point of the unit cube after the other, within the budget."""
+    """Local searches from successive starting points in the unit cube, within the budget."""
     rng = np.random.default_rng(whole("seed", seed, at_least=0))
 
     def search(archive: Archive) -> Search:
@@ -102,12 +102,12 @@ class _Points(NamedTuple):
 
     @property
     def value(self) -> NDArray[np.float64]:
-        """Half the sums of squares [n]."""
+        """Half the sum of squared residuals of each point [n]."""
         return 0.5 * np.sum(self.residuals**2, axis=1)
 
 
 def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: float) -> Search:
-    """One local search in trust regions from `radius` down to `last`; yields candidates [n, d] of the box."""
+    """One local search in trust regions from `radius` down to `last`; yields candidates [n, d] in the box."""
     box, d = archive.box, len(start)
 
     def evaluated(
@@ -125,7 +125,7 @@ def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: 
         best = int(np.argmin(points.value))
         centre = points.unit[best]
         chosen, missing = _spanning(points, best, radius)
-        # A model needs d points besides the best one; far ones serve if near ones are missing.
+        # A model needs d points in addition to the best one; distant ones are used if near ones are missing.
         if missing is None or len(chosen) == d:
             step, predicted = _step(points, best, _enriched(points, best, chosen, radius), radius)
             if predicted > 0 and np.abs(step).max() > 1e-3 * last:
@@ -145,7 +145,7 @@ def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: 
 def _spanning(points: _Points, best: int, radius: float) -> tuple[list[int], NDArray[np.float64] | None]:
     """Points that span the directions around the best one, the latest first, and the directions that are missing.
 
-    Directions [k, d] are missing from a fully linear model if only far points, or none, span them.
+    Directions [k, d] are missing if no near points span them; the model is then not fully linear.
     """
     offset = (points.unit - points.unit[best]) / radius
     distance = np.linalg.norm(offset, axis=1)
@@ -156,7 +156,7 @@ def _spanning(points: _Points, best: int, radius: float) -> tuple[list[int], NDA
         for index in range(len(offset) - 1, -1, -1):
             if index == best or index in chosen or distance[index] > reach * np.sqrt(offset.shape[1]):
                 continue
-            # Gram and Schmidt: the part along directions that the chosen points lack.
+            # Gram-Schmidt: the component along directions that the chosen points do not span.
             rest = offset[index] - basis.T @ (basis @ offset[index])
             if np.linalg.norm(rest) >= NEW_DIRECTION * max(distance[index], 1.0):
                 chosen.append(index)
@@ -170,9 +170,9 @@ def _spanning(points: _Points, best: int, radius: float) -> tuple[list[int], NDA
 
 
 def _enriched(points: _Points, best: int, chosen: list[int], radius: float) -> NDArray[np.int64]:
-    """Further points that determine curvature well, after those that span the directions; the best one is first.
+    """The best point, those that span the directions, and further points that determine curvature well.
 
-    There are at most 2 d + 1, as in the paper's experiments.
+    There are at most 2 d + 1 points, as in the paper's experiments.
     """
     offset = (points.unit - points.unit[best]) / radius
     near = np.flatnonzero(np.linalg.norm(offset, axis=1) <= SPANNING[1] * np.sqrt(offset.shape[1]))
@@ -186,7 +186,7 @@ def _enriched(points: _Points, best: int, chosen: list[int], radius: float) -> N
 
 
 def _pivot(offset: NDArray[np.float64]) -> float:
-    """Smallest singular value of the quadratic terms of points, without the part that a plane can represent."""
+    """Smallest singular value of the quadratic kernel of points, projected onto what no plane can represent."""
     plane = np.hstack([np.ones((len(offset), 1)), offset])
     # Combinations of the points on which every plane vanishes.
     q = np.linalg.qr(plane, mode="complete")[0][:, plane.shape[1] :]
@@ -194,14 +194,14 @@ def _pivot(offset: NDArray[np.float64]) -> float:
 
 
 def _quadratic(offset: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Kernel of the least Frobenius norm of the curvature, (x . y)^2 / 2."""
+    """Kernel whose interpolant has the Hessian of least Frobenius norm, (x . y)^2 / 2."""
     return 0.5 * (offset @ offset.T) ** 2
 
 
 def _step(
     points: _Points, best: int, kept: NDArray[np.int64], radius: float
 ) -> tuple[NDArray[np.float64], float]:
-    """The step that minimises the model in the trust region [d], and the decrease of the value that it predicts."""
+    """The step [d] that minimises the model in the trust region, and the predicted decrease of the value."""
     offset = (points.unit[kept] - points.unit[best]) / radius
     count, d = offset.shape
     plane = np.hstack([np.ones((count, 1)), offset])
@@ -210,7 +210,7 @@ def _step(
     side = np.vstack([points.residuals[kept], np.zeros((d + 1, points.residuals.shape[1]))])
     solved = np.linalg.lstsq(system, side, rcond=1e-12)[0]
     residuals, slopes = points.residuals[best], solved[count + 1 :]  # [m], [d, m]
-    # Sum of residuals times their curvatures, sum_i r_i sum_j lambda_ij s_j s_j^T, and Gauss-Newton's part.
+    # Sum of residuals times their curvatures, sum_i r_i sum_j lambda_ij s_j s_j^T, and the Gauss-Newton term.
     curvature = (offset.T * (solved[:count] @ residuals)) @ offset + slopes @ slopes.T
     gradient = slopes @ residuals
     low = np.maximum(-points.unit[best] / radius, -1.0)
@@ -234,8 +234,8 @@ def improving_point(
 ) -> NDArray[np.float64]:
     """The next point of the unit cube [d] for a model around `centre` [d].
 
-    It lies in one of the missing directions [k, d], against it, or along an axis towards the farther face: where its
-    part along the missing directions is largest within the radius. In a corner, only the axes lead into the cube.
+    It lies within the radius along a missing direction [k, d], opposite to one, or along an axis towards the farther
+    face, whichever has the largest component along the missing directions. In a corner, only the axes lead inside.
     """
     directions = np.vstack([missing, -missing, np.diag(np.where(centre <= 0.5, 1.0, -1.0))])
     edge = np.where(directions > 0, 1.0 - centre, centre)
@@ -248,13 +248,13 @@ def improving_point(
 
 @final
 class GaussNewton(Optimizer):
-    """Least squares with forward differences. Uses residuals; budget as set.
+    """Least squares with finite differences. Uses residuals, with the given budget.
 
     Args:
         seed: Seed of the random points of restarts.
         budget: Number of evaluations.
-        step: Step of the differences, as a share of the box.
-        tolerance: Relative decrease, or step as a share of the box, at which a search has converged.
+        step: Finite-difference step, as a share of the box.
+        tolerance: Relative decrease of the cost, or step as a share of the box, below which a search has converged.
 
     Raises:
         InputError: An argument is out of range.
@@ -282,7 +282,7 @@ class GaussNewton(Optimizer):
 
 
 def _newton(archive: Archive, start: NDArray[np.float64], step: float, tolerance: float) -> Search:
-    """One local search; yields candidates [n, d] of the box."""
+    """One local search; yields candidates [n, d] in the box."""
     box, lowest = archive.box, np.inf
     descent = descend(start[None], 10**6, tolerance)
     unit = next(descent)

@@ -1,11 +1,11 @@
 """Projected Levenberg-Marquardt from many starting points in parallel, for least squares in the unit cube.
 
 A step minimises the damped quadratic model g.p + p.(H + mu I) p / 2 with H = J^T J and g = J^T r within the cube.
-Components that would leave the cube are fixed on its face, group after group, and the system is solved again for the
-others. The damping mu follows the gain ratio after H. B. Nielsen (Damping Parameter in Marquardt's Method,
+Components that would leave the cube are fixed at its face, and the system is solved again for the rest, until none
+leaves it. The damping mu is updated from the gain ratio as in H. B. Nielsen (Damping Parameter in Marquardt's Method,
 IMM-REP-1999-05, Technical University of Denmark).
 
-`descend` is a generator, so its caller decides how points are evaluated: `least_squares.py` uses the engine, and
+`descend` is a generator, so its caller decides how points are evaluated: `least_squares.py` calls the engine, and
 `descend_all` calls a model.
 """
 
@@ -22,11 +22,11 @@ INITIAL_DAMPING = 1e-3
 """Initial mu, as a share of the largest diagonal element of H."""
 
 MERGE_DISTANCE = 1e-3
-"""Distance in the unit cube below which two searches approach the same minimum."""
+"""Distance in the unit cube below which two searches are assumed to approach the same minimum."""
 
 Residuals = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Residuals [s, m] and their Jacobian with respect to unit coordinates [s, m, d]; a row that is not finite is a
-failure."""
+"""Residuals [s, m] and their Jacobian with respect to unit-cube coordinates [s, m, d]; a row that is not finite is a
+failed evaluation."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class Starts:
     """Local searches in progress, with the quadratic model of each.
 
     Attributes:
-        unit: Their points in the unit cube [s, d].
+        unit: Current points in the unit cube [s, d].
         cost: Half the mean square of the residuals there [s].
-        gradient: Its gradient g [s, d].
-        curvature: Its Gauss-Newton matrix H [s, d, d].
-        damping: mu [s].
-        growth: Factor on the damping at the next rejection [s].
+        gradient: Gradient g of the cost [s, d].
+        curvature: Gauss-Newton matrix H of the cost [s, d, d].
+        damping: Damping mu [s].
+        growth: Factor by which the next rejection increases the damping [s].
         searches: Number of searches merged into each one, including itself [s].
     """
 
@@ -57,12 +57,12 @@ class Starts:
 
 
 def begin(unit: NDArray[np.float64], evaluated: Residuals) -> Starts:
-    """Form the models at evaluated points of the unit cube [s, d]; a failed evaluation has infinite cost."""
+    """Form the quadratic models at evaluated points [s, d] in the unit cube; a failed evaluation has infinite cost."""
     r, j = evaluated
     failed = np.asarray(~np.isfinite(r).all(axis=1))
     r, j = np.where(failed[:, None], 0.0, r), np.where(failed[:, None, None], 0.0, j)
     links = r.shape[1]
-    # The cost is half of a mean, so its derivatives are means over the residuals too.
+    # The cost is half the mean square, so its derivatives are means over the residuals too.
     curvature = np.einsum("smi,smj->sij", j, j) / links
     largest = np.diagonal(curvature, axis1=1, axis2=2).max(axis=1)
     return Starts(
@@ -77,9 +77,9 @@ def begin(unit: NDArray[np.float64], evaluated: Residuals) -> Starts:
 
 
 def damped_steps(starts: Starts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Steps inside the unit cube [s, d], and the decreases of cost that the models predict [s]."""
+    """Steps [s, d] that stay inside the unit cube, and the decreases in cost that the models predict [s]."""
     count, dimension = starts.unit.shape
-    # The floor keeps the matrix regular where two parameters act alike and damping has faded.
+    # The floor keeps the matrix regular if two parameters have the same effect and the damping is negligible.
     floor = 1e-13 * np.trace(starts.curvature, axis1=1, axis2=2)
     damping = np.maximum(starts.damping, floor)
     damped = starts.curvature + damping[:, None, None] * np.eye(dimension)
@@ -97,7 +97,7 @@ def damped_steps(starts: Starts) -> tuple[NDArray[np.float64], NDArray[np.float6
         if not outside.any():
             break
         free &= ~outside
-    # Fixing groups of components is a heuristic; the projected gradient step is a floor that always descends.
+    # Fixing groups of components is a heuristic; the projected gradient step, which always descends, is the fallback.
     # The trace is at least the largest curvature in any direction.
     bound = np.trace(damped, axis1=1, axis2=2)[:, None]
     gradient_step = np.clip(-starts.gradient / bound, low, high)
@@ -112,7 +112,7 @@ def _decrease(starts: Starts, step: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> Starts:
-    """Accept or reject trial points by the decrease of cost that was predicted [s], and update the damping."""
+    """Compare the decrease in cost at trial points with the predicted one [s], accept or reject, update the damping."""
     # A failed trial has an infinite cost, hence a ratio of minus infinity.
     ratio = (starts.cost - trial.cost) / predicted
     better = ratio > 1e-4
@@ -130,10 +130,10 @@ def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> St
 
 
 def merge(starts: Starts, settled: Starts) -> tuple[Starts, Starts, NDArray[np.bool_]]:
-    """Find searches that come close to a better one and would only reach the same minimum.
+    """Find searches that are close to a better one and would only reach the same minimum.
 
-    Returns the moving searches and the settled ones, with merged searches counted in `searches` of the better ones, and
-    True for each moving search that can be dropped [s].
+    Returns the moving and the settled searches, where `searches` of a better search counts those merged into it, and a
+    mask of the moving searches that can be dropped [s].
     """
     number, cost = len(settled.cost), np.concatenate([settled.cost, starts.cost])
     # Ties are broken by position, so that of two close searches exactly one is better.
@@ -158,15 +158,14 @@ def descend(
 ) -> Generator[NDArray[np.float64], Residuals, Starts]:
     """Advance all starting points [s, d] until each has converged, merged with a better one, or been abandoned.
 
-    A search has converged if its model predicts a relative decrease of the cost below `tolerance`, or a shorter step.
-    A search is abandoned if its cost exceeds the best one by more than `catch_up` of its predicted decreases. New
-    searches that come close to `earlier` ends are merged with them. Only the `followed` searches of the lowest cost are
-    followed, or all. Yields points to evaluate [s, d]. Returns the earlier searches, then those that converged or were
-    still moving at the end, then those that were abandoned because they were close to another minimum but too far
-    behind.
+    A search has converged if its model predicts a relative decrease in cost, or a step, below `tolerance`. A search is
+    abandoned if its cost exceeds the lowest one by more than `catch_up` times its predicted decrease. Searches that
+    come close to the end of an `earlier` one are merged with it. Only the `followed` starting points with the lowest
+    cost are used; all if None. Yields points to evaluate [s, d]. Returns the earlier searches, then those that
+    converged or were still moving at the end, then the abandoned ones.
     """
     starts = begin(unit, (yield unit))
-    # No search starts at a failed evaluation.
+    # Searches do not start at failed evaluations.
     starts = starts.rows(np.isfinite(starts.cost))
     if followed is not None:
         starts = starts.rows(starts.cost.argsort(kind="stable").argsort() < followed)
@@ -196,7 +195,7 @@ def descend_all(
     iterations: int,
     tolerance: float,
 ) -> Starts:
-    """Descend from `unit` [s, d] on a model, which gives residuals and their Jacobian; return the ends."""
+    """Descend from `unit` [s, d] on a model that returns residuals and their Jacobian; return the final searches."""
     descent = descend(unit, iterations, tolerance)
     points = next(descent)
     while True:
@@ -207,7 +206,7 @@ def descend_all(
 
 
 def distinct(starts: Starts, separation: float) -> Starts:
-    """Keep the best of searches that ended closer than `separation` in the unit cube, with the lowest cost first."""
+    """Of searches that ended within `separation` in the unit cube, keep the best; the lowest cost comes first."""
     order = np.argsort(starts.cost, kind="stable")
     near = cdist(starts.unit[order], starts.unit[order]) < separation
     kept = np.zeros(len(order), dtype=bool)

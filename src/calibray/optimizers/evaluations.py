@@ -12,7 +12,7 @@ from calibray.errors import InputError
 from calibray.optimizers.arguments import Box
 
 Objective = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""Converts residuals [n, m] to the value [n], which rises with their mean square."""
+"""Function from residuals [n, m] to the value [n], which rises with their mean square."""
 
 OBJECTIVE_TOLERANCE = 1e-4
 """Largest relative difference between a value and the one computed from its residuals, for float32 engines."""
@@ -35,7 +35,7 @@ class Evaluations:
 
     Attributes:
         x: Points [n, d].
-        y: Value [n], +inf for a failed evaluation.
+        y: Values [n], +inf for a failed evaluation.
         residuals: Residuals [n, m], whose mean square rises and falls with y, or None.
         jacobian: Derivatives of the residuals with respect to the parameters [n, m, d], or None.
     """
@@ -65,14 +65,14 @@ class Evaluations:
         return self.jacobian
 
     def rows(self, rows: NDArray[np.intp]) -> Evaluations:
-        """The evaluations with these indices [k], in this order."""
+        """The evaluations with the given indices [k], in the given order."""
         residuals = None if self.residuals is None else self.residuals[rows]
         jacobian = None if self.jacobian is None else self.jacobian[rows]
         return Evaluations(self.x[rows], self.y[rows], residuals, jacobian)
 
     @staticmethod
     def joined(parts: list[Evaluations]) -> Evaluations:
-        """Concatenate at least one set of evaluations, all with the same information."""
+        """Concatenate at least one set of evaluations, all with the same optional parts."""
 
         def stack(arrays: Iterable[NDArray[np.float64] | None]) -> NDArray[np.float64] | None:
             present = [array for array in arrays if array is not None]
@@ -87,7 +87,7 @@ class Evaluations:
 
 
 class Archive:
-    """Every evaluation of a run in the order of `tell`, whether it was requested or not."""
+    """All evaluations of a run in the order of `tell`, requested or not."""
 
     def __init__(self, box: Box) -> None:
         self.box = box
@@ -106,10 +106,10 @@ class Archive:
 
     @property
     def best(self) -> Best:
-        """The point and value of `leading`.
+        """The point and value of the evaluation `leading`.
 
         Raises:
-            InputError: Nothing has been told yet.
+            InputError: No evaluation has been passed to `tell` yet.
         """
         return Best(read_only(self.leading.x[0]), float(self.leading.y[0]))
 
@@ -118,7 +118,7 @@ class Archive:
         """The first evaluation with the lowest value.
 
         Raises:
-            InputError: Nothing has been told yet.
+            InputError: No evaluation has been passed to `tell` yet.
         """
         if self._leading is None:
             raise InputError("no best point: there are no evaluations yet; call tell() first")
@@ -126,15 +126,15 @@ class Archive:
 
     @property
     def lowest(self) -> float:
-        """Root mean square of the residuals of `leading`, +inf before a success; the value may have another scale."""
+        """Root mean square of the residuals of `leading`, +inf before a success; `y` may have a different scale."""
         succeeded = self._leading is not None and np.isfinite(self._leading.y[0])
         return float(root_mean_square(self.leading.errors)[0]) if succeeded else np.inf
 
     def all(self) -> Evaluations:
-        """Every evaluation so far in the order of `tell`, without Jacobians.
+        """All evaluations so far in the order of `tell`, without Jacobians.
 
         Raises:
-            InputError: Nothing has been told yet.
+            InputError: No evaluation has been passed to `tell` yet.
         """
         if not self._parts:
             raise InputError("the archive is empty; at least 1 evaluation is needed: call tell() first")
@@ -142,9 +142,9 @@ class Archive:
         return self._parts[0]
 
     def leaders(self, count: int) -> NDArray[np.float64]:
-        """The best distinct points over the whole run [count, d], best first, ties in the order of `tell`.
+        """The best distinct points of the whole run [count, d], best first, ties in the order of `tell`.
 
-        If there are fewer points, the last one is repeated.
+        If there are fewer than `count`, the last one is repeated.
         """
         evaluations = self.all()
         chosen: list[NDArray[np.float64]] = []
@@ -156,9 +156,9 @@ class Archive:
         return np.array(chosen + [chosen[-1]] * (count - len(chosen)))
 
     def imputed(self, evaluations: Evaluations) -> Evaluations:
-        """Give failed evaluations the values of the worst successful one, so that models avoid them.
+        """Give failed evaluations the value and residuals of the worst successful one, so that models avoid them.
 
-        The value is zero while every evaluation of the run has failed.
+        Both are zero while every evaluation of the run has failed.
         """
         run = self.all()
         failed, good = ~np.isfinite(evaluations.y), np.flatnonzero(np.isfinite(run.y))
@@ -179,10 +179,10 @@ def checked_evaluations(
     uses: frozenset[str],
     objective: Objective | None = None,
 ) -> Evaluations:
-    """Validate and copy evaluations: points x [n, d], values y [n]; the parts are residuals and jacobian.
+    """Validate and copy evaluations: points x [n, d], values y [n], and as `parts` residuals and jacobian.
 
-    A value of +inf is a failed evaluation, whose residuals and derivatives are ignored. Parts that the optimizer does
-    not use are checked and omitted. Values are compared with the `objective` of the residuals unless it is None.
+    A value of +inf marks a failed evaluation, whose residuals and derivatives are ignored. Parts that the optimizer
+    does not use are checked and dropped. Values are compared with the `objective` of the residuals unless it is None.
 
     Raises:
         InputError: A shape is wrong, a number is not finite, a point is outside the box, a part that the optimizer uses
@@ -199,7 +199,7 @@ def checked_evaluations(
             f"x[{row}, {column}] = {points[row, column]:g} lies outside its bounds "
             f"[{box.lower[column]:g}, {box.upper[column]:g}]; remove the point or widen the bounds"
         )
-    # Negated, so that NaN is refused as well.
+    # The comparison is negated so that NaN is refused as well.
     for (row,) in np.argwhere(~((values > -np.inf) & (values <= np.inf))):
         raise InputError(f"y[{row}] = {values[row]}; it must be a number, +inf for a failed evaluation")
     residuals, jacobian = parts["residuals"], parts["jacobian"]
@@ -225,10 +225,10 @@ def checked_evaluations(
 
 
 def check_order(evaluations: Evaluations, archive: Archive) -> None:
-    """Check that a lower value comes with a lower mean square, among evaluations and compared with the best so far.
+    """Check that a lower value means a lower mean square, among new evaluations and compared with the best so far.
 
     Raises:
-        InputError: An evaluation has a lower value than another, but a higher mean square.
+        InputError: An evaluation has a lower value than another one, but a higher mean square.
     """
     if len(archive):
         without_jacobian = Evaluations(evaluations.x, evaluations.y, evaluations.residuals)
@@ -237,7 +237,7 @@ def check_order(evaluations: Evaluations, archive: Archive) -> None:
     size = root_mean_square(evaluations.errors)
     order = np.argsort(size, kind="stable")
     value, size = evaluations.y[order], size[order]
-    # In the order of the mean squares, no value may be below an earlier one.
+    # With evaluations sorted by mean square, no value may be below an earlier one.
     highest = np.maximum.accumulate(value)
     slack = OBJECTIVE_TOLERANCE * np.abs(value) + 1e-9
     for row in np.flatnonzero(highest > value + slack):
@@ -257,7 +257,7 @@ def root_mean_square(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
 def merge_repeated(
     unit: NDArray[np.float64], values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Merge repeated points [n, d] of the unit cube: distinct points [k, d], means of their values [k, ...]."""
+    """Merge repeated points [n, d] in the unit cube: distinct points [k, d], and the means of their values [k, ...]."""
     points, group = np.unique(np.round(unit, DECIMALS), axis=0, return_inverse=True)
     # Each row averages the repeats of one point.
     share = (np.arange(len(points))[:, None] == group) / np.bincount(group)[:, None]

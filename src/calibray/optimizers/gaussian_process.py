@@ -1,8 +1,8 @@
-"""Bayesian optimization of the objective with a Gaussian process of the value and its expected improvement.
+"""Bayesian optimization of the objective: a Gaussian process of the value, and its expected improvement.
 
-It models one number, while `VectorSurrogate` models every residual, with the same `regression.py`. A run begins with a
-maximin Latin hypercube. Every further candidate maximises the logarithm of the expected improvement (D. R. Jones, M.
-Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15; the logarithm after S. Ament et al., NeurIPS 2023,
+This method models one number, whereas `VectorSurrogate` models every residual; both use `regression.py`. A run begins
+with a maximin Latin hypercube. Every further candidate maximises the log expected improvement (D. R. Jones, M.
+Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15; the logarithm as in S. Ament et al., NeurIPS 2023,
 arXiv:2310.20708). A failed evaluation enters the model with the worst successful value.
 """
 
@@ -29,8 +29,8 @@ class GaussianProcess(Optimizer):
     """Bayesian optimization. Uses only the value; 20 d evaluations by default.
 
     Args:
-        budget: Number of evaluations, 20 d if None.
-        initial: Points of the initial design, 2 (d + 1) if None; points passed to `tell` before the first `ask` count.
+        budget: Number of evaluations; 20 d if None.
+        initial: Size of the initial design; 2 (d + 1) if None. Points passed to `tell` before the first `ask` count.
 
     Raises:
         InputError: An argument is out of range.
@@ -64,11 +64,11 @@ class GaussianProcess(Optimizer):
             unit = self.box.to_unit(evaluated.x)
             points, values = merge_repeated(unit, evaluated.y[:, None])
             spanned = np.linalg.matrix_rank(points - points.mean(axis=0)) == d
-            if not spanned or len(points) < d + 2 or np.ptp(values) == 0.0:  # too little for a model
+            if not spanned or len(points) < d + 2 or np.ptp(values) == 0.0:  # not enough for a model
                 x = self._rng.random(d)
             else:
                 kernel = None if model is None else model.process.kernel
-                # The scales are estimated every time at first, later every tenth time.
+                # Scales are estimated at every step up to 40 points, and at every tenth step after that.
                 if kernel is None or len(points) <= 40 or turn % 10 == 0:
                     model = fit(points, values, guess=kernel)
                 else:
@@ -77,12 +77,12 @@ class GaussianProcess(Optimizer):
             yield self.box.from_unit(x[None])
 
     def _promising(self, model: Kriging, taken: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The point of the largest expected improvement [d]; `taken` are the evaluated points, best first."""
+        """The point [d] with the largest expected improvement; `taken` are the evaluated points, best first."""
         d, best = self.box.dimension, float(model.residuals.min())
         around = draw_around(taken[:5], CANDIDATES, -3.0, self._rng)
         candidates = np.vstack([self._rng.random((CANDIDATES, d)), around])
         promise = log_improvement(model, candidates, best)
-        # Ever closer around the best candidate so far.
+        # Search at decreasing distances around the best candidate so far.
         for reach in (0.1, 0.01, 0.001):
             closer = reach * self._rng.standard_normal((CANDIDATES // 3, d))
             closer = np.clip(candidates[np.argmax(promise)] + closer, 0.0, 1.0)
@@ -93,7 +93,7 @@ class GaussianProcess(Optimizer):
 
 
 def log_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDArray[np.float64]:
-    """Logarithm of the expected decrease of a modelled value below the best one, at points x [k, d]: [k]."""
+    """Log expected improvement [k] of the modelled value over the best one, at points x [k, d]."""
     mean, share = model.predict(x)
     spread = np.sqrt(np.maximum(share * model.variance[0], 1e-300))
     z = (best - mean[:, 0]) / spread
@@ -101,7 +101,7 @@ def log_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDAr
 
 
 def log_shape(z: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The logarithm of phi(z) + z Phi(z), accurate also for tiny values; z in standard deviations [k].
+    """The logarithm of phi(z) + z Phi(z), also accurate for tiny values; z [k] is in standard deviations.
 
     Example:
         >>> import numpy as np

@@ -1,17 +1,17 @@
-"""Grey wolves: the canonical optimizer (GWO), the paper's baseline, and the paper's method, SGWO-IM.
+"""Grey wolf optimizers: the canonical GWO, which is the paper's baseline, and the paper's method, SGWO-IM.
 
 GWO is S. Mirjalili, S. M. Mirjalili, A. Lewis, "Grey Wolf Optimizer", Advances in Engineering Software 69, 2014. The
 following choices apply where descriptions and common implementations differ:
 
 - Iteration t = 1..T evaluates the whole population, then moves it with a(t) = 2 (1 - t/T). The move after the last
   evaluation is omitted, so a run takes exactly N T evaluations.
-- alpha, beta and delta are the three best *distinct* points over the whole run (not of the last generation), ties in
+- alpha, beta and delta are the three best *distinct* points of the whole run (not of the last generation), with ties in
   the order of evaluation. Wolves at the same point count as one leader.
 - Wolves always move, even to a worse position.
 - Positions outside the bounds are clipped to them before evaluation.
 - A failed evaluation (+inf) ranks last and has no other effect.
-- C multiplies a position, so steps are short near the origin of the coordinates and long far from it: the pack is
-  biased towards the origin, as published.
+- C multiplies a position, so steps are short near the origin of the coordinates and long far from it. The pack is
+  therefore biased towards the origin, as in the published method.
 
 SGWO-IM, the Surrogate-assisted Grey Wolf Optimizer with Individual Memory, is X. Zou, P. Tang, P. Liu, C. Tai,
 "Efficient and Accurate Surrogate-Assisted Electromagnetic Parameter Calibration for 6G Digital Twin Channels",
@@ -23,17 +23,17 @@ The following choices apply where the paper is silent, in addition to those of G
 - "RBF model is available" means t > `full_iterations`. The model is refitted in every iteration on all real evaluations
   of the run, including those that were not requested.
 - Wolves that the surrogate does not select still move; only their real evaluations change their memory.
-- Memory starts at the initial position with a score of infinity, and changes on strictly lower scores.
-- The K elites are evaluated in the order of their predictions; equal predictions keep the order of the pack.
+- Each memory starts at the initial position with a score of infinity, and is replaced only by a strictly lower score.
+- The K elites are evaluated in ascending order of their predictions; ties keep the order of the pack.
 - Memory fusion (eq. 3) uses the unclipped X_GWO; the fused position is clipped.
-- Predictions choose which wolves are evaluated and have no other effect: leaders, memories and the best
-  point come from the archive of real evaluations.
+- Predictions only determine which wolves are evaluated: leaders, memories and the best point come from the archive of
+  real evaluations.
 
 With `w_min = w_max = 0`, linear convergence and no surrogate, this is GWO, bit for bit.
 
 The surrogate is SciPy's `RBFInterpolator`, cubic with a linear tail, on inputs scaled to the unit cube, with smoothing
-1e-6. Repeated points are merged with the mean of their objectives. A failed evaluation counts as the worst successful
-one, so that the model avoids it and is not distorted by infinity.
+1e-6. Repeated points are merged and their objectives averaged. A failed evaluation counts as the worst successful one,
+so that the model avoids it and is not distorted by infinity.
 """
 
 from __future__ import annotations
@@ -51,25 +51,25 @@ from calibray.optimizers.evaluations import Archive, Evaluations, merge_repeated
 from calibray.optimizers.protocol import Optimizer, Schedule, Search, Session
 
 LEADERS = 3
-"""Alpha, beta and delta."""
+"""Number of leaders: alpha, beta and delta."""
 
 WOLVES = 30
-"""N of the paper (table II)."""
+"""Number of wolves, the paper's N (Table II)."""
 
 LEAST_BUDGET = 24
-"""Smallest budget with which SGWO-IM has three leaders."""
+"""Smallest budget that gives SGWO-IM three leaders."""
 
 FULL_ITERATIONS = 5
-"""Iterations that evaluate all wolves (table II)."""
+"""Number of iterations that evaluate all wolves (Table II)."""
 
 ELITES = 5
-"""K, wolves evaluated in each later iteration (table II)."""
+"""Number of wolves evaluated in each later iteration, the paper's K (Table II)."""
 
 SMOOTHING = 1e-6
 
 
 def linear_decay(iteration: int, iterations: int) -> float:
-    """The standard convergence factor a(t) = 2 (1 - t / T) of iteration t, from 1, of T."""
+    """The standard convergence factor a(t) = 2 (1 - t / T) of iteration t = 1..T."""
     return 2.0 * (1.0 - iteration / iterations)
 
 
@@ -80,7 +80,7 @@ def encircle(
     r1: NDArray[np.float64],
     r2: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Move a pack by the guidance of its leaders (Mirjalili et al. 2014, eqs. 3.1 to 3.7).
+    """Move a pack under the guidance of its leaders (Mirjalili et al. 2014, eqs. 3.1 to 3.7).
 
     `r1` and `r2` [n, 3, d] are independent uniform random numbers, and `leaders` are alpha, beta and delta [3, d].
     Returns X_GWO, the mean of the three guided positions [n, d], not yet clipped.
@@ -92,9 +92,9 @@ def encircle(
 
 
 def whole_iterations(budget: int) -> dict[str, int]:
-    """The settings of GWO for a budget: 30 wolves, and as many whole iterations as fit.
+    """The settings of GWO for a budget: 30 wolves, and as many complete iterations as the budget allows.
 
-    There are fewer wolves if two iterations of 30 do not fit.
+    There are fewer wolves if the budget does not allow two iterations of 30.
 
     Example:
         >>> whole_iterations(600), whole_iterations(45)
@@ -110,7 +110,7 @@ class GWO(Optimizer):
 
     Args:
         population: N, number of wolves.
-        iterations: T.
+        iterations: T, number of iterations.
 
     Raises:
         InputError: An argument is out of range.
@@ -158,7 +158,7 @@ class GWO(Optimizer):
 
 
 def cosine_decay(iteration: int, iterations: int) -> float:
-    """The paper's convergence factor a(t) = 2 cos(pi t / (2 T)) of iteration t, from 1, of T (eq. 2)."""
+    """The paper's convergence factor a(t) = 2 cos(pi t / (2 T)) of iteration t = 1..T (eq. 2)."""
     return 2.0 * cos(0.5 * pi * iteration / iterations)
 
 
@@ -171,9 +171,9 @@ CONVERGENCE = {"cosine": cosine_decay, "linear": linear_decay}
 
 
 def screened_iterations(budget: int) -> dict[str, int]:
-    """The settings of SGWO-IM for a budget: the paper's schedule at 225, and in proportion at any other.
+    """The settings of SGWO-IM for a budget: the paper's schedule for 225 evaluations, scaled for other budgets.
 
-    Two thirds are spent in 5 full iterations with at most 30 wolves, and the rest on 5 elites per iteration.
+    Two thirds are spent on 5 full iterations with at most 30 wolves, and the rest on 5 elites per iteration.
 
     Example:
         >>> screened_iterations(225)
@@ -191,7 +191,7 @@ class SGWOIM(Optimizer):
 
     Args:
         population: N, number of wolves.
-        iterations: T.
+        iterations: T, number of iterations.
         full_iterations: Number of iterations that evaluate the whole population before the surrogate selects wolves.
         elites: K, number of wolves evaluated in each later iteration.
         w_min: Memory weight at the start.
@@ -248,10 +248,10 @@ class SGWOIM(Optimizer):
 
     @property
     def memory(self) -> Evaluations:
-        """The best evaluation of each wolf; a wolf not evaluated yet has its initial position and +inf.
+        """The best evaluation of each wolf; its initial position and +inf if it has not been evaluated yet.
 
         Raises:
-            InputError: Nothing has been asked yet.
+            InputError: `ask` has not been called yet.
         """
         if self._memory is None:
             raise InputError(
@@ -274,7 +274,7 @@ class SGWOIM(Optimizer):
             positions = self.box.clip((1.0 - w) * guided + w * memory.x)  # eq. 3
 
     def _screen(self, archive: Archive, positions: NDArray[np.float64], iteration: int) -> NDArray[np.intp]:
-        """The wolves to evaluate: first all of them, then the K that the surrogate ranks best."""
+        """The wolves to evaluate: all of them in full iterations, then the K that the surrogate ranks best."""
         if not self.surrogate or iteration <= self.full_iterations:
             return np.arange(self.population)
         predicted = predict(archive, positions)
@@ -282,7 +282,7 @@ class SGWOIM(Optimizer):
 
 
 def remember(memory: Evaluations, wolves: NDArray[np.intp], answers: Evaluations) -> Evaluations:
-    """Update the pack's memory with the answers of evaluated wolves that have a strictly lower score."""
+    """Update the memory of each evaluated wolf whose answer has a strictly lower score."""
     x, y = memory.x.copy(), memory.y.copy()
     better = answers.y < y[wolves]
     x[wolves[better]], y[wolves[better]] = answers.x[better], answers.y[better]
@@ -290,7 +290,7 @@ def remember(memory: Evaluations, wolves: NDArray[np.intp], answers: Evaluations
 
 
 def predict(archive: Archive, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Predict the objective of candidates [n, d] from all real evaluations; zero while all have failed.
+    """Predict the objective at candidates [n, d] from all real evaluations; zero while all have failed.
 
     The archive must contain more than d distinct points that span the box.
     """

@@ -1,22 +1,22 @@
 """Multi-start least squares with exact derivatives: projected Levenberg-Marquardt on all starts at once.
 
-Local searches are cheap if derivatives come with the residuals, and a batch of candidates takes little longer than one.
-Many searches therefore run in parallel, and each `ask` returns the next trial point of every search that still moves.
-RMSE over permittivities is multimodal (slab resonances), so one starting point is not enough. A search is abandoned if
-it comes close to a better one, or is so far behind the best that it can hardly catch up. Its last point is kept as a
-further minimum (`minima`): minima that fit nearly as well show how ambiguous the best one is. The steps are those of
-`descent.py`.
+Local searches are cheap if the engine returns derivatives, and a batch of candidates takes little longer than one.
+Many searches therefore run in parallel, and each `ask` returns the next trial point of every search still in progress.
+RMSE as a function of permittivities is multimodal (slab resonances), so one starting point is not enough. A search that
+comes close to a better one is merged with it. A search too far behind the best one to catch up is abandoned, and its
+last point is kept as a further minimum (`minima`). Minima that fit nearly as well show how ambiguous the best one is.
+`descent.py` computes the steps.
 
-Starting points come in rounds, until `RETURNS` searches have ended in the best minimum. If another minimum fitted
+Starting points are used in rounds, until `RETURNS` searches have ended in the best minimum. If another minimum fitted
 better and had an equally wide basin, all searches would have missed it with a probability of e^-k after k returns.
 Problems with narrower basins use all their starting points. (The Bayesian rule of Boender and Rinnooy Kan, Mathematical
 Programming 37, 1987, counts the different minima, which requires every search to be followed to its end.)
 
 If too few searches have ended in the best minimum, minima are combined into new starting points (`recombine`). Searches
-start from those that fit best, until they find no better minimum. With a full round of starting points, basin hopping
-follows (Wales and Doye, Journal of Physical Chemistry A 101, 1997): searches start from the best minimum with one or
-two new coordinates. A resonating slab repeats minima along its own coordinate, and materials act nearly independently,
-so a lower minimum often differs in few coordinates.
+start from those that fit best, until they find no better minimum. If there is at least one full round of starting
+points, basin hopping follows (Wales and Doye, Journal of Physical Chemistry A 101, 1997): searches start from the best
+minimum with one or two coordinates redrawn. A resonating slab repeats minima along its own coordinate, and materials
+act nearly independently, so a lower minimum often differs in only a few coordinates.
 """
 
 from __future__ import annotations
@@ -37,44 +37,44 @@ from calibray.optimizers.sampling import design
 from calibray.support.messages import shortened
 
 CATCH_UP = 100.0
-"""Default number of predicted decreases that a search may be behind the best one before it is abandoned."""
+"""Default multiple of its predicted decrease by which a search may lag the best one before it is abandoned."""
 
 NEARER = 10.0
-"""The same for searches that start near their end, or together with such searches."""
+"""The same multiple for searches from combined minima, which start near their end."""
 
 COMBINATIONS = 32
-"""Number of combinations of minima that are tried at a time, at most the number of starting points."""
+"""Number of combinations of minima tried at a time; never more than the number of starting points."""
 
 FOLLOWED = 0.2
-"""Share of the combinations, those that fit best, from which searches start."""
+"""Share of the combinations from which searches start: those that fit best."""
 
 PARENTS = 12
-"""Lowest minima that are combined."""
+"""Number of lowest minima that are combined."""
 
 SPACE = 0.05
-"""Smallest distance in the unit cube of a combination to the known minima and to the other combinations."""
+"""Smallest distance in the unit cube from a combination to the known minima and to the other combinations."""
 
 ROUND = 64
-"""Starts of a round."""
+"""Number of starting points per round."""
 
 HOPS = 8
-"""Number of starting points for each search of a round of basin hopping."""
+"""Number of starting points per search in a round of basin hopping."""
 
 PATIENCE = 6
-"""Rounds without a lower minimum that end basin hopping. In 24 problems of development that use all starting points, 14
-searches ended above the lowest known minimum without it, nine with three rounds, and two with six."""
+"""Number of successive rounds without a lower minimum after which basin hopping ends. In 24 development problems that
+use all starting points, 14 runs ended above the lowest known minimum without hopping, nine with three, two with six."""
 
 RETURNS = 10
-"""Number of searches that end in the best minimum before no more are started."""
+"""Number of searches that must end in the best minimum before the method stops starting new ones."""
 
 LEVEL = 1e-4
-"""Relative difference of the mean square below which two minima fit equally well, as along a valley."""
+"""Relative difference in mean square below which two minima fit equally well, for example along a valley."""
 
 NOISELESS = 1e-9
-"""The same relative to the largest mean square: without noise, the lowest mean squares are rounding errors."""
+"""The same, relative to the largest mean square: without noise, the lowest mean squares are rounding errors."""
 
 APART = 0.01
-"""Distance in the unit cube below which two searches ended in the same minimum."""
+"""Distance in the unit cube below which two searches count as having ended in the same minimum."""
 
 
 @final
@@ -84,15 +84,15 @@ class LeastSquares(Optimizer):
     Args:
         seed: Seed of the scrambled Sobol points that the searches start from.
         starts: Largest number of these points; powers of two are spread best. Each costs about ten evaluations. If all
-            are used, combinations of the minima and basin hopping need about as many again. The best point
+            are used, combinations of the minima and basin hopping need about as many evaluations again. The best point
             passed to `tell` before the first `ask`, if any, is a further starting point.
         x0: Further starting points, [d] or [k, d].
         iterations: Largest number of steps of each search.
-        tolerance: A search has converged if its model predicts less than this relative decrease of the mean square, or
-            a step shorter than this in the unit cube.
-        catch_up: Number of predicted decreases that a search may be behind the best one before it is abandoned. Use a
-            smaller number if some starting points already are minima and the others only have to show whether they lead
-            to a better one.
+        tolerance: A search has converged if its model predicts a relative decrease of the mean square below this
+            tolerance, or a step shorter than this in the unit cube.
+        catch_up: Multiple of its predicted decrease by which a search may lag the best one before it is abandoned. Use
+            a smaller number if some starting points are already minima and the others only need to show whether they
+            lead to a better one.
 
     Raises:
         InputError: An argument is out of range.
@@ -147,7 +147,7 @@ class LeastSquares(Optimizer):
             ended = yield from self._descended(unit, ended, self.catch_up)
             if returns(ended) >= RETURNS:
                 break
-            # Given starting points and the best earlier one belong to the first round.
+            # The user's starting points and the best earlier point belong to the first round only.
             unit = unit[:0]
         if ended is not None and len(ended.cost):
             if returns(ended) < RETURNS:
@@ -159,7 +159,7 @@ class LeastSquares(Optimizer):
         number, before = min(COMBINATIONS, self.starts), np.inf
         followed = round(FOLLOWED * number)
         while followed and ended.cost.min() < before:
-            # Only a cost below this counts as a lower minimum.
+            # Only a lower cost than this counts as a lower minimum.
             before = ended.cost.min() - _slack(ended)
             unit = recombine(distinct(ended, SPACE).unit, number)
             if not len(unit):
@@ -185,7 +185,7 @@ class LeastSquares(Optimizer):
             while True:
                 answers = yield self.box.from_unit(unit)
                 failed = ~np.isfinite(answers.y)[:, None]
-                # `descend` recognises a failure by infinite residuals.
+                # `descend` treats infinite residuals as a failed evaluation.
                 residuals = np.where(failed, np.inf, answers.errors)
                 unit = descent.send((residuals, answers.slopes * self.box.width))
         except StopIteration as end:
@@ -202,19 +202,19 @@ def returns(ended: Starts) -> int:
 def recombine(minima: NDArray[np.float64], number: int) -> NDArray[np.float64]:
     """Combine minima [k, d], the best first, into `number` points from which other minima may be reached.
 
-    The best minimum is shifted by the difference of two others, or takes one coordinate of another. Shifts help because
-    one cause, such as a resonating slab, repeats minima at equal distances for any values of the other parameters. They
-    are the mutation of differential evolution (Storn and Price, Journal of Global Optimization 11, 1997). Exchanges
-    help if parameters act nearly independently, such as materials that rarely occur on the same path. They are its
-    crossover. Points within `SPACE` of a minimum are excluded. Points of the lowest minima come first, with shifted and
-    exchanged ones in turn; there may be fewer points than requested.
+    The best minimum is shifted by the difference between two others, or takes one coordinate from another. Shifts help
+    because one cause, such as a resonating slab, repeats minima at equal distances whatever the other parameters are;
+    they are the mutation of differential evolution (Storn and Price, Journal of Global Optimization 11, 1997).
+    Exchanges, its crossover, help if parameters act nearly independently, such as materials that rarely occur on the
+    same path. Points within `SPACE` of a minimum are excluded. Points from the lowest minima come first, alternating
+    between shifts and exchanges; there may be fewer points than requested.
     """
     best, low, dimension = minima[0], minima[:PARENTS], minima.shape[1]
     target, source = np.nonzero(~np.eye(len(low), dtype=bool))
     # Pairs of the lowest minima first.
     order = np.lexsort((target + source, np.maximum(target, source)))
     shifted = best + (low[target] - low[source])[order]
-    # Every coordinate of every other minimum in turn.
+    # The best minimum with each coordinate of each other minimum in turn.
     exchanged = np.where(np.eye(dimension, dtype=bool), low[1:, None], best).reshape(-1, dimension)
     new = [_new(points, minima) for points in (shifted, exchanged)]
     turn = np.argsort(np.concatenate([np.arange(len(points)) for points in new]), kind="stable")
@@ -228,7 +228,7 @@ def recombine(minima: NDArray[np.float64], number: int) -> NDArray[np.float64]:
 
 
 def hops(best: NDArray[np.float64], number: int, random: np.random.Generator) -> NDArray[np.float64]:
-    """Copies of a point of the unit cube [d], each with one or two coordinates drawn anew [number, d]."""
+    """Copies [number, d] of a point of the unit cube [d], each with one or two coordinates redrawn at random."""
     points = np.repeat(best[None], number, axis=0)
     for point in points:
         count = min(len(best), random.integers(1, 3))
@@ -243,7 +243,7 @@ def _new(points: NDArray[np.float64], minima: NDArray[np.float64]) -> NDArray[np
 
 
 def _slack(ended: Starts) -> float:
-    """Difference of cost below which two minima fit equally well."""
+    """Difference in cost below which two minima fit equally well."""
     return float(LEVEL * ended.cost.min() + NOISELESS * ended.cost.max())
 
 

@@ -1,19 +1,19 @@
-"""Minimisers of other libraries as ask-and-tell searches: CMA-ES, DFO-LS and SciPy's differential evolution.
+"""Minimisers from other libraries as ask-and-tell searches: CMA-ES, DFO-LS and SciPy's differential evolution.
 
 - CMA-ES, in its author's package `cma`: N. Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772. It
-  starts in the middle of the unit cube with a step of 0.3.
+  starts in the middle of the unit cube with a step size of 0.3.
 - DFO-LS, in its authors' package: C. Cartis, J. Fiala, B. Marteau, L. Roberts, "Improving the Flexibility and
   Robustness of Model-Based Derivative-Free Optimization Solvers", ACM Trans. Math. Softw. 45 (2019) 32. It fits a
   linear model to every residual in a trust region, one evaluation at a time. It is a local method.
 - Differential evolution: R. Storn, K. Price, J. Global Optim. 11 (1997) 341, one generation per batch, without SciPy's
   final polish, which would need derivatives.
 
-All start at the best point passed to `tell` before, if any, and restart from a random point or population if they
-converge before their budget is used.
+All start at the best point already passed to `tell`, if any. They restart from a random point or population if they
+converge before their budget is used up.
 
 A minimiser that calls its objective runs in a separate thread, and waits inside the objective for the evaluation. Only
-one side runs at a time, so a run is as reproducible as the library. If a search is dropped before its end, the
-objective raises an exception inside the library, which ends the thread.
+one of the two threads runs at a time, so a run is as reproducible as the library. If a search is dropped before its
+end, the objective raises an exception inside the library, which ends the thread.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ Evaluate = Callable[[NDArray[np.float64]], Evaluations]
 
 
 class _AbandonedError(BaseException):
-    """Ends a minimiser whose search was dropped; not an `Exception`, so that no library catches it."""
+    """Ends a minimiser whose search was dropped; not an `Exception`, because a library might catch that."""
 
 
 def inverted(minimise: Callable[[Evaluate], None]) -> Search:
-    """Run a minimiser in a thread and yield the candidates [n, d] that it needs evaluated.
+    """Run a minimiser in a thread, and yield the candidates [n, d] that it asks to have evaluated.
 
     Raises:
         Exception: Whatever `minimise` raises.
@@ -54,7 +54,7 @@ def inverted(minimise: Callable[[Evaluate], None]) -> Search:
         questions.put(x)
         answer = answers.get()
         if answer is None:
-            answers.put(None)  # for the next call, should the library have caught the exception
+            answers.put(None)  # for the next call, in case the library catches the exception
             raise _AbandonedError
         return answer
 
@@ -85,7 +85,7 @@ class CMAES(Optimizer):
 
     Args:
         budget: Number of evaluations.
-        population: Candidates per generation; 4 + 3 ln d if None.
+        population: Number of candidates per generation; 4 + 3 ln d if None.
 
     Raises:
         InputError: An argument is out of range, or `cma` is not installed.
@@ -117,7 +117,7 @@ class CMAES(Optimizer):
             "bounds": [0.0, 1.0],
             "popsize": self.population,
             "randn": lambda *shape: self._rng.standard_normal(shape),
-            "seed": np.nan,  # leaves NumPy's global generator alone
+            "seed": np.nan,  # does not reseed NumPy's global generator
             "verbose": -9,
         }
         if len(start) == 1:
@@ -133,7 +133,7 @@ class CMAES(Optimizer):
 
 @final
 class DFOLS(Optimizer):
-    """Derivative-free least squares. Uses residuals; budget as set. Needs `calibray[optimizers]`.
+    """Derivative-free least squares. Uses residuals, with the given budget. Needs `calibray[optimizers]`.
 
     Args:
         seed: Seed of the random points of restarts.
@@ -161,7 +161,7 @@ class DFOLS(Optimizer):
         self.box = Box.between(lower, upper)
         self._budget = whole("budget", budget, at_least=1)
         self.radius = real("radius", radius, at_least=1e-6, at_most=0.5)
-        # DFO-LS needs a first region above the last one.
+        # DFO-LS requires an initial radius larger than the final one.
         self.tolerance = real("tolerance", tolerance, at_least=1e-12, at_most=0.5 * self.radius)
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
         self._dfols = library("dfols", "optimizers")
@@ -182,7 +182,7 @@ def _minimise_residuals(
     rng: np.random.Generator,
     evaluate: Evaluate,
 ) -> None:
-    """Minimise from one starting point after the other, without end."""
+    """Minimise from successive starting points indefinitely."""
     box = archive.box
     d = box.dimension
 
@@ -198,9 +198,9 @@ def _minimise_residuals(
             bounds=(np.zeros(d), np.ones(d)),
             rhobeg=radii[0],
             rhoend=radii[1],
-            maxfun=budget + d + 2,  # `limited` keeps the budget, and DFO-LS warns of a small one
+            maxfun=budget + d + 2,  # `limited` enforces the budget, and DFO-LS warns if it is small
             do_logging=False,
-            # Coordinate directions: the random ones come from NumPy's global generator.
+            # Coordinate directions, because random ones are drawn from NumPy's global generator.
             user_params={"init.random_initial_directions": False},
         )
         if len(archive) == before:
@@ -214,7 +214,7 @@ class DifferentialEvolution(Optimizer):
 
     Args:
         budget: Number of evaluations.
-        population: Candidates per generation as a multiple of d; SciPy uses at least 5 in total.
+        population: Number of candidates per generation as a multiple of d; SciPy uses at least 5 in total.
 
     Raises:
         InputError: An argument is out of range.
@@ -236,13 +236,13 @@ class DifferentialEvolution(Optimizer):
 
 
 def _evolve(population: int, archive: Archive, rng: np.random.Generator, evaluate: Evaluate) -> None:
-    """Minimise with one population after the other, without end."""
+    """Minimise with successive populations indefinitely."""
     box = archive.box
 
     def objective(unit: NDArray[np.float64]) -> NDArray[np.float64]:  # [d, n], SciPy's vectorized form
         return archive.imputed(evaluate(box.from_unit(unit.T))).y
 
-    # In other bounds, SciPy's rounding may place a start on a face outside them.
+    # With other bounds than the unit cube, SciPy's rounding may place a start on a face outside them.
     start = box.to_unit(archive.best.x) if len(archive) else None
     while True:
         differential_evolution(

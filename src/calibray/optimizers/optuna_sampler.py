@@ -1,12 +1,13 @@
-"""SGWO-IM as a sampler for Optuna, for use with its storages, dashboard and workers.
+"""SGWO-IM as a sampler for Optuna, for use with Optuna's storages, dashboard and workers.
 
-Every candidate that is returned is written into its trial. A new sampler with the same seed on a stored study therefore
+Every candidate that is returned is stored in its trial. A new sampler with the same seed on a stored study therefore
 repeats the same candidates, uses their stored answers, and continues where the study stopped. Trials that it did not
-propose (enqueued, or from another sampler) join the archive and can lead the pack. A failed trial counts as a failed
-evaluation.
+propose (enqueued, or from another sampler) join the archive and can become leaders of the pack. A failed trial counts
+as a failed evaluation.
 
-The pack cannot move before the iteration is complete. If workers are evaluating every open candidate, one from another
-process is returned again, because that process may have ended; otherwise the next trial is a random point.
+The pack cannot move before the iteration is complete. If workers are already evaluating every open candidate, a
+candidate taken by another process is returned again, because that process may have ended. If there is none, the next
+trial is a random point.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class SGWOIMSampler(BaseSampler):
         **settings: Further settings of `SGWOIM`.
 
     Raises:
-        InputError: A distribution is categorical, or a setting is out of range.
+        InputError: A distribution is neither float nor integer, or a setting is out of range.
 
     Example:
         >>> import optuna
@@ -93,7 +94,7 @@ class SGWOIMSampler(BaseSampler):
     def sample_relative(
         self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
     ) -> dict[str, Any]:
-        """Return a candidate of the pack that no other trial works on; empty if Optuna should draw at random.
+        """Return a candidate of the pack that no other trial is evaluating; empty if Optuna should draw at random.
 
         Raises:
             InputError: The study has several objectives.
@@ -123,7 +124,7 @@ class SGWOIMSampler(BaseSampler):
     def sample_independent(
         self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
     ) -> Any:
-        """Draw a parameter that the pack does not search at random."""
+        """Draw at random the value of a parameter that the pack does not search."""
         return self._random.sample_independent(study, trial, param_name, param_distribution)
 
     def after_trial(
@@ -135,11 +136,11 @@ class SGWOIMSampler(BaseSampler):
                 return
             self._take(self._optimizer, study, trial, state, values)
             if self._optimizer.done:
-                with suppress(RuntimeError):  # trials that are asked for one by one cannot be stopped
+                with suppress(RuntimeError):  # a study used through `ask` and `tell` cannot be stopped
                     study.stop()
 
     def _synchronized(self, study: Study, space: Mapping[str, BaseDistribution]) -> SGWOIM:
-        """The optimizer after every finished trial of the study, in order."""
+        """The optimizer after it has received every finished trial of the study, in order."""
         if self._optimizer is None or self._space != space:
             bounds = np.array([_bounds(cast("Numeric", distribution)) for distribution in space.values()])
             self._optimizer, self._space, self._told = SGWOIM(*bounds.T, **self._settings), dict(space), set()
@@ -160,7 +161,7 @@ class SGWOIMSampler(BaseSampler):
         if trial.number in self._told or optimizer.done:
             return
         self._told.add(trial.number)
-        optimizer.ask()  # the iteration has to begin before its answers are told, even if all are stored already
+        optimizer.ask()  # the iteration must begin before `tell` receives its answers, even if all are already stored
         x = np.array(trial.system_attrs.get(CANDIDATE, self._foreign(trial)), dtype=float)
         if x.shape != optimizer.box.lower.shape or not np.array_equal(x, optimizer.box.clip(x)):
             return
@@ -168,7 +169,7 @@ class SGWOIMSampler(BaseSampler):
         optimizer.tell([x], [sign * values[0] if state == TrialState.COMPLETE and values else np.inf])
 
     def _foreign(self, trial: FrozenTrial) -> list[float]:
-        """Search coordinates of a trial that the pack did not propose; empty if it lacks a parameter."""
+        """Search coordinates of a trial that the pack did not propose; empty if the trial lacks a parameter."""
         if not self._space.keys() <= trial.params.keys():
             return []
         return [
@@ -178,7 +179,7 @@ class SGWOIMSampler(BaseSampler):
 
 
 def _bounds(distribution: Numeric) -> tuple[float, float]:
-    """Bounds of the search coordinate; each value of a grid covers an interval as wide as its step."""
+    """Bounds of the search coordinate; each value on a grid covers an interval one step wide."""
     margin = 0.5 * (distribution.step or 0.0)
     return _coordinate(distribution, distribution.low - margin), _coordinate(
         distribution, distribution.high + margin

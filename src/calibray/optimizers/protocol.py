@@ -1,8 +1,8 @@
-"""The interfaces of every optimizer (ask for candidates, tell their evaluations) and of the cheap model that some use.
+"""The interfaces of every optimizer (`ask` for candidates, `tell` their evaluations) and of the optional cheap model.
 
 An algorithm is written as in its paper: a generator that yields the candidates [n, d] of each iteration and receives
-their evaluations. A `Session` holds it between `ask` and `tell`, checks the evaluations, keeps the archive, and
-collects the answers of a batch in any order and in portions.
+their evaluations. A `Session` suspends it between `ask` and `tell`, checks the evaluations, keeps the archive, and
+collects the answers to a batch, which may come in any order and in portions.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from calibray.optimizers.evaluations import (
 )
 
 Search = Generator[NDArray[np.float64], Evaluations, None]
-"""An algorithm: yields candidates [n, d] inside the box, receives their evaluations in the same order."""
+"""An algorithm: it yields candidates [n, d] inside the box and receives their evaluations in the same order."""
 
 
 class Session:
     """A search in progress.
 
     Args:
-        box: The box searched.
+        box: The search box.
         uses: Parts of an evaluation that the algorithm uses: "value", "residuals", "jacobian".
         search: Starts the algorithm on the archive; no part of it runs before the first `ask`.
-        objective: Converts residuals to the value, if residuals are used.
+        objective: Function that converts residuals to the value, if residuals are used.
 
     Attributes:
         minima: Distinct minima that the algorithm keeps, the lowest first [k, d]; empty until it sets them.
@@ -65,7 +65,7 @@ class Session:
     @property
     def done(self) -> bool:
         """Whether the algorithm has ended; to determine this, it computes the next candidates."""
-        # Nothing starts before the first ask, so that earlier evaluations can still be told.
+        # The algorithm does not start before the first `ask`, so that `tell` can still receive earlier evaluations.
         if self._asked is not None:
             self._advance()
         return self._finished
@@ -99,12 +99,12 @@ class Session:
         self.archive.add(evaluations)
         if self._asked is None:
             return
-        # The whole batch in its order needs no search for each point.
+        # If the whole batch comes in its order, points need not be matched one by one.
         if np.array_equal(evaluations.x, self._asked) and len(self._open) == len(self._asked):
             self._answers, self._open = {0: evaluations}, self._open[:0]
             return
         for row, point in enumerate(evaluations.x):
-            # Equal candidates of a batch are answered one after the other.
+            # Each answer counts for the first open one of equal candidates in a batch.
             same = np.flatnonzero((self._asked[self._open] == point).all(axis=1))
             if same.size:
                 self._answers[int(self._open[same[0]])] = evaluations.rows(np.array([row]))
@@ -123,7 +123,7 @@ class Session:
 
 
 def limited(search: Search, budget: int) -> Search:
-    """End a search when it has used its budget, and shorten the last batch; the search must not end earlier."""
+    """Shorten a search's last batch to the budget and end the search after it; the search must not end earlier."""
     with closing(search):
         x = next(search)
         while True:
@@ -135,16 +135,16 @@ def limited(search: Search, budget: int) -> Search:
 
 
 def first_start(archive: Archive) -> NDArray[np.float64]:
-    """Where a local search starts in the unit cube [d]: at the best point passed to `tell` before, or in the middle."""
+    """Start of a local search in the unit cube [d]: the best point already passed to `tell`, or else the middle."""
     return archive.box.to_unit(archive.best.x) if len(archive) else np.full(archive.box.dimension, 0.5)
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How a method keeps to a budget.
+    """How a method respects a budget.
 
     Attributes:
-        settings: Maps a number of evaluations to the constructor arguments that respect it.
+        settings: Function from a number of evaluations to the constructor arguments that respect it.
         least: Smallest budget with which the method can run.
     """
 
@@ -160,22 +160,22 @@ class Optimizer(ABC):
     """Minimises a value over a box; the caller owns the loop.
 
     `while not opt.done: x = opt.ask(); opt.tell(x, *evaluate(x))` is a complete run. A final class receives its
-    settings in the constructor, passes its algorithm to a `Session`, sets those of the attributes below whose defaults
-    do not apply, and overrides nothing else.
+    settings in the constructor, passes its algorithm to a `Session`, sets the attributes below whose defaults do not
+    apply, and overrides nothing else.
 
     The value may be any number, such as an error or a negative log likelihood. A method that uses residuals minimises
     their mean square, so the value must rise and fall with it. For a likelihood, pass deviance residuals sign(r) sqrt(2
-    (l(r) - l(0))) of residuals r with negative log likelihood l to `tell`.
+    (l(r) - l(0))) to `tell`, where r are residuals with negative log likelihood l.
 
     Every constructor takes `lower` and `upper`, the bounds [d], and `seed`, the seed of the random generator. If
-    residuals are used, it also takes `objective`, which converts residuals [n, m] to the value [n]; by default their
-    root mean square. The value must rise with their mean square, which is minimised; both are checked.
+    residuals are used, it also takes `objective`, a function from residuals [n, m] to the value [n]; the default is
+    their root mean square. `tell` checks that values agree with this function and rise with the mean square.
 
     Attributes:
-        uses: Parts of an evaluation that the method uses, of "value", "residuals" and "jacobian".
-        schedule: How it respects a budget; None if it stops by itself.
+        uses: The parts of an evaluation that the method uses: "value", "residuals", "jacobian".
+        schedule: How the method respects a budget; None if it stops by itself.
         takes_starts: Whether its constructor takes `x0`, starting points, and `starts`, the number of its own starting
-            points. In every other method, the best point passed to `tell` before the first `ask` leads the search.
+            points. In every other method, the best point passed to `tell` before the first `ask` guides the search.
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value"})
@@ -206,12 +206,12 @@ class Optimizer(ABC):
 
     @property
     def budget(self) -> int | None:
-        """Largest number of evaluations that it will request, or None if it stops by itself."""
+        """Largest number of evaluations that the method requests; None if it stops by itself."""
         return self._budget
 
     @property
     def done(self) -> bool:
-        """Whether it has ended."""
+        """Whether the search has ended."""
         return self._session.done
 
     @property
@@ -219,16 +219,16 @@ class Optimizer(ABC):
         """The best real evaluation so far, with `.x` [d] and `.y`.
 
         Raises:
-            InputError: Nothing has been told yet.
+            InputError: No evaluation has been passed to `tell` yet.
         """
         return self._session.archive.best
 
     @property
     def minima(self) -> NDArray[np.float64]:
-        """The best point, then the distinct minima that the method keeps, of which it may be the first [k, d].
+        """The best point, then the distinct minima that the method keeps, which may include the best point [k, d].
 
         Raises:
-            InputError: Nothing has been told yet.
+            InputError: No evaluation has been passed to `tell` yet.
         """
         return np.concatenate([self.best.x[None], self._session.minima])
 
@@ -238,7 +238,7 @@ class Optimizer(ABC):
         return len(self._session.archive)
 
     def ask(self) -> NDArray[np.float64]:
-        """The candidates [n, d] to evaluate next, inside the bounds; the same again until they are evaluated.
+        """The candidates [n, d] to evaluate next, inside the bounds; unchanged until all are evaluated.
 
         Raises:
             InputError: The optimizer is done.
@@ -252,22 +252,22 @@ class Optimizer(ABC):
         residuals: ArrayLike | None = None,
         jacobian: ArrayLike | None = None,
     ) -> None:
-        """Tell evaluations; everything is copied.
+        """Pass evaluations to the optimizer; all arrays are copied.
 
         Requested candidates may come in any order and in portions; the search continues when the batch is complete.
         Points that were not requested, for instance those of an earlier run, join the archive. They can become the best
-        point, a leader or data of a surrogate, but they answer no candidate and end no iteration.
+        point, a leader or data for a surrogate, but they do not count as answers to candidates.
 
         Args:
             x: Points [n, d] inside the bounds.
-            y: Value [n]; +inf for a failed evaluation.
+            y: Values [n]; +inf for a failed evaluation.
             residuals: Residuals [n, m], weighted so that y = sqrt(mean(residuals**2)), or the value that the
                 constructor's `objective` gives. Residuals are ignored if only the value is used.
             jacobian: Derivatives of the residuals with respect to the parameters [n, m, d].
 
         Raises:
-            InputError: A shape is wrong, a number is not finite, a point is outside the bounds, something in `uses` is
-                missing, or a value does not match its residuals. No part of this call is kept.
+            InputError: A shape is wrong, a number is not finite, a point is outside the bounds, a part in `uses` is
+                missing, or a value does not match its residuals. Nothing from this call is kept.
         """
         self._session.tell(x, y, residuals, jacobian)
 
@@ -277,8 +277,8 @@ class CheapAnswer(NamedTuple):
 
     Attributes:
         residuals: Residuals in the order of the engine's residuals [n, m].
-        by_point: Their derivatives with respect to the search coordinates [n, m, d].
-        by_constant: Their derivatives with respect to the model's constants [n, m, q].
+        by_point: Derivatives of the residuals with respect to the search coordinates [n, m, d].
+        by_constant: Derivatives of the residuals with respect to the model's constants [n, m, q].
     """
 
     residuals: NDArray[np.float64]
@@ -291,8 +291,8 @@ class Constants:
     """Constants of a cheap model that the search does not change and that may be wrong.
 
     Attributes:
-        centre: Their believed values [q]; q may be 0.
-        spread: Standard deviations of their errors [q].
+        centre: Assumed values [q]; q may be 0.
+        spread: Standard deviations of the errors of the assumed values [q].
         lower: Lower bounds [q].
         upper: Upper bounds [q].
     """
@@ -318,16 +318,16 @@ class Constants:
 
 
 class CheapModel(Protocol):
-    """A model whose computing time is negligible compared with the engine that is minimised."""
+    """A model whose computing time is negligible compared with that of the engine."""
 
     @property
     def constants(self) -> Constants:
-        """Its constants, which are adjusted until it agrees with the engine."""
+        """The model's constants, which are adjusted until the model agrees with the engine."""
         ...
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Residuals that the model predicts [m]; for the others it returns any constant number."""
+        """Mask of the residuals that the model predicts [m]; for the others it returns an arbitrary constant."""
         ...
 
     def residuals(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -335,5 +335,5 @@ class CheapModel(Protocol):
         ...
 
     def answer(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> CheapAnswer:
-        """Residuals with their derivatives."""
+        """Residuals and their derivatives at the same points and constants."""
         ...

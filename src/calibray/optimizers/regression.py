@@ -3,20 +3,20 @@
     K(x, x') = v_0 + v_1 h(x).h(x') + v_2 M(x, x') + nugget [x = x']
 
 M is the Matern-5/2 kernel with one rate (inverse length scale) per coordinate of the unit cube. h(x) is the response of
-a cheap model at x, if there is one. v_0 therefore allows an offset, v_1 a change of the response and v_2 a smooth rest.
-All residuals share K, so one factorization serves any number of residuals. With a linear trend, the coefficients of 1
-and x are unknown without a prior (universal kriging).
+a cheap model at x, if there is one. v_0 therefore allows an offset, v_1 a change in the response and v_2 a smooth
+remainder. All residuals share K, so one factorization serves any number of residuals. With a linear trend, the
+coefficients of 1 and x are unknown and have no prior (universal kriging).
 
 One derivation covers both cases. C [n, f] contains orthonormal combinations of the points on which the trend vanishes;
 without a trend, C is the identity. C^T y has covariance A = C^T K C, and P = C A^-1 C^T takes the place of K^-1.
 
 C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, MIT Press 2006, eqs. 2.25, 2.26, 2.41,
-2.42, 4.17, 5.9 and sec. 9.9; leave-one-out in closed form after S. Rippa, Adv. Comput. Math. 11 (1999) 193.
+2.42, 4.17, 5.9 and sec. 9.9; closed-form leave-one-out errors: S. Rippa, Adv. Comput. Math. 11 (1999) 193.
 
-`Kriging` interpolates all residuals on length scales learned from them: every residual is a linear trend plus weights
-on Matern-5/2 functions centred at the evaluated points. All residuals share the input scales (one per parameter, so a
-parameter without influence drops out). The scales maximise the restricted likelihood summed over all residuals: with
-tens of links, a dozen points determine them well. Each residual has its own variance, which is profiled out.
+`Kriging` interpolates all residuals with length scales learned from them: every residual is a linear trend plus a
+weighted sum of Matern-5/2 functions centred at the evaluated points. All residuals share the input scales (one per
+parameter, so a parameter without influence drops out). The scales maximise the log restricted likelihood summed over
+all residuals: with tens of links, a dozen points determine them well. Each residual's own variance is profiled out.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
 SINGULAR = 1e10
-"""Value of the likelihood if the kernel matrix cannot be factored."""
+"""Value of the negative log likelihood if the kernel matrix cannot be factored."""
 
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Points in the form for the kernel.
+    """Points as inputs to the kernel.
 
     Attributes:
         unit: Coordinates in the unit cube [n, d].
-        response: Response of a cheap model there, h [n, r]; r = 0 without one.
+        response: Response h of a cheap model there [n, r]; r = 0 without a cheap model.
     """
 
     unit: NDArray[np.float64]
@@ -68,44 +68,44 @@ class Kernel:
 
     @staticmethod
     def of(hyper: NDArray[np.float64], scale: float = 1.0) -> Kernel:
-        """Make a kernel of the logarithms of v_0, v_1, v_2, the rates [d] and the nugget [3 + d + 1].
+        """Make a kernel from the logarithms [3 + d + 1] of v_0, v_1, v_2, the rates [d] and the nugget.
 
-        `scale` squared multiplies variances and nugget.
+        The variances and the nugget are multiplied by `scale` squared.
         """
         return Kernel(scale**2 * np.exp(hyper[:3]), np.exp(hyper[3:-1]), float(scale**2 * np.exp(hyper[-1])))
 
     def logarithms(self, scale: float = 1.0) -> NDArray[np.float64]:
-        """The inverse of `of`; -inf for a variance of 0."""
+        """The logarithms that `of` takes; -inf for a variance of 0."""
         with np.errstate(divide="ignore"):
             variances = np.log(self.variances / scale**2)
         return np.concatenate([variances, np.log(self.rates), [np.log(self.nugget / scale**2)]])
 
     def scaled(self, factor: float) -> Kernel:
-        """The kernel with its variances and the nugget multiplied."""
+        """The kernel with its variances and nugget multiplied by a factor."""
         return Kernel(factor * self.variances, self.rates, factor * self.nugget)
 
     def covariance(self, a: Inputs, b: Inputs) -> NDArray[np.float64]:
-        """Covariance between points a [k] and b [n] without the nugget [k, n]."""
+        """Covariance [k, n] between points a [k] and b [n], without the nugget."""
         smooth = matern(self.distance(a, b))
         return self.variances[0] + self.variances[1] * a.response @ b.response.T + self.variances[2] * smooth
 
     def variance(self, at: Inputs) -> NDArray[np.float64]:
-        """Prior variance at points without the nugget [k]."""
+        """Prior variance at points [k], without the nugget."""
         return self.variances[0] + self.variances[1] * np.sum(at.response**2, axis=1) + self.variances[2]
 
     def matrix(self, at: Inputs) -> NDArray[np.float64]:
-        """Covariance of points among themselves with the nugget, K [n, n]."""
+        """Covariance matrix K of points [n, n], with the nugget."""
         return self.covariance(at, at) + self.nugget * np.eye(len(at.unit))
 
     def distance(self, a: Inputs, b: Inputs) -> NDArray[np.float64]:
-        """Distance between points in length scales [k, n]."""
+        """Distance between points in units of the length scales [k, n]."""
         return np.asarray(cdist(a.unit * self.rates, b.unit * self.rates), dtype=np.float64)
 
 
 class Trend(NamedTuple):
     """A trend at evaluated points.
 
-    `contrasts` is C [n, f]; `left_inverse` maps values at the points to the coefficients of the trend [p, n].
+    `contrasts` is C [n, f]; `left_inverse` [p, n] maps values at the points to the coefficients of the trend.
     """
 
     contrasts: NDArray[np.float64]
@@ -113,7 +113,7 @@ class Trend(NamedTuple):
 
     @staticmethod
     def of(unit: NDArray[np.float64], linear: bool) -> Trend:
-        """The linear trend at points [n, d], or none."""
+        """The linear trend at points [n, d], or no trend."""
         if not linear:
             return Trend(np.eye(len(unit)), np.zeros((0, len(unit))))
         basis = trend_basis(unit)
@@ -135,7 +135,7 @@ class Process:
         freedom: Degrees of freedom of the prior of a residual's variance; 0 if the variance is profiled out.
         trend: The trend at the points.
         lower: Cholesky factor of A [f, f].
-        whitened: Its inverse times C^T y [f, m].
+        whitened: Inverse of `lower` times C^T y [f, m].
         weights: P y [n, m].
         coefficients: Coefficients of the trend [p, m].
     """
@@ -158,7 +158,7 @@ class Process:
 
     @property
     def root(self) -> NDArray[np.float64]:
-        """Factor B of the covariance B^T B of the residuals, relative to K [f, m], or [f + m, m] with a prior."""
+        """Factor B [f, m] of the residuals' covariance B^T B relative to K; [f + m, m] with a prior."""
         rows = self.whitened
         if self.freedom:
             rows = np.vstack([rows, np.sqrt(self.freedom) * np.eye(rows.shape[1])])
@@ -170,11 +170,11 @@ class Process:
         return np.sum(self._whiten(np.eye(len(self.values))) ** 2, axis=0)
 
     def predict(self, at: Inputs) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Predicted mean [k, m], and variance relative to that of each residual [k]."""
+        """Predicted mean [k, m], and predictive variance [k] relative to the variance of each residual."""
         cross, prior = self.kernel.covariance(at, self.inputs), self.kernel.variance(at)
         mean, unexplained = cross @ self.weights, cross
         if self.linear:
-            # The weights g = basis @ left_inverse interpolate the trend. What is left to predict is z(x) - g.y.
+            # The weights g = basis @ left_inverse interpolate the trend. The remaining term to predict is z(x) - g.y.
             basis, left_inverse = trend_basis(at.unit), self.trend.left_inverse
             spread = left_inverse @ self.kernel.matrix(self.inputs)
             mean = mean + basis @ self.coefficients
@@ -190,7 +190,7 @@ class Process:
         return mean + trend_basis(at.unit) @ self.coefficients if self.linear else mean
 
     def slope(self, at: Inputs, response_slope: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """Derivatives of the mean by the unit cube's coordinates [k, m, d], given those of the responses [k, r, d]."""
+        """Derivatives of the mean by unit-cube coordinates [k, m, d], given those of the responses [k, r, d]."""
         rates, variances = self.kernel.rates, self.kernel.variances
         # dM / dx_j = M'(r) / r x rate_j^2 x (difference along j).
         toward = (at.unit[:, :, None] - self.inputs.unit.T) * rates[:, None] ** 2
@@ -203,11 +203,11 @@ class Process:
         return slope.transpose(0, 2, 1)
 
     def left_out_errors(self) -> NDArray[np.float64]:
-        """Value minus prediction of every point when it is left out, hyperparameters unchanged [n, m] (Rippa 1999)."""
+        """Leave-one-out errors, value minus prediction [n, m], with unchanged hyperparameters (Rippa 1999)."""
         return self.weights / self.inverse_diagonal[:, None]
 
     def _whiten(self, columns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Columns over the points [n, k], whitened [f, k]."""
+        """Whiten columns of values at the points [n, k]; returns [f, k]."""
         return solve_triangular(self.lower, self.trend.contrasts.T @ columns, lower=True)
 
 
@@ -226,8 +226,8 @@ def condition(
 class Likelihood:
     """Negative log likelihood of kernels, restricted to the contrasts, up to a constant.
 
-    Without a prior of the variances, each one takes its most likely value; with a prior, the residuals follow a
-    multivariate t distribution. For the arguments see `Process`.
+    Without a prior on the variances, each variance takes its most likely value; with a prior, the residuals follow a
+    multivariate t distribution. The arguments are described in `Process`.
     """
 
     def __init__(
@@ -259,10 +259,10 @@ class Likelihood:
         weights = inverse @ self.values
         square = np.maximum(np.sum(self.values * weights, axis=0), 1e-300)
         free = len(lower)
-        # Of Student's t; without degrees of freedom, of a Gaussian with the best variance of each residual.
+        # Negative log density of Student's t, or without degrees of freedom, of a Gaussian with profiled variances.
         value = residuals * np.log(np.diag(lower)).sum()
         value += 0.5 * (self.freedom + free) * np.log((self.freedom + square) / (self.freedom + free)).sum()
-        # Derivative by K (eq. 5.9), each residual weighted by its precision.
+        # Derivative with respect to K (eq. 5.9); each residual is weighted by its precision.
         by_k = residuals * inverse - (weights * _precision(free, square, self.freedom)) @ weights.T
         by_k *= 0.5
         by_variance = kernel.variances * [by_k.sum(), np.sum(by_k * self.response), np.sum(by_k * smooth)]
@@ -271,14 +271,14 @@ class Likelihood:
 
 
 class Prior(NamedTuple):
-    """Independent normal priors of the logarithms of v_0, v_1, v_2, rates and nugget, within bounds [3 + d + 1].
+    """Independent, bounded normal priors on the logarithms of v_0, v_1, v_2, rates and nugget [3 + d + 1].
 
     Attributes:
         mean: Means.
         spread: Standard deviations.
         lower: Lower bounds.
         upper: Upper bounds.
-        fixed: Number of the first ones that stay at their mean.
+        fixed: Number of leading entries that are fixed at their mean.
     """
 
     mean: NDArray[np.float64]
@@ -299,9 +299,9 @@ def most_probable(
 ) -> Kernel:
     """The kernel with the largest posterior density.
 
-    `scale` squared multiplies variances and nugget. The loss is divided by `divisor`, which determines the size of the
-    first step. The search takes at most `steps` from the prior's mean and from `guess`, such as the kernel of an
-    earlier fit.
+    The variances and the nugget are multiplied by `scale` squared. The loss is divided by `divisor`, which determines
+    the size of the first step. Searches of at most `steps` steps start at the prior's mean and at `guess`, such as the
+    kernel of an earlier fit.
     """
     held, learned = prior.mean[: prior.fixed], slice(prior.fixed, None)
 
@@ -321,7 +321,7 @@ def most_probable(
 
 
 def matern(distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The Matern kernel of smoothness 5/2 at a distance in length scales [...] (eq. 4.17)."""
+    """The Matern kernel of smoothness 5/2 at distances [...] in units of length scales (eq. 4.17)."""
     a = np.sqrt(5.0) * distance
     return (1.0 + a + a * a / 3.0) * np.exp(-a)
 
@@ -333,7 +333,7 @@ def matern_slope(distance: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def trend_basis(unit: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The functions of a linear trend, 1 and the coordinates, at points of the unit cube [n, 1 + d]."""
+    """The basis functions of a linear trend, 1 and the coordinates, at points of the unit cube [n, 1 + d]."""
     return np.hstack([np.ones((len(unit), 1)), unit])
 
 
@@ -342,19 +342,19 @@ def _precision(free: int, square: NDArray[np.float64], freedom: float) -> NDArra
 
 
 NUGGET = 1e-8
-"""Share of the prior variance that keeps the matrix regular; it is below the precision of any engine."""
+"""Nugget that keeps the matrix regular, as a share of the prior variance; below the precision of any engine."""
 
 LENGTH = 0.3
-"""Median of the prior of a length scale, as a share of the unit cube; its logarithm has standard deviation 1."""
+"""Prior median of a length scale, as a share of the unit cube; its logarithm has a standard deviation of 1."""
 
 LOG_RATE_BOUNDS = (-3.0, 5.0)
-"""Length scales from 20 down to 0.007."""
+"""Bounds of the logarithm of a rate: length scales from 20 down to 0.007."""
 
 NOISE_PRIOR = (np.log(1e-4), 3.0)
 """Mean and standard deviation of the logarithm of the nugget if it is estimated."""
 
 CONSTANT = 1e-9
-"""Standard deviation of a residual, relative to the largest, below which it does not affect the scales."""
+"""Relative standard deviation of a residual below which it does not affect the scales."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,7 +362,7 @@ class Kriging:
     """A fitted model.
 
     Attributes:
-        process: The process; its variances are relative to those of the residuals.
+        process: The process; its variances are relative to the variances of the residuals.
         root: Factor B of the prior covariance B^T B of the residuals [n - 1 - d, m].
     """
 
@@ -380,7 +380,7 @@ class Kriging:
         return np.sum(self.root**2, axis=0)
 
     def predict(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Predicted mean [k, m], and variance as a share of the prior's, which is the same for all residuals [k]."""
+        """Predicted mean [k, m], and predictive variance as a share of the prior, equal for all residuals [k]."""
         return self.process.predict(Inputs.plain(unit))
 
     def mean_and_slope(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -389,7 +389,7 @@ class Kriging:
         return self.process.mean(inputs), self.process.slope(inputs)
 
     def with_point(self, point: NDArray[np.float64]) -> Kriging:
-        """Add a point [d] as if its evaluation equalled the prediction: same mean and prior, but no variance there."""
+        """Add a point [d] as if its evaluation equalled the prediction; mean and prior stay unchanged."""
         unit = np.vstack([self.process.inputs.unit, point])
         residuals = np.vstack([self.residuals, self.predict(point[None])[0]])
         return Kriging(solve(unit, residuals, self.process.kernel).process, self.root)
@@ -405,8 +405,7 @@ def fit(
     """Fit a model and its input scales to residuals [n, m] at distinct points of the unit cube [n, d].
 
     There must be at least d + 2 points that span the cube. `noisy` also estimates the nugget, for an engine whose
-    answers scatter; otherwise the model interpolates. `guess` is an additional starting point for the kernel, besides
-    the prior's.
+    answers are noisy; otherwise the model interpolates. `guess` is an additional starting point of the kernel search.
     """
     spread = residuals.std(axis=0)
     varying = residuals[:, spread > CONSTANT * max(spread.max(), 1e-300)]
@@ -426,13 +425,13 @@ def likelihood(unit: NDArray[np.float64], residuals: NDArray[np.float64]) -> Lik
 
 
 def solve(unit: NDArray[np.float64], residuals: NDArray[np.float64], kernel: Kernel) -> Kriging:
-    """The model with a known kernel, given residuals [n, m] at points of the unit cube [n, d]."""
+    """The model with a given kernel, fitted to residuals [n, m] at points of the unit cube [n, d]."""
     process = condition(Inputs.plain(unit), residuals, kernel, linear=True)
     return Kriging(process, process.root)
 
 
 def _prior(dimension: int, noisy: bool) -> Prior:
-    """v_0 and v_1 are 0 and v_2 is 1: the variances of the residuals are profiled out."""
+    """The prior with v_0 = v_1 = 0 and v_2 = 1, because the variances of the residuals are profiled out."""
     low, rates = float(np.log(NUGGET)), np.ones(dimension)
     return Prior(
         mean=np.concatenate(

@@ -20,26 +20,26 @@ from calibray.support.interruption import defer_interruption
 def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Draw points of the unit cube [count, dimension].
 
-    Kinds are "random" (independent and uniform), "latin-hypercube" (one point in each of n slices of every dimension)
-    and "sobol" (scrambled; the first n of the next power of two).
+    Kinds are "random" (independent and uniform), "latin-hypercube" (one point in each of `count` slices of every
+    dimension) and "sobol" (scrambled; the first `count` of the next power of two).
     """
     if kind == "random":
         return rng.random((count, dimension))
-    from scipy.stats import qmc  # takes 0.4 s, which commands that do not search need not wait for
+    from scipy.stats import qmc  # takes 0.4 s, so it is imported only for a search
 
     if kind == "latin-hypercube":
         return qmc.LatinHypercube(dimension, rng=rng).random(count)
-    # SciPy swallows an interruption while it reads its direction numbers, and goes on without them.
+    # If interrupted while it reads its direction numbers, SciPy ignores the interruption and continues without them.
     with defer_interruption():
         sequence = qmc.Sobol(dimension, rng=rng)
-    # Sobol points are balanced in blocks of a power of two only, and SciPy warns about other counts.
+    # Sobol points are balanced only in blocks whose size is a power of two, and SciPy warns about other sizes.
     return sequence.random_base2((count - 1).bit_length())[:count]
 
 
 def maximin_design(
     count: int, dimension: int, rng: np.random.Generator, tries: int = 50
 ) -> NDArray[np.float64]:
-    """The Latin hypercube [count, dimension] with the largest smallest distance between points, out of `tries`."""
+    """The best of `tries` Latin hypercubes [count, dimension]: its smallest distance between points is the largest."""
     drawn = [design("latin-hypercube", count, dimension, rng) for _ in range(tries)]
     spacing = [pdist(points).min(initial=np.inf) for points in drawn]
     return drawn[int(np.argmax(spacing))]
@@ -48,7 +48,7 @@ def maximin_design(
 def draw_around(
     points: NDArray[np.float64], count: int, log_reach: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Draw points [count, d] near given points of the unit cube [n, d], over several orders of magnitude.
+    """Draw points [count, d] around given points of the unit cube [n, d], at distances of several orders of magnitude.
 
     The standard deviation is log-uniform from 10^`log_reach` to 10^-0.5.
     """
@@ -62,12 +62,12 @@ SEPARATION: Final = 1e-4
 
 
 def distance_to_nearest(x: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance of each point x [k, d] to the nearest of at least one other [n, d]."""
+    """Distance [k] from each point of x [k, d] to the nearest of at least one given point [n, d]."""
     return cdist(x, points).min(axis=1)
 
 
 class Sampling(Optimizer):
-    """A search that evaluates a design and does not learn; abstract in the kind of design.
+    """A search that evaluates a design and learns nothing from it; subclasses define the kind of design.
 
     Args:
         seed: Seed of the design.

@@ -1,24 +1,24 @@
 """The vector surrogate: a model of every residual instead of their root mean square, searched globally.
 
 The objective is a sum over links, so an evaluation that returns the residual of every link contains far more
-information than their sum. Residuals are smoother than the objective, and tens of them share one dependence on the
+information than that sum. Residuals are smoother than the objective, and tens of them share one kernel over the
 parameters (`regression.py`).
 
-A run begins with a maximin Latin hypercube. The design has few points for many parameters, because residuals can be
-modelled as soon as a plane fits through them. After the design, three kinds of step take turns on a model that is
+A run begins with a maximin Latin hypercube. The design needs few points even for many parameters, because residuals can
+be modelled as soon as the points determine a plane. After the design, three kinds of step alternate on a model that is
 refitted after every batch:
 
-- *exploration*: the point of the largest expected improvement of the mean square of the residuals, over draws from the
-  model (R. Astudillo, P. Frazier, ICML 2019). A normal distribution of the mean square instead (D. R. Jones, M.
-  Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15) gives weight to values below the possible minimum, and
-  wastes the step on the emptiest corner of many dimensions;
+- *exploration*: the point with the largest expected improvement in the mean square of the residuals, over draws from
+  the model (R. Astudillo, P. Frazier, ICML 2019). Assuming a normal distribution of the mean square instead (D. R.
+  Jones, M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15) would give weight to impossibly low values.
+  In many dimensions, it wastes the step on the emptiest corner;
 - *exploitation*: the lowest minimum of the predicted objective that has not been evaluated yet, found by many local
   searches with exact derivatives of the model;
-- *another basin*: the lowest minimum of the predicted objective where the model is still uncertain, so that polishing
-  one basin does not keep the search from the next.
+- *another basin*: the lowest minimum of the predicted objective where the model is still uncertain, so that refining
+  one basin does not keep the search from exploring the next.
 
 Input scales are estimated at every step up to `OFTEN` points, and then whenever the number of points has grown by a
-tenth. In between, the model only adds new points, which saves most of the time.
+tenth. In between, points are only added to the model, which saves most of the computing time.
 
 In a batch, every further candidate is chosen as if the earlier ones had been evaluated exactly as predicted. A failed
 evaluation enters the model with the residuals of the worst successful one.
@@ -40,7 +40,7 @@ from calibray.optimizers.regression import Kriging, fit, solve
 from calibray.optimizers.sampling import SEPARATION, distance_to_nearest, draw_around, maximin_design
 
 FIRST = 5
-"""Largest number of points of the initial design beyond the number of parameters."""
+"""Largest number by which points of the initial design exceed the parameters."""
 
 CANDIDATES = 600
 """Number of candidates drawn over the box, and of candidates around the best points."""
@@ -52,10 +52,10 @@ OFTEN = 80
 """Number of points up to which input scales are estimated at every step."""
 
 REFIT = 1.1
-"""Growth of the number of points after which they are estimated again."""
+"""Factor by which the number of points must grow before input scales are estimated again."""
 
 SEARCHES = 16
-"""Local searches on the model."""
+"""Number of local searches on the model."""
 
 UNCERTAIN = 1e-3
 """Share of the prior variance above which a predicted minimum counts as another basin."""
@@ -66,11 +66,11 @@ class VectorSurrogate(Optimizer):
     """Surrogate of the residual vector. Uses residuals; 20 d evaluations by default.
 
     Args:
-        budget: Number of evaluations, 20 d if None.
-        initial: Points of the initial design, the lesser of 2 (d + 1) and d + 5 if None. Points passed to `tell` before
-            the first `ask` count; those closer together than half of the design's spacing count as one.
+        budget: Number of evaluations; 20 d if None.
+        initial: Size of the initial design; the lesser of 2 (d + 1) and d + 5 if None. Points passed to `tell` before
+            the first `ask` count; points closer together than half the design's spacing count as one.
         batch: Number of candidates per batch after the initial design, for engines that run in parallel.
-        noisy: Whether the engine's answers scatter; the model then smooths instead of interpolating.
+        noisy: Whether the engine's answers are noisy; the model then smooths instead of interpolating.
 
     Raises:
         InputError: An argument is out of range.
@@ -134,11 +134,11 @@ class VectorSurrogate(Optimizer):
             left, turn = left - count, turn + count
 
     def _design(self, earlier: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The initial design [k, d], without its points next to earlier ones [n, d] that are not clumped."""
+        """The initial design [k, d], without the points that earlier ones [n, d] replace."""
         points = maximin_design(self.initial, self.box.dimension, self._rng)
         spacing, counted = 0.5 * float(pdist(points).min()), earlier[:0]
         for point in earlier:
-            # Every earlier point that counts replaces the nearest one of the design.
+            # Every earlier point that is not close to another one replaces the nearest point of the design.
             clumped = len(counted) and distance_to_nearest(point[None], counted)[0] < spacing
             if len(points) and not clumped:
                 counted = np.vstack([counted, point])
@@ -166,10 +166,10 @@ class VectorSurrogate(Optimizer):
         chosen = []
         for step in range(turn, turn + count):
             fresh = minima[distance_to_nearest(minima, taken) > SEPARATION]
-            # In turns: exploration, the lowest minimum, another basin.
+            # The steps alternate: exploration, the lowest minimum, another basin.
             if step % 3 and len(fresh):
                 _, share = model.predict(fresh)
-                # argmax of flags is the first uncertain minimum, or the lowest one if none is uncertain
+                # argmax of the mask is the first uncertain minimum, or the lowest one if none is uncertain
                 index = 0 if step % 3 == 1 else np.argmax(share > UNCERTAIN)
                 x = fresh[index]
             else:
@@ -182,11 +182,11 @@ class VectorSurrogate(Optimizer):
     def _explore(
         self, model: Kriging, taken: NDArray[np.float64], fresh: NDArray[np.float64], best: float
     ) -> NDArray[np.float64]:
-        """The point of the largest expected improvement [d]."""
+        """The point [d] with the largest expected improvement."""
         around = draw_around(taken[:5], CANDIDATES, -3.0, self._rng)
         candidates = np.vstack([self._rng.random((CANDIDATES, self.box.dimension)), around, fresh])
         candidates = candidates[distance_to_nearest(candidates, taken) > SEPARATION]
-        # Times the root: draws with the covariance of the residuals.
+        # Multiplied by the root, these are draws with the covariance of the residuals.
         normal = self._rng.standard_normal((DRAWS, len(model.root)))
         mean, share = model.predict(candidates)
         gain = improvement(mean, share, normal @ model.root, best)
@@ -199,9 +199,10 @@ class VectorSurrogate(Optimizer):
 def mean_square(model: Kriging, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Expectation and standard deviation [k] of the mean square Q of the residuals at points [k, d].
 
-    With prediction r, prior covariance V of the residuals and share s^2 of it, which grows with the distance from
-    evaluated points, Q has mean (r^T r + s^2 tr V) / m and variance (4 s^2 r^T V r + 2 s^4 tr V^2) / m^2. Errors of
-    different links are correlated: treating them as independent would stop exploration too early.
+    Let r be the prediction and s^2 V the predictive covariance: V is the prior covariance of the residuals, and s^2
+    grows with the distance from evaluated points. Q then has mean (r^T r + s^2 tr V) / m and variance (4 s^2 r^T V r
+    + 2 s^4 tr V^2) / m^2. Errors of different links are correlated: treating them as independent would stop
+    exploration too early.
     """
     mean, share = model.predict(x)
     root, links = model.root, model.root.shape[1]
@@ -213,10 +214,10 @@ def mean_square(model: Kriging, x: NDArray[np.float64]) -> tuple[NDArray[np.floa
 def improvement(
     mean: NDArray[np.float64], share: NDArray[np.float64], draws: NDArray[np.float64], best: float
 ) -> NDArray[np.float64]:
-    """Expected decrease [k] of the mean square of the residuals below the best one, by Monte Carlo.
+    """Expected improvement [k] in the mean square of the residuals over the best one, by Monte Carlo.
 
-    It follows from predictions [k, m], their variance relative to the prior's [k], and draws with the prior covariance
-    [draws, m]; it is 0 if no draw improves. `best` is the root mean square of the best residuals so far.
+    `mean` are predictions [k, m], `share` their variance relative to the prior [k], and `draws` are drawn with the
+    prior covariance [n, m]. The result is 0 if no draw improves. `best` is the lowest root mean square so far.
     """
     # |r + s v|^2 = r.r + 2 s r.v + s^2 v.v for prediction r and draw v.
     along, across = 2.0 * np.sqrt(share)[:, None] * (mean @ draws.T), np.sum(draws**2, axis=1)
@@ -225,6 +226,6 @@ def improvement(
 
 
 def predicted_minima(model: Kriging, starts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Local minima of the predicted objective, lowest first [k, d], from starting points in the unit cube [s, d]."""
+    """Local minima [k, d] of the predicted objective, lowest first, from starting points in the unit cube [s, d]."""
     ends = descend_all(starts, model.mean_and_slope, 30, 1e-8)
     return ends.unit[np.argsort(ends.cost, kind="stable")]

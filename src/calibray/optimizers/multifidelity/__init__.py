@@ -1,1 +1,1 @@
-"""Space mapping: a cheap model corrected by few calls of an expensive engine."""
+"""Space mapping: a cheap model corrected by a few calls of an expensive engine."""

@@ -1,24 +1,24 @@
 """Corrects a cheap model until it agrees with the engine: first its constants, then the remaining discrepancy.
 
-*Input mapping*: the constants of the cheap model are set to the values that explain the engine's answers best. Errors
-are weighted by the covariance of the discrepancy, which is mostly a common offset. An offset of a link therefore does
-not distort a constant. The constants have a prior around their assumed values. This is implicit space mapping (J. W.
-Bandler, Q. S. Cheng, N. K. Nikolova, M. A. Ismail, IEEE Trans. Microw. Theory Tech. 52 (2004) 378). *Output mapping*:
-offset, slope and rest by `discrepancy.py`.
+*Input mapping*: the constants of the cheap model are set to the values that best explain the engine's answers. Errors
+are weighted by the covariance of the discrepancy, which is mostly an offset common to all points. A link's offset
+therefore does not distort the constants. The constants have a prior around their assumed values. This is implicit space
+mapping (J. W. Bandler, Q. S. Cheng, N. K. Nikolova, M. A. Ismail, IEEE Trans. Microw. Theory Tech. 52 (2004) 378).
+*Output mapping*: `discrepancy.py` models the offset, the slope and the remainder.
 
-Slabs resonate, so there are many minima. A kernel that was fitted to wrong constants takes their errors for the
-discrepancy, and then prefers these constants. An input mapping therefore proceeds in rounds. A round tries many
-constants, most of which differ from the present ones in one or two places. Each is judged with the scale of the
-discrepancy that suits it best. The shape of the kernel is the fitted one and the prior's in turns. The round descends
-from the likeliest trials and fits the kernel to the best ends. It accepts an end that makes the answers more probable.
+Slabs resonate, so there are many minima. A kernel that was fitted with wrong constants attributes their errors to the
+discrepancy, and then favours these constants. An input mapping therefore proceeds in rounds. A round tries many sets of
+constants, most of which differ from the present set in one or two constants. Each set is judged with the scale of the
+discrepancy that suits it best. Rounds alternate between the fitted kernel and the prior's. A round descends from the
+likeliest sets and fits the kernel to the best results. It accepts a result that makes the answers more probable.
 
-A few answers do not determine the constants of a cheap model. Several sets of them explain the answers equally well and
-predict minima at different points, and the lowest of these predictions is the most optimistic one. A corrected model is
-therefore averaged over members drawn from the posterior of the constants, each corrected until it passes through all
-answers. Where the members agree, the uncertainty is small. Members are drawn by randomised maximum likelihood: each is
-fitted from a different starting point, to answers and a prior that are both disturbed by their uncertainties (D. S.
-Oliver, N. He, A. C. Reynolds, ECMOR V, 1996). The predicted variance is compared with the errors of the steps so far,
-which were not used in any fit, and scaled accordingly.
+A few answers do not determine the constants of a cheap model. Several sets of constants explain the answers equally
+well and predict minima at different points, and the lowest of these predictions is the most optimistic one. A corrected
+model is therefore averaged over members drawn from the posterior of the constants. Each member is corrected until it
+passes through all answers; where the members agree, the uncertainty is small. Members are drawn by randomised maximum
+likelihood: each is fitted from a different starting point, to answers and a prior that are both perturbed according to
+their uncertainties (D. S. Oliver, N. He, A. C. Reynolds, ECMOR V, 1996). The predicted variance is compared with the
+errors of earlier predictions at points not yet used in a fit, and scaled accordingly.
 """
 
 from __future__ import annotations
@@ -40,22 +40,22 @@ ROUNDS: Final = 4
 """Largest number of rounds of an input mapping."""
 
 GAINED: Final = 1.0
-"""Decrease of the negative log density below which a round has gained nothing."""
+"""Decrease in negative log density below which a round counts as without gain."""
 
 TRIALS: Final = 300
 """Largest number of sets of constants tried in a round."""
 
 COMPARED: Final = 3000
-"""Largest number of these sets times that of the answers with which each is compared."""
+"""Largest product of the number of these sets and the number of answers with which each is compared."""
 
 FOLLOWED: Final = 4
-"""Number of trials, those that explain the answers best, from which a round descends."""
+"""Number of sets from which a round descends: those that explain the answers best."""
 
 REFITTED: Final = 2
-"""Number of ends of a round to which the kernel is fitted."""
+"""Number of results of a round to which the kernel is fitted."""
 
 STEPS: Final = 12
-"""Number of steps of an input mapping from one starting point."""
+"""Largest number of steps of an input mapping from one starting point."""
 
 CONVERGED: Final = 1e-4
 """Relative decrease of the cost, or step in the unit cube, at which an input mapping has converged."""
@@ -74,13 +74,13 @@ class UnitModel:
         return self.model.constants
 
     def residuals(self, unit: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Residuals at points of the unit cube [k, m], with constants [q]."""
+        """Residuals [k, m] at points of the unit cube [k, d], with constants [q]."""
         return self.model.residuals(self.box.from_unit(unit), np.tile(constants, (len(unit), 1)))
 
     def residuals_and_slope(
         self, unit: NDArray[np.float64], constants: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Residuals at points of the unit cube [k, m], with constants [q], and their Jacobian [k, m, d]."""
+        """Residuals [k, m] at points of the unit cube [k, d], with constants [q], and their Jacobian [k, m, d]."""
         answer = self.model.answer(self.box.from_unit(unit), np.tile(constants, (len(unit), 1)))
         return answer.residuals, answer.by_point * self.box.width
 
@@ -90,9 +90,9 @@ class Response:
     """The response of a cheap model over the box.
 
     Attributes:
-        known: Residuals that the model predicts [m].
-        centre: Mean of its residuals [m].
-        scale: Root mean square of their deviations from it.
+        known: Mask of the residuals that the model predicts [m].
+        centre: Mean of the residuals over the box [m].
+        scale: Root mean square of the deviations from this mean.
     """
 
     known: NDArray[np.bool_]
@@ -101,7 +101,7 @@ class Response:
 
     @staticmethod
     def of(residuals: NDArray[np.float64], known: NDArray[np.bool_]) -> Response:
-        """Measure it on residuals at points spread over the box [k, m]; `known` marks the predicted ones [m]."""
+        """The response, from residuals [k, m] at points spread over the box; `known` marks the predicted ones [m]."""
         centre = residuals.mean(axis=0)
         scale = float(np.sqrt(np.mean((residuals - centre)[:, known] ** 2))) if known.any() else 0.0
         return Response(known, centre, max(scale, 1e-6 * max(float(np.abs(residuals).max()), 1e-6)))
@@ -111,7 +111,7 @@ class Response:
         return Inputs(unit, self.scaled(residuals - self.centre))
 
     def scaled(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The predicted residuals among [k, m, ...], scaled together to a mean square of 1 [k, r, ...]."""
+        """The predicted ones [k, r, ...] of residuals [k, m, ...], scaled together to a mean square of 1."""
         return rows[:, self.known] / (self.scale * np.sqrt(max(int(self.known.sum()), 1)))
 
 
@@ -120,9 +120,9 @@ class Corrected:
     """A cheap model with its discrepancy.
 
     Attributes:
-        cheap: The cheap model over the box searched.
-        constants: Its constants as adjusted [q].
-        response: Its response over the box.
+        cheap: The cheap model over the search box.
+        constants: Adjusted constants of the cheap model [q].
+        response: Response of the cheap model over the box.
         residuals: Answers of the engine [n, m].
         discrepancy: The discrepancy.
     """
@@ -135,7 +135,7 @@ class Corrected:
 
     @property
     def unit(self) -> NDArray[np.float64]:
-        """The evaluated points, in the unit cube [n, d]."""
+        """The evaluated points in the unit cube [n, d]."""
         return self.discrepancy.inputs.unit
 
     @property
@@ -144,7 +144,7 @@ class Corrected:
         return self.discrepancy.root
 
     def predict(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Predicted mean [k, m] at points [k, d], and variance relative to that of each residual [k]."""
+        """Predicted mean [k, m] at points [k, d], and predictive variance [k] relative to that of each residual."""
         cheap, inputs = self.base(unit)
         mean, share = self.discrepancy.predict(inputs)
         return cheap + mean, share
@@ -162,10 +162,10 @@ class Corrected:
     def base_and_slope(
         self, unit: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], Inputs, NDArray[np.float64]]:
-        """The values of `base`, and both derivatives with respect to the coordinates of the unit cube.
+        """The results of `base`, and their derivatives with respect to the coordinates of the unit cube.
 
-        Residuals [k, m], their derivatives [k, m, d], the points in the form for the discrepancy, and the derivatives
-        of their responses [k, r, d].
+        Returns residuals [k, m], their derivatives [k, m, d], the points with their responses, and the derivatives of
+        the responses [k, r, d].
         """
         cheap, slope = self.cheap.residuals_and_slope(unit, self.constants)
         return cheap, slope, self.response.inputs(unit, cheap), self.response.scaled(slope)
@@ -178,7 +178,7 @@ class Corrected:
         return replace(self, residuals=answers, discrepancy=process)
 
     def with_constants(self, constants: NDArray[np.float64], kernel: Kernel | None = None) -> Corrected:
-        """Other constants [q], with a discrepancy through the same answers; the kernel stays if None."""
+        """The model with other constants [q], and a discrepancy through the same answers; same kernel if None."""
         moved = replace(self, constants=constants)
         cheap, inputs = moved.base(self.unit)
         process = discrepancy.solve(inputs, self.residuals - cheap, kernel or self.discrepancy.kernel)
@@ -194,10 +194,10 @@ def correct(
     noisy: bool = False,
     before: Corrected | None = None,
 ) -> Corrected:
-    """Fit a corrected model to points of the unit cube [n, d] and an engine's answers there [n, m].
+    """Fit a corrected model to an engine's answers [n, m] at points of the unit cube [n, d].
 
     The response of the cheap model is measured at the points of `cloud` [k, d]. The input mapping starts from the
-    constants of `before`, the model of fewer points. `noisy` states whether the answers scatter.
+    constants of `before`, a model fitted to fewer points. `noisy` states whether the answers are noisy.
     """
 
     def corrected(constants: NDArray[np.float64], guess: Corrected | None) -> Corrected:
@@ -213,7 +213,7 @@ def correct(
         fitted = [corrected(constants, best) for constants in _likelier(shaped, random)]
         present, best = best, min([best, *fitted], key=_own_misfit)
         idle = idle + 1 if _own_misfit(present) - _own_misfit(best) < GAINED else 0
-        # One round with each kernel gained nothing.
+        # A round with each of the two kernels gained nothing.
         if idle == 2:
             break
     return best
@@ -228,7 +228,7 @@ def with_discrepancy(
     noisy: bool = False,
     guess: Corrected | None = None,
 ) -> Corrected:
-    """Fit the discrepancy alone, with known constants [q]; see `correct`. The kernel is also fitted from `guess`."""
+    """Fit only the discrepancy, with given constants [q]; see `correct`. `guess` provides a further start kernel."""
     unit, residuals = answers
     response = Response.of(cheap.residuals(cloud, constants), cheap.model.known)
     base = cheap.residuals(unit, constants)
@@ -242,23 +242,23 @@ def with_discrepancy(
 
 
 def _own_misfit(corrected: Corrected) -> float:
-    """The misfit of a model's constants, with its own kernel."""
+    """The misfit of a model's constants with the model's own kernel."""
     return float(misfit(corrected, corrected.constants[None]).value[0])
 
 
 def constants_fit(
     corrected: Corrected, centre: NDArray[np.float64] | None = None, noise: NDArray[np.float64] | None = None
 ) -> Callable[[NDArray[np.float64]], Residuals]:
-    """The least squares problem of the constants, with a fixed covariance of the discrepancy.
+    """The least squares problem for the constants, with a fixed covariance of the discrepancy.
 
-    The prior has its centre at `centre` [q], or at that of the cheap model. `noise` disturbs the answers, in units of
-    their standard deviations [n m]. Returns a function of constants, in the unit cube between their bounds [s, q], that
-    returns rows and their Jacobian. Half the sum of squares of the rows is the negative log density.
+    The prior is centred at `centre` [q], or at the cheap model's centre if None. `noise` perturbs the answers, in units
+    of their standard deviations [n m]. Returns a function that maps constants, scaled to the unit cube by their bounds
+    [s, q], to rows and their Jacobian. Half the sum of squares of the rows is the negative log density.
     """
     model, process, prior = corrected.cheap.model, corrected.discrepancy, corrected.cheap.constants
     points, width = corrected.cheap.box.from_unit(corrected.unit), prior.width
     (count, links), size = corrected.residuals.shape, len(prior.centre)
-    # Whitened over the points; the weights are inverse standard deviations of the residuals.
+    # Errors are whitened over the points; the weights are inverse standard deviations of the residuals.
     whiten = np.linalg.inv(process.lower)
     weight = np.sqrt(process.precision)
     prior_slope = np.diag(width / prior.spread)
@@ -280,7 +280,7 @@ def constants_fit(
 
 
 class Misfit(NamedTuple):
-    """How badly constants explain the answers.
+    """How poorly sets of constants explain the answers.
 
     Attributes:
         value: Negative log density of the answers and the constants, up to a constant [s].
@@ -294,8 +294,8 @@ class Misfit(NamedTuple):
 def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> Misfit:
     """The misfit of constants [s, q], with the shape of the discrepancy's kernel.
 
-    The variances of the links are integrated out. A link that the present constants do not explain therefore has full
-    weight for other constants.
+    The variances of the links are integrated out. A link that the present constants do not explain therefore keeps its
+    full weight for other constants.
     """
     model, prior = corrected.cheap.model, corrected.cheap.constants
     points, (count, links) = corrected.cheap.box.from_unit(corrected.unit), corrected.residuals.shape
@@ -308,7 +308,7 @@ def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> Misfit:
 
 
 def _likelier(corrected: Corrected, random: np.random.Generator) -> NDArray[np.float64]:
-    """The constants that explain the answers best at the ends of one round, with the kernel of `corrected` [k, q]."""
+    """The best constants at the end of one round [k, q], with the kernel of `corrected`."""
     prior, present = corrected.cheap.constants, corrected.constants
     trials = np.vstack([present, _trials(corrected, random)])
     tried = misfit(corrected, trials)
@@ -324,23 +324,23 @@ def _likelier(corrected: Corrected, random: np.random.Generator) -> NDArray[np.f
 
 
 def _trials(corrected: Corrected, random: np.random.Generator) -> NDArray[np.float64]:
-    """Constants drawn from their prior [s, q]: one, two or all of them; the others are the present ones."""
+    """Sets of constants [s, q], of which one, two or all are drawn from their prior and the rest are unchanged."""
     size, count = len(corrected.constants), max(FOLLOWED, min(TRIALS, COMPARED // len(corrected.unit)))
     drawn = corrected.cheap.constants.draw(random.standard_normal((count, size)))
     one, another = np.eye(size, dtype=bool)[random.integers(0, size, (2, count))]
-    # In turns: one constant, two, all.
+    # Sets alternate between one, two and all constants redrawn.
     number = np.arange(count)[:, None] % 3
     return np.where(one | (another & (number > 0)) | (number > 1), drawn, corrected.constants)
 
 
 UNLIKELY: Final = 30.0
-"""Excess of the negative log density, per constant and three more, above which a member is left out.
+"""Excess in negative log density, over the number of constants plus three, above which a member is left out.
 
-Links share errors, so the posterior is wider than this density, which assumes independent links.
+Links share errors, so the true posterior is wider than this density, which assumes independent links.
 """
 
 CAPPED: Final = 100.0
-"""Largest ratio of squared error to predicted variance that one step contributes."""
+"""Largest ratio of squared error to predicted variance that one step can contribute."""
 
 
 class Prediction(NamedTuple):
@@ -348,8 +348,8 @@ class Prediction(NamedTuple):
 
     Attributes:
         mean: Residuals, averaged over the members [k, m].
-        variance: Variance of a residual, averaged over the residuals [k].
-        members: For every member the residuals [k, m], and the variance relative to `Corrected.root` [k].
+        variance: Predictive variance of a residual, averaged over the residuals [k].
+        members: For every member, its residuals [k, m] and its variance relative to `Corrected.root` [k].
     """
 
     mean: NDArray[np.float64]
@@ -378,7 +378,7 @@ class Averaged:
         return Prediction(mean, variance / len(predictions), predictions)
 
     def with_point(self, point: NDArray[np.float64]) -> Averaged:
-        """Add a point of the unit cube [d] as if its evaluation equalled the prediction; the members agree there."""
+        """Add a point of the unit cube [d] as if its evaluation equalled the prediction; all members agree there."""
         residuals = self.predict(point[None]).mean
         return Averaged(tuple(member.with_point(point, residuals) for member in self.members))
 
@@ -388,14 +388,14 @@ class ErrorRecord:
     """Ratios of the errors of the steps so far to their predicted variances.
 
     Attributes:
-        ratios: Mean square error over predicted variance of every step.
+        ratios: Ratio of mean square error to predicted variance for every step.
     """
 
     ratios: list[float] = field(default_factory=list)
 
     @property
     def stretch(self) -> float:
-        """Factor on variances; the prior is one step with a ratio of 1."""
+        """Factor that scales predicted variances; the prior counts as one step with a ratio of 1."""
         return (1.0 + sum(self.ratios)) / (1.0 + len(self.ratios))
 
     def add(self, mean: NDArray[np.float64], variance: float, residuals: NDArray[np.float64]) -> None:
@@ -405,7 +405,7 @@ class ErrorRecord:
 
 
 def average(corrected: Corrected, starts: NDArray[np.float64], random: np.random.Generator) -> Averaged:
-    """Fit members from constants [s, q] around a model; keep those that explain the answers nearly as well."""
+    """Fit members from starting constants [s, q]; keep those that explain the answers nearly as well as `corrected`."""
     prior = corrected.cheap.constants
     size = len(prior.centre)
     if not size:

@@ -1,18 +1,18 @@
 """The discrepancy between an expensive model and a cheap one: a Gaussian process over the box for every residual.
 
-The discrepancy consists of an offset, a change of response and a rest: v_0, v_1 and v_2 of `regression.py`. h(x) is the
-deviation of the cheap model's residuals from their mean over the box. Links respond similarly to the parameters, so
-paths that the cheap model lacks respond as other links do. The v_1 term is therefore the slope of a link's output
-mapping, and helps for links that the cheap model does not predict. Each residual has a variance, whose inverse gamma
-prior is integrated out. A few links that the cheap model predicts badly therefore do not affect the others.
+The discrepancy consists of an offset, a change in response and a remainder: v_0, v_1 and v_2 of `regression.py`. h(x)
+is the deviation of the cheap model's residuals from their mean over the box. Links respond similarly to the parameters,
+so paths that the cheap model lacks respond as other links do. The v_1 term is therefore the slope of a link's output
+mapping, and also helps with links that the cheap model does not predict. Each residual has its own variance, which is
+integrated out with an inverse gamma prior. A few links that the cheap model predicts badly do not affect the others.
 
 M. C. Kennedy, A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, sec. 4.
 
-A process states its uncertainty at each point, but errors at two nearby points are nearly equal. To learn where the
-minimum of an uncertain function may be, we need whole functions. A function is drawn from the prior, as a sum of the
-kernel's features with normal weights. The process then adds the difference between that function and the answers at the
-evaluated points (J. T. Wilson et al., Efficiently sampling functions from Gaussian process posteriors, ICML 2020, eq.
-10). Features of the Matern kernel are cosines whose frequencies follow Student's t with 5 degrees of freedom (A.
+A process gives the uncertainty at each point, but errors at two nearby points are nearly equal. Locating the possible
+minima of an uncertain function requires samples of whole functions. A function is drawn from the prior as a sum of the
+kernel's features with normal weights. A process through the differences between the answers and that function at the
+evaluated points is then added (J. T. Wilson et al., Efficiently sampling functions from Gaussian process posteriors,
+ICML 2020, eq. 10). Features of the Matern kernel are cosines with Student's t frequencies, 5 degrees of freedom (A.
 Rahimi, B. Recht, Random features for large-scale kernel machines, NIPS 2007).
 """
 
@@ -35,21 +35,21 @@ from calibray.optimizers.regression import (
 )
 
 FREEDOM: Final = 4.0
-"""Degrees of freedom of the prior of a residual's variance."""
+"""Degrees of freedom of the prior on a residual's variance."""
 
 VARIANCES: Final = (1.0, 0.1, 0.1)
-"""Medians of the priors of v_0, v_1 and v_2, relative to the mean square of the cheap model's response."""
+"""Prior medians of v_0, v_1 and v_2, relative to the mean square of the cheap model's response."""
 
 VARIANCE_SPREAD: Final = 2.0
-"""Standard deviation of their logarithms."""
+"""Prior standard deviation of the logarithms of v_0, v_1 and v_2."""
 
 LOG_VARIANCE_BOUNDS: Final = (-14.0, 6.0)
 
 LENGTH: Final = 0.5
-"""Median of the prior of a length scale, as a share of the unit cube."""
+"""Prior median of a length scale, as a share of the unit cube."""
 
 LENGTH_SPREAD: Final = 0.7
-"""Standard deviation of its logarithm."""
+"""Prior standard deviation of the logarithm of a length scale."""
 
 LOG_RATE_BOUNDS: Final = (-2.0, 4.0)
 
@@ -70,8 +70,8 @@ def fit(
 ) -> Process:
     """Fit the process to discrepancies [n, m], by the largest posterior density of its hyperparameters.
 
-    The prior is relative to `scale`, the root mean square of the cheap model's response. `noisy` learns the nugget too.
-    `guess` is an additional starting point for the kernel, besides the prior's.
+    The prior is relative to `scale`, the root mean square of the cheap model's response. `noisy` also estimates the
+    nugget. `guess` is an additional starting point of the kernel search.
     """
     likelihood = Likelihood(inputs, values, freedom=FREEDOM)
     prior = _prior(inputs.unit.shape[1], noisy)
@@ -96,21 +96,21 @@ def _prior(dimension: int, noisy: bool) -> Prior:
 
 
 def solve(inputs: Inputs, values: NDArray[np.float64], kernel: Kernel) -> Process:
-    """The process with a known kernel, given discrepancies [n, m]."""
+    """The process with a given kernel, conditioned on discrepancies [n, m]."""
     return condition(inputs, values, kernel, freedom=FREEDOM)
 
 
 def scaled_density(whitened: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Negative log density [s] of discrepancies [s, n, m] with the most probable scale, and that scale [s].
 
-    They are whitened by the inverse of the Cholesky factor of K. Each residual follows a multivariate t distribution,
-    whose covariance K is multiplied by the scale. The scale has the prior of a variance. Without it, constants that
-    explain the answers much better than the kernel expects would hardly be more probable.
+    Discrepancies are whitened by the inverse of the Cholesky factor of K. Each residual follows a multivariate t
+    distribution, whose covariance K is multiplied by the scale. The scale has the prior of a variance. Without a scale,
+    constants that explain the answers much better than the kernel expects would be only slightly more probable.
     """
     count, links = whitened.shape[-2:]
     square, scale = np.sum(whitened**2, axis=-2), np.ones(len(whitened))
     for _ in range(30):
-        # Reweighting converges to the scale at which a t distribution is most probable.
+        # Iterative reweighting converges to the most probable scale of a t distribution.
         weight = (FREEDOM + count) / (FREEDOM + square / scale[:, None])
         scale = np.maximum(np.mean(weight * square, axis=1) / count, NUGGET)
     density = 0.5 * (FREEDOM + count) * np.log1p(square / scale[:, None] / FREEDOM).sum(axis=1)
@@ -119,7 +119,7 @@ def scaled_density(whitened: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
 
 
 COSINES: Final = 256
-"""Features of the Matern kernel."""
+"""Number of features of the Matern kernel."""
 
 SMOOTHNESS: Final = 5.0
 """Degrees of freedom of the frequencies: twice the smoothness of the kernel."""
@@ -127,11 +127,11 @@ SMOOTHNESS: Final = 5.0
 
 @dataclass(frozen=True, eq=False)
 class PriorDraw:
-    """A function drawn from the prior: an offset, slopes by the responses, and cosines.
+    """A function drawn from the prior: an offset, a linear function of the responses, and cosines.
 
     Attributes:
         offset: Constant part [m].
-        steepness: Slopes by the responses [r, m].
+        steepness: Slopes with respect to the responses [r, m].
         frequency: Frequencies of the cosines [k, d].
         phase: Phases of the cosines [k].
         amplitude: Amplitudes of the cosines [k, m].
@@ -149,7 +149,7 @@ class PriorDraw:
         return self.offset + at.response @ self.steepness + cosines @ self.amplitude
 
     def slopes(self, at: Inputs, response_slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives at points [k, m, d], from those of their responses [k, r, d]."""
+        """Derivatives at points [k, m, d], given the derivatives of their responses [k, r, d]."""
         sines = -np.sin(at.unit @ self.frequency.T + self.phase)[:, :, None] * self.frequency
         waves = np.einsum("kfd,fm->kmd", sines, self.amplitude, optimize=True)
         return waves + np.einsum("krd,rm->kmd", response_slope, self.steepness, optimize=True)
@@ -161,7 +161,7 @@ class SampledFunction:
 
     Attributes:
         prior: A draw from the prior.
-        rest: Process through the differences between the draw and the answers at the evaluated points.
+        rest: Process through the differences between the answers and the draw at the evaluated points.
     """
 
     prior: PriorDraw
@@ -172,12 +172,12 @@ class SampledFunction:
         return self.prior.values(at) + self.rest.mean(at)
 
     def slopes(self, at: Inputs, response_slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives [k, m, d] with respect to the unit cube's coordinates, given those of the responses [k, r, d]."""
+        """Derivatives [k, m, d] by unit-cube coordinates, given those of the responses [k, r, d]."""
         return self.prior.slopes(at, response_slope) + self.rest.slope(at, response_slope)
 
 
 def sample_function(process: Process, random: np.random.Generator, stretch: float = 1.0) -> SampledFunction:
-    """Draw a function; `stretch` multiplies its deviations from the mean, and 0 gives the mean."""
+    """Draw a function; `stretch` multiplies its deviations from the mean; 0 gives the mean."""
     inputs, kernel = process.inputs, process.kernel
     (count, d), residuals = inputs.unit.shape, process.values.shape[1]
     size = stretch * np.sqrt(kernel.variances)
@@ -188,7 +188,7 @@ def sample_function(process: Process, random: np.random.Generator, stretch: floa
         draws = random.standard_normal((rows, count)) @ process.whitened
         return (draws + independent) / np.sqrt(count + FREEDOM)
 
-    # A t distribution is a normal one divided by the root of a chi-square.
+    # A t variable is a normal one divided by the root of a chi-square variable over its degrees of freedom.
     tail = np.sqrt(random.chisquare(SMOOTHNESS, (COSINES, 1)) / SMOOTHNESS)
     prior = PriorDraw(
         size[0] * correlated(1)[0],
@@ -197,13 +197,13 @@ def sample_function(process: Process, random: np.random.Generator, stretch: floa
         random.uniform(0.0, 2.0 * np.pi, COSINES),
         size[2] * np.sqrt(2.0 / COSINES) * correlated(COSINES),
     )
-    # The answers are a function plus errors, so a draw of the errors belongs to what they miss.
+    # The answers are a function plus errors, so a draw of the errors is subtracted too.
     scatter = stretch * np.sqrt(kernel.nugget) * correlated(count)
     missed = process.values - prior.values(inputs) - scatter
     return SampledFunction(prior, solve(inputs, missed, kernel))
 
 
 def standardized_error(process: Process, points: NDArray[np.intp]) -> float:
-    """Root mean square of the errors at points left out, over the expected standard deviations; 1 if both agree."""
+    """Root mean square of leave-out errors divided by their expected standard deviations; 1 if both agree."""
     expected = 1.0 / np.outer(process.inverse_diagonal, process.precision)
     return float(np.sqrt(np.mean((process.left_out_errors() ** 2 / expected)[points])))

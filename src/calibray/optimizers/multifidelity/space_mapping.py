@@ -7,21 +7,21 @@ Its minimum is the first call. After every call, the cheap model is corrected un
 - *exploitation*: among the minima of the corrected model within a trust region, the one with the lowest expected mean
   square, uncertainty included. The trust region is a box around the best point. It is halved after a step that does not
   improve and doubled after one that does;
-- *exploration*: the point of the largest expected improvement over the whole box, by draws of the discrepancy, as in
-  `vector_surrogate.py`. Minima of the corrected model in other basins are among the candidates. An exploration follows
-  an exploitation that gained almost nothing, and replaces one that would repeat a point.
+- *exploration*: the point with the largest expected improvement over the whole box, from draws of the discrepancy, as
+  in `vector_surrogate.py`. Minima of the corrected model in other basins are among the candidates. An exploration
+  follows an exploitation that gained almost nothing, and replaces one that would repeat a point.
 
-Both account for the constants that few answers do not determine, and for the errors of the predictions so far
-(`correction.py`). Without this, steps on planted districts jump across half the box to predicted minima that do not
-exist.
+Both account for constants that a few answers cannot determine, and for the errors of earlier predictions
+(`correction.py`). Otherwise, steps on synthetic districts with planted parameters jump across half the box to predicted
+minima that do not exist.
 
 The cheap model is used only while it helps. Each point is predicted from all other points, once by the corrected model
 and once by the same process without a cheap model; `error_ratio` compares the squared errors of the median link. After
 three and after four calls, the cheap model must reach a ratio of `HELPFUL`. Later it is dropped if the ratio exceeds
 `MISLED` twice in a row. The vector surrogate then continues with all evaluations so far. It also runs from the first
-call if there is no cheap model. The median link decides, because a few links dominate the sum over all. On planted
-problems (eight with their cheap model, four with random tones instead), the ratio was at most 0.66 after four calls
-with the right model (once 1.9 after three), and at least 1.01 with tones.
+call if there is no cheap model. The median link decides, because a few links dominate the sum over all links. On
+problems with planted parameters (eight with their cheap model, four with random sinusoids instead), the ratio was at
+most 0.66 after four calls with the right model (once 1.9 after three), and at least 1.01 with sinusoids.
 
 J. W. Bandler et al., "Space mapping: the state of the art", IEEE Trans. Microw. Theory Tech. 52 (2004) 337.
 """
@@ -51,10 +51,10 @@ from calibray.optimizers.sampling import design, distance_to_nearest, draw_aroun
 from calibray.optimizers.vector_surrogate import VectorSurrogate, improvement
 
 CLOUD: Final = 64
-"""Points at which the cheap model's response is measured."""
+"""Number of points at which the cheap model's response is measured."""
 
 FIRST_SEARCHES: Final = 64
-"""Local searches on the cheap model."""
+"""Number of local searches on the uncorrected cheap model."""
 
 SEARCHES: Final = 16
 """Number of new local searches on each corrected model, in addition to those from earlier minima and the best
@@ -64,7 +64,7 @@ KEPT: Final = 8
 """Number of earlier minima, and of best points, from which local searches start."""
 
 SEARCH_STEPS: Final = 30
-"""Steps of a local search on a model."""
+"""Largest number of steps of a local search on a model."""
 
 CONVERGED: Final = 1e-6
 """Relative decrease of the cost, or step in the unit cube, at which a local search has converged."""
@@ -73,34 +73,34 @@ CANDIDATES: Final = 300
 """Number of candidates drawn over the box, and of candidates around the best points."""
 
 DRAWS: Final = 512
-"""Number of draws of the discrepancy for the expected improvement, of all members together."""
+"""Number of draws of the discrepancy for the expected improvement, in total over all members."""
 
 APART: Final = 0.003
-"""Distance in the unit cube below which two minima are one."""
+"""Distance in the unit cube below which two minima count as one."""
 
 MEMBERS: Final = 8
-"""Number of models with other constants over which the first steps are averaged."""
+"""Number of models with other constants over which predictions for the first steps are averaged."""
 
 AVERAGED: Final = 10
-"""Number of calls up to which steps are averaged over these models."""
+"""Number of calls up to which predictions are averaged over these models."""
 
 SEPARATION: Final = 1e-3
 """Distance in the unit cube below which a point counts as already evaluated."""
 
 REACHES: Final = (0.02, 1.0)
-"""Smallest and largest half width of the trust region."""
+"""Smallest and largest half width of the trust region, in the unit cube."""
 
 GAINED: Final = 1e-3
-"""Share of the root mean square that an exploitation must gain for another one to follow."""
+"""Relative decrease in root mean square that an exploitation must reach for another one to follow."""
 
 JUDGED: Final = 3
-"""Number of calls from which the cheap model is judged."""
+"""Number of calls after which checks of the cheap model begin."""
 
 HELPFUL: Final = 0.8
-"""Error ratio of the median link above which the first checks doubt the cheap model."""
+"""Error ratio of the median link above which one of the first checks fails."""
 
 MISLED: Final = 2.0
-"""Ratio above which later checks doubt it; points are then so close together that any process predicts them."""
+"""Error ratio above which a later check fails; points are then so close together that any process predicts them."""
 
 DOUBTS: Final = 2
 """Number of successive failed checks after which the cheap model is dropped, and number of the first checks."""
@@ -111,10 +111,10 @@ class SpaceMapping(Optimizer):
     """Space mapping. Uses residuals; 20 d evaluations by default.
 
     Args:
-        budget: Number of evaluations, 20 d if None.
+        budget: Number of evaluations; 20 d if None.
         cheap_model: The cheap model; without one, the vector surrogate searches.
         batch: Number of candidates per batch, for engines that run in parallel.
-        noisy: Whether the engine's answers scatter.
+        noisy: Whether the engine's answers are noisy.
 
     Raises:
         InputError: An argument is out of range.
@@ -189,7 +189,7 @@ class SpaceMapping(Optimizer):
             left, turn = left - count, turn + count
 
     def _without(self, archive: Archive, left: int) -> Search:
-        """The vector surrogate, with all evaluations so far."""
+        """Continue with the vector surrogate, from all evaluations so far."""
         surrogate = VectorSurrogate(
             self.box.lower, self.box.upper, seed=self._seed, budget=left, batch=self.batch, noisy=self.noisy,
             objective=self._objective,
@@ -202,7 +202,7 @@ class SpaceMapping(Optimizer):
             surrogate.tell(answers.x, answers.y, residuals=answers.residuals)
 
     def _first(self, model: CheapModel, count: int, turn: int) -> NDArray[np.float64]:
-        """The lowest minima of the cheap model with its assumed constants, after the first `turn` ones [count, d]."""
+        """The lowest minima [count, d] of the cheap model with its assumed constants, without the first `turn`."""
         d = self.box.dimension
 
         def evaluate(unit: NDArray[np.float64]) -> Residuals:
@@ -213,7 +213,7 @@ class SpaceMapping(Optimizer):
         return np.vstack([self._minima[turn:], self._rng.random((count, d))])[:count]
 
     def _averaged(self, corrected: Corrected) -> Averaged:
-        """The corrected model and others that explain the answers; half of them start from the previous ones."""
+        """The corrected model and others that explain the answers; half of them start from the previous members."""
         prior = corrected.cheap.constants
         if len(corrected.residuals) > AVERAGED or not len(prior.centre):
             return Averaged((corrected,))
@@ -224,10 +224,10 @@ class SpaceMapping(Optimizer):
         return model
 
     def _compare(self, unit: NDArray[np.float64], residuals: NDArray[np.float64]) -> None:
-        """Compare the answers to the last batch with the predictions."""
+        """Record the errors of the predictions for the last batch."""
         for point, mean, variance in self._predicted:
             row = int(np.argmin(np.abs(unit - point).max(axis=1)))
-            if np.abs(unit[row] - point).max() < 1e-9:  # else it failed
+            if np.abs(unit[row] - point).max() < 1e-9:  # otherwise its evaluation failed
                 self._errors.add(mean, variance, residuals[row])
 
     def _choose(self, model: Averaged, archive: Archive, count: int) -> NDArray[np.float64]:
@@ -235,7 +235,7 @@ class SpaceMapping(Optimizer):
         evaluated, d = archive.all(), self.box.dimension
         taken = self.box.to_unit(evaluated.x)[np.argsort(evaluated.y, kind="stable")]
         best = archive.lowest
-        # The best evaluated point is the first one.
+        # The first point is the best one.
         near = np.clip(taken[0] + self._reach * self._rng.uniform(-1.0, 1.0, (KEPT, d)), 0.0, 1.0)
         starts = np.vstack([taken[:KEPT], near, self._minima[:KEPT], design("sobol", SEARCHES, d, self._rng)])
         ends = descend_all(starts, model.members[0].mean_and_slope, SEARCH_STEPS, CONVERGED)
@@ -244,7 +244,7 @@ class SpaceMapping(Optimizer):
         for index in range(count):
             fresh = self._minima[distance_to_nearest(self._minima, taken) > SEPARATION]
             within = fresh[np.abs(fresh - taken[0]).max(axis=1) <= self._reach]
-            # Steps of a batch alternate; after a stall the first one explores.
+            # Exploitations and explorations alternate in a batch; after a stall, the batch begins with an exploration.
             if (index % 2 == 1) == self._stalled and len(within):
                 expected = model.predict(within)
                 square = np.mean(expected.mean**2, axis=1) + self._errors.stretch * expected.variance
@@ -260,7 +260,7 @@ class SpaceMapping(Optimizer):
     def _explore(
         self, model: Averaged, taken: NDArray[np.float64], fresh: NDArray[np.float64], best: float
     ) -> NDArray[np.float64]:
-        """The point of the largest expected improvement [d]; `taken` are the evaluated points, best first."""
+        """The point [d] with the largest expected improvement; `taken` are the evaluated points, best first."""
         d, stretch = self.box.dimension, self._errors.stretch
         around = draw_around(taken[:5], CANDIDATES, -2.5, self._rng)
         candidates = np.vstack([fresh, self._rng.random((CANDIDATES, d)), around])
@@ -268,15 +268,15 @@ class SpaceMapping(Optimizer):
         prediction, gain = model.predict(candidates), np.zeros(len(candidates))
         draws = max(1, DRAWS // len(model.members))
         for member, (residuals, share) in zip(model.members, prediction.members, strict=True):
-            # Earlier errors exceeded their predicted variances by this factor, so members deviate by its root.
+            # Earlier squared errors exceeded predicted variances by this factor, so deviations are scaled by its root.
             mean = prediction.mean + np.sqrt(stretch) * (residuals - prediction.mean)
             normal = self._rng.standard_normal((draws, len(member.root)))
             gain += improvement(mean, stretch * share, normal @ member.root, best)
         return candidates[np.argmax(gain)]
 
     def _resize(self, best: float, before: float) -> None:
-        """Resize the trust region after an exploitation, and explore once if it gained too little."""
-        # The step was an exploration, or nothing succeeded before it.
+        """Resize the trust region after an exploitation, and explore once if the gain was too small."""
+        # The last step was an exploration, or no evaluation before it succeeded.
         if self._stalled or not np.isfinite(before):
             self._stalled = False
             return
@@ -285,14 +285,14 @@ class SpaceMapping(Optimizer):
 
 
 def error_ratio(corrected: Corrected, *, noisy: bool = False) -> float:
-    """Squared error with the cheap model over that without it, for the median link.
+    """Ratio of the squared error with the cheap model to that without it, for the median link.
 
     Each of at least three points is predicted from all others. The cheap model helps if the ratio is below 1. `noisy`
-    states whether the answers scatter, which the process without the cheap model must know as well.
+    states whether the answers are noisy, for the process without the cheap model.
     """
     residuals = corrected.residuals
     scale = max(float(residuals.std(axis=0).max()), 1e-12)
-    # The same process on the answers themselves.
+    # The same kind of process, fitted to the answers themselves.
     alone = discrepancy.fit(Inputs.plain(corrected.unit), residuals, scale, noisy=noisy)
     with_it, without = (
         np.sum(process.left_out_errors() ** 2, axis=0) for process in (corrected.discrepancy, alone)
