@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.special import stdtrit
 
 import planted
 from calibray import engines
@@ -122,6 +123,15 @@ def test_delay_spreads_determine_what_path_loss_does_not(tmp_path, table, engine
     assert (upper - lower).min() >= 2 * 2.35 * held_out.rmse
     assert predicted == pytest.approx(both.links.spread_after_ns.to_numpy())
     assert predicted == pytest.approx(table.spread_ns.to_numpy(), abs=1.5)
+
+
+def test_biases_take_degrees_of_freedom_from_the_interval_of_an_observable(tmp_path, table):
+    """Two links per device; the delay of the first path depends on no material."""
+    devices = table.assign(device=list("aabbccddeeff"))
+    found = run(tmp_path, devices, observables={"rtt": FLIGHT | {"bias": "device"}})
+    ends = found.predict_interval(planted.links())
+    half_width = (ends.rtt_upper_ns - ends.rtt_lower_ns).to_numpy() / 2
+    assert half_width == pytest.approx(stdtrit(planted.LINKS - 6, 0.95) * found.fit.observables["rtt"].error)
 
 
 def test_a_conflict_is_reported_with_both_answers(tmp_path, table, engine):

@@ -77,8 +77,10 @@ def further_observables(
         deviation = np.nan_to_num(drawn - value)
         variance = np.mean(deviation**2, axis=0) if len(drawn) else 0.0
         fit, held_out = result.fit.observables[name], result.accuracy.observables.get(name)
-        error, links = (fit.error, fit.links) if held_out is None else (held_out.rmse, held_out.links)
-        half_width = float(stdtrit(links, (1 + level) / 2)) * np.sqrt(error**2 + variance)
+        error, freedom = fit.error, max(fit.links - len(fit.biases), 1)
+        if held_out is not None:
+            error, freedom = held_out.rmse, held_out.links
+        half_width = float(stdtrit(freedom, (1 + level) / 2)) * np.sqrt(error**2 + variance)
         columns += [value - half_width, value + half_width]
     return dict(zip(observable_columns(result.study, level), columns, strict=True))
 
