@@ -82,6 +82,15 @@ def show_scene(desk: Desk) -> None:
         def make() -> None:
             with desk.messages():
                 words: list[object] = ["scene", kind.value, source.value, "--out", "scene"]
+                if (
+                    height.value
+                    and kind.value != "footprints"
+                    and not (kind.value == "plan" and _is_number(height.value))
+                ):
+                    means = (
+                        "a number of metres" if kind.value == "plan" else "empty: the map states the heights"
+                    )
+                    raise InputError(f"Height {height.value}: must be {means}")
                 if kind.value == "plan":
                     words += ["--unit", unit.value] if unit.value else []
                     words += [f"--height={height.value}"] if _is_number(height.value) else []
