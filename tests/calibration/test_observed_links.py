@@ -11,6 +11,7 @@ from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.errors import InputError
 from calibray.fields import path_gains
+from calibray.fitting.observed import with_errors
 from calibray.fitting.preliminary_fits import estimate_noise
 from calibray.fitting.problem import Problem
 from calibray.measurements.observables import Statistic
@@ -303,3 +304,42 @@ def test_a_calibration_that_does_not_fit_from_link_to_link_is_a_conflict(tmp_pat
     (remark,) = [remark for remark in remarks(foreign) if "slope" in remark.values]
     assert remark.values["slope"] + 2 * remark.values["slope_error"] < 1.0
     assert "from link to link" in wording.remark_text(remark)
+
+
+def test_a_link_without_a_path_does_not_change_biases_and_errors(tmp_path):
+    """Its path loss counts with a ceiling; its round trip is measured, but the model has no value for it."""
+    engine = planted.engine(blocked=True)
+    truth = np.array([planted.TRUTH[name] for name in engine.parameters.names])[None]
+    answer = engine.respond(truth, (Statistic("round_trip_time"),))
+    flight, reached = answer.observed[0, 0], np.isfinite(answer.path_loss[0])
+    noise_ns = np.random.default_rng(5).standard_normal(planted.LINKS)
+    table = planted.links(blocked=True).assign(
+        path_loss_db=np.where(reached, answer.path_loss[0], 120.0),
+        rtt_ns=40.0 + noise_ns + np.where(reached, 1e9 * flight, 700.0),
+    )
+    study = planted.study(
+        tmp_path,
+        table,
+        objective={"no_path": "censor", "ceiling_db": 120.0},
+        observables={"rtt": {"kind": "round_trip_time", "column": "rtt_ns", "unit": "ns", "bias": "all"}},
+    )
+    problem = Problem.of(Setup.open(study), engine)
+    weight, (rtt,) = problem.objective.weight, problem.observed
+    assert (weight > 0).all()
+    assert np.count_nonzero(~reached) == 1
+    residuals, biases = rtt.residuals(answer.observed[:, 0], weight)
+    assert biases == pytest.approx(40.0 + noise_ns[reached].mean())
+    assert residuals[0, ~reached] == 0
+    (estimated,) = with_errors(problem.observed, answer.observed[0], weight)
+    assert estimated.std == pytest.approx(np.std(noise_ns[reached], ddof=1))
+    # Derivatives away from the truth are those of the residuals.
+    point = problem.parameters.to_search(truth + np.array([0.5, -1.0, 0.7]))
+    assert problem.evaluate(point, derivatives=True).slopes[0] == pytest.approx(
+        np.stack([central(problem, point, index) for index in range(point.shape[1])], axis=1), abs=1e-5
+    )
+
+
+def central(problem, point, index):
+    step = 1e-5 * np.eye(point.shape[1])[index]
+    above, below = problem.evaluate(np.concatenate([point + step, point - step])).residuals
+    return (above - below) / 2e-5

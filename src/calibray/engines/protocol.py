@@ -79,7 +79,8 @@ class Responses:
         path_loss: Path loss [n, L], [dB]; +inf for a link without a path.
         observed: K further observables [n, K, L], in SI units; NaN for a link without a value.
         loss_slope: Derivatives of path loss with respect to the parameters [n, L, d]; None if not requested.
-        observed_slope: Derivatives of the further observables [n, K, L, d]; None if not requested.
+        observed_slope: Derivatives of the further observables [n, K, L, d]; None if not requested. They are NaN for a
+            link without a value.
     """
 
     path_loss: NDArray[np.float64]

@@ -151,9 +151,13 @@ def link_responses(
 def link_responses_and_slopes(
     channel: Channel, values: NDArray[np.float64], count: int
 ) -> tuple[NDArray[np.float64], ...]:
-    """Path loss, statistics, and their derivatives by the parameters [count, L, d] and [count, K, L, d]."""
+    """Path loss, statistics, and their derivatives by the parameters [count, L, d] and [count, K, L, d].
+
+    Derivatives of a statistic are NaN where it is not finite.
+    """
     answers = _responses_and_slopes(channel, jax.device_put(values), count)
-    return tuple(np.asarray(answer)[:count] for answer in answers)
+    loss, observed, loss_slope, slope = (np.asarray(answer)[:count] for answer in answers)
+    return loss, observed, loss_slope, np.where(np.isfinite(observed)[..., None], slope, np.nan)
 
 
 @compiled

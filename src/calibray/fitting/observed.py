@@ -74,28 +74,33 @@ class Observed:
         """
         used = self.used(weight)
         gap = modelled[:, used] / self.scale - self.measured[used]
-        # A link that loses its paths for a candidate has no statistic.
-        gap = np.where(np.isfinite(gap), gap, 0.0)
+        # A link without a path for a candidate has no statistic: its residual is 0, and no bias depends on it.
+        found = np.isfinite(gap)
+        gap = np.where(found, gap, 0.0)
         if not self.labels:
             return gap, np.zeros((len(gap), 0))
-        bias = self._means(gap, used)
-        return gap - bias[:, self.group[used]], -bias
+        bias = self._means(gap, found, used)
+        return np.where(found, gap - bias[:, self.group[used]], 0.0), -bias
 
     def slopes(self, derivative: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives of the residuals [n, m, k], from those of the modelled values [n, L, k]."""
-        used = self.used(weight)
-        # A link without a statistic has the residual 0 for any parameters.
-        slope = np.nan_to_num(derivative[:, used] / self.scale)
-        if self.labels:
-            slope = (
-                slope - np.moveaxis(self._means(np.moveaxis(slope, 2, 1), used), 1, 2)[:, self.group[used]]
-            )
-        return slope
+        """Derivatives of the residuals [n, m, k], from those of the modelled values [n, L, k].
 
-    def _means(self, values: NDArray[np.float64], used: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Mean of values [..., m] over the links of each group [..., groups]."""
+        The derivatives of a link without a statistic are NaN.
+        """
+        used = self.used(weight)
+        slope = np.moveaxis(derivative[:, used] / self.scale, 2, 1)
+        found = np.isfinite(slope)
+        slope = np.where(found, slope, 0.0)
+        if self.labels:
+            slope = np.where(found, slope - self._means(slope, found, used)[..., self.group[used]], 0.0)
+        return np.moveaxis(slope, 1, 2)
+
+    def _means(
+        self, values: NDArray[np.float64], found: NDArray[np.bool_], used: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Mean of the values found [..., m] over the links of each group [..., groups]; the others are 0."""
         member = (self.group[used][:, None] == np.arange(len(self.labels))).astype(np.float64)
-        return values @ member / np.maximum(member.sum(axis=0), 1.0)
+        return values @ member / np.maximum(found @ member, 1.0)
 
 
 def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
@@ -182,7 +187,8 @@ def with_errors(
             updated.append(observable)
             continue
         residuals, _ = observable.residuals(values[None], weight)
-        std = float(np.sqrt(np.sum(residuals**2) / max(observable.freedom(weight), 1)))
+        freedom = observable.freedom(np.where(np.isfinite(values), weight, 0.0))
+        std = float(np.sqrt(np.sum(residuals**2) / max(freedom, 1)))
         updated.append(
             replace(observable, std=max(std, LEAST * float(np.nanstd(observable.measured)), 1e-300))
         )
