@@ -18,9 +18,11 @@ from calibray.engines.kinds.replay import replay
 from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.measurements.observables import Statistic
+from calibray.prediction import suggestion
 from calibray.scenes import read_scene
 from calibray.study import Study
 from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.uncertainty.residual_correlation import Correlation
 from changed import changed
 from link_tables import links_from_frame
 from small_scenes import write_scene
@@ -137,6 +139,19 @@ def test_a_further_link_is_not_expected_to_have_the_error_of_a_few_exact_ones(fo
     found = cb.calibrate(Study.from_content(content, folder / "exact.toml"))
     before = found.intervals[NAME].upper - found.intervals[NAME].lower
     assert cb.suggest(found, table, 1)[f"{NAME}_width"][0] > 0.5 * before
+
+
+def test_errors_that_the_study_states_as_independent_are_so(result, table, monkeypatch):
+    """Also if the residuals of neighbouring links are alike."""
+    assert result.study.noise.range_m == 0
+    plain = cb.suggest(result, table, 3)
+    alike = Correlation(range_m=100.0, shared_db=0.5, own_db=0.01, log_likelihood=9.0, independent=0.0)
+    monkeypatch.setattr(suggestion, "shared_errors", lambda *_: alike)
+    pd.testing.assert_frame_equal(cb.suggest(result, table, 3), plain)
+    content = result.study.content()
+    del content["noise"]["range_m"]
+    unstated = replace(result, study=Study.from_content(content, result.study.path))
+    assert not cb.suggest(unstated, table, 3).equals(plain)
 
 
 def test_constants_of_the_scene_take_no_degrees_of_freedom(folder, table):

@@ -43,6 +43,7 @@ from calibray.study import Setup
 from calibray.support.messages import percent
 from calibray.support.progress import Progress
 from calibray.uncertainty.draws import evenly_spaced
+from calibray.uncertainty.noise_models import HEAVY
 from calibray.uncertainty.residual_correlation import shared_errors
 
 MOST_DRAWS: Final = 96
@@ -327,13 +328,15 @@ class _ReplayedDraws:
     def _errors(self, candidates: Measurements, common: NDArray[np.float64]) -> Errors:
         """Expected errors of candidates, which have no weight: calibration links count equally.
 
-        `common` is as for `Errors`. Residuals of neighbouring links may be correlated.
+        `common` is as for `Errors`. Residuals of neighbouring links may be correlated, unless the study rules it out.
         """
         problem, objective, links = self.problem, self.problem.objective, self.problem.setup.links
         counted, point = objective.weight > 0, _calibrated_point(self.result, problem)
         residuals = (objective.model(problem.modelled(point[None]))[0] - objective.measured)[counted]
         position = np.hstack([candidates.rx, candidates.tx])
-        correlation = shared_errors(residuals, np.hstack([links.rx, links.tx])[counted])
+        noise, correlation = self.result.study.noise, None
+        if noise.range_m != 0 and noise.kind != HEAVY:
+            correlation = shared_errors(residuals, np.hstack([links.rx, links.tx])[counted])
         if correlation is None:
             own_db = float(np.sqrt(np.mean(residuals**2))) * self.inflation
             return Errors(max(own_db, LEAST_NOISE_DB), common, position)
