@@ -276,7 +276,7 @@ LATER = TABLE.splitlines()[1:]
         (
             TABLE.replace(",", ";") + "0;50,5;1.5;99;LOS;1\n",
             {},
-            r"a decimal comma in row 6 and a decimal point in row \d+; write all with the same mark",
+            r"a decimal comma in row 6 and a decimal point in row \d+; use the same mark throughout",
         ),
         (TABLE.replace("spread", "loss"), {}, "row 1: column 'loss' appears twice"),
         # Columns

@@ -161,7 +161,7 @@ def test_snapshots_of_one_component_do_not_count_in_the_k_factor(tmp_path):
 
 def test_a_table_without_delays_is_refused(tmp_path):
     TABLE.drop(columns="delay_ns").to_csv(tmp_path / "multipath.csv", index=False)
-    with pytest.raises(InputError, match="no column of a delay"):
+    with pytest.raises(InputError, match="no column for a delay"):
         read_multipath(tmp_path / "multipath.csv", "id")
 
 

@@ -1,6 +1,6 @@
 """Measured links: positions, path losses, weights and groups, read from tables and checked.
 
-`reading.measured_links` is the pipeline from the rows of a table to `Measurements`.
+`reading.measured_links` is the pipeline that converts the rows of a table to `Measurements`.
 """
 
 from calibray.measurements.links import FEW as FEW

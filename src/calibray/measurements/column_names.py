@@ -1,4 +1,4 @@
-"""Guess the contents of a table's columns from the words of their names and from their values."""
+"""Guess the contents of a table's columns from the words in their names and from their values."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _DEVICES: Final = (
     "(tele)?phone|smartphone|terminale?|empf(a|ae)nger|(end|mess)?ger(a|ae)t|(mobil)?telefon|handy|receptor|"
     "dispositivo|telefono|movil|celular|recepteur|appareil|ricevitore|apparecchio|cellulare"
 )
-"""Receiving devices in English, German, Spanish, French and Italian."""
+"""Pattern of words for receiving devices in English, German, Spanish, French and Italian."""
 
 PATTERNS: Final = {
-    # What a column may hold, and the regular expression that a whole word of its name matches.
+    # The possible contents of a column, and the regular expression that a whole word of its name must match.
     "transmitter": r"tx|transmitter|bs|bts|site|cell|cell_?(id|name)|[enp]?ci|ap|bssid|[ge]nb|[ge]?nodeb|base|"
     r"basestation|anchor|beacon|gateway|gw|sender|basisstation|((mobil)?funk)?zelle|celda|cellule|cella|celula|emisor|"
     r"transmisor|emetteur|trasmettitore|estacion|station|stazione",
@@ -66,8 +66,8 @@ PATTERNS: Final = {
     "time": r"time|timestamp|date|datetime|utc|epoch|zeit(stempel)?|uhrzeit|datum|fecha|hora|heure",
     "distance": r"dist.*|separation|abstand|entfernung",
 }
-"""Spellings of column names, without accents. To recognize another spelling, add it to its row; case and punctuation do
-not matter."""
+"""Recognized spellings of column names, without accents. To add a spelling, extend its row; case and punctuation do not
+matter."""
 
 LENGTH_UNITS: Final = {
     "cm": 0.01,
@@ -78,24 +78,24 @@ LENGTH_UNITS: Final = {
     "foot": 0.3048,
     "inch": 0.0254,
 }
-"""Units of length in column names, other than the metre [m]."""
+"""Units of length other than the metre that column names may state [m]."""
 
 WATTS: Final = frozenset({"w", "watt", "watts", "kw", "mw", "dbw"})
-"""Words of names of powers that are not in dBm."""
+"""Words in a column's name which show that its powers are not in dBm."""
 
 FREQUENCY_UNITS: Final = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
-"""Units of carriers in column names [Hz]."""
+"""Units of carrier frequency that column names may state [Hz]."""
 
 
 @dataclass(frozen=True)
 class PositionColumns:
-    """The columns of one end's position.
+    """The columns that give the position of one end of a link.
 
     Attributes:
         position: "scene" for metres, "geographic" for degrees.
-        x: Column of x, or of longitudes.
-        y: Column of y, or of latitudes.
-        height: Column of heights; None if there is none.
+        x: Column of x coordinates, or of longitudes.
+        y: Column of y coordinates, or of latitudes.
+        height: Column of heights; None if the table has none.
     """
 
     position: Literal["scene", "geographic"]
@@ -109,9 +109,9 @@ class ValueColumn:
     """The column of measured values.
 
     Attributes:
-        column: The column.
-        quantity: The quantity that it holds.
-        reason: Why it was chosen.
+        column: Name of the column.
+        quantity: The measured quantity.
+        reason: Why the column was chosen.
     """
 
     column: str
@@ -131,7 +131,7 @@ def without_accents(name: object) -> str:
 
 
 def words(name: object) -> frozenset[str]:
-    """Words of a column's name, in lower case; a word in camel case counts as a whole and in parts.
+    """Words of a column's name, in lower case; a camel-case word counts both as a whole and in parts.
 
     Example:
         >>> sorted(words("Rx_X [m]"))
@@ -143,7 +143,7 @@ def words(name: object) -> frozenset[str]:
         >>> sorted(words("delay (\u00b5s)"))
         ['delay', 'us']
     """
-    # A time of flight is no time of day.
+    # A time of flight must not be mistaken for a time of day.
     text = re.sub(r"(?i)time[ _-]*of[ _-]*flight", "tof", without_accents(name).replace("\u03bc", "u"))
     text = re.sub(r"(?i)round[ _-]*trip[ _-]*time", "rtt", text)
     # Units keep their capitals together: "dBm" is one word.
@@ -154,7 +154,7 @@ def words(name: object) -> frozenset[str]:
 
 
 def matches(name: object, *rows: str) -> bool:
-    """Whether a word of a column's name is a spelling in one of the given rows of `PATTERNS`.
+    """Whether a word of a column's name matches one of the given rows of `PATTERNS`.
 
     Example:
         >>> matches("RSRP [dBm]", "received power"), matches("RSRP [dBm]", "x", "y")
@@ -179,7 +179,7 @@ def find_flight_time(frame: pd.DataFrame) -> tuple[str, str, str] | None:
             continue
         unit = next((unit for unit in ("ps", "ns", "us", "ms", "s", "m") if unit in words(name)), None)
         if unit is not None and (without_codes(frame[name]).dropna() > 0).mean() > 0.5:
-            # A round trip in metres is stated as the distance, one way.
+            # A round trip in metres is stated as the one-way distance.
             returned = matches(name, "round-trip time") and unit != "m"
             return name, "round_trip_time" if returned else "time_of_flight", unit
     return None
@@ -195,7 +195,7 @@ def numeric_columns(frame: pd.DataFrame) -> list[str]:
 
 
 def text_instead(frame: pd.DataFrame, *rows: str) -> str:
-    """Text of a column that is named as in some rows of `PATTERNS` but is not numeric; empty without such a column.
+    """Hint at a column that matches the given rows of `PATTERNS` but is not numeric; empty without such a column.
 
     Example:
         >>> text_instead(pd.DataFrame({"Lat": ["51.2N", "51.3N"], "cell": "A"}), "latitude")
@@ -212,7 +212,7 @@ def text_instead(frame: pd.DataFrame, *rows: str) -> str:
 
 
 def no_degrees(frame: pd.DataFrame) -> str:
-    """Text of a column that is named like longitudes or latitudes but has other numbers; empty without such a column.
+    """Hint at a column named like longitudes or latitudes whose numbers are not degrees; empty without such a column.
 
     Example:
         >>> no_degrees(pd.DataFrame({"lat": [4734.12], "lon": [1041.84]}))
@@ -229,9 +229,9 @@ def no_degrees(frame: pd.DataFrame) -> str:
 
 
 def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) -> PositionColumns | None:
-    """Find the columns of one end's position; metres are preferred to degrees.
+    """Find the columns that give the position of one end; metres are preferred to degrees.
 
-    With `unnamed`, columns that name neither end may belong to this end.
+    With `unnamed`, columns whose names state neither end may belong to this end.
 
     Example:
         >>> find_position(pd.DataFrame({"time": [0], "lat": [50.0], "lon": [10.0]}), "rx", unnamed=True)
@@ -256,24 +256,24 @@ def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) 
 
 
 def _height(names: Iterable[str]) -> str | None:
-    """The first column of heights of an antenna, or otherwise of heights, but not of the ground or a building."""
+    """The first column of antenna heights, or else of heights other than those of the ground or of a building."""
     heights = [name for name in names if matches(name, "height") and not matches(name, "another height")]
     return min(heights, key=lambda name: not matches(name, "antenna"), default=None)
 
 
 def find_transmitter_height(frame: pd.DataFrame) -> str | None:
-    """Column of the transmitter's heights, or None."""
+    """Name of the column of transmitter heights, or None."""
     return _first([name for name in numeric_columns(frame) if matches(name, "transmitter")], "height")
 
 
 def find_value(table: SourceTable) -> ValueColumn:
     """Find the column of measured values, and its quantity.
 
-    Names with a decibel unit come first, then path loss before path gain before received power. The sign of the values
-    distinguishes loss and gain.
+    Names with a decibel unit take precedence, then path loss over path gain over received power. The sign of the values
+    distinguishes loss from gain.
 
     Raises:
-        InputError: No column looks like one.
+        InputError: No column looks like measured values.
     """
     kinds: tuple[tuple[str, Quantity], ...] = (
         ("path loss", "path_loss"), ("path gain", "path_gain"), ("received power", "rsrp"),
@@ -285,7 +285,7 @@ def find_value(table: SourceTable) -> ValueColumn:
         if rank is None or matches(name, "another quantity"):
             continue
         if _is_plausible(without_codes(table.frame[name]), kinds[rank][1]):
-            # A reference signal has a known bandwidth; RSSI contains interference.
+            # The power of a reference signal refers to a known bandwidth; RSSI contains interference.
             secondary = rank == 2 and not matches(name, "reference signal")
             has_unit = matches(name, "decibel") or not secondary
             candidates.append((not has_unit, rank, secondary, name, kinds[rank][1]))
@@ -300,7 +300,7 @@ def find_value(table: SourceTable) -> ValueColumn:
             f"({', '.join(map(str, table.frame))}); name it path_loss_db, path_gain_db or rsrp_dbm"
             f"{unlikely or text_instead(table.frame, *(row for row, _ in kinds))}"
         )
-    # Powers without a unit come last; otherwise losses before gains before reference signals before other powers.
+    # Columns without a unit come last. Otherwise the order is losses, gains, reference signals, other powers.
     candidates.sort(key=lambda candidate: candidate[:3])
     *_, name, quantity = candidates[0]
     median = float(np.nanmedian(without_codes(table.frame[name])))
@@ -314,7 +314,7 @@ def find_value(table: SourceTable) -> ValueColumn:
 
 
 def find_transmit_power(frame: pd.DataFrame) -> str | None:
-    """Column of transmitted powers [dBm], or None; names in watts or dBW are left out.
+    """Name of the column of transmitted powers [dBm], or None; columns in watts or dBW are ignored.
 
     Example:
         >>> find_transmit_power(pd.DataFrame({"tx_power_w": [20.0], "EIRP [dBW]": [30.0], "TX power (dBm)": [43.0]}))
@@ -329,10 +329,10 @@ def find_transmit_power(frame: pd.DataFrame) -> str | None:
 
 
 def find_length_unit(names: Iterable[str]) -> float:
-    """Length of the unit that columns name [m]; 1 if they name none.
+    """The unit of length that column names state [m]; 1 if they state none.
 
     Raises:
-        InputError: They name several.
+        InputError: The names state different units.
 
     Example:
         >>> find_length_unit(["X [cm]", "Y [cm]", "device"]), find_length_unit(["x", "y_m"])
@@ -357,10 +357,10 @@ def find_frequency_unit(name: str, default: str = "hz") -> float:
 
 
 def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
-    """Find the column of carriers, and the carrier of every row [Hz], if there is one.
+    """Find the column of carrier frequencies, and the carrier of every row [Hz]; None without such a column.
 
-    The name contains a word for frequency, or otherwise a unit of it. The unit is that of the name, or otherwise
-    follows from the size of the values.
+    The name contains a word for frequency, or else a unit of frequency. The unit is taken from the name, or else
+    inferred from the magnitude of the values.
 
     Example:
         >>> find_frequency(pd.DataFrame({"BW [MHz]": [20.0], "Frq [MHz]": [763.0]}))
@@ -375,7 +375,7 @@ def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
         if np.isnan(values).all():
             continue
         median = float(np.nanmedian(values))
-        # Carriers are below 300 GHz: a larger number is in a smaller unit.
+        # Carriers are below 300 GHz, so larger numbers are in a smaller unit.
         likely_unit = "ghz" if median < 300 else "mhz" if median < 3e5 else "hz"
         carriers = values * find_frequency_unit(name, likely_unit)
         if FREQUENCIES[0] <= np.nanmin(carriers) and np.nanmax(carriers) <= FREQUENCIES[1]:
@@ -384,22 +384,22 @@ def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
 
 
 def find_time(frame: pd.DataFrame) -> str | None:
-    """First column that is named like times, or None."""
+    """Name of the first column that is named like times, or None."""
     return _first([str(name) for name in frame], "time")
 
 
 def find_distance(frame: pd.DataFrame) -> str | None:
-    """Column of distances from transmitter to receiver, or None."""
+    """Name of the column of distances from transmitter to receiver, or None."""
     return _first(numeric_columns(frame), "distance")
 
 
 def _are_degrees(longitude: pd.Series, latitude: pd.Series) -> bool:
-    """Whether coordinates can be degrees; some tables have metres of a map projection in columns with such names."""
+    """Whether coordinates can be degrees; in some tables, columns named like degrees contain projected metres."""
     return bool(longitude.abs().median() <= 180 and latitude.abs().median() <= 90)
 
 
 def is_named_value(name: str) -> bool:
-    """Whether a name contains the words of a measured value."""
+    """Whether a name contains a word for a measured value."""
     return matches(name, "path loss", "path gain", "received power")
 
 
@@ -408,7 +408,7 @@ def _first(names: Iterable[str], row: str) -> str | None:
 
 
 def _is_plausible(values: pd.Series, quantity: Quantity) -> bool:
-    """Whether values can belong to a quantity; the sign of a loss or gain is not decided."""
+    """Whether values are plausible for a quantity; the sign of a loss or gain is ignored."""
     median = float(np.nanmedian(values)) if values.notna().any() else 0.0
-    # The median, because single values may be errors of the logger.
+    # The median is used because single values may be logging errors.
     return -200 < median < -10 if quantity == "rsrp" else 20 < abs(median) < 250

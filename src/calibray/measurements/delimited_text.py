@@ -1,4 +1,4 @@
-"""Tables as text, in the form that loggers and spreadsheets write: encoding, separator, header, units, placeholders."""
+"""Text tables as loggers and spreadsheets write them: encoding, separator, header, units, placeholders."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from calibray.measurements.source_table import SourceTable
 from calibray.support.messages import shortened
 
 SUFFIXES: Final = (".csv", ".txt", ".tsv", ".dat")
-"""Endings of tables as text."""
+"""Extensions of text tables."""
 
 PLACEHOLDERS: Final = frozenset({"-", "--", "---", "\u2013", "\u2014", "?", "*"})
-"""Texts that mark a missing number in a column of numbers."""
+"""Texts that stand for a missing number in a column of numbers."""
 
 UNITS: Final = frozenset({
     "m", "cm", "mm", "km", "ft", "feet", "foot", "in", "inch", "inches", "db", "dbm", "dbi", "hz", "khz",
@@ -31,20 +31,20 @@ UNITS: Final = frozenset({
     "\u03bcs", "ns", "min", "h", "%", "v", "w", "mw", "m/s", "km/h", "mph", "bit", "kbps", "mbps", "bool", "string",
     "text", "int", "float",
 })  # fmt: skip
-"""Units, in lower case, that a row of units below the header may contain."""
+"""Units that a row of units below the header may contain, in lower case."""
 
-_HEAD: Final = 64  # records that show the layout of a file
+_HEAD: Final = 64  # number of records from which the layout of a file is detected
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where a table stands in a text.
+    """The layout of a table in a text.
 
     Attributes:
-        separator: The mark between columns; a space represents any white space.
-        skipped: Lines above the header.
-        units: The unit of every column, from a row below the header; empty if there is none.
-        unit_lines: First line of the row of units, and the line after its end, counted from the header's first line.
+        separator: Column separator; a space represents any white space.
+        skipped: Number of lines above the header.
+        units: Unit of every column, from a row of units below the header; empty without such a row.
+        unit_lines: First line of the row of units, and the line after its end, relative to the header's first line.
     """
 
     separator: str
@@ -54,7 +54,7 @@ class _Layout:
 
 
 def read_text(path: Path) -> str:
-    """Text of a file in UTF-8, in UTF-16 with a byte order mark, or otherwise in Windows-1252.
+    """Text of a file in UTF-8, in UTF-16 with a byte order mark, or else in Windows-1252.
 
     Raises:
         InputError: The file cannot be read, or contains bytes that are not text.
@@ -80,14 +80,14 @@ def read_text(path: Path) -> str:
 def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTable:
     r"""Rows of a table in a text, without blank lines.
 
-    Lines above the header with another number of cells, or with mostly empty cells, are skipped; units in a row below
-    it are appended to the names. Columns of numbers may contain placeholders (`PLACEHOLDERS`) and one unit of decibels
-    in every cell.
+    Lines above the header are skipped if they have a different number of cells or mostly empty cells. Units in a row
+    below the header are appended to the column names. Columns of numbers may contain placeholders (`PLACEHOLDERS`), and
+    the same decibel unit after every number.
 
     Args:
-        path: Name of the table for messages.
+        path: Name of the table in messages.
         text: The text.
-        separator: The mark between columns; detected if None.
+        separator: Column separator; detected if None.
 
     Raises:
         InputError: The text is malformed, or its header or decimal mark is ambiguous.
@@ -105,7 +105,7 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
     if layout.separator == " ":
         lines = [re.sub(r"[ \t]+", " ", line.strip(" \t")) for line in lines]
     first, end = layout.unit_lines
-    # Blank lines in place of the units keep the numbers of the lines.
+    # Blank lines replace the row of units, so that line numbers stay correct.
     lines[first:end] = ["\n"] * (end - first)
     text = "".join(lines)
     header, rows, has_empty_end = _checked_layout(path, text, layout)
@@ -122,7 +122,7 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
             index_col=False if has_empty_end else None,
         )
     except ValueError as error:
-        # pandas reports Ctrl-C while it reads as "source failed"; reading from memory fails so for no other reason.
+        # pandas reports Ctrl-C during reading as "source failed", which has no other cause when reading from memory.
         if "source failed" in str(error):
             raise KeyboardInterrupt from None
         raise InputError(f"{path}: malformed CSV ({shortened(str(error), 300)}); check its quotes") from None
@@ -139,9 +139,9 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
 
 
 def _layout(text: str, separator: str | None) -> _Layout:
-    """The first line from which all lines have the same number of cells, and the mark that gives the most cells."""
+    """The layout from the first line after which all lines have equally many cells, with the widest separator."""
     first_lines = list(islice(io.StringIO(text, newline=""), 30 + 4 * _HEAD))
-    for above in range(31):  # lines above a header
+    for above in range(31):  # number of lines above the header
         layouts: list[tuple[int, _Layout]] = []
         head = first_lines[above : above + 4 * _HEAD]
         if above and (len(head) < 2 or not head[0].strip()):
@@ -150,13 +150,13 @@ def _layout(text: str, separator: str | None) -> _Layout:
             records = _records(head, mark)
             widths = {len(cells) for cells, _, _ in records[1:]}
             width = len(records[0][0]) if records else 0
-            # Rows may end with a separator where the header does not.
+            # Rows may end with a separator even if the header does not.
             if width < 2 or not widths <= {width, width + 1} or len(widths) > 1:
                 continue
             # Spreadsheets pad lines above the header with empty cells.
             if 2 * sum(map(bool, map(str.strip, records[0][0]))) < width:
                 continue
-            # A row of values is no header. What stands above a header is no row of its table.
+            # A row of values is not a header, and lines above a header are not rows of the table.
             if above and (len(records) < 2 or any(map(_is_number, records[0][0]))):
                 continue
             layouts.append((width, _Layout(mark, above, *_unit_row(records))))
@@ -172,7 +172,7 @@ def _layout(text: str, separator: str | None) -> _Layout:
 
 
 def _records(lines: Sequence[str], mark: str) -> list[tuple[list[str], int, int]]:
-    """Cells of the first records of a text that are not blank, with the first line and the line after the end."""
+    """Cells of the first records that are not blank; each with its first line and the line after its end."""
     if mark == " ":
         lines = [re.sub(r"[ \t]+", " ", line.strip(" \t")) for line in lines]
     reader, records, start = csv.reader(lines, delimiter=mark, skipinitialspace=True), [], 0
@@ -187,7 +187,7 @@ def _records(lines: Sequence[str], mark: str) -> list[tuple[list[str], int, int]
 
 
 def _unit_row(records: Sequence[tuple[list[str], int, int]]) -> tuple[tuple[str, ...], tuple[int, int]]:
-    """Units of the columns and their lines, if the row below the header has units where the next row has numbers."""
+    """Units of the columns and the lines of their row, if it is below the header and has units above numbers."""
     if len(records) < 3:
         return (), (0, 0)
     (header, *_), (cells, start, end), (below, *_) = records[:3]
@@ -204,7 +204,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _with_unit(name: object, unit: str) -> str:
-    """Name of a column with its unit, unless the name contains it."""
+    """Name of a column with its unit appended, unless the name already contains the unit."""
     plain = str(name).strip()
     return (
         plain
@@ -216,7 +216,7 @@ def _with_unit(name: object, unit: str) -> str:
 def _plain_numbers(column: pd.Series, decimal: str) -> pd.Series:
     """Convert a column of texts to numbers if each is a number, a placeholder, or a number with the same unit.
 
-    Other texts are stripped of white space at their ends.
+    White space at the ends of other texts is removed.
     """
     if not pd.api.types.is_string_dtype(column):
         return column
@@ -248,16 +248,16 @@ def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
                     lines.setdefault(number[1], layout.skipped + reader.line_num)
     if len(lines) > 1:
         raise InputError(
-            f"{path}: numbers have a decimal comma in row {lines[',']} and a decimal point in row {lines['.']}; write "
-            "all with the same mark"
+            f"{path}: numbers have a decimal comma in row {lines[',']} and a decimal point in row {lines['.']}; use "
+            "the same mark throughout"
         )
     return "," if "," in lines else "."
 
 
 def _checked_layout(path: Path, text: str, layout: _Layout) -> tuple[list[str], list[int], bool]:
-    """Header and first line of each row of a CSV text; a fault that pandas would repair silently is refused.
+    """Header and first line of each row of a CSV text; faults that pandas would silently repair are refused.
 
-    The last result states whether every row ends with an empty cell beyond the header.
+    The last result states whether every row ends with an additional empty cell.
 
     Raises:
         InputError: A column appears twice, or a row has more or fewer cells than the header.

@@ -1,8 +1,8 @@
 """Row filters: a small closed language over the columns of a table.
 
-Python's parser reads a filter, and this module interprets the tree over whole columns; nothing is passed to `eval`.
-Only the operators, functions and methods listed below exist: no attributes, no subscripts, no other calls.
-Precedence follows pandas' queries, in which ``&`` and ``|`` mean ``and`` and ``or`` and bind as loosely.
+Python's parser reads a filter, and this module interprets the syntax tree on whole columns; nothing is passed to
+`eval`. Only the operators, functions and methods listed below exist: no attributes, no subscripts, no other calls.
+Precedence is as in pandas queries: ``&`` and ``|`` mean ``and`` and ``or``, and bind as loosely.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ MAX_PARTS: Final = 2_000
 """Largest number of names, values and operators of a filter."""
 
 MAX_DEPTH: Final = 50
-"""Largest depth to which the parts of a filter may be nested."""
+"""Largest nesting depth of a filter."""
 
 MAX_PATTERN_LENGTH: Final = 200
 """Largest number of characters of a regular expression."""
 
 MAX_SEARCH_STEPS: Final = 1e9
-"""Largest sum of squared text lengths in a column that is searched for a repetition; the search then takes 2 to 5 s."""
+"""Largest sum of squared text lengths in a column that is searched with a repetition; the search takes 2 to 5 s."""
 
 _MAX_INTEGER: Final = int(np.iinfo(np.int64).max)
 
@@ -54,16 +54,16 @@ ARITHMETIC: Final[Mapping[type[ast.operator], Callable[[Any, Any], Any]]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
     ast.FloorDiv: operator.floordiv, ast.Mod: operator.mod, ast.Pow: operator.pow,
 }  # fmt: skip
-"""The operators between numbers."""
+"""The arithmetic operators."""
 
 FUNCTIONS: Final[Mapping[str, np.ufunc]] = {
     name: getattr(np, name)
     for name in ("abs", "arctan2", "ceil", "cos", "exp", "floor", "log", "log10", "sin", "sqrt", "tan")
 }  # fmt: skip
-"""The functions of numbers."""
+"""The functions that take numbers."""
 
 
-# The functions below are the methods of columns. Their parameters are the arguments that a filter may give.
+# The functions below are the methods of columns. Their parameters are the arguments that a filter may pass.
 
 
 def _between(column: pd.Series, left: Any, right: Any, inclusive: Any = "both") -> pd.Series:
@@ -82,13 +82,15 @@ def _isin(column: pd.Series, values: Any) -> pd.Series:
 
 
 def _check_equality(column: pd.Series, values: Iterable[Any]) -> None:
-    """Refuse to compare a column of texts with numbers alone, or numbers with texts alone: none would be equal."""
+    """Refuse to compare a column of texts with numbers only, or of numbers with texts only: none would be equal."""
     kinds = {isinstance(value, str) for value in values if value is not None}
     is_text = pd.api.types.infer_dtype(column, skipna=True) == "string"
     if kinds == {False} and is_text:
-        raise InputError("the column has texts, which equal no number; put the values in quotes")
+        raise InputError("the column contains texts, which never equal a number; put the values in quotes")
     if kinds == {True} and pd.api.types.is_numeric_dtype(column.dtype) and column.notna().any():
-        raise InputError("the column has numbers, which equal no text; leave out the quotes of the values")
+        raise InputError(
+            "the column contains numbers, which never equal a text; remove the quotes around the values"
+        )
 
 
 def _contains(column: pd.Series, pat: Any, case: Any = True, regex: Any = True, na: Any = False) -> pd.Series:
@@ -132,16 +134,16 @@ def _check_types(kind: type, **values: Any) -> None:
 
 
 def _affix(pat: Any, na: Any) -> Any:
-    """The checked beginning or end of a text, or a tuple of them."""
+    """The checked prefix or suffix of a text, or a tuple of them."""
     _check_types(bool, na=na)
     for text in pat if isinstance(pat, tuple) else (pat,):
         _check_types(str, pat=text)
     return pat
 
 
-# A regular expression with several repetitions, or with a repeated group, can take longer than anyone waits. Allowed
-# are alternatives of single characters and classes, of which one per alternative may repeat. `*+` is possessive, so
-# that checking a pattern is cheap as well.
+# A regular expression with several repetitions, or with a repeated group, can take practically forever. The allowed
+# patterns are alternatives of single characters and classes, one of which may repeat in each alternative. `*+` is
+# possessive, so that checking a pattern is cheap as well.
 _CLASS: Final = r"\[\^?(?:\\.|[^\[\]\\])+\]"
 _CHARACTER: Final = rf"(?:\\[^0-9A-Za-z]|\\[bBdDsSwW]|{_CLASS}|[^\\^$*+?{{}}\[\]()|])"
 _ALTERNATIVE: Final = rf"\^?{_CHARACTER}*+[*+?]?{_CHARACTER}*+\$?"
@@ -150,7 +152,7 @@ _REPETITION: Final = re.compile(rf"(?:{_CLASS}|\\.|[^*+?])*+[*+?]")
 
 
 def _check_pattern(pattern: str, column: pd.Series) -> None:
-    """Refuse a regular expression that is malformed or whose search in a column might not end."""
+    """Refuse a regular expression that is malformed, or whose search in a column might take too long."""
     if len(pattern) > MAX_PATTERN_LENGTH:
         raise InputError(f"{len(pattern)} characters, must be at most {MAX_PATTERN_LENGTH}; shorten it")
     try:
@@ -164,7 +166,7 @@ def _check_pattern(pattern: str, column: pd.Series) -> None:
             "only characters, classes, ^, $, | and one *, + or ? per alternative are allowed; set regex=False to "
             "search for a plain text"
         )
-    # Each start of a search may run to the end of the text: the cost grows with the square of its length.
+    # A match attempt at each position may run to the end of the text, so the cost is quadratic in its length.
     if _REPETITION.match(pattern):
         steps = float((column.dropna().astype(str).str.len().astype(float) ** 2).sum())
         if steps > MAX_SEARCH_STEPS:
@@ -172,11 +174,11 @@ def _check_pattern(pattern: str, column: pd.Series) -> None:
 
 
 def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
-    """Mask [rows] of the rows that pass a filter; missing values pass no comparison but `!=` and `not in`.
+    """Mask [rows] of the rows that pass a filter; missing values pass only the comparisons `!=` and `not in`.
 
     Raises:
-        InputError: The filter is malformed or too large, names an unknown column or something that is not allowed, or
-            does not give one truth value per row. The message names the part of the filter, not the filter's source.
+        InputError: The filter is malformed or too large, uses an unknown column or a construct that is not allowed, or
+            does not give one truth value per row. The message quotes the part of the filter, not the filter's source.
 
     Example:
         >>> frame = pd.DataFrame({"x": [1, 2, 3], "my set": ["A", "B", "A"]})
@@ -186,7 +188,7 @@ def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
     if len(expression) > MAX_LENGTH:
         raise InputError(f"{len(expression)} characters, must be at most {MAX_LENGTH}; shorten it")
     code, backticked = _as_python(expression.strip())
-    # Python warns of escapes in texts, and pandas of groups in patterns; neither helps the author of a filter.
+    # Python warns about escapes in texts, and pandas about groups in patterns; neither helps the author of a filter.
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         result = _Interpreter(frame, code, backticked).value(_parse(code, frame))
@@ -195,14 +197,14 @@ def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
     return result.to_numpy(dtype=bool, na_value=False)
 
 
-# Texts and backticked names, so that `&` and `|` are replaced only outside of them.
+# Matches texts and backticked names, so that `&` and `|` are replaced only outside them.
 _TOKENS: Final = re.compile(
     r"""(?P<text>'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")|`(?P<column>[^`\n]+)`|(?P<sign>[&|])"""
 )
 
 
 def _as_python(expression: str) -> tuple[str, dict[str, str]]:
-    """A filter as a Python expression, and the column of each name that replaces a backticked one."""
+    """A filter as a Python expression, and the column for each name that replaces a backticked name."""
     stem = "quoted"
     while stem in expression:
         stem += "_"
@@ -219,7 +221,7 @@ def _as_python(expression: str) -> tuple[str, dict[str, str]]:
 
 
 def _parse(code: str, columns: Iterable[object]) -> ast.expr:
-    """The tree of an expression, refused if it is malformed or too large."""
+    """The syntax tree of an expression, which is refused if it is malformed or too large."""
     try:
         tree = ast.parse(code, mode="eval").body
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
@@ -241,7 +243,7 @@ def _parse(code: str, columns: Iterable[object]) -> ast.expr:
 
 
 class _Interpreter:
-    """One filter over one table."""
+    """Evaluates one filter on one table."""
 
     def __init__(self, frame: pd.DataFrame, code: str, backticked: Mapping[str, str]) -> None:
         self._frame, self._code, self._backticked = frame, code, backticked
@@ -281,14 +283,14 @@ class _Interpreter:
         )
 
     def _refusal(self, node: ast.AST, fault: str) -> InputError:
-        """The error for a part, which it quotes as written in the filter."""
+        """The error for a part, which the message quotes as written in the filter."""
         piece = ast.get_source_segment(self._code, node) or type(node).__name__
         for name, column in self._backticked.items():
             piece = piece.replace(name, f"`{column}`")
         return InputError(f"{shortened(piece)}: {fault}")
 
     def _name(self, node: ast.Name) -> _Value:
-        # Python normalizes identifiers: a full-width x becomes a plain one. A column is meant as it is written.
+        # Python normalizes identifiers: a full-width x becomes a plain x. Columns are looked up as written instead.
         written = ast.get_source_segment(self._code, node) or node.id
         name = self._backticked.get(written, written)
         if name not in self._frame:
@@ -348,7 +350,7 @@ class _Interpreter:
 
     def _comparison(self, node: ast.Compare) -> pd.Series | bool:
         """A comparison, or a chain such as `1 < x < 3`."""
-        # Each side is evaluated once: evaluating it for both neighbours would double the cost with every nesting.
+        # Each side is evaluated once: evaluating it for both neighbours would double the cost at every nesting level.
         sides = [node.left, *node.comparators]
         values = [self.value(node.left), *(self._argument(side) for side in node.comparators)]
         results = [
@@ -399,8 +401,8 @@ class _Interpreter:
         if isinstance(node.op, ast.Pow):
             # In floating point, a power of whole numbers neither takes long nor wraps around.
             left, right = _as_floats(left), _as_floats(right)
-        # Whole numbers wrap around without a message in columns, and division by zero gives infinity; `_overflows`
-        # finds both.
+        # Whole numbers in columns wrap around silently, and division by zero gives infinity; `_overflows` detects
+        # both.
         result = operation(left, right)
         if _overflows(operation, left, right, result):
             raise self._refusal(node, "the result is too large a number; correct it")
@@ -409,7 +411,7 @@ class _Interpreter:
     def _call(self, node: ast.Call) -> _Value:
         name = getattr(node.func, "attr", getattr(node.func, "id", ""))
         if not (ast.get_source_segment(self._code, node.func) or "").endswith(name):
-            # Written with letters that Python normalizes.
+            # The name is written with letters that Python normalizes.
             raise self._refusal(node.func, f"write the method in plain letters, {name!r}")
         match node.func:
             case ast.Name():
@@ -444,7 +446,7 @@ class _Interpreter:
             raise self._refusal(node, str(error)) from None
 
     def _argument(self, node: ast.expr) -> Any:
-        """The value of a part, which may also be a list or tuple of literals."""
+        """The value of an argument, which may also be a list or tuple of literals."""
         if isinstance(node, ast.Tuple):
             return tuple(self._literals(node))
         return self._literals(node) if isinstance(node, ast.List) else self.value(node)

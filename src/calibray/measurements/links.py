@@ -1,4 +1,4 @@
-"""The record of links and their measured values."""
+"""The links and their measured values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MIN_DISTANCE: Final = 1e-3
 """Distance [m] between transmitter and receiver below which they coincide, so that no path loss is defined."""
 
 FEW: Final = 8
-"""Number of links below which their errors say little: no trend, no noise model, no error of predictions."""
+"""Number of links below which no trend, noise model or prediction error is estimated from their errors."""
 
 MAX_CARRIERS: Final = 32
 """Largest number of carriers; a column with more values probably contains another quantity."""
@@ -32,14 +32,14 @@ class Measurements:
     Attributes:
         tx: Transmitter positions [links, 3], [m].
         rx: Receiver positions [links, 3], [m].
-        path_loss_db: Measured path loss [links], [dB]; NaN everywhere for links without measured values.
+        path_loss_db: Measured path loss [links], [dB]; all NaN for links without measured values.
         weight: Relative weights [links], [1], greater than 0; 1 unless given.
         group: Label [links] of each link's group, or None.
         frequency: Carrier of each link [links], [Hz]; None if all have the study's carrier.
-        limit_db: Largest path loss [links], [dB] that could have been measured; None if unknown.
+        limit_db: Largest measurable path loss [links], [dB]; None if unknown.
         censored: Mask [links] of the links below the noise floor, whose path loss is at least `path_loss_db`; None if
             no link is censored.
-        table: The rows of the source table, for filters and messages; if not given, one empty row per link.
+        table: The rows of the source table, for filters and messages; one empty row per link if not given.
 
     Raises:
         InputError: Shapes disagree, a position is not finite, a transmitter and its receiver coincide, a weight is not
@@ -111,17 +111,17 @@ class Measurements:
 
     @property
     def row(self) -> NDArray[np.int64]:
-        """The line [links] of each link in the source file."""
+        """The line number [links] of each link in the source file."""
         return self.table.row
 
     @property
     def source(self) -> str:
-        """The source file."""
+        """The name of the source file."""
         return self.table.source
 
     @property
     def prepared(self) -> dict[str, int]:
-        """What was left out, averaged or moved before rows became links, each with the number of rows."""
+        """Changes before rows became links, such as rows left out or averaged, each with the number of rows."""
         return dict(self.table.changes)
 
     @property
@@ -131,12 +131,12 @@ class Measurements:
 
     @property
     def distance(self) -> NDArray[np.float64]:
-        """The straight distance [links], [m] from transmitter to receiver."""
+        """The straight-line distance [links], [m] from transmitter to receiver."""
         return np.linalg.norm(self.rx - self.tx, axis=1)
 
     @property
     def group_names(self) -> tuple[str, ...]:
-        """The groups, sorted; one with an empty name if the links have no groups."""
+        """The names of the groups, sorted; a single empty name if the links have no groups."""
         return ("",) if self.group is None else tuple(map(str, np.unique(self.group)))
 
     @property
@@ -144,12 +144,12 @@ class Measurements:
         """The index [links] of each link's group in `group_names`."""
         if self.group is None:
             return np.zeros(len(self), dtype=np.int64)
-        # Every group is in the sorted names, so that the insertion point is its index.
+        # Every group is among the sorted names, so the insertion point is its index.
         return np.searchsorted(self.group_names, self.group)
 
     @property
     def carriers(self) -> tuple[tuple[float, NDArray[np.int64]], ...]:
-        """The carriers [Hz], ascending, each with the indices of its links; empty if all have the study's carrier."""
+        """The carriers [Hz] in ascending order, each with the indices of its links; empty if all have the study's."""
         if self.frequency is None:
             return ()
         return tuple(
@@ -161,7 +161,7 @@ class Measurements:
         """The links where a mask [links] is true.
 
         Raises:
-            InputError: The mask is not one truth value per link, or selects none.
+            InputError: The mask does not have one truth value per link, or selects no link.
         """
         chosen = np.asarray(mask)
         if chosen.dtype != np.bool_ or chosen.shape != (len(self),):
@@ -183,7 +183,7 @@ class Measurements:
         )
 
     def where(self, expression: str) -> NDArray[np.bool_]:
-        """The mask [links] of the links that pass a filter over the source table's columns.
+        """The mask [links] of the links that pass a filter on the source table's columns.
 
         Raises:
             InputError: The filter is not valid (see `SourceTable.where`).
@@ -191,10 +191,10 @@ class Measurements:
         return self.table.where(expression)
 
     def held_out(self, holdout: str) -> NDArray[np.bool_]:
-        """The mask [links] of the links that a filter holds out; at least one link is held out and one is not.
+        """The mask [links] of the links that a filter holds out; neither part is empty.
 
         Raises:
-            InputError: The filter is not valid, or one of the parts would be empty.
+            InputError: The filter is not valid, or one of the two parts would be empty.
         """
         held_out = self.where(holdout)
         for part, mask in (("the hold-out", held_out), ("calibration", ~held_out)):
@@ -206,7 +206,7 @@ class Measurements:
 
 
 def _as_array(name: str, values: ArrayLike, dtype: type) -> NDArray[np.generic]:
-    """A copy of the values as an array; masked numbers become NaN."""
+    """A copy of the values as an array, with NaN for masked numbers."""
     try:
         if isinstance(values, np.ma.MaskedArray) and dtype is np.float64:
             return np.where(np.ma.getmaskarray(values), np.nan, np.ma.getdata(values).astype(dtype))
@@ -257,7 +257,7 @@ def _check_carriers(links: Measurements, frequency: NDArray[np.float64]) -> None
 
 
 def _summary(links: Measurements) -> Table:
-    """Source, number and ranges of the links."""
+    """Summary table of the links: source, number, and ranges of values."""
     kind = "measured" if links.measured else "unmeasured"
     rows = [("number", f"{len(links):,} {kind}"), ("distance", _range(links.distance, "m"))]
     if links.measured:

@@ -1,8 +1,8 @@
-"""Observables of links from measured multipath components: delays, powers and angles of every path, link by link.
+"""Observables of links from measured multipath components: the delay, power and angles of every path of every link.
 
-Each is the statistic that the model computes, with a hard limit of the receiver's range. If a link was measured several
-times, for example with rotations of the receiving array, it is the mean over the measurements. Impulse responses are
-converted to components: the samples above a stated threshold.
+Each observable is the same statistic that the model computes, with a hard limit at the receiver's dynamic range. If a
+link was measured several times, for example with rotations of the receiving array, it is the mean over the snapshots.
+Impulse responses are converted to components: the samples above a stated threshold.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ ANGLE: Final = {
 END: Final = {"departure": r"(^|_)([aze]od|departure|tx)(_|$)", "arrival": r"(^|_)([aze]oa|arrival|rx)(_|$)"}
 SNAPSHOT: Final = r"(^|_)(rotation|snapshot|sweep|scan|repetition|orientation)(_|$)"
 ANGLES: Final = (*(kind for kind, unit in kinds.KINDS.items() if unit == "rad"), *kinds.SECTORS)
-"""Kinds of statistics that need an angle."""
+"""Kinds of statistics that need angles."""
 
 SECONDS: Final = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 
 RADIANS: Final = frozenset({"rad", "radian", "radians"})
-"""Words of names of angles that are not in degrees."""
+"""Words in a column's name which show that its angles are not in degrees."""
 
 LONGEST: Final = 0.01
-"""Largest delay [s]: light travels 3,000 km in it."""
+"""Largest plausible delay [s]: light travels 3,000 km in this time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Multipath:
-    """Measured components of links.
+    """Measured multipath components of links.
 
     Attributes:
         link: Label of each component's link [n].
-        snapshot: Label of the component's measurement of its link [n].
+        snapshot: Label of the snapshot of the link to which each component belongs [n].
         delay: Delay [n], [s].
         level_db: Power gain [n], [dB].
         angles: Azimuths, counterclockwise from the x axis, and elevations or zenith angles [n], [rad], by plane and
@@ -69,11 +69,11 @@ class Multipath:
 
 
 def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multipath:
-    """Read a table with one row per component.
+    """Read a table with one row per multipath component.
 
     The columns are recognised by their names: a delay (`delay_ns`), a path loss, path gain or power [dB]
-    (`path_loss_db`), and if present an azimuth, an elevation, and the number of the rotation or snapshot. An angle is
-    that of both ends unless its name states one (`aoa_deg`, `azimuth_tx`).
+    (`path_loss_db`), and if present an azimuth, an elevation, and the number of the rotation or snapshot. An angle
+    counts for both ends unless its name states one (`aoa_deg`, `azimuth_tx`).
 
     Args:
         path: The table.
@@ -81,11 +81,11 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
         compass: Whether azimuths are compass bearings, clockwise from north.
 
     Raises:
-        InputError: The table cannot be read, or lacks links, delays or powers; or its delays or powers do not have
-            the unit or sign that their names state.
+        InputError: The table cannot be read, or has no column of links, delays or powers; or delays or powers do not
+            match the unit or sign that their names imply.
     """
     table = read_table(path)
-    # Words of the names, as in delay_ns for "Delay [ns]".
+    # Names as words joined by underscores, such as delay_ns for "Delay [ns]".
     names = {
         str(name): "_".join(re.findall(r"[a-z0-9]+", str(name).lower()))
         for name in table.frame.columns
@@ -102,7 +102,7 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
         missing = (
             "delay, such as delay_ns" if delay is None else "power, such as path_loss_db or path_gain_db"
         )
-        raise InputError(f"{path}: no column of a {missing}; its columns are {', '.join(names)}")
+        raise InputError(f"{path}: no column for a {missing}; its columns are {', '.join(names)}")
     labels = table.labels(link)
     unit = next((unit for unit in SECONDS if unit in words(delay)), "s")
     seconds = table.numbers(delay) * SECONDS[unit]
@@ -113,7 +113,7 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
         )
     level_db, is_loss = table.numbers(power), re.search(r"loss|(^|_)pl(_|$)", names[power]) is not None
     median, is_level = float(np.median(level_db)), matches(power, "decibel") and "gain" not in power.lower()
-    # A received power of a receiver that is not calibrated can be positive, in decibels.
+    # The received power in decibels of an uncalibrated receiver can be positive.
     if (median < 0) if is_loss else (median > 0 and not is_level):
         raise InputError(
             f"{path}: column {power!r} has values of about {median:g} dB; losses must be positive, gains and "
@@ -122,7 +122,7 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
 
     angles = {}
     for plane, pattern in ANGLE.items():
-        # "AoA" is an azimuth unless the name says elevation.
+        # "AoA" means azimuth unless the name states elevation.
         of_plane = {
             name: plain
             for name, plain in names.items()
@@ -137,7 +137,7 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
             if len(own) == 1:
                 values = table.numbers(own[0])
                 values = values if words(own[0]) & RADIANS else np.radians(values)
-                # A compass counts from north clockwise, the scene from east counter-clockwise.
+                # Compass bearings run clockwise from north, the scene's azimuths counterclockwise from east.
                 angles[plane, end] = np.pi / 2 - values if compass and plane == "azimuth" else values
     return Multipath(
         labels,
@@ -149,13 +149,13 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
 
 
 def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:
-    """A statistic of every link in SI units, by the link's label; the mean over its snapshots.
+    """A statistic of every link in SI units, averaged over the link's snapshots, by the link's label.
 
-    Snapshots of a single component have no K-factor and do not count in its mean. Links of which the receiver detects
-    no component are left out. The components already include the bandwidth of the receiver.
+    Snapshots with a single component have no K-factor and are excluded from its mean. Links with no component that the
+    receiver detects are left out. The components already reflect the bandwidth of the receiver.
 
     Raises:
-        InputError: The statistic needs an angle that was not measured.
+        InputError: The statistic needs angles that were not measured.
 
     Example:
         >>> paths = Multipath(np.array(["a", "a"]), np.array(["", ""]), np.array([1e-7, 2e-7]), np.zeros(2))
@@ -210,11 +210,11 @@ def _value(
         return of_path[statistic.path] * (2 if kind == kinds.ROUND_TRIP else 1)
     if kind == kinds.K_FACTOR:
         strongest = float(weight.max())
-        # Strongest component over the sum of all others; with a single component it is infinite.
+        # Ratio of the strongest component to the sum of all others; infinite for a single component.
         return 10 * float(np.log10(strongest / (1 - strongest))) if strongest < 1 else np.nan
     if statistic.edges is not None:
         low, high = statistic.bin
-        # Angles are turned into the full turn that begins at the sector's lower edge.
+        # Angles are wrapped to the full turn that begins at the sector's lower edge.
         values = delay - first if angle is None else (angle - low) % (2 * np.pi) + low
         with np.errstate(divide="ignore"):
             share_db = 10 * np.log10(weight[(values >= low) & (values < high)].sum())
@@ -226,38 +226,38 @@ def _value(
 
 ENDINGS: Final = (".npz", ".npy", ".mat", ".h5", ".hdf5")
 MOST_BYTES: Final = 4 << 30
-"""Largest size of the arrays of a file."""
+"""Largest total size of the arrays in a file [bytes]."""
 
 DELAYS: Final = ("delay", "delays", "tau", "time", "t")
-"""Names of an array of the delays of the samples [s]."""
+"""Names under which a file may contain the delays of the samples [s]."""
 
 MARGIN_DB: Final = 10.0
-"""Distance from the noise above which a sample counts as signal. The power of noise samples is exponentially
-distributed, so one in 22,000 exceeds its mean by this distance."""
+"""Margin above the mean noise power from which a sample counts as signal [dB]. The power of noise samples is
+exponentially distributed, so one in 22,000 exceeds its mean by this margin."""
 
 
 def read_impulse_responses(
     source: str | Path, labels: list[str], sample_rate: float | None = None, margin_db: float = MARGIN_DB
 ) -> Multipath:
-    """Read impulse responses, and keep the samples of each that exceed its noise.
+    """Read impulse responses, and keep the samples that exceed the noise of each response.
 
-    Files are those of NumPy (.npz, .npy), MATLAB (.mat, also version 7.3) and HDF5.
+    Files may be in the format of NumPy (.npz, .npy), MATLAB (.mat, including version 7.3) or HDF5.
 
-    The noise of a response is that of the median sample; the mean of exponentially distributed powers is the median
-    over ln 2. Most samples of a response must therefore be noise.
+    The noise power of a response is estimated as the median power of its samples divided by ln 2, which is the mean if
+    powers are exponentially distributed. Most samples of a response must therefore be noise.
 
     Args:
-        source: A file with one response per link, in the order of the labels, [links, samples] or
-            [links, snapshots, samples]; or a folder with a file per link, [samples] or [snapshots, samples].
+        source: A file with one response per link in the order of the labels, [links, samples] or
+            [links, snapshots, samples]; or a folder with one file per link, [samples] or [snapshots, samples].
         labels: Labels of the links.
         sample_rate: Samples per second [Hz]; None if the files state delays [s].
-        margin_db: Distance above the noise from which a sample counts [dB].
+        margin_db: Margin above the noise from which a sample counts as a component [dB].
 
     Returns:
-        The samples above the threshold as components; powers are those of the samples.
+        The samples above the threshold, with their powers, as components.
 
     Raises:
-        InputError: A file cannot be read, or its array matches no link.
+        InputError: A file cannot be read, or its array does not match the links.
     """
     source = Path(source)
     parts = []
@@ -271,7 +271,7 @@ def read_impulse_responses(
             parts.append(_above_noise(label, np.atleast_2d(response), delay, margin_db))
     else:
         response, delay = _read(source, sample_rate)
-        # MATLAB's arrays of one row are read without it.
+        # MATLAB arrays with one row are read without the row axis.
         response = response[None] if response.ndim == 1 and len(labels) == 1 else response
         if len(response) != len(labels) or response.ndim not in (2, 3):
             raise InputError(
@@ -287,7 +287,7 @@ def _above_noise(
     label: str, response: NDArray[Any], delay: NDArray[np.float64], margin_db: float
 ) -> tuple[NDArray[Any], ...]:
     """Link, snapshot, delay and level of the samples of a link's responses [snapshots, samples] above the noise."""
-    # Squares of small integers, as of a converter, would wrap around.
+    # Squares of small integer types, such as converter samples, would wrap around.
     power = np.abs(response).astype(np.float64) ** 2
     noise = np.median(power, axis=1, keepdims=True) / np.log(2)
     snapshot, sample = np.nonzero(power > noise * 10 ** (margin_db / 10))
@@ -296,7 +296,7 @@ def _above_noise(
 
 
 def _read(file: Path, sample_rate: float | None) -> tuple[NDArray[Any], NDArray[np.float64]]:
-    """The array of responses of a file, and the delays of its samples [s]."""
+    """The array of responses in a file, and the delays of its samples [s]."""
     with _explained(file):
         arrays = _arrays(file)
     delays = next((arrays.pop(name) for name in list(arrays) if name.lower() in DELAYS), None)
@@ -314,7 +314,7 @@ def _read(file: Path, sample_rate: float | None) -> tuple[NDArray[Any], NDArray[
     ((name, response),) = largest.items()
     if response.dtype.kind != "c" and (response <= 0).all():
         raise InputError(f"{file}: {shortened(name)!r} is in decibels; give complex numbers or amplitudes")
-    # Axes of a single transmitting or receiving antenna.
+    # Remove the axes of a single transmitting or receiving antenna.
     response = np.squeeze(response) if response.ndim > 3 else response
     if not np.isfinite(response).all():
         raise InputError(f"{file}: {shortened(name)!r} contains values that are not finite")
@@ -336,7 +336,7 @@ def _read(file: Path, sample_rate: float | None) -> tuple[NDArray[Any], NDArray[
 
 
 def _arrays(file: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a file by name."""
+    """The arrays in a file, by name."""
     ending = file.suffix.lower()
     if ending == ".npy":
         array = np.load(file, mmap_mode="r", allow_pickle=False)
@@ -380,13 +380,13 @@ def _hdf5_arrays(file: Path, reverse: bool) -> dict[str, NDArray[Any]]:
 def _check_size(file: Path, size: int) -> None:
     if size > MOST_BYTES:
         raise InputError(
-            f"{file}: its arrays take {size / 2**30:.1f} GiB, must take 4 or fewer; split the file"
+            f"{file}: its arrays take {size / 2**30:.1f} GiB, must take at most 4; split the file"
         )
 
 
 @contextmanager
 def _explained(file: Path) -> Iterator[None]:
-    """Convert errors of libraries to errors with the file's name."""
+    """Convert a library's errors to errors that name the file."""
     try:
         yield
     except InputError:

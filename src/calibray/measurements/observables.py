@@ -1,4 +1,4 @@
-"""Further observables of links in addition to path loss: the measured quantity of a link's paths, and its unit."""
+"""Observables of links in addition to path loss: measured statistics of a link's paths, and their units."""
 
 from __future__ import annotations
 
@@ -35,24 +35,24 @@ KINDS: Final = {
     DEPARTURE_SECTOR: "dB",
     ARRIVAL_SECTOR: "dB",
 }
-"""Kinds of observables, with the unit of their values."""
+"""Kinds of observables, each with the unit of its values."""
 
 FLIGHTS: Final = (TIME_OF_FLIGHT, ROUND_TRIP)
-"""Kinds that are times, for which a device may have a bias."""
+"""Kinds that are times, in which a device may have a bias."""
 
 SECTORS: Final = (DEPARTURE_SECTOR, ARRIVAL_SECTOR)
 PROFILES: Final = (DELAY_BIN, *SECTORS)
-"""Kinds that are shares of a link's power in bins: one value per bin, each a separate observable."""
+"""Kinds that are shares of a link's power in bins; each bin is a separate observable."""
 
 SIGNED: Final = (K_FACTOR, *FLIGHTS, *PROFILES)
-"""Kinds whose measured values can be negative: decibels, and times of a clock with a bias."""
+"""Kinds whose measured values can be negative: values in decibels, and times from a clock with a bias."""
 
 SHARE_RANGE_DB: Final = 30.0
 """Dynamic range of the share of power in a bin, unless a study states one [dB]."""
 
 ROUNDING: Final = 1e-12
-"""Delays [s] and azimuths [rad] this close to a limit are on it, as samples at multiples of 1 / bandwidth can be. It is
-more than their differences are rounded by, and less than any receiver resolves."""
+"""Distance within which delays [s] and azimuths [rad] count as on a limit, as for samples at multiples of 1 /
+bandwidth. It exceeds the rounding errors of their differences, and is below the resolution of any receiver."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,10 @@ class Statistic:
         path: Path of a time of flight: "mean", "first" or "strongest".
         dynamic_range_db: Largest level below the strongest path at which the receiver detects paths [dB]; None for all
             paths.
-        floor_db: Path gain below which it detects no paths [dB]; None for no limit.
+        floor_db: Path gain below which the receiver detects no paths [dB]; None for no limit.
         window: Longest delay after the first path [s]; None for no limit.
-        bandwidth: Bandwidth of the receiver [Hz]; None if it resolves all paths.
-        edges: Ends of the bin of one of `PROFILES`: delays after the first path [s], or azimuths [rad].
+        bandwidth: Bandwidth of the receiver [Hz]; None if the receiver resolves all paths.
+        edges: Edges of the bin of one of `PROFILES`: delays after the first path [s], or azimuths [rad].
     """
 
     kind: str
@@ -80,10 +80,10 @@ class Statistic:
 
     @property
     def bin(self) -> tuple[float, float]:
-        """Ends of the bin, each less by `ROUNDING`: a value at the lower end is inside, one at the upper end is not.
+        """Edges of the bin, both reduced by `ROUNDING`: a value at the lower edge is inside, one at the upper is not.
 
         Raises:
-            ValueError: It has none.
+            ValueError: The statistic has no bin.
         """
         if self.edges is None:
             raise ValueError(f"{self.kind}: needs edges, the ends of its bin")
@@ -108,10 +108,10 @@ class Wanted:
     """A statistic that an external program computes.
 
     Attributes:
-        name: Its name in the study.
-        statistic: What is measured.
-        unit: Unit of the answer.
-        scale: The unit in SI units.
+        name: Name of the observable in the study.
+        statistic: The statistic.
+        unit: Unit of the program's answer.
+        scale: Size of this unit in SI units.
     """
 
     name: str
@@ -120,6 +120,6 @@ class Wanted:
     scale: float
 
     def record(self) -> dict[str, object]:
-        """The description sent to a program: name, kind, unit, and the limits that the study states."""
+        """The description sent to the program: name, kind, unit, and the limits that the study states."""
         limits = {key: value for key, value in asdict(self.statistic).items() if value is not None}
         return {"name": self.name, "unit": self.unit, **limits}

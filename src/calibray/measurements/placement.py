@@ -19,17 +19,17 @@ TRACK_COLUMNS: Final = ("track_longitude", "track_latitude")
 """The columns of a row's position on a track [deg]."""
 
 NOT_ON_TRACK: Final = "rows without a position on the track, left out"
-"""The entry in `changes` of rows outside the times of a track; more follows if another clock fits clearly better."""
+"""The entry in `changes` for rows outside the times of a track; extended if another time zone fits clearly better."""
 
 MAX_FILE_SIZE: Final = 200_000_000
-"""Largest GPX file that is read [bytes]; a track with one point per second reaches it after three weeks."""
+"""Largest GPX file that is read [bytes]; a track with one point per second reaches this size after three weeks."""
 
 
 def join_track(table: SourceTable, track: Track) -> SourceTable:
-    """Give rows the positions of a track, linear in time between its points; rows outside its times are left out.
+    """Give rows positions on a track, interpolated linearly in time; rows outside the track's times are left out.
 
-    Times are texts in ISO 8601 (UTC unless they name a time zone), or seconds since 1970. Altitudes are not used: those
-    of satellite receivers have errors of metres. The new columns are `TRACK_COLUMNS`.
+    Times are texts in ISO 8601 (UTC unless they state a time zone), or seconds since 1970. Altitudes are not used,
+    because altitudes of satellite receivers have errors of several metres. The new columns are `TRACK_COLUMNS`.
 
     Raises:
         InputError: The track or a time cannot be read, or no row lies within the times of the track.
@@ -50,7 +50,7 @@ def join_track(table: SourceTable, track: Track) -> SourceTable:
             f"{first} to {last}; {remedy}"
         )
     table = table.keep(covered, NOT_ON_TRACK + (f", which {clock} would keep" if shift else ""))
-    # Across 180 degrees, unwrapped longitudes continue beyond 180.
+    # Unwrapped longitudes continue beyond 180 degrees where the track crosses the antimeridian.
     longitude = np.interp(seconds[covered], times, np.unwrap(points["longitude"], period=360.0))
     latitude = np.interp(seconds[covered], times, points["latitude"])
     return table.assign(**dict(zip(TRACK_COLUMNS, ((longitude + 180) % 360 - 180, latitude), strict=True)))
@@ -93,19 +93,19 @@ def _row_times(table: SourceTable, track: Track) -> NDArray[np.float64]:
 def _covered(
     times: NDArray[np.float64], seconds: NDArray[np.float64], longest_gap: float
 ) -> NDArray[np.bool_]:
-    """Which rows lie between two points of a track, at increasing `times`, that are not too far apart in time."""
+    """Mask of rows between two points of a track, at increasing `times`, that are not too far apart in time."""
     after = np.clip(np.searchsorted(times, seconds, side="left"), 0, len(times) - 1)
-    # At the time of a point itself, gaps next to it do not matter.
+    # For a row at exactly the time of a point, the gaps next to this point do not matter.
     before = np.where(times[after] == seconds, after, np.maximum(after - 1, 0))
-    # Before and after the track, and at missing times (NaN), one of the comparisons is false.
+    # Before the track, after it, and at missing times (NaN), one of the comparisons is false.
     between = (times[before] <= seconds) & (seconds <= times[after])
     return between & (times[after] - times[before] <= longest_gap)
 
 
 def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], longest_gap: float) -> float:
-    """How much a clock in another time zone would be ahead of that of the track [s]; 0 if it does not fit better.
+    """Offset of the time zone that fits better, ahead of the track's clock [s]; 0 if none fits better.
 
-    It fits better if at least a tenth of the rows do not lie on the track, and most of them do with this clock.
+    At least a tenth of the rows must not lie on the track, and the time zone must more than halve their number.
     """
     seconds = seconds[np.isfinite(seconds)]
     seconds = seconds[:: 1 + len(seconds) // 10_000]
@@ -118,7 +118,7 @@ def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], long
 
 
 def _reason(error: Exception) -> str:
-    """Why pandas cannot read a time, without its advice on arguments."""
+    """The reason why pandas cannot read a time, without its advice on arguments."""
     return first_line(error).partition(". You might")[0]
 
 
@@ -128,7 +128,7 @@ def _seconds(times: pd.Series) -> NDArray[np.float64]:
 
 
 def _read_gpx(path: Path) -> pd.DataFrame:
-    """Time (UTC), longitude and latitude [deg] of all track points, in the order of time."""
+    """Time (UTC), longitude and latitude [deg] of all track points, in chronological order."""
     try:
         if path.stat().st_size > MAX_FILE_SIZE:
             raise InputError(f"track {path}: larger than {MAX_FILE_SIZE / 1e6:.0f} MB; split it")
@@ -150,7 +150,7 @@ def _read_gpx(path: Path) -> pd.DataFrame:
         raise InputError(f"track {path}: no track point has a time; export the track, not a route")
     try:
         points["time"] = pd.to_datetime(points["time"], utc=True, format="ISO8601")
-        # Years before 1678 and after 2262 are read, but cannot be subtracted.
+        # pandas reads years before 1678 and after 2262, but cannot subtract them.
         _seconds(points["time"])
     except (ValueError, OverflowError) as error:
         raise InputError(
@@ -184,7 +184,7 @@ POSITION_COLUMNS: Final = (*TX_COLUMNS, *RX_COLUMNS)
 
 
 def position_columns(tx: NDArray[np.float64], rx: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    """The columns `POSITION_COLUMNS` of links with ends [n, 3], [m]; one transmitter [3] serves all links."""
+    """The columns `POSITION_COLUMNS` of links with ends at `tx` and `rx` [n, 3], [m]; `tx` may be one position [3]."""
     ends = np.hstack([np.broadcast_to(tx, rx.shape), rx])
     return dict(zip(POSITION_COLUMNS, ends.T, strict=True))
 
@@ -199,10 +199,10 @@ def ends_of(frame: pd.DataFrame) -> NDArray[np.float64] | None:
 def place_rows(
     table: SourceTable, steps: Preparation, tx: Coordinates, rx: Coordinates
 ) -> tuple[SourceTable, Coordinates, Coordinates]:
-    """Write the positions of both ends as the columns `TX_COLUMNS` and `RX_COLUMNS` in metres.
+    """Write the positions of both ends to the columns `TX_COLUMNS` and `RX_COLUMNS` in metres.
 
-    A position is x, y, z (numbers [m], columns in `steps.unit_m`), or with a frame longitude, latitude [deg] and height
-    [m]. Returns the rows and the names of the columns; returns the arguments unchanged if the only step is a filter.
+    A position is x, y, z (numbers in metres, columns in units of `steps.unit_m`), or with a frame, longitude, latitude
+    [deg] and height [m]. Returns the rows and the names of the columns, or the arguments if the only step is a filter.
 
     Raises:
         InputError: A column is missing or not numeric, or a position is not on the globe.
@@ -218,7 +218,7 @@ def _positions(
 ) -> NDArray[np.float64]:
     """Positions [rows, 3], [m] of one end."""
     if steps.frame is None:
-        # Numbers are metres; columns are in the table's unit.
+        # Numbers are in metres, columns in the table's unit.
         scale = [steps.unit_m if isinstance(coordinate, str) else 1.0 for coordinate in coordinates]
         positions = table.positions(end, coordinates) * scale
         height = positions[:, 2]
@@ -233,15 +233,15 @@ def _positions(
             ground = steps.ground(positions[:, 0], positions[:, 1])
         except InputError as error:
             raise InputError(f"{table.source}: {end}: {error}") from None
-        # Heights are then above the ground, not above the origin or the sea.
+        # The given heights are above the ground, not above the origin or the sea.
         positions[:, 2] = ground + height
     return positions
 
 
 def clear_buildings(table: SourceTable, steps: Preparation, rx: Coordinates) -> SourceTable:
-    """Leave out or move receivers that are inside buildings, as seen from above.
+    """Leave out or move receivers that are inside buildings in plan view.
 
-    The steps `inside` and `outside` are used; without them, the table itself is returned. With the step `ground`, a
+    The steps `inside` and `outside` are used; without them, the table is returned unchanged. With the step `ground`, a
     moved receiver keeps its height above the ground.
 
     Raises:

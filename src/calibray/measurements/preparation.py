@@ -20,13 +20,13 @@ Ground = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64
 """Height of the ground [m] as a function of x and y [m]."""
 
 MoveOutside = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
-"""From positions [n, 3] to positions outside buildings (NaN if too deep inside) and the moved distances [n], [m]."""
+"""Maps positions [n, 3] to positions outside buildings (NaN if too deep inside) and the moved distances [n], [m]."""
 
 Compute = Callable[[SourceTable], NDArray[np.float64] | None]
-"""Values of a new column [rows] from the rows of a table."""
+"""Function from the rows of a table to the values of a new column [rows]; None if a column is missing."""
 
 Divide = Callable[[SourceTable], NDArray[Any]]
-"""Labels [rows] of the parts to which the rows of a table belong."""
+"""Function from the rows of a table to the labels of the parts to which they belong [rows]."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class LinkColumns:
         tx: Transmitter position: x, y, z [m], or longitude, latitude [deg] and height [m].
         rx: Receiver position, likewise.
         value: Column of the measured values.
-        quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm]: a received power with
-            unknown transmitted power. The path loss is then minus the received power, and an offset contains the
-            transmitted power.
+        quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm]: received power with
+            unknown transmitted power. The path loss is then the negative of the received power, and an offset includes
+            the transmitted power.
         group: Column of group labels, or several columns whose labels are joined.
         weight: Column of relative weights [1], greater than 0.
         std: Standard deviation [dB] of the values, a number or a column; the weights become 1 / std^2.
@@ -80,12 +80,12 @@ class Averaging:
     """How samples are averaged, in linear power.
 
     Attributes:
-        by: "place" of equal receiver positions, "cell" of a square grid, stretch of "distance" along the rows' order,
-            or window of "time".
+        by: Samples that are averaged together: at the same "place" (equal receiver positions), in a "cell" of a square
+            grid, in a stretch of "distance" travelled in the order of the rows, or in a window of "time".
         size: Width or length [m], or duration [s]; not used for "place".
         time: Column of times, for "time".
-        unbiased: Whether to correct the bias of the logarithm of a mean of few samples.
-        minimum_count: Smallest number of samples of an average; averages of fewer samples are left out.
+        unbiased: Whether to correct the bias in the logarithm of a mean of few samples.
+        minimum_count: Smallest number of samples in an average; averages of fewer samples are left out.
     """
 
     by: Literal["place", "cell", "distance", "time"]
@@ -97,12 +97,12 @@ class Averaging:
 
 @dataclass(frozen=True)
 class Track:
-    """A GPX track that gives the positions of rows by their times.
+    """A GPX track, which gives rows a position at their times.
 
     Attributes:
         file: GPX file.
-        time: Column of the rows' times.
-        longest_gap: Largest time between two track points [s]; rows between points farther apart are left out.
+        time: Column with the times of the rows.
+        longest_gap: Longest time between two track points [s]; rows between points farther apart in time are left out.
         clock: Time by which the rows' clock is ahead of the track's [s].
     """
 
@@ -117,27 +117,27 @@ class Preparation:
     """The steps that convert rows to links; none by default.
 
     Attributes:
-        wide: Name of the transmitter by column, for a table with one column per transmitter.
+        wide: Transmitter name for each column, for a table with one column per transmitter.
         track: Track that gives each row the columns `selection.TRACK_COLUMNS` [deg].
         where: Row filter.
-        transmitters: One row per transmitter; links get its other columns.
-        transmitter: Column of both tables that names the transmitter.
-        missing: Numbers that mean that nothing was measured, in addition to those that are detected.
-        noise_floor_dbm: Noise floor [dBm]; missing powers count as below it.
+        transmitters: Table with one row per transmitter, whose other columns are added to the links.
+        transmitter: Column that names the transmitter in both tables.
+        missing: Numbers that stand for a missing value, in addition to those that are detected.
+        noise_floor_dbm: Noise floor [dBm]; missing powers count as below the floor.
         censored: Whether links at or below the noise floor are kept, as censored links at the floor.
         frame: The scene's frame on the globe, if positions are longitude, latitude and height; None for lengths.
-        crs: Reference system of positions that have a frame.
+        crs: Coordinate reference system of positions, if there is a frame.
         unit_m: Length of one unit of position columns in the scene's frame [m].
-        ground: Height of the ground, if heights are measured from it.
+        ground: Height of the ground, if heights are measured from the ground.
         averaging: How samples are averaged.
-        keep: Columns whose groups averages keep apart, in addition to the transmitter's.
-        held_out: Labels of the parts that are held out separately, which averages and merged rows keep apart as well.
+        keep: Columns whose groups are averaged separately, in addition to the transmitter column.
+        held_out: Labels of the parts that are held out separately; samples are not averaged or merged across parts.
         observables: Columns of further measured values, which are averaged over rows that repeat a link.
-        flights: Those of them that contain times of flight, in which numbers can mean a missing value.
-        computed: Further columns by name, computed from the rows with the columns of their transmitters. A function
-            returns None if a column that it needs is missing and optional.
+        flights: Observables that are times of flight, in which certain numbers can stand for a missing value.
+        computed: Functions that compute further columns, by name, after the transmitters' columns are added. A function
+            returns None if an optional column that it needs is missing.
         inside: What to do with receivers inside buildings; nothing if None.
-        outside: Moves positions out of buildings; needed with `inside`.
+        outside: Function that moves positions out of buildings; required with `inside`.
     """
 
     wide: Mapping[str, str] = field(default_factory=dict)
@@ -163,7 +163,7 @@ class Preparation:
 
     @property
     def is_filter_only(self) -> bool:
-        """Whether rows are links already, except for the filter."""
+        """Whether a filter is the only step, so that the remaining rows already are links."""
         steps = (
             *(self.track, self.transmitters, self.noise_floor_dbm, self.frame, self.ground),
             *(self.averaging, self.inside),

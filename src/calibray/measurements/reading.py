@@ -1,13 +1,13 @@
 """From a table to links: read the file, select rows, place them, average or merge, clear buildings, check.
 
 Samples are averaged to one row per area or place, in linear power. Along a street, the power fades by several dB within
-a wavelength. Ray tracing from one point does not predict this fading; it predicts the mean power over some tens of
+a wavelength. Ray tracing from one point does not predict this fading; it predicts the mean power over a few tens of
 wavelengths (W. C. Y. Lee, "Estimate of local average power of a mobile radio signal", IEEE Trans. Veh. Technol. 34(1),
-1985: 40 wavelengths, 36 to 50 samples). The mean is taken of powers, not of decibels: for Rayleigh fading, the mean of
-the decibels is 2.5 dB too low.
+1985: 40 wavelengths, 36 to 50 samples). Linear powers are averaged, not decibels: for Rayleigh fading, the mean of the
+decibel values is 2.5 dB too low.
 
 The logarithm of a mean of few samples is also biased low, by (10 / ln 10) var / (2 n mean^2) to second order (delta
-method): 0.2 dB for ten samples of Rayleigh fading, and zero for a single path.
+method): 0.2 dB for ten samples with Rayleigh fading, and zero for a single path.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ def read_measurements(
         tx: Transmitter position (x, y, z) [m] in the scene's frame, each a number or the name of a column.
         rx: Receiver position, likewise.
         value: Column of the measured values.
-        quantity: The measured quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm], a
+        quantity: The measured quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm],
             received power with unknown transmitted power (see `LinkColumns`).
-        where: Filter over the columns (see `filters`); rows that do not pass are left out before any check.
+        where: Row filter on the columns (see `filters`); rows that do not pass are left out before any check.
         group: Column of group labels.
         weight: Column of relative weights [1], greater than 0.
         std: Standard deviation [dB] of the values, a number or a column; the weights become 1 / std^2.
@@ -69,7 +69,7 @@ def read_measurements(
 
     Raises:
         InputError: The file or a column is missing or malformed, a value is missing, not a number or implausible, or
-            no row passes.
+            no row passes the filter.
     """
     columns = LinkColumns(tx, rx, value, quantity, group, weight, std, tx_power_dbm, frequency)
     return measured_links(read_table(path), columns, Preparation(where=where))
@@ -103,10 +103,10 @@ def links_from_table(
     tx: Coordinates = TX_COLUMNS,
     rx: Coordinates = RX_COLUMNS,
 ) -> Measurements:
-    """Links without measured values, with NaN as path loss, from the rows of a file.
+    """Links without measured values, with NaN as path loss, from the rows of a table.
 
-    Labels of several columns in `group` are joined. If the table lacks the column `frequency` [Hz], all links have the
-    study's carrier. No step may leave out rows.
+    If `group` names several columns, their labels are joined. If `frequency`, a column of carriers [Hz], is None or
+    missing in the table, all links have the study's carrier. No step may leave out rows.
 
     Raises:
         InputError: There are no rows, a column is missing or malformed, or a position is not finite.
@@ -126,18 +126,18 @@ def links_from_table(
 
 
 PLAUSIBLE_PATH_LOSS_DB: Final = (20.0, 250.0)
-"""Range [dB] of plausible path losses; a value outside usually has the wrong sign, unit or column."""
+"""Range of plausible path losses [dB]; a value outside it usually has the wrong sign, unit or column."""
 
 PLAUSIBLE_POWER_DBM: Final = (-200.0, 30.0)
-"""Range [dBm] of plausible received powers; a value outside usually has the wrong sign, unit or column."""
+"""Range of plausible received powers [dBm]; a value outside it usually has the wrong sign, unit or column."""
 
 
 LINEAR: Final = 0.1
-"""Magnitude [dBm] below which all received powers of a table lie only if they are in another unit, such as watts."""
+"""Magnitude; if all received powers of a table are below it, they are not in dBm but in another unit, such as watts."""
 
 
 def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> Measurements:
-    """Make one link of each row; positions are in metres. The steps `noise_floor_dbm` and `censored` are used here.
+    """Make one link from each row; positions are in metres. The steps `noise_floor_dbm` and `censored` are used here.
 
     Raises:
         InputError: A column is missing, or a value is missing, not a number or implausible.
@@ -145,7 +145,7 @@ def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> 
     limit_db = censored = None
     if steps.noise_floor_dbm is not None:
         sent_dbm = 0.0 if columns.tx_power_dbm is None else table.numbers(columns.tx_power_dbm)
-        # The path loss at which the received power is the noise floor.
+        # The path loss at which the received power equals the noise floor.
         limit_db = np.full(len(table), sent_dbm - steps.noise_floor_dbm)
         censored = table.numbers(columns.value) <= steps.noise_floor_dbm if steps.censored else None
     return Measurements(
@@ -169,7 +169,7 @@ def _carriers(table: SourceTable, column: str | None) -> NDArray[np.float64] | N
 
 
 def _path_loss_db(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
-    """Path loss [rows], [dB]; minus the received power [dBm] if the transmitted power is unknown."""
+    """Path loss [rows], [dB]; the negative of the received power [dBm] if the transmitted power is unknown."""
     measured = table.numbers(columns.value)
     if columns.quantity in ("rsrp", "received_power") and np.abs(measured).max() < LINEAR:
         raise InputError(
@@ -211,7 +211,7 @@ def _check_range(
 
 
 def _weights(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
-    """Relative weights [rows], from weights or standard deviations."""
+    """Relative weights [rows], from a column of weights or from standard deviations."""
     source = columns.weight if columns.std is None else columns.std
     if source is None:
         return np.ones(len(table))
@@ -223,25 +223,26 @@ def _weights(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
         raise InputError(
             f"{table.cell(first, source)}: {values[first]:g} must be greater than 0; remove the row with a where filter"
         )
-    # Inverse variances: the best weights of independent normal errors.
+    # Inverse variances are the optimal weights for independent normal errors.
     return values if columns.std is None else 1 / values**2
 
 
 MAX_UNCERTAINTY_DB: Final = 1.0
-"""Largest uncertainty of an average from its samples below the noise floor [dB]; averages with more are left out."""
+"""Largest uncertainty of an average due to samples below the noise floor [dB]; averages above it are left out."""
 
 _AREA: Final = "calibray area"
 _PART: Final = "calibray part"
 
 
 def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
-    """Average the samples of one area, transmitter, carrier and group; without averaging, return the table itself.
+    """Average the samples of each area, transmitter, carrier and group; without averaging, return the table unchanged.
 
-    A sample below the noise floor has a power between zero and the floor, and counts as half of the floor. Averages
-    whose uncertainty then exceeds `MAX_UNCERTAINTY_DB` are left out, because the samples above the floor are only the
-    strong ones. The steps `averaging`, `keep`, `held_out`, `transmitter` and `noise_floor_dbm` are used. Returns for
-    each average the row of its first sample, with the mean receiver position, the mean value, and the columns `std_db`
-    (standard deviation of the samples [dB], NaN for one sample) and `count`; weights and further observables are means.
+    A sample below the noise floor has a power between zero and the floor, and counts as half the floor. Averages whose
+    uncertainty then exceeds `MAX_UNCERTAINTY_DB` are left out, because the samples above the floor are only the strong
+    ones. The steps `averaging`, `keep`, `held_out`, `transmitter` and `noise_floor_dbm` are used. Returns the row of
+    the first sample of each average, with the mean receiver position, the mean value, and the columns `std_db`
+    (standard deviation of the samples [dB], NaN for one sample) and `count`. Weights and further observables are also
+    averaged.
 
     Raises:
         InputError: A column is missing or not numeric, a time cannot be read, or no average remains.
@@ -269,7 +270,7 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     group = np.asarray(labels.groupby(list(labels), sort=False, dropna=False).ngroup(), dtype=np.int64)
 
     samples = pd.DataFrame({name: table.numbers(name) for name in rx})
-    # Relative to the strongest sample, so that weak powers do not underflow.
+    # Powers are relative to the strongest sample, so that weak ones do not underflow.
     samples["power"] = 10 ** ((level - level.max()) / 10)
     samples["level"] = level
     samples["below"] = 0.0
@@ -284,19 +285,19 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     uncertain = np.zeros(len(mean), dtype=bool)
     if steps.noise_floor_dbm is not None and samples["below"].any():
         table = table.note("of them at or below the noise floor", int(samples["below"].sum()))
-        highest = 10 ** (mean_level / 10)  # The samples below the floor count as the whole floor.
+        highest = 10 ** (mean_level / 10)  # Samples below the floor count as equal to the floor.
         from_below = mean["below"].to_numpy() * 10 ** (steps.noise_floor_dbm / 10)
         lowest = np.maximum(highest - from_below, 0.0)
-        # The true mean lies between both.
+        # The true mean lies between the lowest and the highest.
         uncertain = highest > lowest * 10 ** (MAX_UNCERTAINTY_DB / 10)
         mean_level = 10 * np.log10(highest - from_below / 2)
     if averaging.unbiased:
-        # Delta method: E[ln m] is below ln E[m] by var / (2 n mean^2), here in decibels.
+        # Delta method: E[ln m] is less than ln E[m] by var / (2 n mean^2), here converted to decibels.
         bias_db = 5 / np.log(10) * groups["power"].var() / (count * mean["power"] ** 2)
         mean_level = mean_level + bias_db.fillna(0.0).to_numpy()
     table = _note_steps(table, group, level, samples["below"].to_numpy() == 0, keys)
 
-    # A deviation that averages state themselves, std_db, is no column of the samples.
+    # `std_db` and `count` are computed for the averages, so they are not columns of the samples.
     stated = {columns.weight, columns.std} - {"std_db", "count"}
     weights = [str(name) for name in stated if name in table.frame]
     averages = table.select(~pd.Series(group).duplicated().to_numpy()).assign(
@@ -312,7 +313,7 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
 
 
 def _areas(table: SourceTable, averaging: Averaging, rx: Sequence[str]) -> NDArray[np.int64]:
-    """Number of the place, cell, stretch or window of every row [rows]; `rx` names the columns of x, y and z [m]."""
+    """Index of the place, cell, stretch or window of every row [rows]; `rx` names the columns of x, y and z [m]."""
     if averaging.by == "place":
         positions = np.stack([table.numbers(name) for name in rx], axis=1)
         return join_positions(positions)
@@ -324,18 +325,18 @@ def _areas(table: SourceTable, averaging: Averaging, rx: Sequence[str]) -> NDArr
     positions = np.stack([table.numbers(name) for name in rx[:2]], axis=1)
     if averaging.by == "distance":
         steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-        # Stretches of the distance along the track, in the order of the rows.
+        # Stretches of equal distance along the track, in the order of the rows.
         return np.floor(np.cumsum([0.0, *steps]) / averaging.size).astype(np.int64)
     cells = np.floor(positions / averaging.size).astype(np.int64)
     return np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 LATEST: Final = 1e11
-"""Largest number of seconds since 1970; loggers on phones write milliseconds, a thousand times as many."""
+"""Largest number of seconds since 1970; phone loggers write milliseconds, which are 1000 times larger."""
 
 
 def _elapsed(table: SourceTable, time: str) -> NDArray[np.float64]:
-    """Times of the rows [rows], [s] from an arbitrary start."""
+    """Times of the rows [rows], [s], relative to an arbitrary start."""
     column = table.column(time)
     if pd.api.types.is_numeric_dtype(column):
         seconds = table.numbers(time)
@@ -351,18 +352,18 @@ def _elapsed(table: SourceTable, time: str) -> NDArray[np.float64]:
 
 
 SAME_POSITION: Final = 1e-4
-"""Distance [m] per axis up to which positions are equal, as in meshes: coordinates are written with a resolution of a
-millimetre at best, and conversions of coordinates differ by micrometres."""
+"""Distance per axis up to which positions count as equal, as in meshes [m]. Coordinates are written to a millimetre at
+best, and coordinate conversions differ by micrometres."""
 
 
 def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
-    """Merge the rows of one link: its first row, with means of linear power, of weights and of further observables.
+    """Merge the rows of each link into its first row, with the means of linear power, weights and further observables.
 
     Rows belong to one link if their positions agree within `SAME_POSITION`, and transmitter, kept columns, carrier,
-    transmitted power and times are equal. Rows at different times stay separate links. A link below the noise floor is
-    not merged with one above it, and a held-out row not with others. Receivers inside buildings are moved later: two
-    positions may be moved to the same corner. The steps `keep`, `held_out`, `observables`, `transmitter`,
-    `noise_floor_dbm` and `averaging` are used; averages merge repeats already.
+    transmitted power and times are equal. Rows at different times remain separate links. A link below the noise floor
+    is not merged with one above it, nor a held-out row with other rows. Receivers inside buildings are moved only after
+    merging, because two positions may be moved to the same corner. The steps `keep`, `held_out`, `observables`,
+    `transmitter`, `noise_floor_dbm` and `averaging` are used; after averaging, no repeats remain to be merged.
 
     Raises:
         InputError: A column is missing or not numeric.
@@ -392,7 +393,7 @@ def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) 
     # A gain or power rises with the linear power, a loss falls with it.
     sign = -1.0 if columns.quantity == "path_loss" else 1.0
     level = sign * value
-    # Relative to the strongest row of each link, so that equal values stay equal to the last digit.
+    # Powers are relative to the strongest row of each link, so that equal values remain equal to the last digit.
     strongest = pd.Series(level).groupby(link).transform("max").to_numpy()
     mean = pd.Series(10 ** ((level - strongest) / 10)).groupby(link).mean().to_numpy()
     merged = {columns.value: sign * (strongest[first] + 10 * np.log10(mean))}
@@ -406,18 +407,18 @@ def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) 
 
 
 def _means(table: SourceTable, name: str, group: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Means of a column's values, without missing ones, over groups of rows [rows]."""
+    """Mean of a column's values, ignoring missing ones, over each group of rows; `group` numbers the rows [rows]."""
     return np.asarray(pd.Series(table.numbers(name, gaps=True)).groupby(group).mean(), dtype=np.float64)
 
 
 LEAST_STEP_DB: Final = 1.0
-"""Smallest difference between labels of a column that is noted if rows of different labels become one link."""
+"""Smallest power difference between labels of a column that is noted if rows with different labels become one link."""
 
 LEAST_RATIO: Final = 5.0
-"""The same as a multiple of its standard error: by chance, one of two million labels differs by more."""
+"""Smallest ratio of this difference to its standard error; by chance, one in two million labels exceeds it."""
 
 MOST_LABELS: Final = 50
-"""Largest number of labels; more would be names of links or of positions."""
+"""Largest number of labels in such a column; a column with more probably names links or positions."""
 
 
 def _note_steps(
@@ -427,16 +428,16 @@ def _note_steps(
     usable: NDArray[np.bool_],
     apart: Sequence[str],
 ) -> SourceTable:
-    """Note columns of texts, such as days, on whose labels the power of a link depends although they are averaged.
+    """Note text columns, such as days, whose labels affect the power of a link although rows are averaged over them.
 
-    Every link is one observation of this difference, because its rows can share errors.
+    Every link counts as one observation of this effect, because its rows can share errors.
 
     Args:
         table: The rows.
         link: The link or average to which each row belongs [rows].
         level: Power or gain [rows], [dB].
-        usable: Rows whose level is above the noise floor [rows].
-        apart: Columns whose labels are kept apart.
+        usable: Mask of the rows whose level is above the noise floor [rows].
+        apart: Columns over whose labels rows are not averaged.
     """
     rows = pd.DataFrame({"link": link, "level": level})[usable]
     for name in [str(name) for name in table.frame if name not in apart]:
@@ -468,7 +469,7 @@ def _note_steps(
 
 
 def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkColumns) -> list[str]:
-    """Columns whose values differ between different links at the same positions; their samples are not averaged."""
+    """Columns that distinguish links at the same positions; samples with different values are not averaged."""
     groups: Sequence[str] = [columns.group] if isinstance(columns.group, str) else columns.group or ()
     names = [*groups, *steps.keep]
     names += [name for name in (columns.frequency, columns.tx_power_dbm) if isinstance(name, str)]
@@ -480,10 +481,10 @@ def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkCol
 def join_positions(
     positions: NDArray[np.float64], group: NDArray[np.int64] | None = None
 ) -> NDArray[np.int64]:
-    """Number the places of positions [N, axes], [m], in the order of the first positions [N].
+    """Number the distinct places among positions [N, axes], [m], in the order of their first occurrence [N].
 
-    Positions within `SAME_POSITION` of each other, directly or through others, are one place, unless they are of
-    different groups [N].
+    Positions within `SAME_POSITION` of each other, directly or through other positions, are one place, unless they
+    belong to different groups [N].
 
     Example:
         >>> join_positions(np.array([[1.0, 2.0], [1.0, 3.0], [1.0 + 1e-7, 2.0]])).tolist()
@@ -496,7 +497,7 @@ def join_positions(
         count = place.max() + 1
         for axis in positions.T:
             order = np.lexsort((axis, place))
-            # A position that is not a number is never a repeat; it is refused later.
+            # A position that is not a number (NaN) is never a repeat; it is refused later.
             starts = (np.diff(place[order]) > 0) | ~(np.diff(axis[order]) <= SAME_POSITION)
             place = place.copy()
             place[order] = np.concatenate([[0], np.cumsum(starts)])

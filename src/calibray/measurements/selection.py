@@ -20,11 +20,11 @@ from calibray.support.messages import MAX_LISTED, did_you_mean, shortened
 def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> SourceTable:
     """Select the rows that become links.
 
-    The steps run in the order of the code, so that a filter can use the columns of the track but not those of the
-    transmitters. The steps `wide`, `track`, `where`, `missing`, `flights`, `transmitters`, `computed`,
-    `noise_floor_dbm` and `censored` are used here. `value` is the column of the measured values; with `wide`, it is
-    the name of the new column. The remaining rows contain no numbers that mean a missing value (`missing_codes`).
-    Values at or below the noise floor, and missing values, are set to the floor.
+    The steps `wide`, `track`, `where`, `missing`, `flights`, `transmitters`, `computed`, `noise_floor_dbm` and
+    `censored` run in this order, so a filter can use the columns of the track but not those of the transmitters.
+    `value` is the column of the measured values; with `wide`, it is the name of the new column. Numbers that stand for
+    a missing value (`find_codes`) do not remain. With a noise floor, missing values and values at or below it are set
+    to the floor.
 
     Raises:
         InputError: A column is missing or malformed, a transmitter is unknown, or no row remains.
@@ -53,7 +53,7 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
         table = table.select(mask)
     if value in table.frame:
         table, coded = mask_codes(table, [value], steps.missing)
-        # With a noise floor, a missing power was too weak to measure; without one, it says nothing.
+        # With a noise floor, a missing power was too weak to measure; without one, it carries no information.
         if steps.noise_floor_dbm is None and coded.any():
             if coded.all():
                 raise InputError(
@@ -78,13 +78,13 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
 def melt(
     table: SourceTable, columns: Mapping[str, str], value: str, transmitter: str, *, keep_empty: bool = False
 ) -> SourceTable:
-    """One row per link, with those of one row together, from a table with one column per transmitter.
+    """Convert a table with one column per transmitter to one row per link; links of one row stay together.
 
-    `value` and `transmitter` name the new columns. With `keep_empty`, cells without a value become links, as for
-    prediction.
+    `value` and `transmitter` name the new columns. With `keep_empty`, cells without a value also become links, as
+    needed for prediction.
 
     Raises:
-        InputError: A column is missing, not numeric or named like a new one, or no cell has a value.
+        InputError: A column is missing, not numeric or named like a new column, or no cell has a value.
     """
     if len(set(columns.values())) != len(columns):
         raise InputError(
@@ -108,9 +108,9 @@ def melt(
 
 
 def plain_labels(column: Iterable[object]) -> list[str]:
-    """Labels for comparison: without case or white space at the ends, with 5 for 5.0 and a colon for a hyphen.
+    """Normalized labels: lower case, no white space at the ends, 5 instead of 5.0, and colons instead of hyphens.
 
-    Tools write the same address as `AA-BB` and as `aa:bb`, and whole numbers as floats if a column has gaps.
+    Tools write the same address as `AA-BB` or as `aa:bb`, and whole numbers as floats if a column has gaps.
 
     Example:
         >>> plain_labels(["C4-64", "c4:64 ", 5.0])
@@ -123,7 +123,7 @@ def plain_labels(column: Iterable[object]) -> list[str]:
 
 
 def comparison(names: Iterable[object]) -> Callable[[Iterable[object]], list[str]]:
-    """How labels are compared with names: with `plain_labels`, unless that makes two names equal."""
+    """The function that normalizes labels and names for comparison: `plain_labels`, unless it makes two names equal."""
     texts = list(map(str, names))
     if len(set(plain_labels(texts))) == len(set(texts)):
         return plain_labels
@@ -131,9 +131,9 @@ def comparison(names: Iterable[object]) -> Callable[[Iterable[object]], list[str
 
 
 def naming_column(transmitters: pd.DataFrame, labels: Iterable[object]) -> str | None:
-    """The column that names the transmitters in their table: no value twice, and at least half of some labels.
+    """The column that names the transmitters in their table: it has no repeated value and at least half the labels.
 
-    Returns None if no column or several columns do so.
+    Returns None if no column or more than one column qualifies.
 
     Example:
         >>> naming_column(pd.DataFrame({"id": ["a", "b"], "height": [5.0, 5.0]}), ["b", "b"])
@@ -149,7 +149,7 @@ def naming_column(transmitters: pd.DataFrame, labels: Iterable[object]) -> str |
 
 
 def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) -> SourceTable:
-    """Links with the other columns of their transmitters, which may be named in a column of another name."""
+    """Add the transmitters' other columns to the links; the column of transmitter names may have a different name."""
     label_of_link = table.labels(key).tolist()
     name = key if key in transmitters.frame else naming_column(transmitters.frame, label_of_link) or key
     labels = transmitters.labels(name).tolist()
@@ -169,14 +169,14 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
             f'where = "`{key}` not in [{cells}]"'
         )
     joined = transmitters.frame.drop(columns=name).iloc[[index_of_label[label] for label in compared_of_link]]
-    # A column that links have already keeps its name there, because filters and positions refer to it.
+    # Columns of the links keep their names, because filters and positions refer to them.
     joined = joined.rename(columns={name: f"{key}_{name}" for name in joined if name in table.frame})
     frame = pd.concat([table.frame.reset_index(drop=True), joined.reset_index(drop=True)], axis=1)
     return replace(table, frame=frame)
 
 
 def _apply_noise_floor(table: SourceTable, steps: Preparation, floor: float, value: str) -> SourceTable:
-    """Set powers at or below the noise floor to the floor; leave these rows out unless a later step uses them."""
+    """Set powers at or below the noise floor to the floor; leave out these rows unless a later step uses them."""
     power = table.numbers(value, gaps=True)
     below = ~(power > floor)  # A missing power counts as below the floor.
     table = table.assign(**{value: np.where(below, floor, power)})
@@ -191,21 +191,21 @@ CODES: Final = (
     *(0, 1, -1, 99, 100, 101, 127, 128, 255, 500, 999, 1000, 9999, 32767, 65535, 99999, 2147483647),
     *(-200, -255, -256, -500, -999, -1000, -9999, -32768, -99999, -2147483648),
 )  # fmt: skip
-"""Numbers that loggers use for missing values: UJIIndoorLoc (100), Wi-Fi RTT logs (-200), Android (2147483647), and
+"""Codes that loggers write for missing values: UJIIndoorLoc (100), Wi-Fi RTT logs (-200), Android (2147483647), and
 others."""
 
 MIN_GAP_DB: Final = 20.0
-"""Smallest distance of a code from every measured value [dB]."""
+"""Smallest difference between a code and any measured value [dB]."""
 
 LARGEST_LEVEL: Final = 190.0
 """Magnitude above which a code with the sign of the other values cannot be a power [dBm] or gain [dB]."""
 
 
 def find_codes(values: ArrayLike, largest: float = LARGEST_LEVEL) -> tuple[float, ...]:
-    """Find the numbers that mark a missing value among values [n], such as powers [dBm]; ascending.
+    """Find the codes that stand for a missing value among values [n], such as powers [dBm], in ascending order.
 
-    A number counts as a code if it is in `CODES`, is far from all other values, and has the other sign or an impossible
-    magnitude, above `largest`: 100 is a code among powers, and a value among path losses.
+    A number counts as a code if it is in `CODES`, is far from all other values, and has the opposite sign or an
+    impossible magnitude, above `largest`: 100 is a code among powers, but a value among path losses.
 
     Example:
         >>> find_codes([-70.0, 100.0, -200.0]), find_codes([70.0, 100.0, 130.0])
@@ -214,7 +214,7 @@ def find_codes(values: ArrayLike, largest: float = LARGEST_LEVEL) -> tuple[float
     numbers = np.asarray(values, dtype=np.float64)
     distinct = np.unique(numbers[np.isfinite(numbers)])
     is_candidate = np.isin(distinct, CODES)
-    # A loss of 100 dB is a candidate, and lies among the other losses.
+    # A path loss of 100 dB is a candidate, but close to other path losses.
     measured = distinct[~is_candidate]
     if not len(measured):
         return ()
@@ -237,11 +237,11 @@ def mask_codes(
 ) -> tuple[SourceTable, NDArray[np.bool_]]:
     """Set the codes in columns of measured values to missing, and record their number.
 
-    Codes are judged over all columns, which contain one quantity; stated codes apply whatever the other values are.
-    Returns the rows, and a mask [rows] of those in which a column had a code.
+    Codes are detected over all columns together, which contain one quantity; `stated` codes always apply. Returns the
+    table, and a mask of the rows that contained a code [rows].
 
     Raises:
-        InputError: There is no such column.
+        InputError: A column does not exist.
     """
     values = np.column_stack([_numbers(table.column(name)) for name in columns])
     codes = sorted({*find_codes(values), *map(float, stated)})
@@ -259,7 +259,7 @@ def mask_codes(
 
 
 def _numbers(column: pd.Series) -> NDArray[np.float64]:
-    """The numbers of a column [rows]; NaN for text, which is refused with its row where values are used."""
+    """The numbers in a column [rows]; NaN for text, which is refused, with its row, when values are used."""
     if not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_string_dtype(column)):
         return np.full(len(column), np.nan)
     return pd.to_numeric(column, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)

@@ -1,4 +1,4 @@
-"""Rows of a table with their lines in the file, so that messages can name file, row and column."""
+"""Rows of a table with their line numbers in the file, so that messages can name file, row and column."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class SourceTable:
 
     Attributes:
         frame: The rows.
-        row: Line [rows] of each row in a CSV file (the header is line 1) or in a sheet, otherwise its number from 1.
+        row: Line number of each row in a CSV file (the header is line 1) or sheet, otherwise its number from 1 [rows].
         source: Name of the file, or another name for messages.
-        changes: What earlier steps left out, averaged or moved, each with the number of rows.
+        changes: Changes by earlier steps, such as rows left out, averaged or moved, each with the number of rows.
     """
 
     frame: pd.DataFrame
@@ -57,7 +57,7 @@ class SourceTable:
         return replace(self, frame=self.frame.loc[mask].reset_index(drop=True), row=self.row[mask])
 
     def keep(self, mask: NDArray[np.bool_], reason: str) -> SourceTable:
-        """The rows where a mask [rows] is true; `changes` records the number of other rows under the reason.
+        """The rows where a mask [rows] is true; `changes` records the number of removed rows under the reason.
 
         Raises:
             InputError: No row remains.
@@ -68,7 +68,7 @@ class SourceTable:
         return (self.note(reason, lost) if lost else self).select(mask)
 
     def where(self, expression: str) -> NDArray[np.bool_]:
-        """Mask [rows] of the rows that pass a filter (see `filters`); missing values pass `!=` and `not in` alone.
+        """Mask [rows] of the rows that pass a filter (see `filters`); missing values pass only `!=` and `not in`.
 
         Raises:
             InputError: The expression is malformed, names an unknown column, or does not give one truth value per row.
@@ -144,15 +144,16 @@ class SourceTable:
                 f"{self.cell(first, names)}: the label is missing ({missing.sum()} in all); give one"
             )
         if pd.api.types.is_float_dtype(column):
-            # A label must not depend on other rows: beside gaps or 0.9, pandas stores the whole number 26 as 26.0.
+            # A label must not depend on other rows: in a column with gaps or 0.9, pandas stores the integer 26 as 26.0.
             return column.astype(str).str.removesuffix(".0").to_numpy(dtype=np.str_)
         return column.astype(str).to_numpy(dtype=np.str_)
 
     def positions(self, end: str, coordinates: Coordinates) -> NDArray[np.float64]:
-        """Positions [rows, 3], [m], in the scene's frame from three numbers or columns; `end` is "tx" or "rx".
+        """Positions [rows, 3], [m], in the scene's frame, from three numbers or columns; `end` is "tx" or "rx".
 
         Raises:
-            InputError: There are not three coordinates, or a column is missing, not numeric or named like degrees.
+            InputError: The number of coordinates is not three, or a column is missing, not numeric or named like
+                degrees.
         """
         if isinstance(coordinates, str) or len(coordinates) != 3:
             raise InputError(f"{end} = {coordinates!r}: must be x, y and z, each a number [m] or a column")
@@ -170,5 +171,5 @@ class SourceTable:
         return np.stack([self.numbers(coordinate) for coordinate in coordinates], axis=1)
 
     def cell(self, index: int, column: str) -> str:
-        """File, row and column of a cell, for messages."""
+        """The file, row and column of a cell, as text for messages."""
         return f"{self.source}, row {self.row[index]}, column {column!r}"

@@ -1,7 +1,7 @@
 """Read tables from CSV, Parquet and Excel files.
 
-The first sheet of a workbook is converted to CSV text, so that one parser reads both formats. It is read row by row, so
-a sheet whose only value is in its last row and column needs no more memory than others.
+The first sheet of a workbook is converted to CSV text, so that one parser reads both formats. Sheets are read row by
+row, so a sheet whose only value is in its last row and column needs no more memory than others.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ _ROW: Final = re.compile(rb"""<(?:\w+:)?row\s(?:[^>]*?\s)?r=["']([^"']*)["']""")
 
 
 def sheet_text(path: Path) -> tuple[list[int], str]:
-    """Read the first sheet of a workbook as CSV, with the sheet's row number of each row that is not blank.
+    """Read the first sheet of a workbook as CSV text, and the row number of each row that is not blank.
 
-    A formula counts as its last computed value. A formula without a value stays text, which no column of numbers
-    accepts. Of merged cells, the first contains the value and the others are empty. The columns are those of the
-    header, which is the first row.
+    A formula is replaced by its last computed value; without one, it remains text, which is refused in a column of
+    numbers. Of merged cells, the first contains the value and the others are empty. The header, which is the first row,
+    determines the columns.
 
     Raises:
         InputError: The file is not a workbook, has no sheet of cells, is too large, or has a value in a column
@@ -71,7 +71,7 @@ def sheet_text(path: Path) -> tuple[list[int], str]:
 
 
 def _check_archive(path: Path) -> bool:
-    """Refuse a workbook that is too large or has rows out of order; return whether it has formulas."""
+    """Refuse a workbook that is too large or has rows out of order; return whether it contains formulas."""
     with zipfile.ZipFile(path) as archive:
         size = sum(entry.file_size for entry in archive.infolist())
         if size > MAX_UNPACKED:
@@ -86,7 +86,7 @@ def _check_archive(path: Path) -> bool:
 
 
 def _check_row_order(path: Path, sheet: bytes) -> None:
-    """Refuse rows that are not in ascending order: openpyxl drops repeated ones and spends hours on filling gaps."""
+    """Refuse rows that are not in ascending order: openpyxl drops repeated rows and spends hours filling gaps."""
     previous = 0
     for text in _ROW.findall(sheet):
         number = int(text) if text.isdigit() and len(text) < 10 else 0
@@ -100,7 +100,7 @@ def _check_row_order(path: Path, sheet: bytes) -> None:
 
 
 def _rows(path: Path, computed: bool) -> Iterator[tuple[int, _Cells]]:
-    """Number and cells of every row that is not blank, up to its last value; computed values or formulas."""
+    """Number and cells of every row that is not blank, up to its last value, as computed values or as formulas."""
     import openpyxl
 
     # The file is opened here because openpyxl does not close files that it cannot read.
@@ -111,7 +111,7 @@ def _rows(path: Path, computed: bool) -> Iterator[tuple[int, _Cells]]:
         if not book.worksheets:
             raise InputError(f"{path}: has no sheet of cells; put the table into the first sheet")
         sheet = book.worksheets[0]
-        sheet.reset_dimensions()  # The size that a sheet states may be wrong.
+        sheet.reset_dimensions()  # The dimensions stated in a sheet may be wrong.
         count = 0
         for number, cells in enumerate(sheet.iter_rows(values_only=True), start=1):
             length = next((index for index in range(len(cells), 0, -1) if _has_value(cells[index - 1])), 0)
@@ -123,7 +123,7 @@ def _rows(path: Path, computed: bool) -> Iterator[tuple[int, _Cells]]:
 
 
 def _with_formulas(values: _Cells, formulas: _Cells) -> _Cells:
-    """A row of computed values, with the formula as text where no value was computed."""
+    """A row of computed values, with the formula as text where there is no computed value."""
     padded = (*values, *[None] * (len(formulas) - len(values)))
     return tuple(
         formula if value is None and str(formula).startswith("=") else value
@@ -132,7 +132,7 @@ def _with_formulas(values: _Cells, formulas: _Cells) -> _Cells:
 
 
 def _below_header(path: Path, rows: list[tuple[int, _Cells]]) -> list[tuple[int, _Cells]]:
-    """Rows cut and padded to the named columns of the first row, the header."""
+    """Rows truncated or padded to the named columns of the header, which is the first row."""
     if not rows:
         return rows
     header_row, header = rows[0]
@@ -155,18 +155,18 @@ def _has_value(cell: Any) -> bool:
 
 
 LARGEST_ROW_GROUP: Final = 2**30
-"""Largest decompressed size of a row group, or of a piece, of a Parquet file that is read in pieces [bytes]."""
+"""Largest decompressed size of a row group, or of a piece, when a Parquet file is read in pieces [bytes]."""
 
 LARGEST_TABLE: Final = 2 * LARGEST_ROW_GROUP
-"""Largest decompressed size of a Parquet file that is read at once [bytes]; pandas needs up to twice as much."""
+"""Largest decompressed size of a Parquet file that is read at once [bytes]; pandas needs up to twice as much memory."""
 
 DECODING_MEMORY: Final = 2 * LARGEST_TABLE
-"""Limit of the address space in which a Parquet file is first decoded [bytes]."""
+"""Limit on the address space of the process that first decodes a Parquet file [bytes]."""
 
 PIECE_ROWS: Final = 100_000
 """Largest number of rows of a Parquet file that are read together."""
 
-# Both codes import pyarrow without NumPy, which it does not need here: a process then takes 0.21 s instead of 0.39 s.
+# Both programs import pyarrow without NumPy, which is not needed here: a process takes 0.21 s instead of 0.39 s.
 _DECODE: Final = """
 sys.modules["numpy"] = None
 from pyarrow import parquet
@@ -198,14 +198,14 @@ except Exception as error:
 """
 
 _decoded: Final[set[tuple[str | int, ...]]] = set()
-"""Files that were decoded before and have not changed since."""
+"""Files that were already decoded, with the states in which they were decoded."""
 
 
 def read_table(path: str | Path) -> SourceTable:
-    """Read a .csv, .txt, .tsv, .dat, .parquet or .xlsx file without blank lines; of a workbook, the first sheet.
+    """Read a .csv, .txt, .tsv, .dat or .parquet file, or the first sheet of an .xlsx file, without blank lines.
 
-    Commas, semicolons, tabs or spaces separate the columns of a text. If the separator is not a comma, numbers may have
-    decimal commas. `parse_text` describes what is skipped.
+    The columns of a text are separated by commas, semicolons, tabs or spaces. If the separator is not a comma, numbers
+    may have decimal commas. `parse_text` describes which lines are skipped.
 
     Raises:
         InputError: The file does not exist, has another extension, is empty or malformed, or the library that reads it
@@ -222,8 +222,8 @@ def read_table(path: str | Path) -> SourceTable:
         case ".xlsx":
             numbers, text = sheet_text(path)
             table = parse_text(path, text, ",")
-            # Lines of the text count line breaks within cells, and rows of the sheet blank rows.
-            # The last rows are those of the table: the header, units and lines above it come first.
+            # Line numbers of the text also count line breaks within cells, and row numbers of the sheet blank rows.
+            # The header, units and lines above it come first, so the rows of the table are the last rows of the sheet.
             table = replace(table, row=np.array(numbers[len(numbers) - len(table) :], dtype=np.int64))
         case suffix:
             raise InputError(
@@ -237,12 +237,12 @@ def read_table(path: str | Path) -> SourceTable:
 @final
 @dataclass(frozen=True, eq=False)
 class PiecedTable:
-    """A table that is read in pieces, so that a large Parquet file is never in memory as a whole.
+    """A table that is read in pieces, so that a large Parquet file is never entirely in memory.
 
     Attributes:
         source: Name of the file.
         rows: Number of rows.
-        whole: All rows, if the file's format can only be read at once; None for Parquet.
+        whole: All rows, if the file's format does not support reading in pieces; None for Parquet.
     """
 
     source: str
@@ -254,7 +254,7 @@ class PiecedTable:
         """Open a CSV, Parquet or Excel file; CSV and Excel files are read immediately.
 
         Raises:
-            InputError: As `read_table`.
+            InputError: As for `read_table`.
         """
         path = Path(path)
         if path.suffix.lower() != ".parquet" or not exists(path):
@@ -271,7 +271,7 @@ class PiecedTable:
         return cls(str(path), rows, None)
 
     def pieces(self, size: int) -> Iterator[SourceTable]:
-        """The rows in the order of the file, in pieces of at most `size`; a column has the same type in all pieces.
+        """The rows in the order of the file, in pieces of at most `size` rows; a column has one type in all pieces.
 
         Raises:
             InputError: The file is damaged.
@@ -287,7 +287,7 @@ class PiecedTable:
             integers_with_gaps, start = _integer_columns_with_gaps(file), 0
             batches = file.iter_batches(batch_size=min(size, PIECE_ROWS))
             while (frame := _next_frame(path, batches)) is not None:
-                # NumPy has no missing integer, so pandas makes such a column float. A piece without a gap must agree.
+                # NumPy has no missing integer, so pandas converts such columns to float, also in pieces without gaps.
                 numpy_columns = [
                     name
                     for name in integers_with_gaps
@@ -313,7 +313,7 @@ def _read_parquet(path: Path) -> SourceTable:
 
 
 def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> int:
-    """The declared size of row groups [bytes], which is refused if too large: kilobytes may decompress to gigabytes.
+    """The declared size of row groups [bytes]; too large a size is refused, as kilobytes may decompress to gigabytes.
 
     Raises:
         InputError: The size exceeds the limit or the memory.
@@ -335,8 +335,8 @@ def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> int
 def _decode_elsewhere(path: Path, size: int, limit: int, whole: bool) -> None:
     """Decode a Parquet file in a process with limits: pages may be larger than declared, and rows may share one text.
 
-    Its declared size and the limit of its rows in memory are in bytes. The limit applies to the whole table or a row
-    group.
+    `size` is the declared size, and `limit` the largest size of the rows in memory, both in bytes. The limit applies to
+    the whole table or to a row group.
 
     Raises:
         InputError: The file needs more memory or time, or is damaged.
@@ -346,7 +346,7 @@ def _decode_elsewhere(path: Path, size: int, limit: int, whole: bool) -> None:
 
 
 def _run_elsewhere(path: Path, code: str, size: int) -> None:
-    """Run code on a file in a process with limits, once for each code and state of the file.
+    """Run a program on a file in a process with limits, once for each program and state of the file.
 
     Raises:
         InputError: The file needs more memory or time, or is damaged.
@@ -369,7 +369,7 @@ def _run_elsewhere(path: Path, code: str, size: int) -> None:
 def _open_parquet(path: Path) -> Any:
     from pyarrow import parquet
 
-    # The library ends the process where damaged metadata contradict themselves.
+    # The library terminates the process if damaged metadata is contradictory.
     _run_elsewhere(path, _METADATA.format(path=str(path.resolve())), path.stat().st_size)
     try:
         # With pre_buffer, pyarrow reads ahead and keeps every row group in memory.
@@ -387,7 +387,7 @@ def _next_frame(path: Path, batches: Iterator[Any]) -> Any:
 
 
 def _integer_columns_with_gaps(file: Any) -> list[str]:
-    """Integer columns with missing values, from the statistics of the row groups."""
+    """Integer columns with missing values, according to the statistics of the row groups."""
     from pyarrow import types
 
     integers = {column.name for column in file.schema_arrow if types.is_integer(column.type)}

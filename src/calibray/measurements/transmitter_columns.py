@@ -1,7 +1,7 @@
-"""Columns about transmitters.
+"""Find the columns that describe transmitters.
 
-They join a table of links with one of transmitters, contain the values of one transmitter each, or describe transmit
-antennas, as planning tools and operators name them.
+These columns join a table of links with a table of transmitters, contain the values of one transmitter each, or
+describe transmit antennas. Planning tools and operators use different names for them.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ location."""
 
 
 def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[str, str]:
-    """Find the columns of a wide table, and the transmitter of each.
+    """Find the columns of a wide table, and the transmitter of each column.
 
     The names of these columns differ only in the name of the transmitter, between separators. If there are several
-    quantities, received power or path loss is chosen. The result is empty if there are fewer than two.
+    quantities, received power or path loss is chosen. The result is empty if there are fewer than two such columns.
 
     Example:
         >>> find_wide_columns(pd.DataFrame({"x": [1.0], "rss_a": [-50.0], "rss_b": [-60.0]}), ["a", "b"])
@@ -33,7 +33,7 @@ def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[
         >>> list(find_wide_columns(pd.DataFrame(columns=["A RTT(mm)", "B RTT(mm)", "A RSS", "B RSS"]), ["A", "B"]))
         ['A RSS', 'B RSS']
     """
-    # By the rest of the name, such as " RSS(dBm)" of "AP1 RSS(dBm)".
+    # Columns by the rest of their name, such as " RSS(dBm)" of "AP1 RSS(dBm)".
     families: dict[tuple[str, str], dict[str, str]] = {}
     for name in transmitters:
         pattern = re.compile(rf"(|.*[^a-z0-9]){re.escape(name.lower())}(|[^a-z0-9].*)")
@@ -53,7 +53,7 @@ def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[
 
 
 def find_unknown_wide_columns(frame: pd.DataFrame, columns: Mapping[str, str]) -> list[str]:
-    """Find columns of a wide table that are named like those of transmitters but belong to none in their table.
+    """Find columns of a wide table that are named like transmitters' columns but match no known transmitter.
 
     Example:
         >>> table = pd.DataFrame(columns=["x", "rss_a", "rss_b", "rss_c"])
@@ -65,14 +65,14 @@ def find_unknown_wide_columns(frame: pd.DataFrame, columns: Mapping[str, str]) -
     """
     column, name = next(iter(columns.items()))
     before, _, after = column.lower().rpartition(name.lower())
-    # Where columns have no other words, those differ from the transmitters' in digits alone.
+    # If the names have no other words, unknown columns differ from known ones only in digits.
     middle = r"[^ _]+" if before + after else re.sub(r"\d+", r"\\d+", re.escape(name.lower()))
     pattern = re.compile(rf"{re.escape(before)}{middle}{re.escape(after)}")
     return [str(other) for other in frame if other not in columns and pattern.fullmatch(str(other).lower())]
 
 
 def name_melted_values(columns: Iterable[str]) -> str:
-    """Name the column of values that the columns of a wide table are combined into, after a word they share.
+    """Name the column into which the columns of a wide table are combined, after a word that they share.
 
     Example:
         >>> name_melted_values(["RSS AP1", "RSS AP2"])
@@ -86,8 +86,8 @@ def name_melted_values(columns: Iterable[str]) -> str:
 def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | None:
     """Find the column by which two tables name the transmitter, if any.
 
-    It is the first column of both tables in which every value of the links appears once among the transmitters;
-    otherwise the first that is named like transmitters and shares some values.
+    It is the first common column whose every value in the links appears exactly once among the transmitters, or else
+    the first one that is named like transmitters, names each of them once and shares at least one value.
     """
     partial = None
     for name in transmitters:
@@ -106,7 +106,7 @@ def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | No
 def find_naming_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> tuple[str, str] | None:
     """Find the column of the links that names the transmitter, and its counterpart in the table of transmitters.
 
-    Columns that are named like transmitters come first, then other columns of texts.
+    Columns that are named like transmitters are tried first, then other text columns.
 
     Example:
         >>> links = pd.DataFrame({"gateway_id": ["a", "b", "a"], "rssi": [-80, -90, -85]})
@@ -124,9 +124,9 @@ def find_naming_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> tuple[st
 
 
 def find_transmitter_of_positions(frame: pd.DataFrame, position: Sequence[str]) -> str | None:
-    """Find the column that names the transmitters whose positions are in columns of the same table.
+    """Find the column that names the transmitters whose positions are in the same table.
 
-    Each of its labels has one position, and there are at least as many labels as positions.
+    Each of its labels has a single position, and there are at least as many labels as positions.
 
     Example:
         >>> links = pd.DataFrame({"cell": ["a", "b", "a"], "tx_x": [0, 50, 0], "tx_y": 0, "rsrp": [-80, -90, -85]})
@@ -149,10 +149,10 @@ def find_transmitter_of_positions(frame: pd.DataFrame, position: Sequence[str]) 
 
 
 def find_transmitter_names(transmitters: pd.DataFrame) -> list[str]:
-    """Find the columns of names in a table of transmitters with one row each, such as those of sites and of cells.
+    """Find the columns of names, such as sites and cells, in a table with one row per transmitter.
 
     Raises:
-        InputError: No column with a name of this kind distinguishes the transmitters.
+        InputError: No column of names distinguishes the transmitters.
     """
     names = [
         str(name)
@@ -183,17 +183,17 @@ def find_devices(frame: pd.DataFrame) -> list[str]:
 
 
 LARGEST_ANGLE: Final = {"azimuth_deg": 360.0, "downtilt_deg": 90.0, "electrical_downtilt_deg": 90.0}
-"""Largest angle that a column can contain [deg], by its key in ``[links.tx_antenna]``."""
+"""Largest plausible angle in a column [deg], by its key in ``[links.tx_antenna]``."""
 
 POWERS: Final = (-30.0, 100.0)
-"""Smallest and largest transmitted power that a column can contain [dBm]."""
+"""Smallest and largest plausible transmitted power in a column [dBm]."""
 
 
 def find_angles(frame: pd.DataFrame, of_transmitters: bool) -> dict[str, str]:
-    """Find the columns of azimuth, mechanical and electrical downtilt by the key of ``[links.tx_antenna]``.
+    """Find the columns of azimuth, mechanical and electrical downtilt, by key of ``[links.tx_antenna]``.
 
-    A downtilt whose name states no kind is mechanical, unless the name states that it is the sum of both. If rows are
-    no transmitters, the names must state that the antenna is a transmitter's.
+    A downtilt whose name states no kind counts as mechanical; columns with the sum of both tilts are ignored. If the
+    rows are not transmitters, the names must state that the antenna is a transmitter's.
 
     Example:
         >>> frame = pd.DataFrame(columns=["Azimuth (°)", "Mechanical Downtilt (°)", "E-Tilt", "Total Tilt"])
@@ -230,7 +230,7 @@ def unusable(frame: pd.DataFrame, key: str, column: str) -> str:
 
 
 def find_antenna_names(frame: pd.DataFrame, known: Iterable[str] = ()) -> str | None:
-    """Column with the name of each antenna's model or file; of several, the one with the most `known` names."""
+    """Column with the name of each antenna's model or file; if there are several, the one with most `known` names."""
     texts = [str(name) for name in frame if not pd.api.types.is_bool_dtype(frame[name])]
     names = [name for name in texts if matches(name, "antenna") and name not in numeric_columns(frame)]
     stems = {plain_name(name) for name in known}
@@ -255,7 +255,7 @@ def plain_name(label: object) -> str:
 
 
 def find_powers(frame: pd.DataFrame) -> dict[str, str]:
-    """Column of EIRP, or otherwise transmitted power, of a table of transmitters, by the key of ``[links]`` [dBm]."""
+    """Column of EIRP, or else of transmitted power [dBm], in a table of transmitters, by key of ``[links]``."""
     likely = [
         name
         for name in numeric_columns(frame)
