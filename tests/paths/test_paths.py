@@ -224,7 +224,7 @@ def test_changed_file_is_refused_until_it_is_sealed(paths: Paths, tmp_path: Path
     with h5py.File(file, "a") as content:
         content["paths/delay"][0] *= 2
     with pytest.raises(
-        InputError, match=r"paths\.h5: is damaged \(its checksum does not agree\); trace again"
+        InputError, match=r"paths\.h5: is damaged \(its checksum does not match\); trace again"
     ):
         Paths.load(file)
     seal(file)

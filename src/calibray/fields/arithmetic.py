@@ -1,11 +1,11 @@
-"""Complex numbers as pairs of real arrays, the functions of them that fields need, and sums over segments.
+"""Arithmetic of complex numbers stored as pairs of real arrays, and sums over segments.
 
 Compilers vectorize pairs of real arrays, which are therefore several times faster than complex types. All functions
 work element by element and can be differentiated.
 
-Segments are the paths of a link, or the interactions of a link and a material. XLA scatters and adds one number
-at a time, which takes about 5 ns. Most of them can be added in blocks instead: numbers are ordered so that each block
-belongs to one segment, and only the remainder of every segment is scattered.
+Segments are the paths of a link, or the interactions of a link with a material. XLA scatters and adds one number at a
+time, which takes about 5 ns. Most numbers can be added in blocks instead: they are ordered so that each block belongs
+to one segment, and only the remainder of each segment is scattered.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Values = TypeVar("Values")
 
 _QUARTER: Final = (1.5707963267341256, 6.077100506506192e-11)
 """Pi / 2 as the sum of two numbers (Cody and Waite, Software Manual for the Elementary Functions, 1980, ch. 8). The
-first has 33 bits, so its product with the number of quarter turns is exact up to a million turns."""
+first has 33 bits, so its product with the number of quarter turns is exact for up to a million turns."""
 
 _SINE: Final = (
     1.58969099521155010221e-10,
@@ -37,7 +37,7 @@ _SINE: Final = (
     -1.66666666666666324348e-01,
     1.0,
 )
-"""Minimax polynomial of sin(x) / x on [-pi / 4, pi / 4] in powers of x^2, highest first."""
+"""Minimax polynomial for sin(x) / x on [-pi / 4, pi / 4] in powers of x^2, highest first."""
 
 _COSINE: Final = (
     -1.13596475577881948265e-11,
@@ -49,7 +49,7 @@ _COSINE: Final = (
     -0.5,
     1.0,
 )
-"""Minimax polynomial of cos(x), likewise."""
+"""Minimax polynomial for cos(x) on the same interval, likewise in powers of x^2."""
 
 
 def multiply(a: Pair, b: Pair) -> Pair:
@@ -69,17 +69,17 @@ def squared_magnitude(value: Pair) -> jax.Array:
 
 
 def safe_sqrt(value: jax.Array) -> jax.Array:
-    """Square root of numbers >= 0 [...], whose derivative at 0 is 0 instead of infinity."""
+    """Square root of non-negative numbers [...], with derivative 0 instead of infinity at 0."""
     positive = value > 0
-    # The inner selection keeps the infinite derivative out of the branch that is not taken.
+    # The inner `where` avoids an infinite derivative in the branch that is not selected.
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1.0)), 0.0)
 
 
 def materialize(values: Values, positive: jax.Array) -> Values:
     """The same values, computed once and stored; `positive` is any positive number that is unknown at compile time.
 
-    XLA on CPU fuses a computation into each of its uses, so it repeats sines and exponentials many times; it also drops
-    `optimization_barrier`. It cannot fuse across a branch on a value that is unknown when it compiles.
+    On the CPU, XLA fuses a computation into each of its uses, so it repeats sines and exponentials many times; it also
+    drops `optimization_barrier`. It cannot fuse across a branch on a value that is unknown at compile time.
     """
     return jax.lax.cond(
         positive > 0, lambda kept: kept, lambda kept: jax.tree.map(jnp.negative, kept), values
@@ -90,22 +90,22 @@ def materialize(values: Values, positive: jax.Array) -> Values:
 def cosine_and_sine(angle: ArrayLike) -> tuple[jax.Array, jax.Array]:
     """Cosine and sine of many angles [...], [rad], at once.
 
-    In double precision, XLA on CPU calls the system's functions for one number at a time, which takes about 30 ns for
-    both. The same polynomials without a branch are vectorized and take 2 ns. Each result is within 2.3e-16 of the true
-    value; beyond a million turns, the error is that of rounding the angle itself.
+    In double precision, XLA on the CPU calls the system's functions for one number at a time, which takes about 30 ns
+    for both. Polynomials without branches are vectorized and take 2 ns. Each result is within 2.3e-16 of the true
+    value; beyond a million turns, the rounding error of the angle itself dominates.
     """
     angle_as_given = jnp.asarray(angle)
     angle = angle_as_given.astype(jnp.float64)
-    # The angle is `quarters` quarter turns and a rest of at most pi / 4. Both parts of pi / 2 are subtracted in turn,
-    # so that the rest keeps its digits.
+    # The angle is `quarters` quarter turns plus a remainder of magnitude at most pi / 4. Subtracting the two parts of
+    # pi / 2 in turn keeps the remainder accurate.
     quarters = jnp.round(angle * (2 / jnp.pi))
     rest = (angle - quarters * _QUARTER[0]) - quarters * _QUARTER[1]
     square = rest * rest
     sine, cosine = rest * _polynomial(_SINE, square), _polynomial(_COSINE, square)
     quadrant = quarters - 4 * jnp.floor(quarters / 4)  # 0, 1, 2 or 3
     odd = (quadrant == 1) | (quadrant == 3)
-    # An odd number of quarter turns exchanges cosine and sine; the cosine is negative in quadrants 1 and 2, the sine in
-    # 2 and 3.
+    # An odd number of quarter turns swaps cosine and sine; the cosine is negative in quadrants 1 and 2, the sine in
+    # quadrants 2 and 3.
     across, along = jnp.where(odd, sine, cosine), jnp.where(odd, cosine, sine)
     cosine = jnp.where((quadrant == 1) | (quadrant == 2), -across, across)
     sine = jnp.where(quadrant >= 2, -along, along)
@@ -120,7 +120,7 @@ def _cosine_and_sine_jvp(primals: tuple, tangents: tuple) -> tuple:
 
 
 def _polynomial(factors: tuple[float, ...], x: jax.Array) -> jax.Array:
-    """Value of a polynomial by Horner's scheme, with factors from the highest power down."""
+    """Value of a polynomial by Horner's scheme, with coefficients from the highest power down."""
     value = jnp.full_like(x, factors[0])
     for factor in factors[1:]:
         value = value * x + factor
@@ -137,8 +137,8 @@ class Segments:
     """The segments of an array of numbers.
 
     Attributes:
-        order: Order of the numbers, whole blocks first [n]; None if it is unchanged.
-        segment: Segment of every block, then of every remaining number [blocks + n - BLOCK blocks].
+        order: Order in which the numbers are added, whole blocks first [n]; None if the order is unchanged.
+        segment: Segment of every block, then of every remaining number [blocks + n - BLOCK x blocks].
         blocks: Number of whole blocks.
         count: Number of segments.
     """
@@ -150,7 +150,7 @@ class Segments:
 
 
 def make_segments(segment: NDArray[np.integer], count: int) -> Segments:
-    """Order numbers for summation by their segments [n]; the order depends on `segment` only."""
+    """Order numbers by their segments [n] for summation; the order depends on `segment` only."""
     size = np.bincount(segment, minlength=count)
     if not (size >= BLOCK).any():
         return Segments(None, jax.device_put(segment.astype(np.int32)), 0, count)
@@ -167,7 +167,7 @@ def make_segments(segment: NDArray[np.integer], count: int) -> Segments:
 
 
 def segment_sums(segments: Segments, values: jax.Array) -> jax.Array:
-    """Sum of the numbers [n] of every segment [count]; 0 for a segment without numbers."""
+    """Sum of the numbers [n] in every segment [count]; 0 for a segment without numbers."""
     if segments.order is not None:
         end = segments.blocks * BLOCK
         blocks = values.at[segments.order[:end]].get(mode="promise_in_bounds").reshape(-1, BLOCK).sum(axis=1)

@@ -1,8 +1,8 @@
 """Delays, angles and power delay profiles of links, for any materials.
 
-All of them are means over a link's paths weighted by the paths' powers, so they depend on the materials as smoothly as
-path loss does. `statistics` and `delay_profile` are pure JAX; with `calibray.fields.path_powers` they can be
-differentiated with respect to the materials, within `calibray.fields.jax_settings`.
+All are computed from the powers of a link's paths, so they depend on the materials as smoothly as path loss does.
+`statistics` and `delay_profile` are pure JAX; with `calibray.fields.path_powers` they can be differentiated with
+respect to the materials, within `calibray.fields.jax_settings`.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class ChannelStatistics:
     Attributes:
         mean_delay: Mean delay [L], [s].
         delay_spread: Root mean square delay spread [L], [s].
-        k_factor_db: Power of the strongest path over that of all others [L], [dB]; +inf for a single path.
-        departure_spread: Azimuth spread of departure [L], [rad].
-        arrival_spread: Azimuth spread of arrival [L], [rad].
+        k_factor_db: Ratio of the strongest path's power to that of all other paths [L], [dB]; +inf for a single path.
+        departure_spread: Azimuth spread at departure [L], [rad].
+        arrival_spread: Azimuth spread at arrival [L], [rad].
     """
 
     mean_delay: jax.Array
@@ -87,7 +87,7 @@ def statistics(
 
 
 def link_mean(weight: jax.Array, value: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
-    """Weighted mean of the values of every link [L]; NaN if no value has a weight."""
+    """Weighted mean of each link's values [L]; NaN if all weights are 0."""
     total = partial(jax.ops.segment_sum, segment_ids=link, num_segments=num_links)
     sums = total(weight)
     return jnp.where(sums > 0, total(weight * value) / jnp.where(sums > 0, sums, 1.0), jnp.nan)
@@ -96,7 +96,7 @@ def link_mean(weight: jax.Array, value: jax.Array, link: jax.Array, num_links: i
 def delay_spread(power: jax.Array, delay: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
     """Root mean square delay spread of every link [L], [s] (ITU-R P.1407-8 eq. 3); NaN without power."""
     mean = link_mean(power, delay, link, num_links)
-    # Relative to the mean: the difference of two second moments of absolute delays would lose its digits.
+    # Delays relative to the mean avoid the cancellation between the mean square and the squared mean.
     excess_delay = delay - jnp.nan_to_num(mean)[link]
     variance = link_mean(power, excess_delay**2, link, num_links)
     return jnp.where(jnp.isfinite(mean), safe_sqrt(variance), jnp.nan)
@@ -107,13 +107,13 @@ def angular_spread(power: jax.Array, angle: jax.Array, link: jax.Array, num_link
     # sqrt(-2 ln |sum P e^{j phi} / sum P|)
     cosine, sine = (link_mean(power, part(angle), link, num_links) for part in (jnp.cos, jnp.sin))
     resultant = jnp.hypot(cosine, sine)
-    # Equal powers from opposite directions have the resultant 0, whose logarithm is infinite.
+    # Equal powers from opposite directions have a resultant of 0, whose logarithm is infinite.
     spread = safe_sqrt(-2 * jnp.log(jnp.clip(resultant, 1e-300, 1.0)))
     return jnp.where(jnp.isfinite(cosine), spread, jnp.nan)
 
 
 def k_factor_db(power: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
-    """Power of the strongest path over that of all others of every link [L], [dB]; NaN without power."""
+    """Ratio of the strongest path's power to that of all other paths of a link [L], [dB]; NaN without power."""
     total = jax.ops.segment_sum(power, link, num_links)
     strongest = jax.ops.segment_max(power, link, num_links)
     rest = total - strongest
@@ -125,7 +125,7 @@ def k_factor_db(power: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
 def power_delay_profile(
     paths: Paths, delays: NDArray[np.float64], materials: Mapping[str, Material] | None = None
 ) -> NDArray[np.float64]:
-    """Power gain of every link by delay.
+    """Power gain of every link in each delay bin.
 
     Args:
         paths: The path program.
@@ -133,7 +133,7 @@ def power_delay_profile(
         materials: Constants by name; materials that are not named keep the constants of the trace.
 
     Returns:
-        Power gains [L, n]; paths outside the edges are left out.
+        Power gains [L, n]; paths outside all bins are ignored.
 
     Raises:
         InputError: The edges do not increase, or a material is unknown.
@@ -149,12 +149,12 @@ def power_delay_profile(
 
 
 def delay_profile(program: GroupedProgram, power: jax.Array, edges: jax.Array) -> jax.Array:
-    """Power gains of every link by delay [L, n], from path powers [P] and increasing bin edges [n + 1], [s]."""
+    """Power gain of every link in each delay bin [L, n]: path powers [P], increasing bin edges [n + 1], [s]."""
     link, delay = program.phases
     num_bins = edges.shape[0] - 1
     index = jnp.searchsorted(edges, delay, side="right") - 1
     inside = (index >= 0) & (index < num_bins)
-    # Paths outside the edges add 0 to the first bin.
+    # Paths outside all bins add 0 to the first bin.
     segment = jnp.where(inside, link * num_bins + index, 0)
     total = jax.ops.segment_sum(jnp.where(inside, power, 0.0), segment, program.num_links * num_bins)
     return total.reshape(program.num_links, num_bins)

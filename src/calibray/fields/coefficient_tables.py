@@ -1,14 +1,14 @@
-"""Tables of the slab coefficients over the angle of incidence, for programs with many interactions.
+"""Tables of the slab coefficients by angle of incidence, for programs with many interactions.
 
 A coefficient depends on the geometry only through the cosine of incidence. If a program has many more interactions than
 its tables have nodes, each candidate's coefficients are computed at the nodes. Cubics through four nodes then
-interpolate them, in about 10 ns per interaction instead of 100. The position of an interaction in its table does not
+interpolate them, in about 10 ns per interaction instead of 100 ns. The position of an interaction in its table does not
 depend on the materials, so it is computed once. Each pair of material and mode has its own row of nodes.
 
 Nodes are evenly spaced in a root of the cosine: the square root, or the sixth root for metals, whose Brewster angle is
 within a thousandth of grazing incidence. A sheet of plasterboard at 2 GHz needs about a hundred intervals, and a thick
 slab at 60 GHz needs thousands. `table_intervals` chooses the number of intervals from a few representative candidates.
-`table_error` then bounds the error for every candidate, also at Brewster angles, grazing incidence and slab resonances.
+`table_error` then bounds every candidate's error, even at Brewster angles, grazing incidence and slab resonances.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from calibray.fields.slab import FIELD_COLUMN, Mode, coefficients_of_materials, 
 from calibray.paths import Kind, Paths
 
 Intervals = int | NDArray[np.integer]
-"""Number of intervals of every row, or by material and mode [M, 3]."""
+"""Number of intervals: one for all rows, or by material and mode [M, 3]."""
 
 FINEST: Final = 65536
 """Largest number of intervals in a row of the tables."""
@@ -39,19 +39,20 @@ COARSEST: Final = 16
 """Smallest number of intervals in a row."""
 
 _STAGES: Final = (1024, 8192, FINEST)
-"""Successive limits of the search for a number of intervals; the next one is only tried if the one before fails."""
+"""Successive limits of the search for a number of intervals; each is tried only if the previous one fails."""
 
 _TOLERANCE_SHARE: Final = 0.1
-"""Share of the tolerance that the representative candidates may use."""
+"""Largest error of the representative candidates, as a share of the tolerance."""
 
 _METAL_LOSS: Final = 1e3
 """Loss term above which a material is treated as a metal."""
 
 _GRAZING: Final = 1e-9
-"""Cosine at the first node. At exactly 0, even air would reflect everything."""
+"""Smallest cosine at a node. At exactly 0, even air would reflect everything."""
 
 _EXTRA_NODES: Final = 3
-"""Nodes of a row beyond its intervals: one before the first, one at the end of the last, one after it."""
+"""Number of nodes of a row in addition to its number of intervals: one before the first interval, one at the end of the
+last, and one after it."""
 
 _STENCIL: Final = 3
 """Nodes on either side that `table_error` needs."""
@@ -60,15 +61,15 @@ _STENCIL: Final = 3
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TableLayout:
-    """The position of each coefficient in the tables. The rows of all pairs of material and mode follow one another.
+    """The position of each coefficient in the tables. The rows of all pairs of material and mode are concatenated.
 
     Attributes:
-        cell: Node below the coefficient, counted over all rows; one array for each step of each group, [n] or [k, n].
-        fraction: Distance from that node in units of the interval, in the same arrays.
+        cell: Node below the coefficient, numbered over all rows; one array for each step of each group, [n] or [k, n].
+        fraction: Distance from that node in units of the interval, in arrays of the same shapes.
         cosine: Cosine of incidence at every node [N].
         material: Material of every node [N].
         mode: Mode of every node [N].
-        inner: Whether a node has at least three others of its row on either side [N].
+        inner: Whether a node has at least three other nodes of its row on either side [N].
     """
 
     cell: tuple[jax.Array, ...]
@@ -85,22 +86,22 @@ class CoefficientTables:
     """Tables of coefficients. The numbers of a cell are adjacent, so that a look-up reads one or two cache lines.
 
     Attributes:
-        values: Cubic polynomials from every node to the next: real and imaginary part of the transverse electric and
-            of the transverse magnetic coefficient at the node, then their factors of the fraction, of its square and
-            of its cube [N + 4, 16]. The last four nodes have the coefficient 1.
+        values: Cubic polynomials in the fraction, from every node to the next [N + 4, 16]. For each power, lowest
+            first: real and imaginary part for the transverse electric, then for the transverse magnetic coefficient.
+            The coefficient at the last four nodes is 1.
     """
 
     values: jax.Array
 
 
 Arguments = tuple[NDArray[np.integer], NDArray[np.integer], NDArray[np.float64]]
-"""Material, mode and cosine of incidence of coefficients [J] each."""
+"""Material, mode and cosine of incidence of coefficients, each [J]."""
 
 
 def coefficient_arguments(paths: Paths) -> Arguments:
-    """Material, mode and cosine of incidence of every coefficient of a path program [J] each.
+    """Material, mode and cosine of incidence of every coefficient of a path program, each [J].
 
-    First those of all interactions, then those of the n-faces of diffracting wedges.
+    The coefficients of all interactions come first, then those of the n-faces of diffracting wedges.
     """
     wedge = np.flatnonzero(paths.kind == Kind.DIFFRACTION)
     kind, material = (np.concatenate([column, column[wedge]]) for column in (paths.kind, paths.material))
@@ -111,7 +112,7 @@ def coefficient_arguments(paths: Paths) -> Arguments:
 
 
 def spacing_roots(table: NDArray[np.float64], wavelength: float) -> NDArray[np.int64]:
-    """The root of the cosine, 6 for metals and otherwise 2 [M], in which each material's nodes are evenly spaced."""
+    """Degree of the root of the cosine in which a material's nodes are evenly spaced: 6 for metals, otherwise 2 [M]."""
     loss = loss_term(jnp.asarray(table[:, FIELD_COLUMN["conductivity"]]), jnp.asarray(wavelength))
     return np.where(np.asarray(loss) > _METAL_LOSS, 6, 2)
 
@@ -123,10 +124,10 @@ def table_layout(
     intervals: Intervals,
     dtype: type,
 ) -> TableLayout:
-    """Find the position of every coefficient [J] in the tables, with `spacing_roots` `root` [M].
+    """Find the position of every coefficient [J] in the tables, for the degrees `root` [M] from `spacing_roots`.
 
-    `steps` are the coefficients at each step of each group, of any shape; J marks an empty position, whose coefficient
-    is 1.
+    `steps` are the indices of the coefficients at each step of each group, of any shape; the index J marks an empty
+    position, whose coefficient is 1.
     """
     material, mode, cosine = arguments
     rows, row = np.unique(material.astype(np.int64) * len(Mode) + mode, return_inverse=True)
@@ -137,9 +138,9 @@ def table_layout(
     row_of_node = np.repeat(np.arange(len(rows)), cells + _EXTRA_NODES)
     rank = np.arange(total) - first[row_of_node]  # of a node within its row
     position = cosine ** (1 / root[material]) * cells[row]
-    # Normal incidence is the end of the last interval, not the start of another one.
+    # Normal incidence is the end of the last interval, not the start of the next one.
     below = np.minimum(position.astype(np.int64), cells[row] - 1)
-    # A step without a coefficient takes the cell of the four nodes of 1 at the end.
+    # Empty positions use the cell among the last four nodes, where the coefficient is 1.
     cell = np.append(first[row] + 1 + below, total + 1).astype(np.uint32)
     fraction = np.append(position - below, 0.0).astype(dtype)
     last, material_of_node = cells[row_of_node] + _EXTRA_NODES - 1, (rows // len(Mode))[row_of_node]
@@ -157,7 +158,7 @@ def table_layout(
 
 
 def fill_tables(layout: TableLayout, table: jax.Array, wavelength: jax.Array) -> CoefficientTables:
-    """Compute the coefficients at all nodes, of materials with constants [M, 8] at a wavelength [m]."""
+    """Compute the coefficients at all nodes for material constants [M, 8] and a wavelength [m]."""
     te, tm = coefficients_of_materials(
         layout.cosine,
         table,
@@ -172,7 +173,7 @@ def fill_tables(layout: TableLayout, table: jax.Array, wavelength: jax.Array) ->
 
 
 def _cubics(value: jax.Array) -> jax.Array:
-    """Factors [N, 16] of the cubics from every node to the next, by Lagrange through both and their neighbours.
+    """Coefficients [N, 16] of the cubics from every node to the next: Lagrange interpolation with both neighbours.
 
     Cubics at nodes without these neighbours are meaningless and are not used.
     """
@@ -184,9 +185,9 @@ def _cubics(value: jax.Array) -> jax.Array:
 
 
 def interpolate(tables: CoefficientTables, cell: jax.Array, fraction: jax.Array) -> tuple[Pair, Pair]:
-    """Transverse electric and magnetic coefficients (real, imaginary) [...], interpolated from the table.
+    """Transverse electric and magnetic coefficients (real, imaginary) [...], interpolated from the tables.
 
-    `cell` is the node below, counted over all rows [...], and `fraction` is the distance from it in units of the
+    `cell` is the node below, numbered over all rows [...], and `fraction` is the distance from it in units of the
     interval [...].
     """
 
@@ -200,9 +201,9 @@ def interpolate(tables: CoefficientTables, cell: jax.Array, fraction: jax.Array)
 def table_error(tables: CoefficientTables, layout: TableLayout, num_materials: int) -> jax.Array:
     """Upper bound of the interpolation error of any real or imaginary part, by material and mode [M, 3].
 
-    Every node is compared with the cubic through the nodes one and three steps away, which has twice the step. The
-    error of cubics decreases with the fourth power of the step, so the tables' error is a sixteenth of the largest
-    difference. The bound is twice that.
+    Every inner node is compared with the cubic through the nodes one and three steps away, whose step is twice as
+    large. The error of a cubic scales with the fourth power of the step, so the tables' error is a sixteenth of the
+    largest difference. The bound is twice that.
     """
     value = tables.values[: len(layout.cosine), :4]
 
@@ -219,8 +220,8 @@ def table_error(tables: CoefficientTables, layout: TableLayout, num_materials: i
 def table_intervals(paths: Paths, tables: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
     """Number of intervals by material and mode [M, 3] for coefficients with an error within `tolerance` [1].
 
-    They are powers of two up to `FINEST`; 0 if there is no such row. The constants `tables` [n, M, 8] belong to
-    representative candidates.
+    The numbers are powers of two up to `FINEST`; 0 if no coefficient has this material and mode. `tables` [n, M, 8] has
+    the constants of representative candidates.
     """
     material, mode, _ = coefficient_arguments(paths)
     needed = np.zeros((tables.shape[1], len(Mode)), dtype=np.int64)
@@ -238,7 +239,7 @@ def table_intervals(paths: Paths, tables: NDArray[np.float64], tolerance: float)
 def _row_intervals(
     constants: NDArray[np.float64], mode: int, root: int, wavelength: float, tolerance: float
 ) -> int:
-    """Number of intervals that a row needs for one material's constants [8]."""
+    """Number of intervals that a row needs for its material's constants [8]."""
     for finest in _STAGES:
         errors = np.asarray(_errors_by_intervals(constants[None], mode, root, wavelength, finest))
         sufficient = np.flatnonzero(errors <= tolerance)
@@ -251,7 +252,7 @@ def _row_intervals(
 def _errors_by_intervals(
     table: jax.Array, mode: jax.Array, root: jax.Array, wavelength: jax.Array, finest: int
 ) -> jax.Array:
-    """Largest error of a row with `COARSEST` intervals, with twice as many, and so on up to `finest`."""
+    """Largest error of a row for `COARSEST` intervals, twice as many, and so on up to `finest`."""
     cosine = jnp.maximum((jnp.arange(2 * finest + 1) / (2 * finest)) ** root, _GRAZING)
     material = jnp.zeros(cosine.shape, dtype=jnp.int32)
     te, tm = coefficients_of_materials(
@@ -264,7 +265,7 @@ def _errors_by_intervals(
         # Coefficients are even functions of the root of the cosine, so the node before the first mirrors the second.
         node = jnp.concatenate([node[1:2], node])
         interpolated = 9 / 16 * (node[1:-2] + node[2:-1]) - 1 / 16 * (node[:-3] + node[3:])
-        # Nodes end at normal incidence here, so the last interval lacks a neighbour and is left out.
+        # Nodes end at normal incidence here, so the last interval lacks a neighbour and is omitted.
         errors.append(jnp.abs(middle[:-1] - interpolated).max())
         step //= 2
     return jnp.stack(errors)

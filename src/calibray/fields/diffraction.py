@@ -51,7 +51,7 @@ def affine_form(table: Diffraction, row: NDArray[np.int64], frequency: float) ->
 def transition(x: NDArray[np.float64]) -> NDArray[np.complex128]:
     """Transition function F(x) = 2 j sqrt(x) e^{jx} int_{sqrt x}^inf e^{-j u^2} du (Kouyoumjian and Pathak, eq. 27).
 
-    Its argument is at least 0 [...].
+    The argument x is at least 0 [...].
     """
     root = np.sqrt(x)
     return 2j * root * np.exp(1j * x) * modfresnelm(root)[0]

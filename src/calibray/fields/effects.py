@@ -1,7 +1,7 @@
-"""Effects on a path program that no material has: they change the antenna fields of its paths.
+"""Effects that are not properties of a material: they change the antenna fields of a program's paths.
 
-An effect takes the values of its own parameters. All that follows from the fields (path loss, delay spread, derivatives
-by the materials) is evaluated on the changed program.
+An effect has its own parameters. Everything that follows from the fields (path loss, delay spread, derivatives with
+respect to the materials) is evaluated on the changed program.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Effect(Protocol):
     """An effect on the paths of a program; an immutable pytree."""
 
     def ordered(self, order: NDArray[np.int64]) -> Effect:
-        """The same effect with its paths in another order, that of a program [P]."""
+        """The same effect with its paths in the order of a program [P]."""
         ...
 
     def apply(self, program: GroupedProgram, values: jax.Array) -> GroupedProgram:
@@ -34,19 +34,19 @@ Effects = tuple[Effect, ...]
 
 
 class EffectBatch(NamedTuple):
-    """Effects, and values of all their parameters for a batch of candidates [n, e]."""
+    """Effects, and the values of all their parameters for a batch of candidates [n, e]."""
 
     effects: Effects
     values: jax.Array | NDArray[np.floating]
 
 
 def apply_effects(program: GroupedProgram, effects: Effects, values: jax.Array) -> GroupedProgram:
-    """The program with all effects, for the values of their parameters [e]."""
+    """The program with all effects applied, for the values of their parameters [e]."""
     return reduce(lambda changed, effect: effect.apply(changed, values), effects, program)
 
 
 AntennaFields = tuple[jax.Array, jax.Array]
-"""Transmit and receive fields of a group of paths, which are all that effects change."""
+"""Transmit and receive fields of a group of paths, the only arrays that effects change."""
 
 
 def antenna_fields(program: GroupedProgram) -> list[AntennaFields]:
@@ -55,7 +55,7 @@ def antenna_fields(program: GroupedProgram) -> list[AntennaFields]:
 
 
 def with_antenna_fields(program: GroupedProgram, fields: list[AntennaFields]) -> GroupedProgram:
-    """The program with these antenna fields."""
+    """The program with the given antenna fields of every group of paths."""
     pairs = zip(program.groups, fields, strict=True)
     return replace(program, groups=tuple(replace(group, tx=tx, rx=rx) for group, (tx, rx) in pairs))
 
@@ -63,13 +63,13 @@ def with_antenna_fields(program: GroupedProgram, fields: list[AntennaFields]) ->
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class ExtraLoss:
-    """Loss of paths through regions such as woodland: it saturates with the length of the path in them.
+    """Loss of paths through regions such as woodland; it saturates with the length of the path inside them.
 
     Attributes:
-        length: Length of every path inside the regions, times the specific attenuation at the paths' carrier over
-            that at the study's [P], [m].
+        length: Length of every path inside the regions, times the ratio of the specific attenuation at the paths'
+            carrier to that at the study's carrier [P], [m].
         maximum_db: Loss of a very long path [dB].
-        index: Number of the parameter that is the specific attenuation [dB/m]; None if it is fixed.
+        index: Index of the parameter that is the specific attenuation [dB/m]; None if it is fixed.
         fixed: The specific attenuation if it is fixed [dB/m].
     """
 
@@ -86,7 +86,7 @@ class ExtraLoss:
         """See `Effect.apply`."""
         specific = self.fixed if self.index is None else values[self.index]
         # A = A_m (1 - exp(-d gamma / A_m)), ITU-R P.833-10 equation 1
-        # For short paths it is d gamma; expm1 keeps the digits there.
+        # For short paths the loss is nearly d gamma, which expm1 computes without cancellation.
         loss_db = self.maximum_db * -jnp.expm1(-jnp.asarray(self.length) * specific / self.maximum_db)
         return scaled(program, jnp.exp(-np.log(10) / 20 * loss_db))
 
@@ -99,8 +99,8 @@ class RoughSurfaces:
     Attributes:
         exponent: 8 (pi / lambda)^2 times the sum of cos^2 theta over the specular reflections of each path on each
             material [P, M], [1/mm^2].
-        fixed: Standard deviation of the surface heights of each material, where it is fixed [M], [mm].
-        index: Number of the parameter that is this standard deviation, for each material; None where it is fixed.
+        fixed: Standard deviation of the surface height of each material, where it is fixed [M], [mm].
+        index: Index of the parameter that is this standard deviation, for each material; None where it is fixed.
     """
 
     exponent: jax.Array | NDArray[np.float64]
@@ -119,15 +119,15 @@ class RoughSurfaces:
                 for fixed, index in zip(self.fixed, self.index, strict=True)
             ]
         )
-        # The mean field of heights with standard deviation s: exp(-8 (pi s cos theta / lambda)^2), W. S. Ament, Proc.
-        # IRE 41(1), 1953; its square is the share of the power that stays in the specular direction.
+        # Mean reflected field for heights of standard deviation s: exp(-8 (pi s cos theta / lambda)^2), W. S. Ament,
+        # Proc. IRE 41(1), 1953; its square is the share of the power that stays in the specular direction.
         return scaled(program, jnp.exp(-jnp.asarray(self.exponent) @ heights**2))
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class DisplacementLoss:
-    """Change of path loss by displacements of G groups of links along K axes, a cubic between each two of N knots.
+    """Change of path loss by displacements of G groups of links along K axes: cubics between N knots.
 
     Attributes:
         link: Link of every path [P].
@@ -135,7 +135,7 @@ class DisplacementLoss:
         weights: Displacement of every group per unit of each effect parameter, K of [G, e].
         origin: Values of the effect parameters at which the paths were traced [e].
         knots: Traced displacements of every link, ascending [K, N, L], [m]; beyond them the change is constant.
-        coefficients: Coefficients of the cubics in the distance from the lower knot, that of the highest power first
+        coefficients: Coefficients of the cubics in the distance from the lower knot, highest power first
             [K, 4, N - 1, L].
     """
 
@@ -152,11 +152,11 @@ class DisplacementLoss:
 
     @property
     def error_db(self) -> NDArray[np.float64]:
-        """Error of path loss between the five middle knots, summed over the axes [L], [dB]; 0 with fewer than seven.
+        """Interpolation error between the five middle knots, for all axes [L], [dB]; 0 for fewer than seven knots.
 
-        It is the RMS of what lines between its two neighbours miss at each of the three inner knots. A step of J dB
-        next to the middle knot gives J / sqrt(6), which is the RMS error of a line in place of a step somewhere; a step
-        in one of the two outer intervals gives J / sqrt(12).
+        At each of the three inner knots, the change is compared with the straight line between the two neighbours. The
+        RMS differences of the axes add in quadrature. A step of J dB next to the middle knot gives J / sqrt(6), the RMS
+        error of a line in place of a step at an unknown position; a step in an outer interval gives J / sqrt(12).
         """
         middle = self.coefficients.shape[2] // 2
         if middle < 3:
@@ -174,7 +174,7 @@ class DisplacementLoss:
             knots = jnp.asarray(self.knots[axis])
             stated = (jnp.asarray(weights) @ (values - self.origin))[group]
             displacement = jnp.clip(stated, knots[0], knots[-1])
-            # Index of the lower knot: the number of inner knots that the displacement has passed.
+            # Index of the lower knot: the number of inner knots that do not exceed the displacement.
             below = (displacement >= knots[1:-1]).sum(axis=0)[None]
             distance = displacement - jnp.take_along_axis(knots, below, axis=0)[0]
             cubic = jnp.take_along_axis(jnp.asarray(self.coefficients[axis]), below[None], axis=1)[:, 0]
@@ -183,7 +183,7 @@ class DisplacementLoss:
 
 
 def scaled(program: GroupedProgram, amplitude: jax.Array) -> GroupedProgram:
-    """The program with the fields of its paths, in its order, times an amplitude [P]."""
+    """The program with the field of each path, in the order of the program, multiplied by an amplitude [P]."""
     groups, first = [], 0
     for group in program.groups:
         own = amplitude[first : first + group.size].astype(group.rx.dtype)

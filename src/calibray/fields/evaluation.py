@@ -1,8 +1,8 @@
 """Path loss of every link of a program, and its derivatives, for batches of candidates.
 
-With the slab formula, a batch is one compiled loop over its candidates: the numbers of one candidate stay in a core's
-nearest cache, and fewer candidates take less time. Within the loop, the stages are materialized
-(`calibray.fields.arithmetic.materialize`), because XLA on CPU would otherwise fuse each stage into all its uses and
+With the slab formula, a batch is one compiled loop over its candidates: the data of one candidate stay in the core's
+first-level cache, and fewer candidates take less time. Within the loop, the stages are materialized
+(`calibray.fields.arithmetic.materialize`), because XLA would otherwise fuse each stage into all its uses on the CPU and
 repeat it there.
 
 Large programs with tables are evaluated in stages that are compiled separately. One stage interpolates coefficients,
@@ -48,7 +48,7 @@ from calibray.materials import Material
 from calibray.paths import Paths
 
 WITHOUT_TABLES: Final = np.zeros((1, 1, 3))
-"""Errors of coefficients that do not come from tables, for any number of candidates."""
+"""Errors of coefficients that are not interpolated from tables, for any number of candidates."""
 
 
 @jax_settings()
@@ -83,15 +83,15 @@ def path_loss(
     Args:
         paths: The path program.
         materials: Constants by name; materials that are not named keep the constants of the trace.
-        combining: "power" sums the paths' powers (a wide band, or many snapshots), "coherent" sums their fields at the
-            carrier, and "band" averages the coherent power over `bandwidth`.
+        combining: "power" sums the paths' powers (for a wide band, or many snapshots), "coherent" sums their fields at
+            the carrier, and "band" averages the coherent power over `bandwidth`.
         bandwidth: Bandwidth [Hz], for "band".
 
     Returns:
         Path loss [L], [dB]; +inf for a link without a path.
 
     Raises:
-        InputError: The combining or a material is unknown, or the bandwidth is missing.
+        InputError: `combining` or a material is unknown, or the bandwidth is missing or not positive.
     """
     prepared = Combining.make(combining, paths.link, paths.delay, bandwidth)
     tables = paths.material_table(materials)[None]
@@ -102,7 +102,7 @@ def path_loss(
 def program_path_loss(program: GroupedProgram, table: jax.Array, combining: Combining = POWER) -> jax.Array:
     """Path loss of every link [L], [dB], for material constants [M, 8], as one pure function.
 
-    Path loss is +inf for a link without a path. To differentiate or compile the function, do so within
+    Path loss is +inf for a link without a path. Differentiate or compile the function within
     `calibray.fields.jax_settings`.
     """
     response = materialize(material_response(program, table), program.wavelength)
@@ -123,7 +123,7 @@ def program_gains(program: GroupedProgram, table: jax.Array) -> Pair:
 def path_powers(program: GroupedProgram, table: ArrayLike) -> jax.Array:
     """Power gain of every path [P], in the order of the program, for material constants [M, 8].
 
-    The power is summed over receive ports and averaged over transmit ports, in one pure function.
+    The power is summed over receive ports and averaged over transmit ports. The function is pure.
     """
     return _path_powers(program, _split_by_step(program, _material_response(program, jnp.asarray(table))))
 
@@ -138,8 +138,8 @@ def path_losses(
     """Path loss [count, L], [dB], of a batch of candidates with material constants [n, M, 8].
 
     Path loss is +inf for a link without a path. The second result is the largest error of a tabulated coefficient by
-    candidate, material and mode [count, M, 3], or zeros. Only the first `count` candidates are evaluated. The function
-    is compiled for the number of tables, so that a partly filled batch saves a compilation.
+    candidate, material and mode [count, M, 3], or zeros without tables. Only the first `count` candidates are
+    evaluated. The function is compiled for a batch of n, so that a partly filled batch needs no new compilation.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
@@ -153,7 +153,7 @@ def path_losses(
             power = _link_power(program, response, combining)
         else:
             power = _link_power_of_steps(program, _split_by_step_wide(program, response), combining)
-        # Waits for the candidate, so that the intermediate numbers of one at a time are in memory.
+        # Waits for this candidate, so that only one candidate's intermediate arrays are in memory.
         powers.append(np.asarray(power))
         errors.append(error)
     return _stacked_losses(powers, len(tables)), np.stack(errors)
@@ -169,9 +169,9 @@ def path_losses_and_slopes(
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
     """Path loss as in `path_losses`, and its derivatives [count, L, M, columns], [dB] per unit.
 
-    The derivatives with respect to the materials' constants in `columns` of the tables are 0 for a link without a path.
-    The third result is the largest error of a tabulated coefficient by candidate, material and mode [count, M, 3], or
-    zeros.
+    The derivatives are with respect to the material constants in `columns` of the tables, and 0 for a link without a
+    path. The third result is the largest error of a tabulated coefficient by candidate, material and mode
+    [count, M, 3], or zeros without tables.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
@@ -217,7 +217,7 @@ def path_losses_and_slopes_with_effects(
     combining: Combining = POWER,
     count: int | None = None,
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
-    """Path loss with effects, and its derivatives by materials [count, L, M, columns] and by effects [count, L, e]."""
+    """Path loss with effects, and its derivatives by constants [count, L, M, columns] and by effects [count, L, e]."""
     count = len(tables) if count is None else count
     answers = _slopes_with_effects(program, tables, effects, count, columns, combining)
     loss, slope, by_effect = (np.asarray(answer)[:count] for answer in answers)
@@ -242,7 +242,7 @@ def _slope(
 ) -> tuple[jax.Array, tuple[GroupResponse, ...]]:
     """Power gain of every link, and its derivative with respect to the response at every step.
 
-    Every path belongs to one link, so one reverse pass over the summed power gives the derivatives of all links.
+    Every path belongs to one link, so one reverse pass over the sum of all powers gives the derivatives for all links.
     """
     power, pull = jax.vjp(lambda responses: _power(program, responses, combining, keep=True), responses)
     (slope,) = pull(jnp.ones_like(power))
@@ -258,8 +258,8 @@ def contract(
     """Derivatives of a quantity of every link with respect to material constants [L, M, columns].
 
     Every interaction belongs to one material, so one tangent per column serves all materials at once: the time does not
-    grow with their number. `slope` has the derivatives of the quantity with respect to the response at every step, and
-    `derivatives` those of the response with respect to the constants of each column.
+    grow with the number of materials. `slope` has the derivatives of the quantity with respect to the response at every
+    step; `derivatives` has those of the response with respect to the constants in each column.
     """
     if not derivatives:
         return jnp.zeros((program.num_links, num_materials, 0), program.wavelength.dtype)
@@ -286,19 +286,19 @@ def _contract(
     derivatives: tuple[MaterialResponse, ...],
     num_materials: int,
 ) -> jax.Array:
-    """Derivatives of path loss [L, M, columns] from those of the power with respect to the response."""
+    """Derivatives of path loss [L, M, columns], from those of the power with respect to the response."""
     return _loss_slope(power)[:, None, None] * contract(program, slope, derivatives, num_materials)
 
 
 def _loss_slope(power: jax.Array) -> jax.Array:
-    """Derivative of path loss [dB] by the power of a link [L]; 0 for a link without a path."""
+    """Derivative of path loss [dB] with respect to the power of a link [L]; 0 for a link without a path."""
     return -10 / np.log(10) * jnp.where(power > 0, 1 / jnp.where(power > 0, power, 1.0), 0.0)
 
 
 def _by_path(by_field: list[AntennaFields], tangents: list[AntennaFields], blank: jax.Array) -> jax.Array:
     """Derivatives of the power of every path with respect to effect parameters [P, e], through the antenna fields.
 
-    `blank` is what no path gives [0, e].
+    `blank` is the result for no paths [0, e].
     """
     groups = [blank]
     for outer, inner in zip(by_field, tangents, strict=True):
@@ -309,13 +309,13 @@ def _by_path(by_field: list[AntennaFields], tangents: list[AntennaFields], blank
 
 
 def _dot(a: object, b: object) -> jax.Array:
-    """Sum of the products of two trees' arrays."""
+    """Inner product of two pytrees of arrays."""
     return reduce(add, (x * y for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)))
 
 
 _decibel = jax.jit(decibel)
 _material_response = jax.jit(material_response)
-# The functions of `path_powers` have no compiler options, because a user may compile them as part of another function.
+# The functions that `path_powers` calls have no compiler options: a user may compile them as part of another function.
 _split_by_step = jax.jit(split_by_step)
 _split_by_step_wide = jax.jit(split_by_step, compiler_options=WIDE)
 _gains = compiled(program_gains)
@@ -353,7 +353,7 @@ def _link_power(program: GroupedProgram, response: MaterialResponse, combining: 
 def _slopes_by_formula(
     program: GroupedProgram, tables: jax.Array, count: int, columns: tuple[int, ...], combining: Combining
 ) -> tuple[jax.Array, jax.Array]:
-    """Path loss [n, L] and derivatives [n, L, M, columns] of the first candidates, one after the other."""
+    """Path loss [n, L] and derivatives [n, L, M, columns] of the first `count` candidates, one at a time."""
     stored = partial(materialize, positive=program.wavelength)
 
     def evaluate(index: jax.Array, results: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -375,7 +375,7 @@ def _slopes_by_formula(
 def _losses(
     program: GroupedProgram, tables: jax.Array, effects: EffectBatch | None, count: int, combining: Combining
 ) -> jax.Array:
-    """Path loss [n, L] of the first candidates, one after the other."""
+    """Path loss [n, L] of the first `count` candidates, one at a time."""
 
     def evaluate(index: jax.Array, losses: jax.Array) -> jax.Array:
         changed = program
@@ -395,11 +395,11 @@ def _slopes_with_effects(
     columns: tuple[int, ...],
     combining: Combining,
 ) -> tuple[jax.Array, ...]:
-    """Path loss [n, L] and derivatives [n, L, M, columns], [n, L, e] of the first candidates, one after the other."""
+    """Path loss [n, L] and derivatives [n, L, M, columns], [n, L, e] of the first `count` candidates, one at a time."""
     stored, values = partial(materialize, positive=program.wavelength), effects.values
 
     def evaluate(index: jax.Array, results: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        # Effects change the antenna fields alone: their tangents meet the reverse pass over the power there.
+        # Effects change only the antenna fields, so their tangents are combined with the power's gradient there.
         fields, push = jax.linearize(
             lambda value: antenna_fields(apply_effects(program, effects.effects, value)), values[index]
         )

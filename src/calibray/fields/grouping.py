@@ -1,8 +1,8 @@
 """Groups of paths that are evaluated together, and the sequence of their interactions.
 
 Paths of a group have interactions of the same kinds in the same order, so that every step of a group is a dense array.
-With padding, paths that differ only in the length of a run of reflections and transmissions share a group, and shorter
-runs are padded with interactions that change nothing.
+With padding, paths that differ only in the lengths of their runs of reflections and transmissions share a group, and
+shorter runs are padded with interactions that change nothing.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SCATTERING: Final = "s"
 DIFFRACTION: Final = "d"
 
 _LETTERS: Final = ("?", COEFFICIENT, SCATTERING, DIFFRACTION)
-"""Letters by the numbers of `_numbers`."""
+"""Letters, indexed by the results of `_numbers`."""
 
 _COEFFICIENT_NUMBER: Final = _LETTERS.index(COEFFICIENT)
 
@@ -56,21 +56,21 @@ def exact_groups(paths: Paths) -> list[PathGroup]:
 
 
 def padded_groups(paths: Paths) -> list[PathGroup]:
-    """Group paths that are equal if each run of reflections and transmissions counts as one interaction.
+    """Group paths whose sequences are equal if each run of reflections and transmissions counts as one interaction.
 
-    Within a group, the path with the most reflections and transmissions comes first; a run is as long as the longest
-    one of its paths.
+    Within a group, the path with the most reflections and transmissions comes first; each run has the length of the
+    longest one among the group's paths.
     """
     number, interaction = _numbers(paths), np.arange(paths.num_interactions)
     path = np.repeat(np.arange(paths.num_paths), np.diff(paths.first))
     is_coefficient = number == _COEFFICIENT_NUMBER
-    # Run that an interaction belongs to, or ends: the number of other interactions before it on its path.
+    # Index of the run that an interaction belongs to or ends: the number of other interactions before it on its path.
     others_before = np.concatenate([[0], np.cumsum(~is_coefficient)])
     run = others_before[:-1] - others_before[paths.first[path]]
     last_other = np.maximum.accumulate(np.where(is_coefficient, -1, interaction))
     rank = interaction - np.maximum(last_other + 1, paths.first[path])  # within its run
     count = np.bincount(path, is_coefficient, paths.num_paths)
-    # Paths with short runs come last, so that most empty positions are at the end of a line.
+    # Paths with fewer of these interactions come last, so that most empty positions are at the end of a line.
     members = [
         group[np.argsort(-count[group], kind="stable")]
         for group in _equal(_sequence_codes(paths, np.where(is_coefficient, 0, number)))
@@ -112,12 +112,12 @@ def _sequence_codes(paths: Paths, number: NDArray[np.int64]) -> NDArray[np.int64
         digit = number[paths.first[:-1][deep] + step]
         code[deep] = np.where(digit > 0, code[deep] * 4 + digit, code[deep])
         if step % 16 == 15:
-            # Two bits a step: renumber before a long path exceeds 64 bits. The last digit of the new codes is 0, so
-            # that a path that goes on gets the code of no path that ends here.
+            # Each step takes two bits: renumber before the code of a long path exceeds 64 bits. The last digit of the
+            # new codes is 0, so that a longer path cannot get the code of a path that ends here.
             code = 4 * np.unique(code, return_inverse=True)[1].reshape(-1)
     return code
 
 
 def _equal(code: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Indices with equal codes."""
+    """Groups of indices with equal codes."""
     return [np.flatnonzero(code == value) for value in np.unique(code)]

@@ -2,11 +2,11 @@
 
 Outside of Calibray's calls, the user's settings apply.
 
-Within `jax_settings`, JAX computes in double precision, and reads compiled programs from a folder that outlives the
-process. A compiled program is machine code, so it is read only from a folder that only the user can write to
+Within `jax_settings`, JAX computes in double precision and keeps compiled programs in a folder across processes.
+A compiled program is machine code, so it is read only from a folder that nobody but the user can write to
 (`calibray.support.cache_folder.Store`). JAX's own cache on disk writes entries in place and does not check them.
-Calibray uses JAX's keys, which cover everything a program depends on, but reads and writes through the store. If the
-user has set a folder for JAX's cache (`JAX_COMPILATION_CACHE_DIR`), that folder is used.
+Calibray uses JAX's keys, which cover everything a program depends on, but reads and writes through its own store. If
+the user has set a folder for JAX's cache (`JAX_COMPILATION_CACHE_DIR`), JAX uses that folder instead.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from calibray.support.messages import first_line, shortened
 
 _lock = threading.Lock()
 _calls = 0
-"""Number of calls in progress that use the store, over all threads."""
+"""Number of calls in progress that use the store, in all threads."""
 _users_cache: Any = None
-"""JAX's cache on disk before the first of these calls."""
+"""The cache that JAX used before the first of these calls."""
 
 
 @contextmanager
 def jax_settings() -> Iterator[None]:
-    """Compute in double precision and keep compiled programs; afterwards JAX has the user's settings again.
+    """Compute in double precision and keep compiled programs; on exit, the user's JAX settings are restored.
 
-    Every function of `calibray.fields` that computes uses these settings. Enter them yourself to differentiate or
-    compile code around one of the pure functions.
+    Every function of `calibray.fields` that computes uses these settings. Enter this context yourself to differentiate
+    or compile code around one of the pure functions.
 
     Raises:
         InputError: JAX finds no device to compute on.
@@ -54,7 +54,7 @@ def jax_settings() -> Iterator[None]:
     """
     _check_device()
     with jax.enable_x64(True):
-        # A folder is set if the user named one, or within another call of Calibray.
+        # A folder is set if the user named one, or within another call to Calibray.
         programs = _kept_programs() if jax.config.values["jax_compilation_cache_dir"] is None else None
         if programs is None:
             yield
@@ -65,7 +65,7 @@ def jax_settings() -> Iterator[None]:
 
 @cache
 def _check_device() -> None:
-    """Refuse a platform on which JAX has no device."""
+    """Raise an error if JAX has no device on the chosen platform."""
     try:
         jax.devices()
     except (RuntimeError, AssertionError, ValueError) as error:
@@ -80,8 +80,8 @@ def _check_device() -> None:
 def _cache_of_jax(programs: Any) -> Iterator[None]:
     """Make the store JAX's cache on disk.
 
-    JAX has one cache for all threads, but the folder is a setting of each thread. The store therefore serves only
-    threads in which its own folder is set, so that programs of the user are not kept.
+    JAX has one cache for all threads, but each thread has its own setting for the folder. The store therefore serves
+    only threads in which its own folder is set, so that the user's own programs are not kept.
     """
     global _calls, _users_cache
     from jax._src import compilation_cache, config
@@ -93,7 +93,7 @@ def _cache_of_jax(programs: Any) -> Iterator[None]:
     try:
         with (
             config.compilation_cache_dir(str(programs._path)),
-            # Programs that compile faster than JAX's limit are kept too.
+            # Keep programs regardless of their compilation time.
             config.persistent_cache_min_compile_time_secs(0.0),
         ):
             yield
@@ -111,7 +111,7 @@ def _kept_programs() -> Any:
     if store is None or not store.trusted:
         return None
     try:
-        # JAX has no public way to bring another storage.
+        # JAX has no public interface for a custom store.
         from jax._src import compilation_cache, config
         from jax._src.compilation_cache_interface import CacheInterface
     except ImportError:
@@ -137,7 +137,7 @@ def _kept_programs() -> Any:
 
 
 def _entry_name(key: str) -> str:
-    """Name of an entry, which includes the processor, because its code may crash on another one."""
+    """Name of an entry. It depends on the processor, because compiled code may crash on a different one."""
     return hashlib.sha256(f"{key} {_processor()}".encode()).hexdigest()
 
 
@@ -152,20 +152,20 @@ def _processor() -> str:
 
 
 WIDE: Final = {"xla_cpu_prefer_vector_width": 512}
-"""Compile for vectors of 512 bits. XLA prefers 256 even on processors with wider instructions; on others the option has
-no effect. The numbers are the same."""
+"""Compile for vectors of 512 bits. XLA prefers 256 bits even on processors with wider vectors; on other processors the
+option has no effect. The results are the same."""
 
 _QUICK: Final = WIDE | {"xla_cpu_use_fusion_emitters": False}
-"""The same without XLA's emitters of fused loops. The numbers differ by rounding."""
+"""The same without XLA's emitters of fused loops, which compiles faster. The results differ by rounding."""
 
 
 def compiled(
     function: Callable[..., Any] | None = None, *, static_argnums: int | tuple[int, ...] = ()
 ) -> Callable[..., Any]:
-    """A compiled function, like `jax.jit`, whose first argument is a program or has one as `program`.
+    """Compile a function like `jax.jit`; its first argument is a program or has one as the attribute `program`.
 
-    It is compiled for every value of the arguments at the positions `static_argnums`. Without a function, the result is
-    a decorator.
+    It is compiled anew for each value of the arguments at the positions `static_argnums`. Without a function, the
+    result is a decorator.
     """
     if function is None:
         return lambda function: compiled(function, static_argnums=static_argnums)
@@ -182,7 +182,7 @@ def compiled(
 
 @cache
 def _xla_has_the_option() -> bool:
-    """Whether this version of XLA knows the option; an unknown one is an error."""
+    """Whether this version of XLA knows the option of `_QUICK`; XLA raises an error for unknown options."""
     try:
         jax.jit(lambda: 0, compiler_options=_QUICK)()
     except jax.errors.JaxRuntimeError:

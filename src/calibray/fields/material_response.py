@@ -27,10 +27,10 @@ from calibray.fields.program import DiffuseArguments, FormulaArguments, GroupedP
 from calibray.fields.slab import FIELD_COLUMN, coefficients_of_materials, loss_term
 
 Coefficients = tuple[Pair, Pair]
-"""Transverse electric and magnetic coefficient."""
+"""Transverse electric and transverse magnetic coefficient."""
 
 GroupResponse = tuple[tuple[Coefficients, ...], tuple[tuple[jax.Array, jax.Array], ...]]
-"""The coefficients at every step of a group (at a diffraction two), and both amplitudes at every diffuse reflection."""
+"""The coefficients at every step of a group (a diffraction has two), and two amplitudes at every diffuse reflection."""
 
 
 @jax.tree_util.register_dataclass
@@ -40,8 +40,8 @@ class MaterialResponse:
 
     Attributes:
         coefficients: Transverse electric and magnetic coefficients, each (real, imaginary) [K]; or their tables.
-        co_polarized: S sqrt(f_s dOmega (1 - K_x)) of the diffuse interactions, which keep the polarization [D].
-        cross_polarized: S sqrt(f_s dOmega K_x), which turns it [D].
+        co_polarized: Amplitude S sqrt(f_s dOmega (1 - K_x)) of each diffuse interaction in the same polarization [D].
+        cross_polarized: Amplitude S sqrt(f_s dOmega K_x) in the orthogonal polarization [D].
     """
 
     coefficients: Coefficients | CoefficientTables
@@ -82,7 +82,7 @@ def material_response(program: GroupedProgram, table: jax.Array) -> MaterialResp
 def response_and_derivatives(
     program: GroupedProgram, table: jax.Array, columns: tuple[int, ...]
 ) -> tuple[MaterialResponse, tuple[MaterialResponse, ...]]:
-    """Response of the materials, and its derivatives by the `columns` of each interaction's own material."""
+    """Response of the materials; its derivatives by the constants in `columns` of each interaction's own material."""
     response, push = jax.linearize(partial(material_response, program), table)
     permittivity, conductivity = FIELD_COLUMN["relative_permittivity"], FIELD_COLUMN["conductivity"]
     derivatives = {
@@ -122,8 +122,8 @@ def split_by_step(
 ) -> tuple[GroupResponse, ...]:
     """The response, or its derivatives, split into the parts for each step of each group, group by group.
 
-    Reverse passes differentiate with respect to these parts. With respect to the flat arrays, every part would need a
-    pass over all of them. `blank` is the value of a coefficient at empty positions: 1, or 0 for derivatives.
+    Reverse passes differentiate with respect to these parts. Otherwise, each part would need a pass over the complete
+    flat arrays. `blank` is the value of a coefficient at empty positions: 1, or 0 for derivatives.
     """
     groups, row = [], 0
     step_coefficients = _coefficients_by_step(program, response, blank)
@@ -143,7 +143,7 @@ def split_by_step(
 def _coefficients_by_step(
     program: GroupedProgram, response: MaterialResponse, blank: float
 ) -> Iterator[Coefficients]:
-    """The coefficients of one step after the other."""
+    """The coefficients of all groups, one step at a time."""
     source = program.coefficients
     if isinstance(source, TableLayout) and isinstance(response.coefficients, CoefficientTables):
         for cell, fraction in zip(source.cell, source.fraction, strict=True):
@@ -162,9 +162,9 @@ def _coefficients_by_step(
 def _unpacked(
     values: jax.Array, start: int, lines: tuple[int, ...], shape: tuple[int, ...], blank: float = 0.0
 ) -> jax.Array:
-    """The numbers of one step of a group, with `blank` at positions that are not stored.
+    """The coefficients of one step of a group, with `blank` at positions that are not stored.
 
-    A line is read beyond its end into the next one and the excess is replaced, which needs no separate pass.
+    Each line is read past its end, and the excess is replaced, which needs no separate pass.
     """
     parts, size = [], shape[-1]
     for length in reversed(lines):  # the last line is stored first
@@ -176,21 +176,21 @@ def _unpacked(
 
 
 LARGEST_EXPONENT = 64
-"""Largest exponent alpha of a lobe whose normalization is a sum; beyond it, lobes are Gaussian within 0.0021 dB."""
+"""Largest exponent alpha for which the normalization is a sum; above it, a Gaussian lobe is accurate to 0.0021 dB."""
 
 
 def pattern_value(table: jax.Array, diffuse: DiffuseArguments) -> jax.Array:
-    """Density f_s [D], [1/sr], of the diffusely reflected power over directions, for constants [M, 8]."""
+    """Angular density f_s [D], [1/sr], of the diffusely reflected power, for constants [M, 8]."""
     material, patterns, lambertian = diffuse.material, diffuse.patterns, diffuse.cos_scattered / jnp.pi
     if all(pattern == "lambertian" for pattern in patterns):
         return lambertian
     alpha_r, alpha_i, share = (table[:, FIELD_COLUMN[name]] for name in ("alpha_r", "alpha_i", "lambda_"))
-    # The directive pattern is the backscattering one with all energy in the lobe around the specular direction.
+    # The directive pattern is the backscattering pattern with all energy in the lobe around the specular direction.
     is_directive = np.array([pattern == "directive" for pattern in patterns])
     share, alpha_i = jnp.where(is_directive, 1.0, share), jnp.where(is_directive, 1.0, alpha_i)
     norm_r, norm_i = (_normalization(alpha, diffuse) for alpha in (alpha_r, alpha_i))
     alpha_r, alpha_i, share = alpha_r[material], alpha_i[material], share[material]
-    # ((1 + cos psi) / 2)^alpha, with psi from the specular direction, and from the direction back to the source.
+    # ((1 + cos psi) / 2)^alpha, with psi measured from the specular direction and from the direction to the source.
     lobes = (
         share * (0.5 * (1 + diffuse.cos_specular)) ** alpha_r
         + (1 - share) * (0.5 * (1 + diffuse.cos_backward)) ** alpha_i
@@ -200,10 +200,10 @@ def pattern_value(table: jax.Array, diffuse: DiffuseArguments) -> jax.Array:
 
 
 def _normalization(alpha: jax.Array, diffuse: DiffuseArguments) -> jax.Array:
-    """F_alpha [D], integral of a lobe over the half space (eqs. 7 and 8 of the paper), for exponents alpha [M].
+    """F_alpha [D], the integral of a lobe over the half space (eqs. 7 and 8 of the paper), for exponents alpha [M].
 
-    It is linear between whole exponents. Beyond `LARGEST_EXPONENT`, ((1 + cos psi) / 2)^alpha is nearly
-    exp(-alpha psi^2 / 4), of which the plane of the surface cuts off a tail.
+    It is interpolated linearly between integer exponents. Above `LARGEST_EXPONENT`, ((1 + cos psi) / 2)^alpha is nearly
+    exp(-alpha psi^2 / 4), and the plane of the surface truncates its tail.
     """
     low = jnp.clip(jnp.floor(alpha), 1, LARGEST_EXPONENT - 1)
     weight, row = alpha - low, low.astype(jnp.int32)
@@ -217,11 +217,11 @@ def _normalization(alpha: jax.Array, diffuse: DiffuseArguments) -> jax.Array:
 
 @cache
 def _whole_normalizations() -> NDArray[np.float64]:
-    """Factors of F_alpha for alpha = 0 .. LARGEST_EXPONENT [terms, alpha].
+    """Coefficients of F_alpha for alpha = 0 .. LARGEST_EXPONENT [terms, alpha].
 
-    F_alpha = 2^-alpha sum_j binom(alpha, j) I_j. I_j is 2 pi / (j + 1) for even j, and for odd j that times
-    cos theta sum_{w <= (j - 1) / 2} binom(2w, w) (sin^2 theta / 4)^w. The factors are those of cos theta sin^2w theta,
-    the highest power first, and then the constant.
+    F_alpha = 2^-alpha sum_j binom(alpha, j) I_j. I_j is 2 pi / (j + 1) for even j; for odd j it is multiplied by
+    cos theta sum_{w <= (j - 1) / 2} binom(2w, w) (sin^2 theta / 4)^w. The result has the coefficients of
+    cos theta sin^2w theta, highest power first, then the constant.
     """
     alpha = np.arange(LARGEST_EXPONENT + 1)
     j, w = alpha[:, None], np.arange(LARGEST_EXPONENT // 2)[::-1, None]

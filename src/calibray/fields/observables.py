@@ -1,10 +1,10 @@
-"""Further observables of links in addition to path loss, as a receiver measures them, with derivatives.
+"""Observables of links other than path loss, as a receiver measures them, with derivatives.
 
-Each is a power-weighted statistic of the paths of a link that a receiver resolves. A receiver of limited bandwidth
+Each is a power-weighted statistic of the paths that a receiver resolves in a link. A receiver of limited bandwidth
 resolves taps instead of paths: samples of its power delay profile, in which the pulse of each path is spread over a few
 taps. It detects neither taps far below the strongest tap nor taps below its noise floor. A logistic function of the
-level in dB, `SOFT_DB` wide, replaces that hard limit, so that derivatives are exact. It changes the weight of taps
-within about 2 dB of the limit. `docs/measurements/observables.md` shows the error of the smooth limit.
+level in dB, `SOFT_DB` wide, replaces each of these hard limits, so that derivatives are exact. It changes the weight of
+taps within about 2 dB of a limit. `docs/measurements/observables.md` shows the error of the smooth limit.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from calibray.measurements import observables as kinds
 from calibray.measurements.observables import Statistic
 
 SOFT_DB: Final = 0.5
-"""Width of the limit of a receiver's range [dB]."""
+"""Scale of the logistic function at the limits of a receiver's range [dB]."""
 
 TAPS: Final = 4
-"""Taps over which a path is spread: the main lobe of a Hann pulse is four taps wide. All side lobes together contain
-0.05 % of the power, and the highest is 31 dB down."""
+"""Number of taps over which a path is spread: the main lobe of a Hann pulse is four taps wide. All side lobes together
+contain 0.05 % of the power, and the highest is 31 dB below the main lobe."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Taps:
-    """The T taps of all links in which a receiver of limited bandwidth resolves P paths.
+    """The T taps of all links into which a receiver of limited bandwidth resolves P paths.
 
     Attributes:
         delay: Delay of every tap [T], [s].
         link: Link of every tap [T].
-        index: Taps of every path [P, TAPS].
-        share: Shares of the path's power in them [P, TAPS].
+        index: Indices of the taps of every path [P, TAPS].
+        share: Share of the path's power in each of these taps [P, TAPS].
     """
 
     delay: NDArray[np.float64]
@@ -57,14 +57,14 @@ class Taps:
     def of(cls, delay: NDArray[np.float64], link: NDArray[np.integer], bandwidth: float) -> Taps:
         """The taps of paths with delays [P], [s], in links [P], at a bandwidth [Hz].
 
-        Taps are 1 / bandwidth apart. At this spacing they preserve the power, the mean and the mean square of the
-        delays of the sampled profile, wherever a path lies between two taps.
+        Taps are 1 / bandwidth apart. At this spacing, sampling preserves the power, mean delay and mean square delay
+        of the profile, wherever a path lies between two taps.
         """
         # The two taps at or before the path, and the two after it.
         number = np.floor(delay * bandwidth).astype(np.int64)[:, None] + np.arange(TAPS) - TAPS // 2 + 1
         share = hann_pulse(number - delay[:, None] * bandwidth)
         span = int(number.max(initial=0)) + TAPS
-        # Numbers are at least 1 - TAPS // 2.
+        # The tap numbers are at least 1 - TAPS // 2.
         taps, index = np.unique(
             np.asarray(link)[:, None] * (span + TAPS) + number + TAPS, return_inverse=True
         )
@@ -81,14 +81,14 @@ class Taps:
         return jax.ops.segment_sum(spread.ravel(), jnp.asarray(self.index).ravel(), len(self.delay))
 
     def of_paths(self, seen: jax.Array) -> jax.Array:
-        """Share of every path's power [P] that is detected, from that of every tap [T]."""
+        """Detected share of every path's power [P], from the detected share of every tap [T]."""
         return jnp.sum(seen[jnp.asarray(self.index)] * self.share, axis=1)
 
 
 def hann_pulse(time: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Power of the pulse of a receiver whose spectrum has a Hann window, at times in units of 1 / bandwidth.
+    """Power of the pulse of a receiver that applies a Hann window to its spectrum, at times in units of 1 / bandwidth.
 
-    Its root mean square width is 1 / (sqrt(3) bandwidth). The power is 0 outside the main lobe.
+    The root mean square width of the pulse is 1 / (sqrt(3) bandwidth). Outside the main lobe, the power is set to 0.
     """
     inside = np.abs(time) < TAPS / 2
     near = np.isclose(np.abs(time), 1.0)
@@ -99,18 +99,18 @@ def hann_pulse(time: NDArray[np.float64]) -> NDArray[np.float64]:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Channel:
-    """Paths, and what a receiver measures of them for values of d parameters.
+    """Paths, and the statistics that a receiver measures, as functions of d parameters.
 
     Attributes:
         program: The program, with delays.
         effects: Effects on the paths.
         base: Constants of the materials before calibration [M, 8].
         departure: Zenith and azimuth of departure of every path [P, 2], [rad].
-        arrival: The same of arrival.
-        taps: The taps at every bandwidth of the statistics.
-        cells: Index of a parameter, row and column of its constant, for every parameter of a material.
+        arrival: Zenith and azimuth of arrival, in the same form.
+        taps: The taps for each bandwidth among the statistics.
+        cells: For every material parameter: its index, and the row and column of its constant in `base`.
         of_effects: Indices of the parameters of effects.
-        wanted: The K statistics.
+        wanted: The K statistics to compute.
     """
 
     program: GroupedProgram
@@ -125,7 +125,7 @@ class Channel:
 
     @jax_settings()
     def measuring(self, wanted: tuple[Statistic, ...]) -> Channel:
-        """The same with other statistics."""
+        """The same channel with different statistics."""
         link, delay = (np.asarray(part) for part in self.program.phases)
         taps = tuple(Taps.of(delay, link, bandwidth) for bandwidth in _bandwidths(wanted))
         return jax.device_put(replace(self, taps=taps, wanted=wanted))
@@ -139,9 +139,9 @@ def _bandwidths(wanted: tuple[Statistic, ...]) -> list[float]:
 def link_responses(
     channel: Channel, values: NDArray[np.float64], count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Path loss by the sum of powers [count, L], [dB], and statistics [count, K, L]; NaN for a link without a path.
+    """Path loss from the sum of powers [count, L], [dB], and statistics [count, K, L]; NaN for a link without a path.
 
-    Of the values of the parameters [n, d], the first `count` are evaluated; the function is compiled for n.
+    The first `count` rows of the parameter values [n, d] are evaluated; the function is compiled for n rows.
     """
     loss, observed = _responses(channel, jax.device_put(values), count)
     return np.asarray(loss)[:count], np.asarray(observed)[:count]
@@ -151,9 +151,9 @@ def link_responses(
 def link_responses_and_slopes(
     channel: Channel, values: NDArray[np.float64], count: int
 ) -> tuple[NDArray[np.float64], ...]:
-    """Path loss, statistics, and their derivatives by the parameters [count, L, d] and [count, K, L, d].
+    """Path loss, statistics, and their derivatives with respect to the parameters [count, L, d], [count, K, L, d].
 
-    Derivatives of a statistic are NaN where it is not finite.
+    Derivatives of a statistic are NaN where the statistic is not finite.
     """
     answers = _responses_and_slopes(channel, jax.device_put(values), count)
     loss, observed, loss_slope, slope = (np.asarray(answer)[:count] for answer in answers)
@@ -177,7 +177,7 @@ def _responses_and_slopes(channel: Channel, values: jax.Array, count: int) -> tu
         def push(direction: jax.Array) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
             return jax.jvp(partial(_response, channel), (values[index],), (direction,))
 
-        # Statistics are many and parameters few: forward mode is faster to compile and to run.
+        # With many statistics and few parameters, forward mode is faster to compile and to run.
         found, slopes = jax.vmap(push, out_axes=(None, -1))(directions)
         answers = *found, *slopes
         return tuple(array.at[index].set(answer) for array, answer in zip(every, answers, strict=True))
@@ -193,7 +193,7 @@ def _blank(channel: Channel, size: int) -> tuple[jax.Array, jax.Array]:
 
 
 def _response(channel: Channel, values: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Path loss [L] and the statistics [K, L] for values of the parameters [d]."""
+    """Path loss [L] and the statistics [K, L] for parameter values [d]."""
     program, table = channel.program, jnp.asarray(channel.base)
     stored = partial(materialize, positive=program.wavelength)
     if channel.cells:
@@ -209,14 +209,14 @@ def _response(channel: Channel, values: jax.Array) -> tuple[jax.Array, jax.Array
 
 
 def _statistic(channel: Channel, power: jax.Array, wanted: Statistic) -> jax.Array:
-    """A statistic of every link [L], from the powers of paths [P]."""
+    """One statistic of every link [L], from the powers of the paths [P]."""
     num_links, (link, delay) = channel.program.num_links, channel.program.phases
     taps, tap_delay, tap_link, tap_power = None, delay, link, power
     if wanted.bandwidth is not None:
         taps = channel.taps[_bandwidths(channel.wanted).index(wanted.bandwidth)]
         tap_delay, tap_link, tap_power = jnp.asarray(taps.delay), jnp.asarray(taps.link), taps.power(power)
     seen = _seen(tap_power, tap_link, num_links, wanted)
-    # Where the receiver sees more than half of a tap, it detects it.
+    # A tap counts as detected if its detected share is at least one half.
     detected = jnp.where((tap_power > 0) & (seen >= 0.5), tap_delay, jnp.inf)
     first = jax.ops.segment_min(detected, tap_link, num_links)
     if wanted.window is not None:
@@ -239,14 +239,14 @@ def _statistic(channel: Channel, power: jax.Array, wanted: Statistic) -> jax.Arr
     angle = jnp.asarray(_angles(channel, wanted.kind))
     if wanted.kind in kinds.SECTORS:
         start, _ = wanted.bin
-        # Counted from the start of the sector, which may contain the jump from pi to -pi.
+        # Angles are measured from the start of the sector, which may contain the jump from pi to -pi.
         turned = (angle - start) % (2 * np.pi) + start
         return _share(path_weight, turned, link, num_links, wanted)
     return angular_spread(path_weight, angle, link, num_links)
 
 
 def _seen(power: jax.Array, link: jax.Array, num_links: int, wanted: Statistic) -> jax.Array:
-    """Share of every tap that the receiver detects, by its level [T]."""
+    """Share of every tap's power that the receiver detects, by the level of the tap [T]."""
     level_db, seen = -decibel(power), jnp.ones_like(power)
     if wanted.dynamic_range_db is not None:
         strongest = jax.ops.segment_max(power, link, num_links)
@@ -255,25 +255,25 @@ def _seen(power: jax.Array, link: jax.Array, num_links: int, wanted: Statistic) 
         seen = seen * jax.nn.sigmoid((below + wanted.dynamic_range_db) / SOFT_DB)
     if wanted.floor_db is not None:
         seen = seen * jax.nn.sigmoid((level_db - wanted.floor_db) / SOFT_DB)
-    # A tap of no power is not seen, whatever its level.
+    # A tap without power is never detected.
     return jnp.where(power > 0, seen, 0.0)
 
 
 def _share(
     weight: jax.Array, value: jax.Array, link: jax.Array, num_links: int, wanted: Statistic
 ) -> jax.Array:
-    """Share of every link's weight whose value lies in the bin [L], [dB]; at least minus the dynamic range."""
+    """Share of each link's weight with values in the bin [L], [dB]; not below the negative dynamic range."""
     low, high = wanted.bin
     share = link_mean(weight, ((value >= low) & (value < high)).astype(weight.dtype), link, num_links)
     range_db = kinds.SHARE_RANGE_DB if wanted.dynamic_range_db is None else wanted.dynamic_range_db
-    # Power below the dynamic range is not seen; it also keeps the level of an empty bin finite.
+    # The added term is the power that lies below the dynamic range; it keeps the level of an empty bin finite.
     return 10 * jnp.log10(share + 10 ** (-range_db / 10))
 
 
 def _flight(
     weight: jax.Array, seen: jax.Array, delay: jax.Array, link: jax.Array, num_links: int, wanted: Statistic
 ) -> jax.Array:
-    """Time of flight of every link [L], [s]: of the mean path, or of one path and those not resolved from it."""
+    """Time of flight of every link [L], [s]: the mean of all paths, or of one path and those not resolved from it."""
     if wanted.path == "mean":
         return link_mean(weight, delay, link, num_links)
     if wanted.path == "first":

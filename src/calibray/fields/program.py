@@ -1,11 +1,10 @@
 """A path program laid out for evaluation.
 
 Paths are grouped by the kinds of their interactions (`calibray.fields.grouping`), so that each group is a dense array.
-The arguments of the coefficients of all groups are stored in one flat array, because the slab formula is evaluated for
-all of them at once.
+The slab formula is evaluated for all groups at once, so its arguments are stored in flat arrays over all groups.
 
-A large program is stored without padding. A small program takes less time to evaluate than to compile. In a small
-program, shorter runs of reflections and transmissions are therefore padded, so that fewer groups have to be compiled.
+A large program with tables is stored without padding. In other programs, shorter runs of reflections and transmissions
+are padded, so that fewer groups have to be compiled: a small program takes less time to evaluate than to compile.
 """
 
 from __future__ import annotations
@@ -34,11 +33,11 @@ from calibray.fields.slab import Mode
 from calibray.paths import Kind, Paths
 
 LARGE: Final = 50_000
-"""Number of interactions above which a program is large: it is not padded, and a candidate takes milliseconds."""
+"""Number of interactions above which a program is large: not padded with tables, and milliseconds per candidate."""
 
 SMALL: Final = 300
-"""Largest number of coefficients of a small program. With 120, path loss and derivatives are compiled in 2.3 s instead
-of 3.4 s, and a candidate takes up to 20 us longer; with 960, 135 us longer (`docs/measurements/speed.md`)."""
+"""Largest number of coefficients in a small program. With 120, path loss and derivatives compile in 2.3 s instead of
+3.4 s, and a candidate takes up to 20 us longer; with 960, it takes 135 us longer (`docs/measurements/speed.md`)."""
 
 
 @jax.tree_util.register_dataclass
@@ -49,9 +48,9 @@ class Group:
     Attributes:
         tx: Transmit field, real and imaginary part [2, T, 2, n]; only the real part if all are real [1, T, 2, n].
         rx: Receive field times A lambda / 4 pi, in the same form [2 or 1, R, 2, n].
-        rotation: Per step (cos, sin) into the frame of the interaction [2, n]; for a run of k [k, 2, n].
-        turn: Per step (cos, sin) from the frame of incidence into the basis (theta, phi) [2, n], or None.
-        wedge: Per step the matrices C_0 .. C_4, real and imaginary part [2, 5, 2, 2, n], or None.
+        rotation: Per step, (cos, sin) of the rotation into the interaction's frame [2, n]; [k, 2, n] for a run of k.
+        turn: Per step, (cos, sin) from the frame of incidence into the basis (theta, phi) [2, n], or None.
+        wedge: Per step, the matrices C_0 .. C_4, real and imaginary part [2, 5, 2, 2, n], or None.
         signature: One letter for each step, see `calibray.fields.grouping`.
         size: Number of paths n.
     """
@@ -76,13 +75,13 @@ class FormulaArguments:
     Attributes:
         material: Material [K].
         cosine: Cosine of the angle of incidence [K].
-        transmitted: Whether the coefficient is a transmission [K].
-        unreduced: Whether it is a reflection that keeps the scattered energy, as in a diffuse interaction [K].
+        transmitted: Whether the coefficient is a transmission coefficient [K].
+        unreduced: Whether it is a reflection coefficient not reduced by scattering, as in a diffuse interaction [K].
         blank: Whether the position is empty and its coefficient is 1 [K]; None if no position is empty.
         shapes: Shape of the positions at each step of each group, (n,) or (k, n).
-        lines: Number of stored positions in each line (one line, or k for a run) of each step; the last line comes
+        lines: Number of stored positions in each line (one line, or k for a run) of each step; the last line is stored
             first.
-        any_transmitted: Whether any coefficient is a transmission.
+        any_transmitted: Whether any coefficient is a transmission coefficient.
     """
 
     material: jax.Array
@@ -102,12 +101,11 @@ class DiffuseArguments:
 
     Attributes:
         material: Material [D].
-        solid_angle: Solid angle of the ray tube over its sampling probability [D], [sr].
-        cos_scattered: Cosine between scattered direction and normal [D].
+        solid_angle: Solid angle of the ray tube, divided by its sampling probability [D], [sr].
+        cos_scattered: Cosine of the angle between the scattered direction and the normal [D].
         cos_incidence: Cosine of the angle of incidence [D]; empty if every material is Lambertian.
-        cos_specular: Cosine between scattered and specular direction [D]; empty in the same case.
-        cos_backward: Cosine between scattered direction and the direction back to the source [D]; empty in the same
-            case.
+        cos_specular: Cosine of the angle between the scattered and specular directions [D]; empty in the same case.
+        cos_backward: Cosine of the angle between the scattered direction and the direction to the source [D]; likewise.
         patterns: Scattering pattern of every material.
     """
 
@@ -126,11 +124,11 @@ class GroupedProgram:
     """A path program laid out for evaluation: P paths, J coefficients, D diffuse interactions, M materials.
 
     Attributes:
-        groups: The paths, grouped by kind of interactions.
+        groups: The paths, grouped by sequence of interactions.
         by_link: Segments of the paths by link.
         link: Link of every path, in the order of the groups [P]; None if only powers are summed.
         delay: Delay of every path, in the order of the groups [P], [s]; None in the same case.
-        wavelength: [m].
+        wavelength: Wavelength [m].
         coefficients: Arguments of the slab formula, or positions in tables.
         diffuse: Arguments of the scattering patterns.
         by_material: Segments of the coefficients and of the diffuse interactions by link and material (segment:
@@ -176,7 +174,7 @@ class GroupedProgram:
 
 @dataclass(frozen=True)
 class Layout:
-    """A grouped program, and the index in the path program of each of its paths [P]."""
+    """A grouped program, and the index of each of its paths in the path program [P]."""
 
     program: GroupedProgram
     order: NDArray[np.int64]
@@ -186,13 +184,13 @@ class Layout:
 def layout(
     paths: Paths, dtype: type = np.float64, intervals: Intervals | None = None, phases: bool = True
 ) -> Layout:
-    """Lay a path program out for evaluation, in a precision, on JAX's default device.
+    """Lay a path program out for evaluation in a given precision on JAX's default device.
 
-    With `intervals`, one for all or by material and mode [M, 3], the coefficients are tabulated over the angle of
+    With `intervals`, one number or one by material and mode [M, 3], the coefficients are tabulated by angle of
     incidence; None evaluates the slab formula at every interaction. With `phases`, links and delays of the paths are
-    kept. Without them, only sums of powers can be computed.
+    kept. Without `phases`, only sums of powers can be computed.
     """
-    # Arrays are put on the device as they are: jnp.asarray compiles a program for every shape, 15 ms each.
+    # Use jax.device_put: jnp.asarray compiles a program for every shape, which takes 15 ms each.
     padded = intervals is None or paths.num_interactions <= LARGE
     path_groups = padded_groups(paths) if padded else exact_groups(paths)
     order = _joined([group.paths for group in path_groups])
@@ -200,7 +198,7 @@ def layout(
     num_materials = len(paths.materials)
     link = np.repeat(paths.link, np.diff(paths.first)).astype(np.int64)
     segment = link * num_materials + paths.material
-    # Padding is counted with segment 0. It adds nothing there, because its derivatives are 0.
+    # Padding belongs to segment 0. It adds nothing there, because its derivatives are 0.
     segment_of_coefficient = np.concatenate([segment, segment[numbering.wedges], [0]])
     num_segments = paths.num_links * num_materials
     program = GroupedProgram(
@@ -222,16 +220,16 @@ def layout(
 
 
 class _Numbering:
-    """Numbers of the coefficients in the order in which the steps of all groups use them.
+    """Indices of the coefficients in the order in which the steps of all groups use them.
 
-    Coefficients are numbered by interaction; those of the n-faces of diffracting wedges follow.
+    Coefficients are numbered by interaction, followed by those of the n-faces of diffracting wedges.
 
     Attributes:
-        wedges: The diffractions [W].
-        count: Number of coefficients; as an index it denotes an empty position.
+        wedges: Interaction indices of the diffractions [W].
+        count: Number of coefficients; as an index, it marks an empty position.
         table_row: Row of each interaction in the table of its kind, -1 for reflections and transmissions [I].
         steps: Coefficients at each step of each group, [n] or [k, n]; a diffraction has two steps.
-        scattered: Diffuse interactions in the order of use [D].
+        scattered: Indices of the diffuse interactions in the order of use [D].
     """
 
     def __init__(self, paths: Paths, groups: list[PathGroup]) -> None:
@@ -269,7 +267,7 @@ def _coefficients(
     ]
     position = _joined([line for step in lines for line in reversed(step)])
     blank = position == numbering.count
-    # At empty positions the formula is evaluated for arbitrary arguments; the result is replaced by 1.
+    # At empty positions, the formula is evaluated for arbitrary arguments, and the result is replaced by 1.
     material, mode, cosine = (
         np.append(column, filler)[position] for column, filler in zip(arguments, (0, 0, 1.0), strict=True)
     )
@@ -305,7 +303,7 @@ def _diffuse(
         solid_angle=column(table.solid_angle[row]),
         cos_scattered=column(table.cos_scattered[row]),
         cos_incidence=column(paths.cos_incidence[interaction][lobes]),
-        # Rounded below -1, they would be the negative base of a power, which is not a number.
+        # A cosine rounded below -1 would make the base of a power negative and give NaN.
         cos_specular=column(np.maximum(table.cos_specular[row][lobes], -1.0)),
         cos_backward=column(np.maximum(table.cos_backward[row][lobes], -1.0)),
         patterns=patterns,
@@ -323,10 +321,10 @@ def _group(paths: Paths, group: PathGroup, table_row: NDArray[np.int64], dtype: 
         wedge.append(
             _parts(affine_form(paths.diffraction, row, paths.frequency), dtype) if diffracts else None
         )
-    # (lambda / 4 pi) A of the gain of a path
+    # Factor (lambda / 4 pi) A in the gain of a path.
     scale = paths.spreading[group.paths] * speed_of_light / paths.frequency / (4 * np.pi)
     if paths.correction is not None:
-        # The correction is a ratio of powers, the scale one of fields.
+        # The correction is a ratio of powers, but `scale` multiplies fields.
         scale = scale * np.sqrt(paths.correction[group.paths])
     tx, rx = paths.tx_field[group.paths], paths.rx_field[group.paths] * scale[:, None, None]
     return Group(
@@ -341,7 +339,7 @@ def _group(paths: Paths, group: PathGroup, table_row: NDArray[np.int64], dtype: 
 
 
 def _num_parts(field: NDArray[np.complex128]) -> int:
-    """1 if all fields are real, as with most linearly polarized antennas, otherwise 2."""
+    """Number of parts to store: 1 if all fields are real, as for most linearly polarized antennas, otherwise 2."""
     return 2 if field.imag.any() else 1
 
 

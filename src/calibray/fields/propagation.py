@@ -1,4 +1,4 @@
-"""From the antennas to the path loss of a link: the chain of Jones matrices of every path, and the sum over paths.
+"""Path loss of links: the chain of Jones matrices between the antennas of every path, and the sum over paths.
 
 - Reflection and transmission: a real rotation into the frame of incidence, then the diagonal (c_te, c_tm).
 - Diffuse reflection: not linear in the field, because its amplitude follows the specularly reflected field.
@@ -76,7 +76,7 @@ def _group_gains(group: Group, response: GroupResponse, keep: Keep) -> Pair:
 
 
 def _component(field: jax.Array, component: int) -> Pair:
-    """One component of an antenna's field [ports, n]; the imaginary part is not stored if it is 0 everywhere."""
+    """One component of an antenna's field [ports, n]; an imaginary part that is 0 everywhere is not stored."""
     real = field[0, :, component]
     return real, field[1, :, component] if field.shape[0] == 2 else jnp.zeros_like(real)
 
@@ -92,7 +92,7 @@ def _rotate(rotation: jax.Array, a: Pair, b: Pair) -> tuple[Pair, Pair]:
 def _run(te: Pair, tm: Pair, c_te: Pair, c_tm: Pair, rotation: jax.Array, keep: Keep) -> tuple[Pair, Pair]:
     """Reflections and transmissions in succession.
 
-    The loop is unrolled: a loop of XLA takes twice as long to run and as long to compile.
+    The loop is unrolled: an XLA loop takes twice as long to run and just as long to compile.
     """
     for step, cos_sin in enumerate(rotation):
         te, tm = _rotate(cos_sin, te, tm)
@@ -115,7 +115,7 @@ def _scatter(
     reflected = squared_magnitude(r_te) * squared_magnitude(te) + squared_magnitude(r_tm) * squared_magnitude(
         tm
     )
-    # Gamma = |R E| / |E|, of the incident field
+    # Gamma = |R E| / |E| for the incident field E
     gamma = keep(safe_sqrt(reflected / jnp.where(incident > 0, incident, 1.0)))
     theta, phi = _rotate(turn, te, tm)  # the XPD matrix acts in the basis (theta, phi)
     co, cross = co_polarized * gamma, cross_polarized * gamma
@@ -161,9 +161,9 @@ class Combining:
     def make(
         cls, kind: str, link: NDArray[np.integer], delay: NDArray[np.float64], bandwidth: float | None = None
     ) -> Combining:
-        """Check a way of combining, "power", "coherent" or "band" with a bandwidth [Hz], and prepare it for paths.
+        """Check and prepare a way of combining paths: "power", "coherent", or "band" with a bandwidth [Hz].
 
-        Links of the paths [P] do not decrease; delays are [P], [s].
+        `link` [P] must be non-decreasing; `delay` is [P], [s].
 
         Raises:
             InputError: The kind is unknown, or the bandwidth is missing or not positive.
@@ -174,16 +174,16 @@ class Combining:
 
 
 POWER: Final = Combining()
-"""The sum of powers."""
+"""Combining by the sum of powers."""
 
 
 def _band_nodes(
     link: NDArray[np.integer], delay: NDArray[np.float64], bandwidth: float | None
 ) -> NDArray[np.float64]:
-    """Gauss-Legendre nodes and weights over a band [2, q], enough for the largest spread of delays within a link.
+    """Gauss-Legendre nodes and weights over a band [2, q], with enough nodes for the largest delay span in any link.
 
     The average of |H|^2 over the band contains oscillations e^{j 2 pi f (tau_i - tau_j)}. A rule with n nodes
-    integrates them to machine precision if n exceeds about a quarter of their phase [rad] plus ten.
+    integrates them to machine precision if n exceeds about ten plus a quarter of their phase change over the band.
 
     Raises:
         InputError: The bandwidth is not positive.
@@ -216,7 +216,7 @@ def link_power(
 ) -> jax.Array:
     """Power gain of every link [L] from its path gains [R, T, P]; 0 for a link without a path.
 
-    With several ports the power is summed over receive ports and averaged over transmit ports.
+    With several ports, the power is summed over receive ports and averaged over transmit ports.
     """
     total = partial(jax.ops.segment_sum, segment_ids=link, num_segments=num_links)
     if combining.kind == "power":
@@ -231,7 +231,7 @@ def link_power(
 
 
 def decibel(power: jax.Array) -> jax.Array:
-    """Path loss -10 log10(power) of power gains [dB]; +inf where the power is 0."""
+    """Path loss -10 log10(power) from power gains [dB]; +inf where the power is 0."""
     reached = power > 0
     return jnp.where(reached, -10 * jnp.log10(jnp.where(reached, power, 1.0)), jnp.inf)
 

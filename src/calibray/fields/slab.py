@@ -16,18 +16,18 @@ FIELD_COLUMN: Final = {name: column for column, name in enumerate(FIELDS)}
 """Column of each material constant in a table of materials."""
 
 _SELECTED_MATERIALS: Final = 12
-"""Up to this number of materials, a constant is selected by comparing indices; beyond it, it is gathered. XLA gathers
+"""Number of materials up to which a constant is selected by comparing indices; with more, it is gathered. XLA gathers
 one number at a time, but vectorizes comparisons."""
 
 
 class Mode(IntEnum):
-    """How a coefficient is used."""
+    """Use of a coefficient."""
 
     REFLECTION = 0
-    """Specular reflection or wedge face: reduced by the scattered energy."""
+    """Specular reflection or wedge face; reduced by the scattered energy."""
     TRANSMISSION = 1
     FULL_REFLECTION = 2
-    """Reflection of a diffuse interaction: not reduced."""
+    """Reflection in a diffuse interaction; not reduced."""
 
 
 def loss_term(conductivity: jax.Array, wavelength: jax.Array) -> jax.Array:
@@ -44,11 +44,11 @@ def coefficients(
     wavelength: jax.Array,
     transmitted: jax.Array | bool,
 ) -> tuple[Pair, Pair]:
-    """Transverse electric and magnetic coefficient of reflection, or of transmission where `transmitted` [...].
+    """Transverse electric and magnetic reflection coefficients, or transmission coefficients where `transmitted` [...].
 
-    The permittivity is relative, `loss` is `loss_term`, the thickness in [m]. Each coefficient is (real, imaginary)
-    [...], in the precision of the cosine. They are computed in double precision: the fourth power of a metal's
-    permittivity exceeds the range of single precision.
+    The permittivity is relative, `loss` is from `loss_term`, and the thickness is in [m]. Each coefficient is
+    (real, imaginary) [...], in the precision of the cosine. Coefficients are computed in double precision: the fourth
+    power of a metal's permittivity exceeds the range of single precision.
     """
     precision = cosine.dtype
     cosine, permittivity, loss, thickness, wavelength = (
@@ -86,9 +86,9 @@ def coefficients_of_materials(
     transmitted: jax.Array | bool,
     unreduced: jax.Array,
 ) -> tuple[Pair, Pair]:
-    """Coefficients [...] from constants of materials [M, 8]; reflection is reduced by the scattered energy.
+    """Coefficients [...] from material constants [M, 8].
 
-    Where `unreduced` [...] is true, it is not reduced.
+    The scattered energy reduces reflection coefficients, except where `unreduced` [...] is true.
     """
     column = {name: table[:, index] for name, index in FIELD_COLUMN.items()}
     te, tm = coefficients(
@@ -118,9 +118,10 @@ def _of_material(constant: jax.Array, material: jax.Array) -> jax.Array:
 def _slab(
     numerator: Pair, denominator: Pair, phase: Pair, phase_twice: Pair, transmitted: jax.Array | bool
 ) -> Pair:
-    """Coefficient of a slab with the half-space coefficient R' = numerator / denominator.
+    """Coefficient of a slab, given the half-space coefficient R' = numerator / denominator.
 
-    Eqs. 43a and 43b are multiplied by the squared denominator of R', so that one division serves both.
+    Numerators and denominators of eqs. 43a and 43b are multiplied by the squared denominator of R', so that one
+    division suffices.
     """
     square, norm = multiply(numerator, numerator), multiply(denominator, denominator)
     round_trip = multiply(square, phase_twice)
@@ -138,9 +139,9 @@ def _slab(
 
 
 def _root(real: jax.Array, loss: jax.Array) -> Pair:
-    """Principal square root of real - j loss, both at least 0.
+    """Principal square root of real - j loss, for non-negative arguments.
 
-    The result is at least 1e-30, so that its fourth power is not rounded to 0.
+    The magnitude is at least 1e-30, so that its fourth power does not underflow.
     """
     size = jnp.maximum(real, 1e-60)
     modulus = jnp.sqrt(size * size + loss * loss)

@@ -1,4 +1,4 @@
-"""Paths: the path program, and the chains of interactions from which any tracer makes one."""
+"""Paths: the path program, and the chains of interactions from which any tracer's paths are compiled."""
 
 from calibray.paths.file_format import FORMAT_VERSION as FORMAT_VERSION
 from calibray.paths.file_format import seal as seal

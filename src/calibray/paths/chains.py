@@ -3,8 +3,8 @@
 The field of a path is a Jones vector. Each interaction has its own frame for this vector: the first axis is s = k x n /
 |k x n| (transverse electric), and the second is k x s. Sionna RT expresses the field between interactions in the basis
 (theta, phi) of the direction of travel; here the two rotations, out of one frame and into the next, are combined.
-Sionna's conventions apply (reference near the poles, orientation of normals and wedges, the mirrored direction instead
-of the traced one after a reflection), so that path gains also agree in phase.
+Sionna's conventions apply (reference near the poles, orientation of normals and wedges, mirrored instead of traced
+direction after a reflection), so that path gains also agree in phase.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ class Chains:
         source: Start of every path [P, 3], [m].
         target: End of every path [P, 3], [m].
         vertex: Interaction points [P, D, 3], [m].
-        normal: Normals of the hit surfaces, on either side [P, D, 3].
-        kind: Kinds of interaction, 0 beyond the last one [P, D].
+        normal: Normals of the hit surfaces, pointing to either side [P, D, 3].
+        kind: Kinds of interaction, 0 after the last interaction [P, D].
         material: Material of every interaction [P, D].
         probability: Probability with which the tracer chose the kind of interaction [P, D].
-        samples: Rays launched per source.
+        samples: Number of rays launched per source.
         edge: Direction of the diffracting edge [P, 3]; empty [0, 3] without diffraction.
         normal_n: Normal of the wedge's n-face [P, 3]; empty [0, 3] without diffraction.
-        edge_lengths: Lengths s' before and s after the edge [P, 2], [m]; empty [0, 2] without diffraction.
+        edge_lengths: Path lengths s' before and s after the edge [P, 2], [m]; empty [0, 2] without diffraction.
     """
 
     source: NDArray[np.float64]
@@ -55,17 +55,17 @@ class Geometry:
     """The geometric part of a path program; names and shapes as in `calibray.paths.Paths`.
 
     Attributes:
-        delay: [P], [s].
-        spreading: [P], [1/m].
+        delay: Propagation delay [P], [s].
+        spreading: Amplitude spreading [P], [1/m].
         departure_direction: Unit vector of departure [P, 3].
         arrival_direction: Unit vector of travel at the target [P, 3].
         departure_rotation: (cos, sin) from the basis (theta, phi) of departure into the first frame [P, 2].
         arrival_rotation: (cos, sin) from the last frame into the basis (theta, phi) of arrival [P, 2].
-        first: [P + 1].
-        kind: [I].
-        material: [I].
-        cos_incidence: [I].
-        rotation: [I, 2].
+        first: Index of each path's first interaction [P + 1].
+        kind: Kind of every interaction [I].
+        material: Index of its material [I].
+        cos_incidence: Cosine of the angle of incidence [I].
+        rotation: (cos, sin) of the rotation from the previous frame into the interaction's own [I, 2].
         diffuse: Table of diffuse interactions.
         diffraction: Table of diffractions.
     """
@@ -86,7 +86,7 @@ class Geometry:
 
 
 def compile_chains(chains: Chains) -> Geometry:
-    """Compute the geometry that determines the fields of traced paths; interactions are in path order."""
+    """Compute the geometry that determines the fields of traced paths, with interactions in path order."""
     count, depth = chains.kind.shape
     present = chains.kind != 0
     length = present.sum(axis=1)
@@ -94,7 +94,7 @@ def compile_chains(chains: Chains) -> Geometry:
     # the target follows the last interaction
     stop[np.arange(count), length] = chains.target
     ahead = np.concatenate([stop[:, :1] - chains.source[:, None], np.diff(stop, axis=1)], axis=1)
-    # Behind the target, `stop` is padding.
+    # After the target, `stop` is padding.
     segment = np.linalg.norm(ahead, axis=2) * (np.arange(depth + 1) <= length[:, None])
     total = segment.sum(axis=1)
     direction = ahead / np.where(segment > 0, segment, 1.0)[..., None]
@@ -107,7 +107,7 @@ def compile_chains(chains: Chains) -> Geometry:
     # Solid angle of the ray tube, as in Sionna RT: rays share the sphere equally, and every interaction divides by the
     # probability with which it was chosen.
     solid_angle = np.full(count, 4 * np.pi / chains.samples)
-    # A diffuse reflection starts a new ray tube; length travelled up to there.
+    # Path length up to the start of the ray tube; a diffuse reflection starts a new ray tube.
     tube_start = np.zeros(count)
     # 1/sqrt(s s' (s + s')) where an edge diffracts, else 0
     spread = np.zeros(count)
@@ -116,7 +116,7 @@ def compile_chains(chains: Chains) -> Geometry:
         row = np.flatnonzero(present[:, step])
         incident, leaving = direction[row, step], direction[row, step + 1]
         normal = chains.normal[row, step]
-        # The normal shall point towards the incident wave.
+        # Orient the normal towards the incident wave.
         normal = normal * _sign(_dot(normal, -incident))[:, None]
         cosine[row, step] = np.abs(_dot(incident, normal))
         solid_angle[row] *= _inverse(chains.probability[row, step])
@@ -139,7 +139,7 @@ def compile_chains(chains: Chains) -> Geometry:
                 )
             )
             exiting[diffuse], onward[diffuse] = spherical_basis(k_out, pole_reference=False), k_out
-            # The tube of a diffuse reflection is the half space.
+            # The ray tube of a diffuse reflection fills the half space.
             solid_angle[rows] = 2 * np.pi
             tube_start[rows] = travelled[rows]
 
@@ -166,7 +166,7 @@ def compile_chains(chains: Chains) -> Geometry:
         travelled[row] += segment[row, step + 1]
 
     last = direction[np.arange(count), length]
-    # 1 / r from the start of the ray tube, or that of the diffraction
+    # 1 / r from the start of the ray tube, or the spreading of the diffraction
     spread = np.where(spread > 0, spread, 1 / (total - tube_start))
     flat = present.reshape(-1)
     return Geometry(
@@ -187,7 +187,7 @@ def compile_chains(chains: Chains) -> Geometry:
 
 
 def spherical_basis(direction: NDArray[np.float64], pole_reference: bool = True) -> NDArray[np.float64]:
-    """Basis vector theta [..., 3] of directions of travel [..., 3], the first axis of the basis (theta, phi).
+    """Basis vector theta [..., 3] for directions of travel [..., 3], the first axis of the basis (theta, phi).
 
     Near the poles, `pole_reference` uses Sionna's fixed reference -x instead of the limit of theta.
     """
@@ -209,7 +209,7 @@ def spherical_basis(direction: NDArray[np.float64], pole_reference: bool = True)
 
 
 def transverse_electric(direction: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """First axis [..., 3] of the frame of incidence, k x n (ITU-R P.2040 section 2.2.2).
+    """First axis [..., 3] of the frame of incidence: k x n, normalized (ITU-R P.2040 section 2.2.2).
 
     At normal incidence any transverse vector may be used, because the transverse electric and magnetic coefficients
     then describe the same reflection.
@@ -236,7 +236,7 @@ def zenith_azimuth(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     """Zenith in [0, pi] and azimuth in (-pi, pi] of unit vectors [..., 2], [rad]; the azimuth is 0 near the poles."""
     x, y, z = np.moveaxis(direction, -1, 0)
     rho = np.hypot(x, y)
-    # As in `spherical_basis`; rounding errors would give a vertical path any azimuth.
+    # As in `spherical_basis`; rounding errors would otherwise give a vertical path an arbitrary azimuth.
     return np.stack([np.arctan2(rho, z), np.where(rho < 1e-6, 0.0, np.arctan2(y, x))], axis=-1)
 
 
@@ -266,7 +266,7 @@ def _wedge(
     """Constants of a wedge diffraction, with Sionna RT's conventions.
 
     With distances s and s' to the edge, `distance` is s s' / (s + s').
-    The columns are those of `Diffraction` (Kouyoumjian and Pathak 1974; ITU-R P.526-15 section 4.5).
+    The results are the columns of `Diffraction` (Kouyoumjian and Pathak 1974; ITU-R P.526-15 section 4.5).
     """
     # Both normals point out of the wedge, so its interior angle is arccos(-n_0 . n_n).
     exterior = 2 * np.pi - np.arccos(np.clip(-_dot(normal_0, normal_n), -1, 1))
@@ -297,14 +297,14 @@ def _wedge(
 def _azimuth(
     away: NDArray[np.float64], tangent: NDArray[np.float64], normal: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Angle of a direction that points away from the edge, from the 0-face in [0, 2 pi)."""
+    """Azimuth in [0, 2 pi) of a direction that points away from the edge, measured from the 0-face."""
     # arccos alone gives the angle in front of the plane of the 0-face; behind it, the azimuth is 2 pi minus that.
     angle = np.pi - np.arccos(np.clip(_dot(away, tangent), -1, 1))
     return np.pi - angle * _sign(_dot(away, normal))
 
 
 def _compose(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(cos, sin) of two rotations, one after the other."""
+    """(cos, sin) of the composition of two rotations."""
     (cos_1, sin_1), (cos_2, sin_2) = first.T, second.T
     return np.stack([cos_1 * cos_2 - sin_1 * sin_2, sin_1 * cos_2 + cos_1 * sin_2], axis=-1)
 
@@ -318,7 +318,7 @@ def _in_path_order(
     path, step, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.lexsort((step, path))
     columns = [column[order] for column in columns]
-    # The solid angle was collected last, and is the second column of the table.
+    # The solid angle was collected last, but is the second column of the table.
     if isinstance(empty, Diffuse):
         rotation, scattered, specular, backward, solid_angle = columns
         return [rotation, solid_angle, scattered, specular, backward]
@@ -346,5 +346,5 @@ def _reject(vector: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[n
 
 
 def _inverse(probability: NDArray[np.float64]) -> NDArray[np.float64]:
-    # A choice of probability 0 contributes nothing, as in Sionna RT.
+    # A choice with probability 0 contributes nothing, as in Sionna RT.
     return np.where(probability > 0, 1 / np.where(probability > 0, probability, 1.0), 0.0)

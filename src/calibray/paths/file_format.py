@@ -1,13 +1,13 @@
-"""Content of a path file: every dataset with its shape, type and range, checked on reading; and its seal.
+"""Content and seal of a path file: every dataset has a shape, type and range, which are checked on reading.
 
 `docs/reference/path-file.md` explains the datasets.
 
-The seal is a checksum at the start of the file, which is compared before anything else is read. HDF5 allows a user
+The seal is a checksum at the start of the file, which is verified before anything else is read. HDF5 allows a user
 block in front of the file's content. The block contains the SHA-256 of the content in one line of text. A damaged file
-can hang or crash the HDF5 library (among 3,000 files with flipped bits, one did each), so the library reads a file only
-if the checksum is right. A file from another source may have been changed and sealed again (5 of 3,000 such files did
-not end within a minute), so it is first read in a process with limits. A file that this user's Calibray wrote or
-validated before is recognised by its checksum and read directly.
+can hang or crash the HDF5 library (of 3,000 files with flipped bits, one hung and one crashed it), so the library reads
+a file only if the checksum matches. A file from another source may have been changed and sealed again (reading 5 of
+3,000 such files took more than a minute), so it is first read in a process with limits. A file that this user's
+Calibray wrote or validated earlier is recognised by its checksum and read directly.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _SETTING: Final = "setting_"
 """Prefix of the attributes that record how the paths were traced."""
 
 _ROUNDING: Final = 1e-3
-"""Tolerance of the ranges, for numbers that were rounded to single precision."""
+"""Tolerance of the ranges, because numbers may have been rounded to single precision."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Dataset:
     """One dataset of a path file.
 
     Attributes:
-        shape: Its sizes: numbers, or the letters of `docs/reference/path-file.md`.
-        kind: "f" for numbers, "i" for integers, "O" for text.
+        shape: Sizes of its dimensions: numbers, or the letters used in `docs/reference/path-file.md`.
+        kind: "f" for floating-point numbers, "i" for integers, "O" for text.
         lower: Smallest value.
         upper: Largest value.
     """
@@ -77,7 +77,7 @@ class Content:
 _COSINE = (-1 - _ROUNDING, 1 + _ROUNDING)
 _TO_NORMAL = (0.0, _COSINE[1])  # normals point to the side of the wave
 _ANGLE = (-2 * pi - _ROUNDING, 2 * pi + _ROUNDING)
-# Far beyond any antenna (120 dB), scene and path, and far below numbers whose sum of powers overflows.
+# Far above the values of any antenna (120 dB), scene and path, and far below values whose sum of powers overflows.
 _FIELD = (-1e6, 1e6)
 _LENGTH = 1e9  # [m]
 _DIVISOR = 1e-9  # a power divided by 0 is infinite
@@ -118,7 +118,7 @@ DATASETS: Final[Mapping[str, Dataset]] = MappingProxyType(
     }
 )
 
-# Zero would remove a path; the largest value is far beyond any antenna and power.
+# Zero would remove a path; the upper limit is far above the values of any antenna and power.
 OPTIONAL: Final[Mapping[str, Dataset]] = MappingProxyType(
     {"paths/correction": Dataset(("P",), "f", 1e-30, 1e30)}
 )
@@ -126,7 +126,7 @@ OPTIONAL: Final[Mapping[str, Dataset]] = MappingProxyType(
 
 
 def write(file: h5py.File, content: Content) -> None:
-    """Write the content of a path file, with every dataset of `DATASETS`, and those of `OPTIONAL` that it has."""
+    """Write the content of a path file: every dataset of `DATASETS`, and the datasets of `OPTIONAL` that it has."""
     file.attrs.update({"format": FORMAT, "version": FORMAT_VERSION, "frequency_hz": content.frequency})
     file.attrs.update({f"{_SETTING}{key}": value for key, value in content.settings.items()})
     for name, dataset in (DATASETS | OPTIONAL).items():
@@ -140,7 +140,7 @@ def read(file: h5py.File) -> Content:
     """Read a path file and check its whole content.
 
     Raises:
-        InputError: It has another format or version, or a dataset is missing, has another shape or type, or is out of
+        InputError: The format or version differs, or a dataset is missing, has a wrong shape or type, or is out of
             range; the message omits the file's name.
     """
     if (name := file.attrs.get("format")) != FORMAT:
@@ -181,7 +181,7 @@ def _settings(file: h5py.File) -> Iterator[tuple[str, object]]:
 
 
 def _array(file: h5py.File, name: str, dataset: Dataset) -> NDArray[Any]:
-    """One dataset. The dataset must be stored in this file, contiguously, and not exceed the file's size."""
+    """Read one dataset. It must be stored contiguously in this file and must not exceed the file's size."""
     item, length = file.get(name), file.id.get_filesize()
     link = file.get(name, getlink=True)
     if not isinstance(item, h5py.Dataset) or not isinstance(link, h5py.HardLink):
@@ -197,7 +197,7 @@ def _array(file: h5py.File, name: str, dataset: Dataset) -> NDArray[Any]:
         return np.array(item.asstr()[()], dtype=object)
     if item.dtype.kind not in {"i": "iu", "f": "f"}[dataset.kind]:
         raise _damaged(f"dataset {name} has the type {item.dtype}")
-    # Other programs write other sizes and byte orders: some do not mix, and single precision is too coarse for wedges.
+    # Other programs may write other sizes and byte orders, which do not all mix; wedges need double precision.
     native = item.dtype.newbyteorder("=")
     if dataset.kind == "i":
         return item[()].astype(native if native.itemsize < 8 else np.int64, copy=False)
@@ -239,7 +239,7 @@ def _check_values(arrays: Mapping[str, NDArray[Any]]) -> None:
         values = arrays[name]
         if dataset.kind == "O":
             continue
-        # NaN fails the comparisons, infinity may pass them.
+        # NaN fails the comparisons, but infinity may pass them.
         if not ((values >= dataset.lower) & (values <= dataset.upper)).all() or not np.isfinite(values).all():
             raise _damaged(f"dataset {name} has a number that is not finite or out of range")
     for name in ("interactions/rotation", "diffuse/rotation", "diffraction/rotations"):
@@ -275,7 +275,7 @@ _CHUNK: Final = 2**20
 def seal(path: str | Path) -> None:
     """Write or renew the checksum of a path file that another program has written or changed.
 
-    `Paths.save` seals its files itself.
+    `Paths.save` already seals the files that it writes.
 
     Raises:
         InputError: The file does not exist, is not an HDF5 file, or cannot be written.
@@ -284,7 +284,7 @@ def seal(path: str | Path) -> None:
     try:
         with target.open("rb") as file:
             head = file.read(BLOCK)
-            # A user block, sealed or still empty, precedes the content; other programs write none.
+            # A user block, sealed or still empty, precedes the content; other programs do not write one.
             start = BLOCK if head.startswith(PATH_SEAL) or not any(head) else 0
             file.seek(start)
             if not file.read(len(_SIGNATURE)) == _SIGNATURE:
@@ -310,10 +310,10 @@ def write_checksum(partial: Path) -> str:
 
 
 def verify(path: Path) -> str:
-    """Refuse a file whose content differs from the sealed one; return its checksum in hexadecimal.
+    """Raise an error if the content does not match the seal; return the checksum in hexadecimal.
 
     Raises:
-        InputError: The file is not a sealed HDF5 file, or has changed since; the message omits its name.
+        InputError: The file is not a sealed HDF5 file, or has changed since it was sealed; the message omits its name.
         OSError: The file cannot be read.
     """
     with path.open("rb") as file:
@@ -325,7 +325,7 @@ def verify(path: Path) -> str:
         if not head.startswith(PATH_SEAL):
             raise InputError("is damaged or not a path file; trace again")
         if _block(file) != head:
-            raise InputError("is damaged (its checksum does not agree); trace again")
+            raise InputError("is damaged (its checksum does not match); trace again")
     return _digest(head)
 
 
@@ -334,7 +334,7 @@ def _digest(block: bytes) -> str:
 
 
 def _block(file: BinaryIO) -> bytes:
-    """The user block for the content from the file's current position on."""
+    """The user block for the content that starts at the file's current position."""
     start, digest = file.tell(), hashlib.sha256()
     while chunk := file.read(_CHUNK):
         digest.update(chunk)
@@ -359,7 +359,7 @@ _known_here: Final[set[str]] = set()
 
 
 def remember(digest: str) -> None:
-    """Record that this user's Calibray wrote or validated the file with a checksum."""
+    """Record that this user's Calibray wrote or validated the file with this checksum."""
     _known_here.add(digest)
     store = _known_files()
     if store is not None and store.trusted:
@@ -367,10 +367,10 @@ def remember(digest: str) -> None:
 
 
 def validate(file: Path, digest: str) -> None:
-    """Read a path file whose checksum is right, in another process unless the checksum is known.
+    """Read a path file with a matching checksum in a separate process, unless the checksum is known.
 
     Raises:
-        InputError: The file is damaged, or reading it does not end; the message omits its name.
+        InputError: The file is damaged, or the reading does not finish; the message omits its name.
     """
     store = _known_files()
     if digest in _known_here or (store is not None and store.trusted and store.get(digest) is not None):

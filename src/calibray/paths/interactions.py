@@ -1,4 +1,4 @@
-"""Kinds of interaction, and the tables of the constants that only diffuse reflections and diffractions have."""
+"""Kinds of interaction, and tables of the constants that only diffuse reflections and diffractions have."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class Diffuse:
     Attributes:
         rotation: (cos, sin) of the rotation from the transverse electric frame into the spherical basis (theta, phi)
             of the incident direction, in which the XPD matrix acts [D, 2].
-        solid_angle: Solid angle of the ray tube over its sampling probability at trace time [D], [sr].
-        cos_scattered: Cosine between the scattered direction and the normal [D].
-        cos_specular: Cosine between the scattered and the specular direction [D].
-        cos_backward: Cosine between the scattered direction and the direction back to the source [D].
+        solid_angle: Solid angle of the ray tube, divided by its sampling probability when traced [D], [sr].
+        cos_scattered: Cosine of the angle between the scattered direction and the normal [D].
+        cos_specular: Cosine of the angle between the scattered and the specular direction [D].
+        cos_backward: Cosine of the angle between the scattered direction and the direction back to the source [D].
     """
 
     rotation: NDArray[np.float64]
@@ -52,9 +52,9 @@ class Diffraction:
     Attributes:
         cos_incidence_n: Cosine of the angle of incidence on the n-face [W].
         exterior_angle: Exterior angle of the wedge [W], [rad].
-        azimuth_in: Azimuth phi' of the incident ray around the edge, from the 0-face [W], [rad].
-        azimuth_out: Azimuth phi of the diffracted ray [W], [rad].
-        sin_edge: Sine of the angle beta_0 between ray and edge [W].
+        azimuth_in: Azimuth phi' of the incident ray around the edge, measured from the 0-face [W], [rad].
+        azimuth_out: Azimuth phi of the diffracted ray, measured from the 0-face [W], [rad].
+        sin_edge: Sine of the angle beta_0 between the ray and the edge [W].
         distance: L = s s' sin^2(beta_0) / (s + s') [W], [m].
         rotations: (cos, sin) of the four rotations between the edge-fixed frames and the transverse electric frames
             of the faces: in 0, out 0, in n, out n [W, 4, 2].

@@ -1,9 +1,9 @@
 """The path program: traced paths in a form in which fields can be evaluated for any materials.
 
-A path is a transmit field, a chain of interactions, and a receive field. An interaction has everything that its
-material acts through: the material, the cosine of the angle of incidence, the kind, and the real rotation from the
-frame of the previous interaction into its own (first axis k x n, transverse electric). The first rotation is part of
-the transmit field, and the last one is part of the receive field.
+A path is a transmit field, a chain of interactions, and a receive field. An interaction stores everything that
+determines how its material acts: the material, the cosine of the angle of incidence, the kind, and the real rotation
+from the frame of the previous interaction into its own (first axis k x n, transverse electric). The first rotation is
+part of the transmit field, and the last rotation is part of the receive field.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from calibray.support.messages import first_line
 from calibray.support.output_files import as_path, check_file, exists, replacing
 
 _WIDTH: Final = 80
-"""Largest length of a line of the summary [characters]."""
+"""Maximum length of a line in the summary [characters]."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -45,21 +45,21 @@ class Paths:
         delay: Propagation delay [P], [s].
         spreading: Amplitude spreading [P], [1/m]: 1/r, or 1/sqrt(s s' (s + s')) with a diffraction.
         departure: Zenith and azimuth of departure [P, 2], [rad].
-        arrival: Zenith and azimuth of the direction towards the source [P, 2], [rad].
+        arrival: Zenith and azimuth of arrival, from the receiver towards the source [P, 2], [rad].
         tx_field: Transmit pattern in the frame of the first interaction [P, T, 2], complex.
         rx_field: Receive pattern in the frame after the last interaction [P, R, 2], complex.
         first: Index of each path's first interaction [P + 1]; path p has interactions first[p] .. first[p + 1] - 1.
         kind: `Kind` of every interaction [I].
-        material: Index of its material [I].
+        material: Index of the material of every interaction [I].
         cos_incidence: Cosine of the angle of incidence [I].
         rotation: (cos, sin) of the rotation from the previous frame into the interaction's own [I, 2].
-        vertex: Points of interaction [I, 3], [m], for drawing; in single precision, or in double precision far from the
-            origin. No field depends on them.
+        vertex: Points of interaction [I, 3], [m], for plots; in single precision, or in double precision far from the
+            origin. The fields do not depend on them.
         diffuse: Further constants of the diffuse interactions.
         diffraction: Further constants of the diffractions.
         settings: How the paths were traced, for documentation.
-        correction: Power of the path in the engine that found it over the power of its replay there [P]; the power of
-            the path is multiplied by this ratio. None if the replay needs no correction.
+        correction: Ratio of the path's power in the engine that found it to its replayed power with the same constants
+            [P]; the power of the path is multiplied by this ratio. None if the replay needs no correction.
     """
 
     frequency: float
@@ -116,10 +116,10 @@ class Paths:
         return np.flatnonzero(np.bincount(self.link, minlength=self.num_links) == 0)
 
     def at(self, frequency: float, materials: Mapping[str, Material] | None = None) -> Paths:
-        """The same paths at another carrier, at which the traced geometry is the same.
+        """The same paths at another carrier frequency; the traced geometry is unchanged.
 
-        Diffuse reflection and refraction sample a share of the paths that depends on the constants at the carrier of
-        the trace; the estimate stays unbiased at other carriers.
+        With diffuse reflection and refraction, the share of sampled paths depends on the constants at the traced
+        carrier; the estimate stays unbiased at other carriers.
 
         Args:
             frequency: Carrier frequency [Hz].
@@ -129,7 +129,7 @@ class Paths:
             The program at that carrier.
 
         Raises:
-            InputError: The frequency is not in `calibray.materials.FREQUENCIES`, or a material is not among the paths'.
+            InputError: The frequency is not in `calibray.materials.FREQUENCIES`, or a material is not in the paths.
         """
         return replace(self, frequency=check_frequency(frequency), materials=self._with_materials(materials))
 
@@ -197,7 +197,7 @@ class Paths:
             The path program, equal to the one saved.
 
         Raises:
-            InputError: The file does not exist, is not a path file, has another version, or is damaged.
+            InputError: The file does not exist, is not a path file, has a different version, or is damaged.
         """
         source = as_path(path, "path file")
         if not exists(source):
@@ -212,10 +212,10 @@ class Paths:
 
 
 def read_paths(file: str | Path) -> Paths:
-    """Read the path program of an HDF5 file without comparing its checksum.
+    """Read the path program from an HDF5 file without verifying its checksum.
 
     Raises:
-        InputError: It is not a path file, has another version, or is damaged; the message omits its name.
+        InputError: It is not a path file, has a different version, or is damaged; the message omits its name.
     """
     try:
         with h5py.File(file, "r") as stream:
@@ -233,16 +233,16 @@ _INTERACTION_ARRAYS = ("kind", "material", "cos_incidence", "rotation", "vertex"
 
 
 def _numbers(index: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Numbers [n], given as such or as a mask."""
+    """Indices [n], given as indices or as a mask."""
     return np.flatnonzero(index) if np.asarray(index).dtype == np.bool_ else np.asarray(index, dtype=np.int64)
 
 
 def take(paths: Paths, index: NDArray[np.int64] | NDArray[np.bool_]) -> Paths:
-    """The program of some of its paths [n], in a given order or by a mask, over the same links."""
+    """Select paths [n] by index, in the given order, or by a mask; the links are unchanged."""
     index = _numbers(index)
     depth = np.diff(paths.first)[index]
     first = np.concatenate([[0], np.cumsum(depth)]).astype(np.int64)
-    # Consecutive numbers from the first interaction of each taken path on.
+    # Consecutive indices, starting from the first interaction of each selected path.
     interaction = np.arange(first[-1]) - np.repeat(first[:-1], depth) + np.repeat(paths.first[index], depth)
     return replace(
         paths,
@@ -256,12 +256,12 @@ def take(paths: Paths, index: NDArray[np.int64] | NDArray[np.bool_]) -> Paths:
 
 
 def take_links(paths: Paths, links: NDArray[np.int64] | NDArray[np.bool_]) -> Paths:
-    """The program of some links [n], in a given order or by a mask; a link may be used more than once."""
+    """Select links [n] by index, in the given order, or by a mask; a link may be selected more than once."""
     links = _numbers(links)
     start = np.searchsorted(paths.link, np.arange(paths.num_links + 1))
     count = np.diff(start)[links]
     end = np.cumsum(count)
-    # The paths of the first taken link, then those of the second, and so on.
+    # The paths of the first selected link, then those of the second, and so on.
     index = np.arange(count.sum()) + np.repeat(start[links] - (end - count), count)
     return replace(
         take(paths, index),
@@ -274,7 +274,7 @@ def take_links(paths: Paths, links: NDArray[np.int64] | NDArray[np.bool_]) -> Pa
 def concatenate(parts: Sequence[Paths]) -> Paths:
     """Join path programs of the same links, and sort their paths by link; within a link, the order is that of `parts`.
 
-    All share frequency, materials and link table.
+    All parts have the same frequency, materials and links.
     """
     offsets = np.cumsum([0, *(part.num_interactions for part in parts)])
     first = [part.first[:-1] + offset for part, offset in zip(parts, offsets[:-1], strict=True)]
@@ -295,7 +295,7 @@ def concatenate(parts: Sequence[Paths]) -> Paths:
 def join_links(parts: Sequence[tuple[NDArray[np.int64], Paths]]) -> Paths:
     """Join path programs of different links, each with the indices of its links in the joined program.
 
-    Together they contain every link once. All share frequency and materials; the settings are those of the first.
+    Together they contain every link once. All have the same frequency and materials; the first part gives the settings.
     """
     num_links = sum(len(links) for links, _ in parts)
     tx, rx = np.empty((num_links, 3)), np.empty((num_links, 3))
@@ -310,7 +310,7 @@ def join_links(parts: Sequence[tuple[NDArray[np.int64], Paths]]) -> Paths:
 
 
 def _rows(table: Table, has_row: NDArray[np.bool_], interaction: NDArray[np.int64]) -> Table:
-    """The rows of some interactions in the table of their kind; `has_row` marks the interactions of that kind [I]."""
+    """The table's rows for the given interactions; `has_row` marks all interactions of the table's kind [I]."""
     # An interaction's row is the number of interactions of its kind before it.
     row = (np.cumsum(has_row) - 1)[interaction[has_row[interaction]]]
     return type(table)(*(getattr(table, field.name)[row] for field in fields(table)))
@@ -388,7 +388,7 @@ def _paths(content: file_format.Content) -> Paths:
 
 
 def _summary(paths: Paths) -> dict[str, str]:
-    """A summary of the paths for a terminal or a notebook: texts by heading."""
+    """Summary of the paths for a terminal or a notebook: text by heading."""
     num_unreached = len(paths.links_without_path)
     counts = np.bincount(paths.kind, minlength=max(Kind) + 1)
     kinds = [f"{counts[kind]:,} {kind.name.lower()}" for kind in Kind if counts[kind]]
@@ -409,7 +409,7 @@ def _summary(paths: Paths) -> dict[str, str]:
 
 
 def _size_text(num_bytes: int) -> str:
-    """A number of bytes in a suitable unit.
+    """A size in bytes, formatted in a suitable unit.
 
     Example:
         >>> _size_text(512), _size_text(3_500_000)
