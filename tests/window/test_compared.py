@@ -64,7 +64,7 @@ def test_results_without_links_in_common_are_not_compared(results):
     assert better("old", "new", folder).startswith("new: not validated")
     other = held_out(3.0, 2)
     planted["new"] = replace(other, measured_db=other.measured_db + 1)
-    assert "on other links" in better("old", "new", folder)
+    assert "on different links" in better("old", "new", folder)
     planted["old"] = replace(other, block=np.where(other.block < 2, other.block, -1))
     planted["new"] = replace(other, block=np.where(other.block < 2, -1, other.block))
     assert "no held-out link in common" in better("old", "new", folder)

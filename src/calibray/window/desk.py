@@ -1,9 +1,9 @@
-"""Data that the steps of the window share: the study's folder, its commands, selections, and the scene in 2-D and 3-D.
+"""State that the steps of the window share: the study's folder, its commands, selections, and the scene in 2-D and 3-D.
 
-Of the folder, only the files that the command line reads and writes are used.
+In the folder, only files that the command line reads and writes are used.
 
-In 3-D, lengths are scaled so that the scene fits into a sphere of `RADIUS` around the origin: the camera of the page
-covers 0.1 to 1000 units.
+In 3-D, lengths are scaled so that the scene fits into a sphere of `RADIUS` around the origin, because the page's camera
+covers distances of 0.1 to 1000 units.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ TABLES: Final = (*SUFFIXES, ".xlsx", ".parquet")
 MESHES: Final = (".ply", ".obj")
 PARTS: Final = (".shx", ".dbf", ".prj", ".cpg", ".tif", ".tiff", ".gpx", ".xml", ".json")
 PLACE, CANDIDATES, SUGGESTED = "place.csv", "candidates.csv", "suggested.csv"
-"""Tables that the window writes: a place to predict at, candidates for the next measurement, and the suggested ones."""
+"""Tables that the window writes: the place to predict, candidates for the next measurement, and the suggested ones."""
 
 PREDICTED: Final = "-predicted.csv"
-"""End of the names of predicted tables."""
+"""Suffix of the names of predicted tables."""
 
 LARGEST: Final = 2**30
 """Largest size of an uploaded file [bytes]; put larger files into the folder."""
@@ -58,12 +58,12 @@ Control = TypeVar("Control", bound=ValueElement)
 
 _NAME: Final = re.compile(r"[\w][\w .()+-]*")
 _LONGEST_NAME: Final = 200
-"""Of file names [bytes]; file systems take 255, and some files of a scene have longer names."""
+"""Largest length of a file name [bytes]; file systems accept 255, and files derived from a scene have longer names."""
 
 
 @dataclass(frozen=True)
 class StudyFolder:
-    """A study's folder, by its absolute path."""
+    """A study's folder, given by its absolute path."""
 
     path: Path
 
@@ -73,23 +73,23 @@ class StudyFolder:
         return self.path / STUDY
 
     def files(self, endings: tuple[str, ...]) -> list[str]:
-        """Names of the folder's files with one of the extensions."""
+        """Names of the files in the folder that have one of the given extensions."""
         candidates = (file for file in self.path.iterdir() if file.name.lower().endswith(endings))
         return sorted(file.name for file in candidates if file.is_file() and not file.name.startswith("."))
 
     def tables(self) -> list[str]:
-        """Names of the folder's tables, except those that the window writes."""
+        """Names of the tables in the folder, except those that the window writes."""
         written = (PLACE, CANDIDATES, SUGGESTED)
         return [name for name in self.files(TABLES) if name not in written and not name.endswith(PREDICTED)]
 
     def scenes(self) -> list[str]:
-        """The scenes of the folder and of its subfolders, except those of results."""
+        """The scenes in the folder and its subfolders, except those in results."""
         files = [*self.path.glob("*.xml"), *self.path.glob("*/*.xml")]
         names = (file.relative_to(self.path).as_posix() for file in files if file.name != "result-scene.xml")
         return sorted(name for name in names if not name.startswith("."))
 
     def results(self) -> list[str]:
-        """The folders with results, the latest last."""
+        """Names of the folders that contain results, the latest last."""
         written = {
             file.parent.name: file.stat().st_mtime_ns
             for file in self.path.glob("*/result.json")
@@ -112,12 +112,12 @@ class StudyFolder:
             raise InputError(f"{file}: cannot be read ({shortened(str(error))})") from None
 
     def check_upload(self, name: str) -> Path:
-        """The path at which an uploaded file is stored; meshes go to `meshes`, where scenes expect them.
+        """The path for an uploaded file; meshes are stored in `meshes`, where scenes expect them.
 
         Raises:
             InputError: The name is not a plain file name, Calibray does not read this kind of file, or the file exists.
         """
-        # Some systems write an umlaut as a letter and a mark; other scripts have marks that no single letter replaces.
+        # Some systems encode an umlaut as a letter and a combining mark; in other scripts, only the marks exist.
         name = unicodedata.normalize("NFC", name)
         letters = "".join(letter for letter in name if not unicodedata.category(letter).startswith("M"))
         shown = shortened(repr(name))
@@ -125,12 +125,12 @@ class StudyFolder:
             raise InputError(f"{shown}: the name is too long; shorten it to {_LONGEST_NAME} bytes")
         if not _NAME.fullmatch(letters) or name.endswith((" ", ".")):
             raise InputError(
-                f"{shown}: use letters, digits, spaces, and . _ - ( ) + in names of files; rename it"
+                f"{shown}: use letters, digits, spaces, and . _ - ( ) + in file names; rename the file"
             )
         ending = Path(name).suffix.lower()
         if ending not in (*MAPS, *TABLES, *PARTS, *TWO_CUT_SUFFIXES, *MESHES):
             raise InputError(
-                f"{shown}: files of this kind are not read; give a map, a plan, a table or a scene"
+                f"{shown}: Calibray does not read this kind of file; give a map, a plan, a table or a scene"
             )
         target = (self.path / "meshes" if ending in MESHES else self.path) / name
         if target.exists() or target.is_symlink():
@@ -138,14 +138,14 @@ class StudyFolder:
         return target
 
     def content(self) -> dict[str, Any]:
-        """The sections of the study file; empty without one or if it is not TOML."""
+        """The sections of the study file; empty if there is no study file or it is not TOML."""
         try:
             return tomllib.loads(self.study_file.read_text(encoding="utf-8"))
         except (OSError, ValueError, RecursionError):
             return {}
 
     def valid_content(self) -> dict[str, Any]:
-        """The sections of the study file, whose values have the types of a study; empty if it is not one."""
+        """The sections of the study file, with values of the types required in a study; empty if it is not valid."""
         content = self.content()
         try:
             Study.from_content(content, self.study_file)
@@ -154,14 +154,14 @@ class StudyFolder:
         return content
 
     def text(self) -> str:
-        """The study file; empty without one."""
+        """The text of the study file; empty if there is none."""
         try:
             return self.study_file.read_text(encoding="utf-8", errors="replace")
         except OSError:
             return ""
 
     def reasons(self) -> dict[str, str]:
-        """Reasons by the dotted name of a section or key, from the comments of a draft."""
+        """The reasons for drafted settings, from the comments in a draft, by the dotted name of a section or key."""
         from calibray.study.toml_file import reasons_in
 
         return reasons_in(self.text())
@@ -170,7 +170,7 @@ class StudyFolder:
         """Write the study file, with its reasons as comments.
 
         Raises:
-            InputError: The content is not a study; the file is unchanged.
+            InputError: The content is not a valid study; the file is unchanged.
         """
         from calibray.study.toml_file import study_text
 
@@ -179,7 +179,7 @@ class StudyFolder:
         write_text(self.study_file, text)
 
     def set_aside(self) -> None:
-        """Rename the study file, so that another one can be drafted."""
+        """Rename the study file, so that another study can be drafted."""
         number = 1
         while (target := self.path / f"study-{number}.toml").exists():
             number += 1
@@ -191,12 +191,12 @@ RADIUS: Final = 10.0
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A scene in 3-D, scaled.
+    """A scene in 3-D, in scaled units.
 
     Attributes:
-        meshes: Corners of the faces by material [F, 3, 3].
-        tx: Transmitters [n, 3].
-        rx: Receivers [n, 3].
+        meshes: Corners of the faces [F, 3, 3], by material.
+        tx: Transmitter positions [n, 3].
+        rx: Receiver positions [n, 3].
     """
 
     meshes: dict[str, NDArray[np.float64]]
@@ -204,7 +204,7 @@ class Solid:
     rx: NDArray[np.float64]
 
     def stl(self, material: str) -> bytes:
-        """The faces of a material as an STL file."""
+        """The faces of a material, as the content of an STL file."""
         corners = self.meshes[material]
         trimesh = library("trimesh", "scenes")
         faces = np.arange(3 * len(corners)).reshape(-1, 3)
@@ -212,7 +212,7 @@ class Solid:
 
 
 def solid(folder: StudyFolder, scene: str | None) -> Solid | None:
-    """The scene of a study, or a chosen one if there is no study; None without either.
+    """The scene of the study, or the chosen scene if there is no study; None if there is neither.
 
     Raises:
         InputError: The scene or the links cannot be read.
@@ -234,7 +234,7 @@ def solid(folder: StudyFolder, scene: str | None) -> Solid | None:
 
 
 def filled(control: ui.number) -> float:
-    """The number in a field.
+    """The number entered in a field.
 
     Raises:
         InputError: The field is empty.
@@ -250,15 +250,15 @@ class Desk:
 
     Attributes:
         folder: The study's folder.
-        scene: The chosen scene, relative to the folder.
+        scene: Path of the chosen scene, relative to the folder.
         point: The chosen place, x and y [m].
         area: The chosen area: west, south, east, north [m].
-        sites: Transmitters of the measured links, as `sites` lists them.
-        findings: Suspicions about the links.
+        sites: Transmitters of the measured links, as listed by `sites`.
+        findings: Warnings about suspicious links.
         solid: The scene that is shown in 3-D.
         entered: Values that the user entered, by the label of their control.
-        edits: Functions that write what a step shows into the study's content, by tab and step.
-        show_again: Functions that show all steps again, by tab.
+        edits: Functions that write the values shown in a step into the study's content, by tab and step.
+        show_again: Functions that redraw all steps, by tab.
     """
 
     folder: StudyFolder
@@ -276,14 +276,14 @@ class Desk:
         self.jobs = Jobs(self.folder.path)
 
     def start(self, words: Sequence[object]) -> None:
-        """Start a command and report this, or the reason why not."""
+        """Start a command, and notify the user that it started or why it did not."""
         with self.messages():
             job = self.jobs.start([str(word) for word in words])
             ui.notify(f"Started: {job.command}", type="info", color="primary")
             self.refresh()
 
     def refresh(self) -> None:
-        """Show all steps of this tab again."""
+        """Redraw all steps of this tab."""
         self.show_again[ui.context.client.id]()
 
     def mark(self) -> None:
@@ -292,7 +292,7 @@ class Desk:
         ui.run_javascript(f"plan.mark({json.dumps(self.point)}, {json.dumps(area)})")
 
     def keep(self, control: Control) -> Control:
-        """The control, with the value that the user entered before its step was last shown, if it can have it."""
+        """The control, with the value that the user entered before its step was redrawn, if it is still an option."""
         name = control.text if isinstance(control, ui.switch) else str(control.props["label"])
         if name in self.entered and self.entered[name] in getattr(control, "options", [self.entered[name]]):
             control.set_value(self.entered[name])
@@ -300,11 +300,11 @@ class Desk:
         return control
 
     def edit(self, step: str, write: Callable[[dict[str, Any]], None]) -> None:
-        """Let a step of this tab write what it shows when the study is saved."""
+        """Register the function with which a step of this tab writes its values when the study is saved."""
         self.edits[ui.context.client.id, step] = write
 
     async def save(self) -> None:
-        """Save the study with what all steps of this tab show."""
+        """Save the study with the values shown in all steps of this tab."""
         with self.messages():
             content = self.folder.content()
             for (client, _), write in self.edits.items():
@@ -316,7 +316,7 @@ class Desk:
 
     @contextmanager
     def messages(self) -> Iterator[None]:
-        """Show an error of the input or of a file, as text, instead of raising it."""
+        """Show an input or file error as text instead of raising it."""
         try:
             yield
         except (InputError, OSError) as error:
@@ -324,10 +324,10 @@ class Desk:
 
 
 def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
-    """The map of a study, or of a scene of the folder if there is no study.
+    """The map of the study, or of a scene in the folder if there is no study.
 
-    `west`, `north` [m] and `scale` [1/m] of the outlines, `buildings` and `walls` as data of SVG paths; `links`, each
-    with x, y [m], path loss [dB] and 1 where it is suspicious; `transmitters`, x, y, z [m]; `sites`.
+    It contains `west`, `north` [m] and `scale` [1/m] of the outlines; `buildings` and `walls` as SVG path data;
+    `links`, each with x, y [m], path loss [dB] and 1 if suspicious, else 0; `transmitters`, x, y, z [m]; and `sites`.
 
     Raises:
         InputError: The scene or the links cannot be read.
@@ -358,17 +358,17 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
 
 
 def sites(study: Study, links: Measurements) -> list[dict[str, Any]]:
-    """The transmitters of the links, once for each group and carrier, because a mast may carry several sectors.
+    """The transmitters of the links, listed once for each group and carrier, because a mast may carry several sectors.
 
-    Each has its `name`, `tx` [m], and the `columns` that a prediction needs, such as the azimuth, with their values.
+    Each has a `name`, a position `tx` [m], and the values of the `columns` that a prediction needs, such as azimuth.
     """
     names = [study.links.transmitter, *study.offset_groups, study.links.frequency]
     key = list(dict.fromkeys(name for name in names if name is not None and name in links.frame))
     columns = links.frame[list(dict.fromkeys([*key, *mounting_columns(study)]))]
     tx = pd.DataFrame(links.tx.round(2), columns=["x", "y", "z"])
-    # The first link of every mast, group and carrier stands for the others.
+    # The first link of every mast, group and carrier represents the others.
     first = ~pd.concat([tx, columns[key].reset_index(drop=True)], axis=1).duplicated().to_numpy()
-    # By way of JSON: NumPy's numbers and NaN cannot be sent to the page. A frame without columns becomes no rows.
+    # Converted via JSON, because NumPy numbers and NaN cannot be sent to the page. Without columns, there are no rows.
     rows = json.loads(columns[first].to_json(orient="records")) or [{}] * int(first.sum())
     return [
         {
@@ -383,7 +383,7 @@ def sites(study: Study, links: Measurements) -> list[dict[str, Any]]:
 
 
 def opened(folder: StudyFolder, scene: str | None) -> tuple[str | None, Study | None]:
-    """The scene of a folder and its study: the study's scene, or the chosen one if there is no study.
+    """The scene to show, and the study if there is one: the study's scene, or else the chosen scene.
 
     Raises:
         InputError: The study cannot be read.
@@ -397,9 +397,9 @@ def opened(folder: StudyFolder, scene: str | None) -> tuple[str | None, Study | 
 
 
 def _geometry(source: str, study: Study | None) -> tuple[Scene, Triangles]:
-    """A scene with the materials of its study, and its faces."""
+    """A scene with the materials of the study, and the faces of the scene."""
     if study is None:
-        # Only the names of the materials are used, and nearly all of P.2040 have constants at 1 GHz.
+        # Only material names are used, and nearly all materials of ITU-R P.2040 have constants at 1 GHz.
         scene = read_scene(source, 1e9)
     else:
         scene = read_scene(source, study.scene.frequency, study.overrides, study.objects)
@@ -409,7 +409,7 @@ def _geometry(source: str, study: Study | None) -> tuple[Scene, Triangles]:
 def grid_above_ground(
     folder: StudyFolder, scene: str | None, x: NDArray[np.float64], y: NDArray[np.float64], height: float
 ) -> NDArray[np.float64]:
-    """Places of a grid of ascending, equally spaced x and y [m], at a height above the ground [n, 3], [m].
+    """Points [n, 3], [m], of a grid with ascending, equally spaced x and y [m], at a height above the ground.
 
     Raises:
         InputError: There is no scene, or it cannot be read.
@@ -418,13 +418,13 @@ def grid_above_ground(
     if source is None:
         raise InputError("heights above the ground need a scene: make or add one first")
     _, triangles = _geometry(source, study)
-    # As in a coverage map, so that a place has the same height in both.
+    # Computed as in a coverage map, so that a place has the same height in both.
     z = ground_heights(triangles, x, y) + height
     return np.stack([*np.meshgrid(x, y), z], axis=-1).reshape(-1, 3)
 
 
 def findings(folder: StudyFolder) -> list[str]:
-    """Suspicions about the links of a study, as sentences; none without a study.
+    """Warnings about suspicious links of a study, as sentences; none without a study.
 
     Raises:
         InputError: The scene or the links cannot be read.

@@ -1,11 +1,11 @@
-"""Commands that the window started in a study's folder, and runs that were started there from a terminal.
+"""Commands that the window started in a study's folder, and commands that were started there from a terminal.
 
-Each is a separate process with three files in `.calibray-window`: `0001.json` describes the command, `0001.log`
-contains its output, and `0001.exit` its exit status. A command without exit status and without process died; the same
-command resumes.
+Each command of the window is a separate process with three files in `.calibray-window`: `0001.json` describes it,
+`0001.log` contains its output, and `0001.exit` its exit status. A command with neither an exit status nor a process has
+died; starting it again resumes its work.
 
-`python -m calibray.window.jobs` runs one command and records how it ended, in its own session, so that it outlives the
-server. Ctrl-C is passed to the command, which keeps finished work.
+`python -m calibray.window.jobs` runs one command in a session of its own, so that it outlives the server, and records
+its exit status. Ctrl-C is passed to the command, which keeps finished work.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from calibray.support.output_files import write_text
 
 FOLDER: Final = ".calibray-window"
 WIDTH: Final = "80"
-"""Characters per line of a command's tables."""
+"""Number of characters per line in a command's tables."""
 
 TAIL: Final = 16_384
-"""Number of bytes that are shown from the end of a log: a few screens."""
+"""Number of bytes shown from the end of a log: a few screenfuls."""
 
 
 _LINE: Final = re.compile(
     r"(?P<name>[A-Za-z][^,/]*?)(?: (?P<done>\d+)(?:/(?P<total>\d+))?)?(?:, \d+ %)?(?:, [\d.e+-]+/s)?"
     r", (?P<seconds>\d+) s(?:, about (?P<left>\d+) s left)?(?:, (?P<found>.+))?"
 )
-"""A line of progress in a log (`calibray.cli.console.line`)."""
+"""Pattern of a progress line in a log (`calibray.cli.console.line`)."""
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,11 @@ class Job:
     """A command and its state.
 
     Attributes:
-        number: Its number in the folder; 0 if it was started from a terminal.
-        words: Its arguments.
+        number: Number in the folder; 0 if the command was started from a terminal.
+        words: Arguments of the command.
         state: "running", "done", "failed", "stopped" or "died".
-        pid: Its process.
-        log: The end of its output.
+        pid: Process ID.
+        log: End of the output.
     """
 
     number: int
@@ -65,7 +65,7 @@ class Job:
 
     @property
     def command(self) -> str:
-        """The command in the form for a terminal."""
+        """The command as typed in a terminal."""
         return command(*self.words)
 
 
@@ -83,17 +83,17 @@ class Jobs:
             InputError: Another command is running, or the folder cannot be written to.
         """
         if running := self.running():
-            raise InputError(f"{running.command}: is running; wait for its end, or stop it")
+            raise InputError(f"{running.command}: is running; wait until it ends, or stop it")
         if self._folder.is_symlink():
             raise InputError(f"{self._folder}: is a link; remove it")
         try:
             self._folder.mkdir(exist_ok=True)
-            # Of all files: a command that was never recorded may have left its log.
+            # All files count, because a command that was never recorded may have left its log.
             used = (int(file.stem) for file in self._folder.glob("[0-9]*.*") if file.stem.isdecimal())
             number = max(used, default=0) + 1
             stem = self._folder / f"{number:04d}"
             arguments = [sys.executable, "-m", "calibray.window.jobs", f"{stem}.exit", *words]
-            # The command writes while it runs; an exclusive file follows no link and replaces nothing.
+            # The command writes while it runs; exclusive creation follows no link and replaces no file.
             output = os.fdopen(os.open(f"{stem}.log", os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb")
             with output as log, _held_back(signal.SIGINT):
                 child = subprocess.Popen(
@@ -101,7 +101,7 @@ class Jobs:
                     start_new_session=True, env={**os.environ, "COLUMNS": WIDTH},
                 )  # fmt: skip
             created = psutil.Process(child.pid).create_time()
-            # Without a wait the ended process would stay in the system's table; before, it may be looked up there.
+            # Without a wait, the ended process would stay in the process table; the look-up above needs it there.
             Thread(target=child.wait, daemon=True).start()
             record = {"words": list(words), "pid": child.pid, "created": created}
             write_text(Path(f"{stem}.json"), json.dumps(record) + "\n")
@@ -110,12 +110,12 @@ class Jobs:
         return Job(number, tuple(words), "running", child.pid)
 
     def list(self) -> list[Job]:
-        """The commands of the folder, the latest first."""
+        """The commands started in the folder, the latest first."""
         files = sorted(self._folder.glob("[0-9]*.json"), reverse=True)
         return [job for job in map(_read, files) if job is not None]
 
     def running(self) -> Job | None:
-        """The command that is running now, if any."""
+        """The command that is currently running, if any."""
         return next((job for job in self.list() if job.state == "running"), None)
 
     def elsewhere(self) -> list[Job]:
@@ -124,7 +124,7 @@ class Jobs:
         commands = []
         for process in psutil.process_iter(["pid", "ppid", "cmdline", "cwd"]):
             line, parent = process.info["cmdline"] or [], process.info["ppid"]
-            # As `calibray`, `python .../calibray` or `python -m calibray`.
+            # The command line is `calibray`, `python .../calibray` or `python -m calibray`.
             start = next((k for k, word in enumerate(line[:3]) if Path(word).name == "calibray"), None)
             here = process.info["cwd"] == str(self._study_folder)
             if start is not None and here and parent not in own and line[start + 1 : start + 2] != ["open"]:
@@ -132,13 +132,13 @@ class Jobs:
         return commands
 
     def stop(self, job: Job) -> None:
-        """Interrupt a command like Ctrl-C; finished work is kept."""
+        """Interrupt a command as Ctrl-C does; finished work is kept."""
         with suppress(ProcessLookupError, PermissionError):
             if job.number:
                 os.killpg(job.pid, signal.SIGINT)
 
     def wait(self, job: Job, seconds: float) -> Job:
-        """Wait until a command has ended, and return its state then."""
+        """Wait until a command ends, at most for a number of seconds, and return its latest state."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             now = next(other for other in self.list() if other.number == job.number)
@@ -150,7 +150,7 @@ class Jobs:
 
 @contextmanager
 def _held_back(number: signal.Signals) -> Iterator[None]:
-    """Hold back a signal of this thread, and of processes that it starts, which inherit this."""
+    """Block a signal in this thread and in the processes that it starts, which inherit the block."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {number})
     try:
         yield
@@ -159,7 +159,7 @@ def _held_back(number: signal.Signals) -> Iterator[None]:
 
 
 def _read(file: Path) -> Job | None:
-    """The command of a file; None if the window did not write the file."""
+    """The command recorded in a file; None if the window did not write the file."""
     try:
         record = json.loads(file.read_text(encoding="utf-8"))
         words, pid = tuple(map(str, record["words"])), int(record["pid"])
@@ -173,12 +173,12 @@ def _read(file: Path) -> Job | None:
 
 
 def _state(exit_file: Path, pid: int, created: float) -> str:
-    # After Ctrl-C a command exits with 130. It ends with -2 if the signal killed it, or came before it started.
+    # After Ctrl-C, a command exits with 130, or with -2 if the signal killed it or came before it started.
     with suppress(OSError, ValueError):
         return {0: "done", 130: "stopped", -2: "stopped"}.get(int(exit_file.read_text()[:20]), "failed")
     with suppress(psutil.Error, OverflowError, ValueError):
         process = psutil.Process(pid)
-        # Another process may have got the number since; it must not be taken for the command, nor be stopped.
+        # Another process may have received this ID since; it must not be mistaken for the command or stopped.
         if abs(process.create_time() - created) < 1 and process.status() != psutil.STATUS_ZOMBIE:
             return "running"
     return "died"
@@ -198,11 +198,11 @@ class Stage:
     """A stage of a command.
 
     Attributes:
-        name: Its name.
-        share: Share that is done, 0 to 1; None if unknown.
-        seconds: How long it has taken [s].
+        name: Name of the stage.
+        share: Completed share, 0 to 1; None if unknown.
+        seconds: Elapsed time [s].
         left: Remaining time [s]; None if unknown.
-        best: The best value so far, such as "best RMSE 3.10 dB"; empty if the log has none.
+        best: The best value so far, such as "best RMSE 3.10 dB"; empty if the log states none.
     """
 
     name: str
@@ -213,7 +213,7 @@ class Stage:
 
 
 def stages(log: str) -> list[Stage]:
-    r"""The stages that a log shows, in order; stages of less than a few seconds print no line.
+    r"""The stages that a log shows, in order; stages that take less than a few seconds print no progress line.
 
     Example:
         >>> stages("tracing 3/4, 75 %, 1/s, 3 s, about 1 s left\nWritten to result")
@@ -231,11 +231,11 @@ def stages(log: str) -> list[Stage]:
 
 
 def main() -> None:
-    """Run the command given after the file for the exit status, unless it is stopped before."""
+    """Run the command whose words follow the exit-status file in the arguments, unless it is stopped before."""
     stopped: list[int] = []
     # A handler, unlike SIG_IGN, is not inherited by the command.
     signal.signal(signal.SIGINT, lambda number, _: stopped.append(number))
-    # `Jobs.start` held it back while Python started.
+    # `Jobs.start` blocked this signal while Python started.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     _, status_file, *words = sys.argv
     status = -signal.SIGINT

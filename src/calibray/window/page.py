@@ -1,4 +1,4 @@
-"""The page: the map, the steps from a map to a prediction, and a dialog with the scene in 3-D."""
+"""The page: the map, the steps from a map to a prediction, and a dialog that shows the scene in 3-D."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ UPLOADS: Final = {
     "Map or plan": "Add maps, plans, scenes, height models",
     "Measurements": "Add tables, tracks",
 }
-"""The steps that take files, and their buttons."""
+"""The steps that accept files, with the labels of their buttons."""
 
 HEAD: Final = '<link rel="stylesheet" href="/window/window.css"><script src="/window/plan.js" defer></script>'
 
 
 def build(desk: Desk) -> None:
-    """Build the page for one tab of the browser."""
-    # Of this tab alone: if a tab shows its command again, the others keep their buttons and the keyboard.
+    """Build the page for one browser tab."""
+    # Each tab has its own: if one tab redraws its command, the others keep their buttons and the keyboard focus.
     progress = ui.refreshable(_progress)
 
     @ui.refreshable
@@ -51,7 +51,7 @@ def build(desk: Desk) -> None:
             for number, (name, show) in enumerate(STEPS, 1):
                 with ui.element("section").classes("step").props(f'aria-label="{name}"'):
                     heading(f"{number}. {name}", 2)
-                    # Outside of what is shown again, which would end an upload.
+                    # Placed outside the part that is redrawn, because redrawing would abort an upload.
                     if name in UPLOADS:
                         upload(desk, UPLOADS[name])
                     show(desk)
@@ -60,7 +60,7 @@ def build(desk: Desk) -> None:
 
 
 def _show_map(desk: Desk, activity: Callable[[], None]) -> ui.label:
-    """Draw the map with its buttons, and the last command; returns the label of the chosen place or area."""
+    """Draw the map with its buttons, and the last command; return the label of the chosen place or area."""
 
     def clear_area() -> None:
         desk.area = None
@@ -77,7 +77,7 @@ def _show_map(desk: Desk, activity: Callable[[], None]) -> ui.label:
         )
         canvas.classes("map")
         with ui.row().classes("tools"):
-            # Without the server, so that what follows at once already finds the map as asked.
+            # Handled in the browser, without the server, so that the map has changed before the next input.
             for name, call in (("Whole map", "fit"), ("Draw an area", "drawArea")):
                 button = ui.button(name).props("outline dense")
                 button.on("click", js_handler=f"() => plan.{call}()")
@@ -90,7 +90,7 @@ def _show_map(desk: Desk, activity: Callable[[], None]) -> ui.label:
 
 
 def _answer_map(desk: Desk, place: ui.label) -> None:
-    """Take what the script of the map reports: choices of the user, and data that it has loaded."""
+    """Handle what the map's script reports: choices of the user, and data that it has loaded."""
 
     def picked(event: events.GenericEventArguments) -> None:
         # Adding 0 removes the sign of a negative zero.
@@ -123,10 +123,10 @@ def _answer_map(desk: Desk, place: ui.label) -> None:
 def _follow_changes(
     desk: Desk, activity: ui.refreshable[[], None], progress: ui.refreshable[[Job], None]
 ) -> None:
-    """Show steps again when the files of the folder, or the command that is running, have changed."""
+    """Redraw steps when the files in the folder or the running command have changed."""
 
     def contents() -> dict[str, object]:
-        """What the steps with fields for texts show; they are shown again only if it changes."""
+        """What the steps with text fields show; they are redrawn only if it changes."""
         text, files = desk.folder.text(), desk.folder.files((*MAPS, ".tif", ".tiff"))
         return {
             "Map or plan": (text, files, desk.folder.scenes(), desk.scene),
@@ -147,7 +147,7 @@ def _follow_changes(
                 show.refresh()
         show_commands.refresh()
         shown.update(now)
-        # Otherwise `watch` would show the command again, and a click on its Stop would be lost.
+        # Otherwise `watch` would redraw the command, and a click on its Stop button would be lost.
         watched["job"] = desk.jobs.running()
         activity.refresh()
         reload_map()
@@ -158,14 +158,14 @@ def _follow_changes(
 
     def watch() -> None:
         before, job = watched["job"], desk.jobs.running()
-        # Only what has changed: a button that is made again loses the keyboard, and a click.
+        # Only changed parts are redrawn: a redrawn button loses the keyboard focus, and a click.
         if job is None or before is None or job.number != before.number:
             if job != before:
                 activity.refresh()
         elif job != before:
             progress.refresh(job)
         watched["job"] = job
-        # A command that has ended may have written files, and an editor the study.
+        # A command that has ended may have written files, and an editor may have changed the study.
         if (before is not None and job is None) or desk.folder.text() != shown["Parameters"]:
             refresh()
 
@@ -175,13 +175,13 @@ def _follow_changes(
 
 
 def heading(text: str, level: int) -> None:
-    """A heading, for readers of the screen too."""
+    """Draw a heading that screen readers recognize."""
     with ui.element(f"h{level}"):
         ui.label(text)
 
 
 def _activity(desk: Desk, progress: Callable[[Job], None]) -> None:
-    """The command that is running, or ran last, with the end of its output."""
+    """Draw the command that is running or ran last, with the end of its output."""
     jobs = desk.jobs.list()
     if not jobs:
         return
@@ -197,7 +197,7 @@ def _activity(desk: Desk, progress: Callable[[Job], None]) -> None:
 
 
 def _progress(job: Job) -> None:
-    """The stages of a running command: the earlier ones, the progress of the last one, and the best value so far."""
+    """Draw the stages of a running command: earlier ones, the progress of the last one, and the best value so far."""
     shown = stages(job.log)
     for stage in shown[:-1]:
         ui.label(" · ".join(filter(None, (stage.name, f"{stage.seconds} s", stage.best)))).classes("quiet")
@@ -216,7 +216,7 @@ def _progress(job: Job) -> None:
 
 
 COLORS: Final = ("#8f9aa3", "#56b4e9", "#e69f00", "#009e73", "#cc79a7", "#f0e442", "#0072b2", "#d55e00")
-"""Grey, then the colours of Okabe and Ito, which colour-blind people can distinguish (jfly.uni-koeln.de/color)."""
+"""Grey, then the Okabe-Ito colours, which colour-blind people can distinguish (jfly.uni-koeln.de/color)."""
 
 
 @dataclass
@@ -224,8 +224,8 @@ class Camera:
     """A camera on a sphere around the scene.
 
     Attributes:
-        azimuth: From the east, anticlockwise [rad].
-        elevation: Above the horizon [rad].
+        azimuth: Azimuth, counterclockwise from east [rad].
+        elevation: Elevation above the horizon [rad].
         distance: Distance from the centre of the scene.
     """
 
@@ -234,20 +234,20 @@ class Camera:
     distance: float = 1.9 * RADIUS
 
     def move(self, turn: float = 0.0, rise: float = 0.0, factor: float = 1.0) -> None:
-        """Turn, raise and approach the camera; straight down, the direction up would be undefined."""
+        """Turn and raise the camera and scale its distance; straight down is excluded, as up would be undefined."""
         self.azimuth += turn
         self.elevation = float(np.clip(self.elevation + rise, 0.05, 1.5))
         self.distance = float(np.clip(self.distance * factor, 0.1 * RADIUS, 10 * RADIUS))
 
     def place(self) -> tuple[float, float, float]:
-        """Where it is."""
+        """The position of the camera."""
         across = self.distance * np.cos(self.elevation)
         x, y = across * np.cos(self.azimuth), across * np.sin(self.azimuth)
         return float(x), float(y), float(self.distance * np.sin(self.elevation))
 
 
 def view_button(desk: Desk) -> None:
-    """A button that opens a dialog with the scene in 3-D: its materials can be hidden."""
+    """Draw a button that opens a dialog with the scene in 3-D, in which materials can be hidden."""
     dialog = ui.dialog().props('aria-label="Scene in 3-D"')
 
     async def show() -> None:

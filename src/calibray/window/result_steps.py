@@ -1,6 +1,6 @@
-"""The steps of the page from a study to its use: the runs, their results, predictions.
+"""The steps of the page from a study to its use: the runs, their results, and predictions.
 
-A step is drawn again after a command.
+Steps are redrawn after each command.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ from calibray.window.study_steps import safe
 
 @ui.refreshable
 def show_run(desk: Desk) -> None:
-    """Draw the step of the runs: calibrate, validate, and everything that has run or is running in the folder."""
+    """Draw the step of the runs: calibrate, validate, and all commands that have run or are running in the folder."""
     if desk.folder.study_file.is_file():
         with ui.row():
             out = desk.keep(ui.input("Name of the result", value="result"))
             blocks = desk.keep(
-                ui.number("Blocks to validate by", value=4, min=2, max=100, step=1, format="%d")
+                ui.number("Number of validation blocks", value=4, min=2, max=100, step=1, format="%d")
             )
 
         def start(words: list[object]) -> None:
             if not re.fullmatch(r"\w[\w-]*", out.value or ""):
-                ui.notify("Use letters, digits, _ and - in names of results.", type="negative")
+                ui.notify("Use letters, digits, _ and - in the name of a result.", type="negative")
                 return
             desk.start(words)
 
@@ -66,7 +66,7 @@ def show_run(desk: Desk) -> None:
 
 @ui.refreshable
 def show_commands(desk: Desk) -> None:
-    """Draw what has run or is running in the folder."""
+    """Draw the list of commands that have run or are running in the folder."""
     jobs = [*desk.jobs.elsewhere(), *desk.jobs.list()][:20]
     if not jobs:
         ui.label("Nothing has run here yet.").classes("quiet")
@@ -94,7 +94,7 @@ NONE = "-"
 
 @ui.refreshable
 def show_result(desk: Desk) -> None:
-    """Draw the step of the results: key numbers in a table, and the report."""
+    """Draw the step of the results: a table of key figures, and the report."""
     names = desk.folder.results()
     if not names:
         ui.label("No result yet.").classes("quiet")
@@ -115,13 +115,13 @@ def show_result(desk: Desk) -> None:
         ui.button("Write the report again", on_click=lambda: desk.start(["report", chosen.value])).props(
             "outline"
         ).tooltip("After a validation: with the errors of the held-out blocks")
-    link = ui.link("Open the report in its own tab", "#", new_tab=True)
+    link = ui.link("Open the report in a new tab", "#", new_tab=True)
     chosen.on_value_change(point)
     point()
 
 
 def _table(desk: Desk, names: list[str]) -> None:
-    """Values and errors, with one column per result."""
+    """Draw parameter values and errors, with one column per result."""
     columns = {name: _facts(desk, name) for name in names}
     rows = dict.fromkeys(key for column in columns.values() for key in column)
     _facts_table(
@@ -130,7 +130,7 @@ def _table(desk: Desk, names: list[str]) -> None:
 
 
 def _facts_table(names: list[str], rows: dict[str, dict[str, str]]) -> None:
-    """Rows of texts, with one column per result; differences from the first result are bold."""
+    """Draw rows of texts, with one column per result; differences from the first result are bold."""
     with ui.element("div").classes("scrolled").props("tabindex=0"), ui.element("table").classes("facts"):
         with ui.element("tr"):
             for text in ("", *names):
@@ -148,7 +148,7 @@ def _facts_table(names: list[str], rows: dict[str, dict[str, str]]) -> None:
 
 
 def _facts(desk: Desk, name: str) -> dict[str, str]:
-    """Key numbers of a result by their names."""
+    """Key figures of a result, by name."""
     record = desk.folder.result(name)
     facts = {
         "Links": _shown(record, "links", "calibrated_on"),
@@ -171,7 +171,7 @@ def _facts(desk: Desk, name: str) -> dict[str, str]:
 
 
 def _comparison(desk: Desk, names: list[str]) -> None:
-    """The differences between the studies, and which result predicts better."""
+    """Draw the differences between the studies, and a button that shows which result predicts better."""
     changed = changes([desk.folder.result(name).get("study") or {} for name in names])
     ui.label("Differences between the studies").classes("title")
     if changed:
@@ -229,17 +229,17 @@ def settings(study: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def changes(studies: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Settings that differ between studies: by dotted name, the value of each; None if a study lacks it."""
+    """Settings that differ between studies: the value in each study, None where it is missing, by dotted name."""
     tables = [settings(study) for study in studies]
     rows = {name: [table.get(name) for table in tables] for table in tables for name in table}
     return {name: values for name, values in rows.items() if any(value != values[0] for value in values)}
 
 
 def predictive_errors(folder: Path) -> tuple[str, HeldOutErrors] | None:
-    """The model that a result's predictions use, and its held-out errors; None without a validation of this model.
+    """The model that a result's predictions use, and its held-out errors; None if this model was not validated.
 
     Raises:
-        InputError: The result or its validation cannot be read, or belong to different studies.
+        InputError: The result or its validation cannot be read, or they belong to different studies.
     """
     fields = read(folder, allow_changed_inputs=True)
     held_out, model = fields["held_out"], fields["prediction"].model.name
@@ -247,7 +247,7 @@ def predictive_errors(folder: Path) -> tuple[str, HeldOutErrors] | None:
 
 
 def better(first: str, second: str, folder: Path) -> str:
-    """Which of two results of a folder predicts held-out blocks better, with what certainty, as a sentence.
+    """A sentence that states which of two results in a folder predicts held-out blocks better, and how certainly.
 
     Raises:
         InputError: Both are the same result, or a result or its validation cannot be read.
@@ -260,14 +260,16 @@ def better(first: str, second: str, folder: Path) -> str:
     (model, one), (other_model, other) = (errors for errors in results.values() if errors is not None)
     same = [(one.position, other.position), (one.measured_db, other.measured_db)]
     if not all(np.array_equal(*pair) for pair in same):
-        return f"{first} and {second} were validated on other links, so nothing shows which predicts better."
+        return (
+            f"{first} and {second} were validated on different links, so nothing shows which predicts better."
+        )
     judged = (one.block >= 0) & (other.block >= 0)
     if not judged.any():
         return f"{first} and {second} have no held-out link in common. Validate both with the same blocks."
     errors = {first: one.errors[model][judged], second: other.errors[other_model][judged]}
     best, worst = sorted(errors, key=lambda name: float(np.mean(errors[name] ** 2)))
     judgement = compare(errors[best], {worst: errors[worst]}, one.position[judged])
-    # The blocks of the first result: those of the second may be others.
+    # The blocks are those of the first result; the second may have different ones.
     lower = sum(
         np.mean(errors[best][rows] ** 2) < np.mean(errors[worst][rows] ** 2)
         for rows in (one.block[judged] == block for block in np.unique(one.block[judged]))
@@ -283,12 +285,12 @@ def better(first: str, second: str, folder: Path) -> str:
 
 
 MOST_CANDIDATES: Final = 2000
-"""Largest number of candidate places; each is traced."""
+"""Largest number of candidate places; each one is traced."""
 
 
 @ui.refreshable
 def show_prediction(desk: Desk) -> None:
-    """Draw the step of the predictions: at a place and over an area, where to measure, and export."""
+    """Draw the step of the predictions: at a place, over an area, suggested places to measure, and export."""
     names = desk.folder.results()
     if not names:
         ui.label("Calibrate first.").classes("quiet")
@@ -374,9 +376,9 @@ def show_prediction(desk: Desk) -> None:
 def write_links(
     desk: Desk, file: str, site: dict[str, Any], x: NDArray[np.float64], y: NDArray[np.float64], height: float
 ) -> None:
-    """Write a table of links to the folder: from a transmitter to a grid of places x, y at a height above the ground.
+    """Write a table of links from a transmitter to a grid of places x, y at a height above the ground, all in [m].
 
-    The links have the transmitter's groups, its carrier and the direction of its antenna; lengths are in [m].
+    The links have the transmitter's groups, carrier and antenna direction.
 
     Raises:
         InputError: The scene cannot be read, or the table cannot be written.
@@ -389,13 +391,13 @@ def write_links(
 
 
 def _grid(desk: Desk, cell: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Eastings and northings of a regular grid in the chosen area [m]."""
+    """Eastings and northings [m] of a regular grid in the chosen area."""
     if desk.area is None:
         raise InputError("draw an area on the map first; its places are the candidates")
     west, south, east, north = desk.area
     if (east - west) * (north - south) / cell**2 > MOST_CANDIDATES:
         raise InputError(
-            f"the area has more than {MOST_CANDIDATES} cells; draw a smaller one, or widen the cells"
+            f"the area has more than {MOST_CANDIDATES} cells; draw a smaller area, or use wider cells"
         )
     return np.arange(west, east, cell), np.arange(south, north, cell)
 
@@ -415,9 +417,9 @@ def _predicted(desk: Desk) -> None:
 
 
 def predicted_text(row: pd.Series) -> str:
-    """A prediction as a sentence, in the quantity that was measured.
+    """A sentence with the predicted value of the measured quantity.
 
-    If received power was measured and the transmitted power is unknown, the path loss contains this power.
+    If received power was measured and the transmitted power is unknown, the path loss includes this unknown power.
     """
     value, lower, upper, name, unit = "path_loss_db", "lower_db", "upper_db", "path loss", "dB"
     for key, quantity in QUANTITIES.items():

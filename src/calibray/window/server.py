@@ -22,11 +22,11 @@ from calibray.window.page import build
 
 ASSETS = Path(__file__).parent / "assets"
 SHOWN = ("report.html", "map.png")
-"""Files of a result that the page shows."""
+"""Files in a result's folder that the page shows."""
 
 
 def serve(folder: Path, port: int, opened: Callable[[str], None]) -> None:
-    """Show a study's folder until Ctrl-C; port 0 is a free one. `opened` is called with the address.
+    """Serve the page for a study's folder until Ctrl-C; port 0 selects a free one. `opened` is called with the address.
 
     Raises:
         InputError: The port is in use.
@@ -53,7 +53,7 @@ def application(desk: Desk) -> FastAPI:
         except InputError as error:
             return JSONResponse({"links": [], "transmitters": [], "sites": [], "error": str(error)})
 
-    # Apart from the map, which need not wait for it.
+    # Served separately, so that the map need not wait for the findings.
     @app.get("/data/findings.json")
     async def suspicions() -> Response:
         try:
@@ -75,7 +75,7 @@ def application(desk: Desk) -> FastAPI:
         path = desk.folder.path / name / file
         if not path.is_file():
             return Response("not written yet", 404)
-        # A result's page may come from elsewhere: its scripts get an origin of their own and can ask for nothing.
+        # A report may come from elsewhere, so its scripts run in an origin of their own and cannot send requests.
         policy = "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
         return FileResponse(
             path, headers={"Content-Security-Policy": policy + "img-src data:; font-src data:"}
@@ -98,12 +98,12 @@ def _listen(port: int) -> socket.socket:
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind(("127.0.0.1", port))
-        # Connections wait from here on, so that the address can be opened before the server runs.
+        # From here on, connections are queued, so that the address can be opened before the server runs.
         listening.listen()
     except (OSError, OverflowError) as error:
         listening.close()
         raise InputError(
-            f"--port {port}: cannot be opened ({error}); give another, or 0 for a free one"
+            f"--port {port}: cannot be opened ({error}); give another port, or 0 for a free one"
         ) from None
     return listening
 
@@ -123,16 +123,16 @@ HEADERS: Final = (
 
 @final
 class Guard:
-    """An ASGI application that refuses requests, to the port of the server, before they reach another one."""
+    """An ASGI application that refuses unauthorized requests to the server's port before they reach the wrapped one."""
 
     def __init__(self, app: Any, token: str, port: int) -> None:
         self._app, self._token, self._port = app, token.encode(), port
         self._hosts = {f"{name}:{port}".encode() for name in ("127.0.0.1", "localhost")}
-        # Cookies do not tell ports apart, so the name does.
+        # Cookies are shared between ports, so the cookie's name contains the port.
         self._cookie = f"calibray_{port}"
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        """Answer a request, or pass it on."""
+        """Answer a request, or pass it to the wrapped application."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
@@ -140,7 +140,7 @@ class Guard:
         fault = self._fault(scope, headers)
         entering = scope["type"] == "http" and scope["path"] == "/" and self._given(scope)
         if fault is None and entering:
-            # The token leaves the address bar and the history; the cookie stands for it.
+            # The token disappears from the address bar and the history; the cookie replaces it.
             cookie = f"{self._cookie}={self._token.decode()}; HttpOnly; SameSite=Strict; Path=/".encode()
             await _answer(send, 303, b"", ((b"location", b"/"), (b"set-cookie", cookie)))
         elif fault is not None or not self._known(headers):
@@ -150,27 +150,27 @@ class Guard:
             await self._app(scope, receive, _with_headers(send))
 
     def _fault(self, scope: Any, headers: dict[bytes, bytes]) -> str | None:
-        """The reason to refuse a request from any sender; None if there is none."""
+        """The reason to refuse a request regardless of its token; None if there is none."""
         path = scope["path"]
         if ".." in path.split("/") or "\\" in path or not path.isprintable():
-            return "the path leads out of the window"
+            return "the path is outside the window's pages"
         if headers.get(b"host") not in self._hosts:
             return "the request names another host"
         origins = {b"http://" + host for host in self._hosts}
         if b"origin" in headers and headers[b"origin"] not in origins:
             return "the request comes from another origin"
-        # Another port of this machine is the same site, so SameSite=Strict alone would let it pass.
+        # Another port on this machine is the same site, so SameSite=Strict alone would let its requests pass.
         if headers.get(b"sec-fetch-site", b"none") not in {b"none", b"same-origin"}:
             return "the request comes from another site"
         return None
 
     def _given(self, scope: Any) -> bool:
-        """Whether the address has the token."""
+        """Whether the address contains the token."""
         query = parse_qs(scope["query_string"].decode("latin-1"))
         return self._same(query.get("token", [""])[0])
 
     def _known(self, headers: dict[bytes, bytes]) -> bool:
-        """Whether the cookie has the token."""
+        """Whether the cookie contains the token."""
         try:
             cookies = SimpleCookie(headers.get(b"cookie", b"").decode("latin-1"))
         except CookieError:
@@ -198,7 +198,7 @@ async def _answer(send: Any, status: int, body: bytes, headers: tuple[tuple[byte
 
 
 def _with_headers(send: Any) -> Any:
-    """Add the headers of the window to responses, which may have a stricter policy of their own."""
+    """Add the window's headers to responses, and its content security policy unless a response has its own."""
 
     async def sending(message: Any) -> None:
         if message["type"] == "http.response.start":

@@ -1,4 +1,4 @@
-"""The steps of the page from a map to a study: the scene, the measurements, the parameters."""
+"""The steps of the page from a map to a study: the scene, the measurements, and the parameters."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from calibray.window.desk import LARGEST, MAPS, STUDY, Desk, StudyFolder, filled
 
 ITU: Final = [name for name in ITU_MATERIALS[DEFAULT_REVISION] if name != "vacuum"]
 COMMANDS: Final = {".osm": "osm", ".pbf": "osm", ".csv": "plan", ".dxf": "plan"}
-"""How files are converted to scenes; files of other kinds may be footprints or plans."""
+"""The command that converts a file to a scene, by extension; files with other extensions may be footprints or plans."""
 
 
 def upload(desk: Desk, label: str) -> None:
-    """Take files into the folder."""
+    """Draw the control that adds files to the folder."""
 
     async def take(event: events.MultiUploadEventArguments) -> None:
         for file in event.files:
@@ -44,7 +44,7 @@ def upload(desk: Desk, label: str) -> None:
     files = ui.upload(
         on_multi_upload=take, on_rejected=refuse, multiple=True, auto_upload=True, max_file_size=LARGEST
     )
-    # The header of Quasar's uploader, which is hidden, has buttons without names.
+    # The header of Quasar's uploader is hidden, because its buttons have no names.
     uploader = f"getElement({files.id}).$refs.qRef"
     files.classes("wide").on("uploaded", js_handler=f"() => {uploader}.removeUploadedFiles()")
     button.on("click", js_handler=f"() => {uploader}.pickFiles()")
@@ -52,10 +52,10 @@ def upload(desk: Desk, label: str) -> None:
 
 @ui.refreshable
 def show_scene(desk: Desk) -> None:
-    """Draw the step of the scene: a map, footprints or a floor plan is converted, or a scene is chosen."""
+    """Draw the step of the scene: convert a map, footprints or a floor plan, or choose a scene."""
     sources, terrain = desk.folder.files(MAPS), desk.folder.files((".tif", ".tiff"))
     if sources:
-        # Tables are seldom plans.
+        # Tables are rarely plans.
         likely = min(sources, key=lambda name: (name.endswith(".csv"), "plan" not in name.lower()))
         with ui.row():
             source = desk.keep(
@@ -114,7 +114,9 @@ def show_scene(desk: Desk) -> None:
     scenes = desk.folder.scenes()
     if of_study := desk.folder.valid_content().get("scene", {}).get("file", ""):
         ui.label(f"Scene of the study: {of_study}")
-        ui.label("The step Measurements changes it: its section scene, or Draft again.").classes("quiet")
+        ui.label("To change it, use the section scene of the step Measurements, or Draft again.").classes(
+            "quiet"
+        )
         return
     if desk.scene not in scenes:
         desk.scene = scenes[0] if scenes else None
@@ -140,12 +142,12 @@ def _is_number(text: str | None) -> bool:
 
 
 SECTIONS = ("scene", "links", "antennas", "trace", "offset")
-"""Sections with assumptions that this step shows; parameters have their own step."""
+"""Sections whose assumptions the step of the measurements shows; parameters have their own step."""
 
 
 @ui.refreshable
 def show_measurements(desk: Desk) -> None:
-    """Draw the step of the measurements: tables of links become a drafted study, whose assumptions can be changed."""
+    """Draw the step of the measurements: draft a study from tables of links, and change its assumptions."""
     if desk.folder.study_file.is_file():
         _assumptions(desk)
         findings(desk)
@@ -176,7 +178,7 @@ def show_measurements(desk: Desk) -> None:
         options = {
             "--transmitters": sites.value, "--track": track.value, "--frequency": frequency.value, "--tx": tx.value
         }  # fmt: skip
-        # One word each, so that a negative x is not taken for an option.
+        # Each option and its value are one word, so that a negative x is not mistaken for an option.
         words += [f"{option}={value}" for option, value in options.items() if value]
         desk.start(words)
 
@@ -185,7 +187,7 @@ def show_measurements(desk: Desk) -> None:
 
 @ui.refreshable
 def findings(desk: Desk) -> None:
-    """Suspicions about the links, which are orange on the map."""
+    """Draw the warnings about suspicious links, which are orange on the map."""
     for finding in desk.findings:
         ui.label(finding).classes("warning").props("role=note")
 
@@ -251,7 +253,7 @@ def _control(key: str, value: Any, columns: list[str]) -> Callable[[], Any]:
 
 
 def _toml(value: Any) -> str:
-    """A value in the form of the study file."""
+    """A value in the syntax of the study file."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{json.dumps(key)} = {_toml(part)}" for key, part in value.items()) + " }"
     if isinstance(value, list):
@@ -260,7 +262,7 @@ def _toml(value: Any) -> str:
 
 
 def _columns(desk: Desk, content: dict[str, Any]) -> list[str]:
-    """The columns of the table of links."""
+    """The names of the columns in the table of links."""
     try:
         return [str(name) for name in read_table(desk.folder.path / str(content["links"]["file"])).frame]
     except (InputError, KeyError, TypeError, OSError):
@@ -270,7 +272,7 @@ def _columns(desk: Desk, content: dict[str, Any]) -> list[str]:
 def likely_tables(folder: StudyFolder, tables: Sequence[str]) -> tuple[str, str]:
     """The tables that most likely contain the links and their transmitters, by columns first, then by names.
 
-    The second is empty if no table looks like one of transmitters.
+    The second is empty if no table looks like a table of transmitters.
     """
     content = {name: _content(folder.path / name, (folder.path / name).stat().st_mtime_ns) for name in tables}
     named = {name for name in tables if any(word in name.lower() for word in SITES)}
@@ -286,14 +288,14 @@ def likely_tables(folder: StudyFolder, tables: Sequence[str]) -> tuple[str, str]
 
 
 SITES: Final = ("cell", "site", "mast", "access", "transmitter", "station")
-"""Words in names of tables of transmitters."""
+"""Words in the file names of tables of transmitters."""
 
 
 @lru_cache(maxsize=100)
 def _content(file: Path, changed: int) -> str:
-    """What the columns of a table contain: "links", "transmitters", or empty if they show neither.
+    """What a table contains, judged by its columns: "links" or "transmitters"; empty if neither is recognized.
 
-    A file that is written again, and so has another time of change, is read again.
+    `changed` is the file's modification time, so that a modified file is read again.
     """
     del changed
     try:
@@ -311,7 +313,7 @@ def _content(file: Path, changed: int) -> str:
 
 @ui.refreshable
 def show_parameters(desk: Desk) -> None:
-    """Draw the step of the parameters: what is calibrated, within which bounds, and with which prior."""
+    """Draw the step of the parameters: which are calibrated, with which bounds and which prior."""
     parameters = desk.folder.valid_content().get("parameters")
     if not isinstance(parameters, dict):
         ui.label("Draft the study first.").classes("quiet")
@@ -327,11 +329,11 @@ def show_parameters(desk: Desk) -> None:
 
 
 def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | None]:
-    """The controls of a parameter, and a function that reads its entry; None if it is not calibrated."""
+    """Draw the controls of a parameter; return a function that reads its entry, None if it is not calibrated."""
     low, high = map(float, entry["bounds"])
     prior = entry.get("prior", {})
     stated = prior.get("itu", "")
-    # The study may state a revision or a material that the list lacks ("concrete@P.2040-1").
+    # The study may state a revision or a material that is not in the list ("concrete@P.2040-1").
     materials = list(dict.fromkeys(["", stated, *ITU]))
     with ui.element("fieldset"):
         with ui.element("legend"):
@@ -347,7 +349,7 @@ def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | No
         if entry.get("scale") != "log":
             with ui.row():
                 for bound, which in ((lower, "lowest"), (upper, "highest")):
-                    # Errors of antennas have negative bounds.
+                    # Parameters such as antenna errors can have negative bounds.
                     slider = ui.slider(min=min(2 * low, 0.0), max=max(2 * high, 20.0), step=0.1)
                     slider.bind_value(bound).classes("bound").props(
                         f'label aria-label="{safe(name)} {which}, slider"'
@@ -375,5 +377,5 @@ def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | No
 
 
 def safe(name: str) -> str:
-    """A name for a property, whose syntax has quotes."""
+    """A name without the quotes that would end a property string."""
     return "".join(letter for letter in name if letter.isalnum() or letter in " ._-")

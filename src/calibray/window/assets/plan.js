@@ -1,11 +1,11 @@
-// The map of the window on a canvas: outlines, links, transmitters, the chosen place and area.
+// The window's map on a canvas: outlines, links, transmitters, and the chosen place and area.
 "use strict";
 const plan = (() => {
   let canvas, context, data = { links: [], transmitters: [] }, buildings, walls;
   let centre = [0, 0], zoom = 1, point = null, area = null, suggested = [], drawing = false, grip = null, moved = false, whole = true;
   let width = 1, height = 1, queued = false;
-  const pointers = new Map(); // where each finger or the mouse is, while it is down
-  let layer = null; // what does not change while the map is dragged: an image of twice the size, its centre and zoom
+  const pointers = new Map(); // position of each finger, or of the mouse while its button is down
+  let layer = null; // cached image of what does not change while the map is dragged: twice the map's size, with centre and zoom
 
   const color = (name) => getComputedStyle(document.body).getPropertyValue(name).trim();
   const toScreen = (x, y) => [width / 2 + (x - centre[0]) * zoom, height / 2 - (y - centre[1]) * zoom];
@@ -159,7 +159,7 @@ const plan = (() => {
       event.preventDefault();
     });
   }
-  // Asked for while the page is still being built.
+  // The request is sent while the page is still being built.
   const ask = (scene) => fetch("/data/plan.json" + (scene ? "?scene=" + encodeURIComponent(scene) : ""));
   let early = ask();
   async function load(scene) {
@@ -168,7 +168,7 @@ const plan = (() => {
       context = canvas.getContext("2d");
       listen();
       new ResizeObserver(size).observe(canvas);
-      // A file that is dropped beside the fields for files would replace the page.
+      // A file dropped outside the upload fields would replace the page.
       for (const name of ["dragover", "drop"]) {
         window.addEventListener(name, (event) => {
           if (!event.dataTransfer.types.includes("Files")) return;
