@@ -83,7 +83,7 @@ def test_a_table_in_windows_1252_is_read(tmp_path):
         (PLAIN.replace("-71", "-71 dBm"), "'-71 dBm' is not a number"),
         (PLAIN.replace("-71", "none"), "'none' is not a number"),
         (PLAIN.replace("-70.5", "dBm"), "'dBm' is not a number"),
-        ("1,2,3\n4,5,6\n", "row 1: contains numbers; put a line with the names"),
+        ("1,2,3\n4,5,6\n", "row 1: contains numbers; add a line with the column names"),
         ("Logger\n" + PLAIN + "4,5,6\n", "cells, the header has"),
     ],
 )

@@ -276,7 +276,7 @@ def _checked_layout(path: Path, text: str, layout: _Layout) -> tuple[list[str], 
                 header = cells
                 if all(map(_is_number, filter(str.strip, header))):
                     raise InputError(
-                        f"{path}, row {line}: contains numbers; put a line with the names of the columns above it"
+                        f"{path}, row {line}: contains numbers; add a line with the column names above it"
                     )
                 names = Counter(name.strip() for name in header if name.strip())
                 if repeated := [name for name, count in names.items() if count > 1]:

@@ -316,7 +316,7 @@ class _Interpreter:
             return value
         raise self._refusal(
             node,
-            "must be true or false to be joined by and, or, not; compare it, or put comparisons in parentheses",
+            "must be true or false to be combined by and, or, not; compare it, or put comparisons in parentheses",
         )
 
     def _number(self, node: ast.expr) -> pd.Series | int | float:
@@ -377,7 +377,7 @@ class _Interpreter:
             raise self._refusal(node, "is and is not are not allowed; use ==, != or isna()")
         for side, value in zip(sides, values, strict=True):
             if isinstance(value, list | tuple):
-                raise self._refusal(side, "a list of values can only be compared by in, not in, == and !=")
+                raise self._refusal(side, "a list of values can only be compared with in, not in, == and !=")
         if kind in (ast.Eq, ast.NotEq):
             self._check_equality(node, left, [right])
             self._check_equality(node, right, [left])

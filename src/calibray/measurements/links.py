@@ -16,7 +16,7 @@ from calibray.support.messages import first_line, shortened
 from calibray.tables import Column, Table, hertz, named, short_html, short_text
 
 MIN_DISTANCE: Final = 1e-3
-"""Distance [m] between transmitter and receiver below which they coincide, so that no path loss is defined."""
+"""Distance [m] between transmitter and receiver below which they count as coincident, without a path loss."""
 
 FEW: Final = 8
 """Number of links below which no trend, noise model or prediction error is estimated from their errors."""

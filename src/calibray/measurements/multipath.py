@@ -1,7 +1,7 @@
 """Observables of links from measured multipath components: the delay, power and angles of every path of every link.
 
 Each observable is the same statistic that the model computes, with a hard limit at the receiver's dynamic range. If a
-link was measured several times, for example with rotations of the receiving array, it is the mean over the snapshots.
+link was measured several times, for example with rotations of the receiving array, snapshots are averaged.
 Impulse responses are converted to components: the samples above a stated threshold.
 """
 
@@ -275,7 +275,7 @@ def read_impulse_responses(
         response = response[None] if response.ndim == 1 and len(labels) == 1 else response
         if len(response) != len(labels) or response.ndim not in (2, 3):
             raise InputError(
-                f"{source}: an array of shape {response.shape}, must have one row for each of {len(labels)} links"
+                f"{source}: the array has shape {response.shape}, must have one row for each of {len(labels)} links"
             )
         for label, own in zip(labels, response, strict=True):
             parts.append(_above_noise(label, np.atleast_2d(own), delay, margin_db))
@@ -308,8 +308,8 @@ def _read(file: Path, sample_rate: float | None) -> tuple[NDArray[Any], NDArray[
     largest = {name: array for name, array in numeric.items() if array.size == size}
     if len(largest) > 1:
         raise InputError(
-            f"{file}: contains several arrays of {size} numbers ({shortened(', '.join(largest))}); keep one, complex "
-            f"or an amplitude, and name delays {DELAYS[0]}"
+            f"{file}: contains several arrays of {size} numbers ({shortened(', '.join(largest))}); keep only "
+            f"one, of complex numbers or amplitudes, and name the delays {DELAYS[0]!r}"
         )
     ((name, response),) = largest.items()
     if response.dtype.kind != "c" and (response <= 0).all():
@@ -324,7 +324,7 @@ def _read(file: Path, sample_rate: float | None) -> tuple[NDArray[Any], NDArray[
         if len(delay) != count:
             raise InputError(f"{file}: {len(delay)} delays for {count} samples of {shortened(name)!r}")
     elif sample_rate is None:
-        raise InputError(f"{file}: states no delays ({', '.join(DELAYS)}); give the sample rate [Hz]")
+        raise InputError(f"{file}: contains no delays ({', '.join(DELAYS)}); give the sample rate [Hz]")
     else:
         delay = np.arange(count) / sample_rate
     if not delay.max(initial=0.0) <= LONGEST:

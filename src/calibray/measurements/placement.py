@@ -105,7 +105,7 @@ def _covered(
 def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], longest_gap: float) -> float:
     """Offset of the time zone that fits better, ahead of the track's clock [s]; 0 if none fits better.
 
-    At least a tenth of the rows must not lie on the track, and the time zone must more than halve their number.
+    Shifts are tried if more than a tenth of the rows are off the track, and must reduce their number by more than half.
     """
     seconds = seconds[np.isfinite(seconds)]
     seconds = seconds[:: 1 + len(seconds) // 10_000]

@@ -173,7 +173,7 @@ def _path_loss_db(table: SourceTable, columns: LinkColumns) -> NDArray[np.float6
     measured = table.numbers(columns.value)
     if columns.quantity in ("rsrp", "received_power") and np.abs(measured).max() < LINEAR:
         raise InputError(
-            f"{table.source}: column {columns.value!r} has values up to {measured.max():g}, as powers in watts have; "
+            f"{table.source}: column {columns.value!r} has values up to {measured.max():g}, typical of watts; "
             "convert them to dBm"
         )
     match columns.quantity:

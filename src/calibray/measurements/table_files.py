@@ -47,7 +47,7 @@ def sheet_text(path: Path) -> tuple[list[int], str]:
     determines the columns.
 
     Raises:
-        InputError: The file is not a workbook, has no sheet of cells, is too large, or has a value in a column
+        InputError: The file is not a workbook, contains no worksheet, is too large, or has a value in a column
             without a name; or openpyxl is not installed.
     """
     library("openpyxl", "excel")
@@ -109,7 +109,7 @@ def _rows(path: Path, computed: bool) -> Iterator[tuple[int, _Cells]]:
         closing(openpyxl.load_workbook(file, read_only=True, data_only=computed)) as book,
     ):
         if not book.worksheets:
-            raise InputError(f"{path}: has no sheet of cells; put the table into the first sheet")
+            raise InputError(f"{path}: contains no worksheet; put the table into the first sheet")
         sheet = book.worksheets[0]
         sheet.reset_dimensions()  # The dimensions stated in a sheet may be wrong.
         count = 0
@@ -227,7 +227,7 @@ def read_table(path: str | Path) -> SourceTable:
             table = replace(table, row=np.array(numbers[len(numbers) - len(table) :], dtype=np.int64))
         case suffix:
             raise InputError(
-                f"{path}: cannot read a {suffix or 'nameless'} table; use .csv, .txt, .parquet or .xlsx"
+                f"{path}: cannot read a {suffix or 'extensionless'} table; use .csv, .txt, .parquet or .xlsx"
             )
     if len(table) == 0:
         raise InputError(f"{path}: contains no rows; a table needs a header and at least one row")
@@ -327,7 +327,7 @@ def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> int
     if size > min(limit, available_memory()):
         raise InputError(
             f"{path}: {what} takes {size / 2**30:,.1f} GiB decompressed, at most {limit / 2**30:g} GiB and the free "
-            "memory are read; keep the columns and rows that you need, or write smaller row groups"
+            "memory can be read; keep only the columns and rows that you need, or write smaller row groups"
         )
     return size
 
@@ -404,5 +404,5 @@ def _integer_columns_with_gaps(file: Any) -> list[str]:
 def _damaged(path: Path, error: Exception) -> InputError:
     """The error for a Parquet file that its library cannot read."""
     if isinstance(error, MemoryError):
-        return InputError(f"{path}: does not fit into memory; keep the columns and rows that you need")
+        return InputError(f"{path}: does not fit into memory; keep only the columns and rows that you need")
     return InputError(f"{path}: not a Parquet file ({first_line(error)}); export it again")

@@ -38,7 +38,7 @@ INDEPENDENT: Final = 1e-3
 """Smallest pivot with which a further point may determine curvature (theta_2)."""
 
 ACCEPTED: Final = 0.05
-"""Share of the predicted decrease that a successful step reaches; the trust region then does not shrink."""
+"""Smallest share of the predicted decrease that makes a step successful; the trust region then does not shrink."""
 
 LARGEST: Final = 0.5
 """Largest trust-region radius, as a share of the box."""

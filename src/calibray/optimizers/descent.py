@@ -112,7 +112,7 @@ def _decrease(starts: Starts, step: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> Starts:
-    """Compare the decrease in cost at trial points with the predicted one [s], accept or reject, update the damping."""
+    """Accept or reject trial points by comparing actual and predicted decreases in cost [s]; update the damping."""
     # A failed trial has an infinite cost, hence a ratio of minus infinity.
     ratio = (starts.cost - trial.cost) / predicted
     better = ratio > 1e-4

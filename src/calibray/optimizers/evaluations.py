@@ -18,7 +18,7 @@ OBJECTIVE_TOLERANCE = 1e-4
 """Largest relative difference between a value and the one computed from its residuals, for float32 engines."""
 
 DECIMALS = 9
-"""Number of decimals of unit coordinates in which two points must agree to count as one."""
+"""Number of decimals to which the unit-cube coordinates of two points must agree for them to count as one."""
 
 
 @dataclass(frozen=True)

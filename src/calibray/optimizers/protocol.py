@@ -38,7 +38,7 @@ class Session:
     Args:
         box: The search box.
         uses: Parts of an evaluation that the algorithm uses: "value", "residuals", "jacobian".
-        search: Starts the algorithm on the archive; no part of it runs before the first `ask`.
+        search: Function that starts the algorithm on the archive; no part of it runs before the first `ask`.
         objective: Function that converts residuals to the value, if residuals are used.
 
     Attributes:
@@ -313,7 +313,7 @@ class Constants:
         return self.upper - self.lower
 
     def draw(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Constants from their prior within the bounds [k, q], from standard normal numbers [k, q]."""
+        """Draw constants [k, q] from their prior within the bounds, using standard normal numbers [k, q]."""
         return np.clip(self.centre + self.spread * normal, self.lower, self.upper)
 
 

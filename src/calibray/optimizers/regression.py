@@ -190,7 +190,7 @@ class Process:
         return mean + trend_basis(at.unit) @ self.coefficients if self.linear else mean
 
     def slope(self, at: Inputs, response_slope: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """Derivatives of the mean by unit-cube coordinates [k, m, d], given those of the responses [k, r, d]."""
+        """Derivatives of the mean [k, m, d] in the unit cube, given the derivatives of the responses [k, r, d]."""
         rates, variances = self.kernel.rates, self.kernel.variances
         # dM / dx_j = M'(r) / r x rate_j^2 x (difference along j).
         toward = (at.unit[:, :, None] - self.inputs.unit.T) * rates[:, None] ** 2

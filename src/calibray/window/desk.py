@@ -134,7 +134,7 @@ class StudyFolder:
             )
         target = (self.path / "meshes" if ending in MESHES else self.path) / name
         if target.exists() or target.is_symlink():
-            raise InputError(f"{shown}: already exists; rename one of them")
+            raise InputError(f"{shown}: already exists; rename one of the files")
         return target
 
     def content(self) -> dict[str, Any]:

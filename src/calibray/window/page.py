@@ -73,7 +73,7 @@ def _show_map(desk: Desk, activity: Callable[[], None]) -> ui.label:
         ui.label(str(desk.folder.path)).classes("quiet")
         canvas = ui.element("canvas").props(
             'id=plan tabindex=0 role=application aria-label="Map: arrow keys move it, plus and minus zoom, Enter '
-            'chooses the middle"'
+            'chooses the centre"'
         )
         canvas.classes("map")
         with ui.row().classes("tools"):

@@ -393,7 +393,7 @@ def write_links(
 def _grid(desk: Desk, cell: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Eastings and northings [m] of a regular grid in the chosen area."""
     if desk.area is None:
-        raise InputError("draw an area on the map first; its places are the candidates")
+        raise InputError("draw an area on the map first; its grid cells are the candidates")
     west, south, east, north = desk.area
     if (east - west) * (north - south) / cell**2 > MOST_CANDIDATES:
         raise InputError(

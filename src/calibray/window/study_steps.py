@@ -167,8 +167,8 @@ def show_measurements(desk: Desk) -> None:
         track = desk.keep(
             ui.select(["", *tracks], label="Track", value=tracks[0] if tracks else "").classes("wide")
         )
-        frequency = desk.keep(ui.input("Carrier frequency [Hz]", placeholder="3.5e9, unless a column has it"))
-        tx = desk.keep(ui.input("Transmitter x,y,z [m]", placeholder="unless a table has it"))
+        frequency = desk.keep(ui.input("Carrier frequency [Hz]", placeholder="3.5e9, unless in a column"))
+        tx = desk.keep(ui.input("Transmitter x,y,z [m]", placeholder="unless in a table"))
 
     def draft() -> None:
         if desk.scene is None:
@@ -246,7 +246,7 @@ def _control(key: str, value: Any, columns: list[str]) -> Callable[[], Any]:
             return tomllib.loads(f"value = {shown.value}")["value"]
         except ValueError as error:
             raise InputError(
-                f"{key} = {shown.value}: is not a value ({error}); put texts in quotes"
+                f"{key} = {shown.value}: is not a valid value ({error}); put text in quotes"
             ) from None
 
     return read

@@ -172,7 +172,7 @@ class SampledFunction:
         return self.prior.values(at) + self.rest.mean(at)
 
     def slopes(self, at: Inputs, response_slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives [k, m, d] by unit-cube coordinates, given those of the responses [k, r, d]."""
+        """Derivatives [k, m, d] with respect to unit-cube coordinates, given those of the responses [k, r, d]."""
         return self.prior.slopes(at, response_slope) + self.rest.slope(at, response_slope)
 
 
