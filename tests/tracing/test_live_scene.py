@@ -107,7 +107,7 @@ def test_materials_of_another_carrier_cause_a_warning(caplog: pytest.LogCaptureF
     assert not caplog.messages
     apply_materials(scene, marble, 28e9)
     assert caplog.messages == [
-        "scene.frequency is 3.5 GHz, but the calibrated constants hold at 28 GHz; set scene.frequency = 28000000000.0"
+        "scene.frequency is 3.5 GHz, but the calibrated constants are for 28 GHz; set scene.frequency = 28000000000.0"
     ]
 
 

@@ -96,7 +96,7 @@ def test_a_gain_is_in_dbi_if_its_line_contains_dbi(unit: str, tmp_path: Path) ->
         ("VERTICAL 360", "HORIZONTAL 360", r"line 366: HORIZONTAL is given twice"),
         ("HORIZONTAL 360", "HORIZONTAL \xb2", r"line 5: HORIZONTAL '.*number of its lines"),
         ("HORIZONTAL 360", "HORIZONTAL 359", r"line 365: '359.*belongs to no cut"),
-        ("VERTICAL 360", "VERTICAL 30", r"VERTICAL leaves 331 degrees without a value"),
+        ("VERTICAL 360", "VERTICAL 30", r"VERTICAL has a gap of 331 degrees"),
     ],
 )  # fmt: skip
 def test_malformed_files_are_refused_with_line_and_remedy(

@@ -1,6 +1,6 @@
-"""Tracing: finding the paths of links, by default with Sionna RT, which is imported only when a scene is opened.
+"""Tracing: finds the paths of links, by default with Sionna RT, which is imported only when a scene is opened.
 
-`protocol` defines what any ray tracer must do; only the room `tracing.sionna` imports Sionna RT.
+`protocol` defines the interface of a ray tracer; only the subpackage `tracing.sionna` imports Sionna RT.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ class SionnaFactory:
         tx_antenna: Antenna,
         rx_antenna: Antenna,
     ) -> Tracer:
-        """Open a scene; see `TracerFactory`. The machine has neither a GPU nor an LLVM for tracing."""
+        """Open a scene; see `TracerFactory`. It fails on a machine with neither a GPU nor an LLVM for tracing."""
         from calibray.tracing.sionna import Tracer as SionnaTracer
 
         return SionnaTracer(scene, frequency, settings, tx_antenna, rx_antenna)
 
 
 SIONNA: Final = SionnaFactory()
-"""The tracer that is used unless another one is given."""
+"""The default tracer."""

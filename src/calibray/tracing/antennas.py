@@ -1,11 +1,11 @@
-"""Antennas: their patterns, their own direction on every link, and the Jones vectors of departing and arriving paths.
+"""Antennas: their patterns, their directions on every link, and the Jones vectors of departing and arriving paths.
 
-Patterns and polarization are those of Sionna RT, in closed form and double precision. The field is polarized along one
+Patterns and polarizations are those of Sionna RT, in closed form and double precision. The field is polarized along one
 slant angle in every direction of the antenna's frame (3GPP TR 38.901, eq. 7.3-4/5); its amplitude is the square root of
 the gain.
 
-Paths do not depend on the antennas. Paths traced with isotropic vertical antennas store the frame of their first and
-last interaction. Their fields with any pattern and orientation therefore need no new trace.
+The geometry of paths does not depend on the antennas. Paths traced with isotropic vertical antennas store the frames of
+their first and last interactions. Their fields with any pattern and orientation therefore need no new trace.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class AntennaPattern:
 
     Attributes:
         antenna: The antenna.
-        element: Amplitude of its field, which is 1 in every direction for an isotropic one; for an array, of one
+        element: Field amplitude of the antenna, or of one element of an array; 1 in every direction for an isotropic
             antenna.
     """
 
@@ -73,13 +73,13 @@ class AntennaPattern:
     def amplitude(
         self, zenith: Any, azimuth: Any, downtilt: Any = 0.0, steering: Any = 0.0, xp: Any = np
     ) -> Any:
-        """Amplitude of the field in a direction, with an electrical downtilt and a horizontal steering [rad].
+        """Amplitude of the field in a direction, with electrical downtilt and horizontal steering [rad].
 
-        They shift the phases of an array; the pattern of a single antenna is shifted downwards. An array's amplitude
-        is relative to its centre and can be negative.
+        Both steer the beam of an array by the phases of its elements. For a single antenna, the downtilt shifts the
+        pattern downwards. An array's amplitude has its phase reference at the array's centre and can be negative.
         """
         if not self.antenna.is_array:
-            # Zenith angles grow downwards: the shifted pattern has the gain that the stated one has `downtilt` above.
+            # Zenith angles increase downwards, so the shifted pattern is the given one at `zenith - downtilt`.
             return self.element(xp.clip(zenith - downtilt, 0.0, np.pi), azimuth, xp)
         return self.element(zenith, azimuth, xp) * array_factor(
             self.antenna, zenith, azimuth, downtilt, steering, xp
@@ -88,7 +88,7 @@ class AntennaPattern:
     def jones_vectors(self, direction: NDArray[np.float64], arriving: bool = False) -> NDArray[np.complex128]:
         """Jones vectors [P, ports, 2] in the wave's basis (theta, phi), for directions seen from the antenna [P, 3].
 
-        The waves arrive from this direction, or depart in it.
+        The waves depart in this direction or, if `arriving`, come from it.
         """
         to_world = rotation_matrix(self.antenna.orientation)
         local = direction @ to_world
@@ -122,7 +122,7 @@ def hw_dipole(zenith: Any, azimuth: Any, xp: Any = np) -> Any:
 
 def tr38901(zenith: Any, azimuth: Any, xp: Any = np) -> Any:
     """Amplitude of a base station's antenna element (3GPP TR 38.901, Table 7.3-1); see `Amplitude`."""
-    # Both cuts lose 12 dB at a whole beamwidth from the main direction, at most 30 dB; the gain is 8 dBi.
+    # Both cuts are 12 dB down at one beamwidth from the main direction, and at most 30 dB down; the gain is 8 dBi.
     vertical_loss_db = xp.minimum(12 * ((zenith - np.pi / 2) / BEAMWIDTH) ** 2, 30)
     horizontal_loss_db = xp.minimum(12 * (azimuth / BEAMWIDTH) ** 2, 30)
     return xp.power(10.0, (8 - xp.minimum(vertical_loss_db + horizontal_loss_db, 30)) / 20)
@@ -131,13 +131,13 @@ def tr38901(zenith: Any, azimuth: Any, xp: Any = np) -> Any:
 def array_factor(
     antenna: Antenna, zenith: Any, azimuth: Any, downtilt: Any = 0.0, steering: Any = 0.0, xp: Any = np
 ) -> Any:
-    """Field of a planar array of isotropic antennas, in which equal amplitudes share the power of one antenna.
+    """Field of a planar array of isotropic elements of equal amplitude, with the total power of one antenna.
 
     Its main direction is `downtilt` below the horizon and `steering` from the x axis towards the y axis [rad]. `xp` has
-    cosine and sine. Coupling between the antennas is neglected, as in Sionna RT and 3GPP TR 38.901, section 7.3.
+    cosine and sine. Mutual coupling of the elements is neglected, as in Sionna RT and 3GPP TR 38.901, section 7.3.
     """
     horizontal, vertical = (2 * np.pi * distance for distance in antenna.spacing)
-    # Phase between neighbours: 2 pi d / lambda times the direction cosine along y or z, from the main direction on.
+    # Phase between neighbours: 2 pi d / lambda times the direction cosine along y or z relative to the main direction.
     of_columns = horizontal * (xp.sin(zenith) * xp.sin(azimuth) - xp.cos(downtilt) * xp.sin(steering))
     of_rows = vertical * (xp.cos(zenith) + xp.sin(downtilt))
     factors = [
@@ -149,10 +149,10 @@ def array_factor(
 
 
 def _sum_of_cosines(count: int, phase: Any, xp: Any) -> Any:
-    """Sum of cos((k - (n - 1) / 2) phase) over n numbers k from 0: the field of a row of antennas, about its centre."""
+    """Sum of cos((k - (n - 1) / 2) phase) over k = 0 .. n - 1: field of a row of antennas relative to its centre."""
     half = xp.cos(phase / 2)
     double = 2 * (2 * half * half - 1)
-    # cos((m + 1) x) = 2 cos x cos(m x) - cos((m - 1) x), from m = 0, or from m = 1/2 if the number is even.
+    # cos((m + 1) x) = 2 cos x cos(m x) - cos((m - 1) x), from m = 0, or from m = 1/2 if `count` is even.
     before, value = (half, half) if count % 2 == 0 else (double / 2, 1.0)
     total = 2 * value if count % 2 == 0 else value
     for _ in range((count - 1) // 2):
@@ -187,18 +187,18 @@ def rotate_jones(field: NDArray, rotation: NDArray[np.float64]) -> NDArray:
 
 
 POSE: Final = "tx:"
-"""Beginning of the names of the parameters of transmit antennas."""
+"""Prefix of the names of transmit antennas' parameters."""
 FIELDS: Final = ("azimuth", "downtilt", "gain")
 EVERY: Final = "*"
-"""Name of the transmitter that represents all of them."""
+"""Name of the transmitter that represents all transmitters."""
 
 
 NEW: Final = "new transmitters"
-"""Name of the transmitter that represents those without measured links, in a population."""
+"""Name of the transmitter that represents the transmitters without measured links in a population."""
 
 
 def concerned(names: NDArray[np.str_], label: str, own: Collection[str]) -> NDArray[np.bool_]:
-    """The transmitters that a parameter of the transmitter `label` affects; `own` have their own one of that field."""
+    """Mask of the transmitters that a parameter of transmitter `label` affects; `own` have their own parameter."""
     if label == EVERY:
         return np.ones(len(names), dtype=bool)
     return ~np.isin(names, list(own)) if label == NEW else names == label
@@ -210,14 +210,14 @@ def turns(name: str) -> bool:
 
 
 class Pose(NamedTuple):
-    """Directions of antennas, of P paths or L links.
+    """Directions of the antennas of P paths or L links.
 
     Attributes:
         yaw: Rotation about z [rad], from the scene's x axis towards its y axis.
-        downtilt: Mechanical downtilt [rad]: the antenna leans forward after it was rotated by `yaw`.
-        electrical_downtilt: Shift of the pattern downwards in the antenna's own frame [rad].
-        steering: Direction in the antenna's own frame, from its x axis towards its y axis, to which phases steer the
-            beam of an array [rad].
+        downtilt: Mechanical downtilt [rad]: the antenna is tilted forward after its rotation by `yaw`.
+        electrical_downtilt: Downward shift of the pattern in the antenna's own frame [rad].
+        steering: Azimuth to which phases steer the beam of an array in the antenna's own frame, from its x axis
+            towards its y axis [rad].
     """
 
     yaw: Any
@@ -231,9 +231,9 @@ class Mounting:
     """The antennas at one end of L links.
 
     Attributes:
-        antennas: The different antennas; each orientation is that of the antenna in its mount.
-        index: Antenna of every link [L].
-        pose: Where they point [L].
+        antennas: The distinct antennas; each orientation is that of the antenna in its mount.
+        index: Index of the antenna of every link [L].
+        pose: Directions of the antennas [L].
 
     Raises:
         InputError: The antennas have different numbers of ports.
@@ -249,18 +249,18 @@ class Mounting:
             names = " and ".join(f"{antenna.polarization!r}" for antenna in ports.values())
             raise InputError(
                 f"antennas: polarizations {names} have different numbers of ports at one end; give all antennas of an "
-                "end one port, or two"
+                "end one port each, or two each"
             )
 
     def of_paths(self, link: NDArray[np.integer]) -> Mounting:
-        """The mounting of paths whose links are given [P]."""
+        """The mounting for paths, from the link of each path [P]."""
         return Mounting(self.antennas, self.index[link], Pose(*(angle[link] for angle in self.pose)))
 
 
 def mount(paths: Paths, mountings: Mapping[str, Mounting]) -> Paths:
-    """Give paths of isotropic vertical antennas the fields of the antennas that are mounted at "tx" or "rx".
+    """Replace isotropic vertical antennas by the antennas mounted at "tx" or "rx" in the fields of paths.
 
-    Ends without a mounting keep their fields.
+    The fields at ends without a mounting are unchanged.
     """
     fields = {}
     for end, mounting in mountings.items():
@@ -275,7 +275,8 @@ def mount(paths: Paths, mountings: Mapping[str, Mounting]) -> Paths:
 def theta_axis(paths: Paths, mounting: Mounting) -> NDArray[np.float64]:
     """Theta vector of departing paths in the frame of their first interaction [P, 2], from mounted transmit antennas.
 
-    A path that leaves in a perfect null of its antenna has no theta vector, and gets zeros: it stays without power.
+    A path that departs in a perfect null of its antenna has no defined theta vector. The result is then 0, so the path
+    has no power with any antenna.
     """
     theta, phi = stated_jones(mounting.of_paths(paths.link), paths.departure)[:, 0].T
     field = paths.tx_field[:, 0].real
@@ -286,7 +287,7 @@ def theta_axis(paths: Paths, mounting: Mounting) -> NDArray[np.float64]:
 
 
 def stated_jones(mounting: Mounting, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Jones vectors [P, ports, 2] of mounted antennas, each in one direction: zenith and azimuth [P, 2], [rad]."""
+    """Jones vectors [P, ports, 2] of mounted antennas, each in one direction, by zenith and azimuth [P, 2], [rad]."""
     jones = np.zeros((len(angles), mounting.antennas[0].ports, 2))
     for number, antenna in enumerate(mounting.antennas):
         chosen = mounting.index == number
@@ -308,7 +309,7 @@ def wave_basis(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def jones_vectors(pattern: AntennaPattern, basis: Any, pose: Pose) -> NDArray[np.float64]:
-    """Jones vectors [P, ports, 2] of waves in their basis (theta, phi), seen from a mounted antenna in a pose [P]."""
+    """Jones vectors [P, ports, 2] in the waves' basis (theta, phi), for a mounted antenna in a pose [P]."""
     return of_ports(pattern.antenna, *antenna_response(pattern, basis, pose))
 
 
@@ -320,23 +321,23 @@ def antenna_response(
     index: Any = None,
     stored: Callable[[Any], Any] = lambda values: values,
 ) -> tuple[Any, Any, Any]:
-    """The response of a mounted antenna: amplitude, cosine and sine of its theta vector in the waves' basis [P] each.
+    """Response of a mounted antenna: amplitude, and components (cos, sin) of its theta vector in the waves' basis.
 
-    The basis is that of `wave_basis`. The pose is that of every path, or with `index` [P] a pose that several paths
-    share. `xp` is the array library: NumPy, or a namespace of `jax.numpy` within a JAX function, which has derivatives
-    by the pose. `stored` keeps intermediate values from being computed again at each use.
+    Each result is [P]; the basis is that of `wave_basis`. There is one pose for each path or, with `index` [P], poses
+    that paths share. `xp` is the array library: NumPy, or `jax.numpy` within a JAX function that is differentiated with
+    respect to the pose. `stored` keeps intermediate values from being computed again at each use.
     """
     cos_yaw, sin_yaw = xp.cos(pose.yaw), xp.sin(pose.yaw)
     cos_tilt, sin_tilt = xp.cos(pose.downtilt), xp.sin(pose.downtilt)
     to_mount = rotation_matrix(pattern.antenna.orientation).T
-    # From the scene into the mount, R_y(downtilt)' R_z(yaw)', then into the antenna (3GPP TR 38.901, eq. 7.1-4).
+    # From scene to mount, R_y(downtilt)' R_z(yaw)', then to the antenna's frame (3GPP TR 38.901, eq. 7.1-4).
     mount = (
         (cos_tilt * cos_yaw, cos_tilt * sin_yaw, -sin_tilt),
         (-sin_yaw, cos_yaw, xp.zeros_like(cos_yaw)),
         (sin_tilt * cos_yaw, sin_tilt * sin_yaw, cos_tilt),
     )
     of_paths = (lambda shared: shared) if index is None else (lambda shared: shared[index])
-    # Row of the antenna's frame, axis of the scene.
+    # Rows are axes of the antenna's frame, columns are axes of the scene.
     rotation = stored(
         [[sum(row[k] * mount[k][axis] for k in range(3)) for axis in range(3)] for row in to_mount]
     )
@@ -345,7 +346,7 @@ def antenna_response(
     (x, y, z), theta, phi = stored(
         [[sum(row[axis] * vector[axis] for axis in range(3)) for row in rotation] for vector in basis]
     )
-    # A direction along the antenna's own axis has no azimuth; as in `zenith_azimuth`, it is 0.
+    # The azimuth of a direction along the antenna's own z axis is undefined; it is set to 0, as in `zenith_azimuth`.
     axial = x**2 + y**2 < 1e-12
     rho = xp.sqrt(xp.where(axial, 1.0, x**2 + y**2))
     cos_own, sin_own = xp.where(axial, 1.0, x / rho), xp.where(axial, 0.0, y / rho)
@@ -353,8 +354,8 @@ def antenna_response(
     tilt, steering = (of_paths(xp.asarray(angle)) for angle in (pose.electrical_downtilt, pose.steering))
     zenith, azimuth = stored((xp.arctan2(sin_zenith, z), xp.arctan2(sin_own, cos_own)))
     amplitude = pattern.amplitude(zenith, azimuth, tilt, steering, xp)
-    # The antenna's own theta vector is that of the path turned about the direction.
-    # It is (z cos_own, z sin_own, -sin_zenith) there.
+    # The antenna's theta vector is the path's theta vector rotated about the direction of the wave. In the antenna's
+    # frame, it is (z cos_own, z sin_own, -sin_zenith).
     cosine, sine = (
         vector[0] * z * cos_own + vector[1] * z * sin_own - vector[2] * sin_zenith for vector in (theta, phi)
     )
@@ -362,7 +363,7 @@ def antenna_response(
 
 
 def of_ports(antenna: Antenna, amplitude: Any, cosine: Any, sine: Any, xp: Any = np) -> Any:
-    """Jones vectors [P, ports, 2] of an antenna's ports, whose slant turns the theta vector of `antenna_response`."""
+    """Jones vectors [P, ports, 2] of an antenna's ports: the response of `antenna_response`, rotated by each slant."""
     ports = []
     for slant in SLANTS[antenna.polarization]:
         a, b = np.cos(slant), np.sin(slant)

@@ -1,7 +1,7 @@
 """Stored traces: the same scene, links, antennas, settings and versions are traced only once.
 
 Traces are stored in Calibray's cache folder (`support.cache_folder`). A damaged trace is removed, with a warning in the
-log. If several users share the folder, each uses only the traces that the user or root has written.
+log. If several users share the folder, each user's runs read only traces written by that user or root.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def trace_digest(
 
 
 def files_digest(scene: Scene, antennas: tuple[Antenna, Antenna]) -> str:
-    """Fingerprint of the files that a tracer reads when it loads a scene: its meshes and the gains of the antennas."""
+    """Fingerprint of the files that a tracer reads when it loads a scene: meshes and gain tables of the antennas."""
     digest = hashlib.sha256(json.dumps([antenna.record() for antenna in antennas]).encode())
     for mesh in mesh_files(scene):
         digest.update(mesh.read_bytes())
@@ -74,7 +74,7 @@ def files_digest(scene: Scene, antennas: tuple[Antenna, Antenna]) -> str:
 
 
 def load_trace(digest: str) -> Paths | None:
-    """Load the trace with a fingerprint; None if there is none, or if another user may have written it.
+    """Load the trace with a given fingerprint; None if there is none, or if another user may have written it.
 
     A file that cannot be read is removed.
     """
@@ -89,8 +89,8 @@ def load_trace(digest: str) -> Paths | None:
         if not _is_trusted(os.fstat(stream.fileno())):
             _LOG.warning("%s: belongs to another user, or others can write to it; tracing again", path)
             return None
-        # Whoever else may write to a shared folder could put another file there after the check, so that the open one
-        # is read where the system has a name for it.
+        # In a shared folder, another user could replace the file after this check. The open file is therefore read,
+        # if the system has a path for it.
         opened = Path(f"/proc/self/fd/{stream.fileno()}")
         try:
             return Paths.load(opened if opened.exists() else path)
@@ -104,7 +104,7 @@ def load_trace(digest: str) -> Paths | None:
 
 
 def _is_trusted(status: os.stat_result) -> bool:
-    """Whether a file belongs to the user or root, and nobody else can write to it: the paths in it become results."""
+    """Whether a file belongs to the user or root and nobody else can write to it, since results depend on its paths."""
     if not stat.S_ISREG(status.st_mode):
         return False
     if not hasattr(os, "geteuid"):  # Windows keeps other users out of a user's folders
@@ -119,11 +119,11 @@ def store_trace(digest: str, paths: Paths) -> None:
         with suppress(OSError, InputError):
             path.parent.mkdir(parents=True, exist_ok=True)
             paths.save(path)
-            path.chmod(0o644)  # whatever the umask: a file that others can write to is not read
+            path.chmod(0o644)  # regardless of the umask: a file that others can write to is not read
 
 
 def stored_traces() -> list[Path]:
-    """The files of stored traces, the latest first; no other file of the cache folder."""
+    """The files of stored traces in the cache folder, latest first."""
     folder = cache_folder()
     if folder is None or not folder.is_dir():
         return []

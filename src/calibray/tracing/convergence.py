@@ -1,7 +1,7 @@
-"""Check whether a trace launched enough rays, by tracing again with twice as many and another seed.
+"""Checks whether a trace launched enough rays, by tracing again with twice as many rays and a different seed.
 
-Rays find paths by chance. With more rays, fewer paths are missed, and diffuse reflection, an average over rays,
-scatters less. The change from a trace to a finer one estimates what the first one lacks.
+Rays find paths by chance. With more rays, fewer paths are missed, and diffuse reflection, an average over rays, has
+less sampling noise. The change from a trace to one with more rays estimates the error of the first trace.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from calibray.paths import Paths
 from calibray.tracing.settings import RANGES, TraceSettings
 
 PathLoss = Callable[[Paths], NDArray[np.float64]]
-"""Path loss of every link of a path program [L], [dB]; as `calibray.path_loss`."""
+"""A function such as `calibray.path_loss`, which gives the path loss of every link of a path program [L], [dB]."""
 
 
 @dataclass(frozen=True)
 class Convergence:
-    """The changes between a trace and one with more rays.
+    """The changes from a trace to one with more rays.
 
     Attributes:
-        samples: Rays per transmitter of the trace that was checked.
-        change_db: Path loss of every link with more rays minus that before [L], [dB]. It is 0 if neither trace has a
-            path, -inf if only the finer one has, and +inf if only the coarser one has.
-        paths_before: Number of paths of every link [L].
-        paths_after: The same with more rays [L].
+        samples: Number of rays per transmitter in the trace that was checked.
+        change_db: Change of each link's path loss with more rays [L], [dB]. It is 0 if neither trace has a path,
+            -inf if only the trace with more rays has one, and +inf if only the checked trace has one.
+        paths_before: Number of paths of every link in the checked trace [L].
+        paths_after: Number of paths of every link with more rays [L].
     """
 
     samples: int
@@ -39,21 +39,21 @@ class Convergence:
 
     @property
     def gained(self) -> NDArray[np.int64]:
-        """Links that have more paths than before [links]."""
+        """Indices of the links that have more paths than in the checked trace [links]."""
         return np.flatnonzero(self.paths_after > self.paths_before)
 
     @property
     def lost(self) -> NDArray[np.int64]:
-        """Links that have fewer paths than before [links]."""
+        """Indices of the links that have fewer paths than in the checked trace [links]."""
         return np.flatnonzero(self.paths_after < self.paths_before)
 
     @property
     def largest(self) -> NDArray[np.int64]:
-        """Links ordered by the size of their change, the largest first [L]."""
+        """Indices of the links, ordered by the magnitude of their change, largest first [L]."""
         return np.argsort(-np.abs(self.change_db), kind="stable")
 
     def quantile(self, share: float) -> float:
-        """Size of change [dB] that a share of the links does not exceed, 0.5 for the median.
+        """Quantile of the magnitude of the change over the links [dB]; `share` 0.5 is the median.
 
         It is +inf if too many links have a path in only one trace.
         """
@@ -65,7 +65,7 @@ class Convergence:
 
 
 def compare(before: Paths, after: Paths, samples: int, path_loss: PathLoss) -> Convergence:
-    """Compare the path loss of two traces of the same links, the first with `samples` rays per transmitter.
+    """Compare the path loss of two traces of the same links; `before` has `samples` rays per transmitter.
 
     Raises:
         InputError: The links differ.
@@ -80,7 +80,7 @@ def compare(before: Paths, after: Paths, samples: int, path_loss: PathLoss) -> C
     no_path = np.isinf(loss_before) & np.isinf(loss_after)
     return Convergence(
         samples=samples,
-        # inf - inf is not a number: links without a path in both traces are set to 0 before and after.
+        # inf - inf is NaN, so the change of links without a path in both traces is set to 0.
         change_db=np.where(no_path, 0.0, loss_after - np.where(no_path, 0.0, loss_before)),
         paths_before=np.bincount(before.link, minlength=before.num_links),
         paths_after=np.bincount(after.link, minlength=after.num_links),
@@ -90,21 +90,21 @@ def compare(before: Paths, after: Paths, samples: int, path_loss: PathLoss) -> C
 def check(
     settings: TraceSettings, trace: Callable[[TraceSettings], Paths], before: Paths, path_loss: PathLoss
 ) -> Convergence:
-    """Trace links again with twice the rays and the next seed, and compare with the paths found before.
+    """Trace links again with twice as many rays and the next seed, and compare the result with `before`.
 
     Args:
         settings: Settings with which `before` was traced.
         trace: Traces the same links with other settings.
-        before: The paths found before.
+        before: The paths to check.
         path_loss: Path loss of every link [L], [dB].
 
     Raises:
-        InputError: `before` contains other links, or its rays were added in rounds, of which the last is the check.
+        InputError: `before` contains other links, or its rays were added in rounds; the last round is then the check.
         EngineError: The paths exceed what the tracer can store.
     """
     if settings.samples == "auto":
         raise InputError(
-            "trace.samples = 'auto' needs no second trace: its last round of rays is the check; its change is "
+            "trace.samples = 'auto' needs no second trace: its last round of rays is the check; the change is in "
             "settings['last_round_db'] of the paths"
         )
     # The largest seed is followed by 0.
@@ -114,7 +114,7 @@ def check(
 
 
 def join(parts: Sequence[tuple[NDArray[np.int64], Convergence]]) -> Convergence:
-    """Join the changes of links that were traced in parts, each with the numbers of its links among all."""
+    """Join the changes of links that were traced in parts, each with the indices of its links among all links."""
     count = sum(len(links) for links, _ in parts)
     change = np.empty(count)
     before, after = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)

@@ -1,12 +1,12 @@
 """Measured antenna patterns: the gain of an antenna on a grid of directions, from a CSV file or an MSI file.
 
-Between grid points the gain is interpolated bilinearly in decibels, also across the end of the azimuth axis. In
-decibels, main lobes are nearly parabolas (3GPP TR 38.901, Table 7.3-1, is one), so the error is smallest where the
+Between grid points, the gain is interpolated bilinearly in decibels, also across the end of the azimuth axis. In
+decibels, main lobes are nearly parabolas (as in 3GPP TR 38.901, Table 7.3-1), so the error is smallest where the
 antenna radiates most. Nulls that are narrower than the grid become shallower.
 
-Planning tools give a horizontal and a vertical cut, in MSI Planet's text format (`TwoCuts`). Attenuations are relative
-to the gain of the header. Horizontal angles are clockwise from the main direction as seen
-from above; vertical angles are downwards from the horizon in front of the antenna, via the ground to its back.
+Planning tools export a horizontal and a vertical cut in MSI Planet's text format (`TwoCuts`). Attenuations are relative
+to the gain in the header. Horizontal angles are measured clockwise from the main direction, as seen from above.
+Vertical angles are measured downwards from the horizon in front of the antenna, through the nadir to its back.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ TWO_CUT_SUFFIXES: Final = (".msi", ".pln", ".ant")
 DIPOLE_GAIN_DBI: Final = 2.15
 """Gain of a half-wave dipole, the reference of dBd [dBi]."""
 CUT_RANGES: Final = {"GAIN": (-30.0, 60.0), "angle": (-180.0, 360.0), "attenuation": (-0.5, 100.0)}
-"""Ranges of the gain [dBi], of angles [deg] and of attenuations [dB]; rounded cuts slightly exceed their gain."""
+"""Ranges of gain [dBi], angles [deg] and attenuations [dB]; rounded attenuations may be slightly negative."""
 LARGEST_STEP_DEG: Final = 15.0
 _NUMBER: Final = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?")
 
@@ -38,9 +38,9 @@ class TwoCuts:
     """Two cuts of an antenna's gain through its main direction.
 
     Attributes:
-        gain_dbi: Gain to which attenuations refer [dBi].
-        horizontal_db: Attenuation at whole degrees clockwise from the main direction [360], [dB].
-        vertical_db: Attenuation at whole degrees downwards from the horizon in front [360], [dB].
+        gain_dbi: Reference gain of the attenuations [dBi].
+        horizontal_db: Attenuation at whole degrees, clockwise from the main direction [360], [dB].
+        vertical_db: Attenuation at whole degrees, downwards from the horizon in front of the antenna [360], [dB].
     """
 
     gain_dbi: float
@@ -50,14 +50,14 @@ class TwoCuts:
     def gain(self, azimuth_deg: ArrayLike, elevation_deg: ArrayLike) -> NDArray[np.float64]:
         """Gain in any direction of the antenna's frame [...], [dBi]; azimuths counter-clockwise from the x axis.
 
-        Between the cuts, the gain is interpolated by horizontal projection, which keeps both cuts exactly (Gil et al.,
-        "A 3D interpolation method for base-station-antenna radiation patterns", IEEE Antennas and Propagation Magazine
-        43, 2001).
+        Between the cuts, the gain is interpolated by horizontal projection, which preserves both cuts exactly (Gil et
+        al., "A 3D interpolation method for base-station-antenna radiation patterns", IEEE Antennas and Propagation
+        Magazine 43, 2001).
         """
         azimuth = (np.asarray(azimuth_deg, dtype=float) + 180.0) % 360.0 - 180.0
         down = -np.asarray(elevation_deg, dtype=float)
         horizontal, back = self._at(self.horizontal_db, -azimuth), np.abs(azimuth) / 180.0
-        # Both cuts state the gain in front and at the back; differences from there do not count it twice.
+        # Both cuts contain the attenuation in front and at the back; these differences avoid counting it twice.
         front_db = self._at(self.vertical_db, down) - self.horizontal_db[0]
         back_db = self._at(self.vertical_db, 180.0 - down) - self.horizontal_db[180]
         return self.gain_dbi - (horizontal + (1 - back) * front_db + back * back_db)
@@ -69,13 +69,12 @@ class TwoCuts:
 def read_two_cuts(path: str | Path) -> TwoCuts:
     """Read an MSI file (also .pln, .ant): header lines, then the cuts HORIZONTAL and VERTICAL.
 
-    Each cut states its number of lines, each with an angle [deg] and an attenuation [dB], in any order, around a full
-    turn in steps of at most 15 degrees. Blanks, tabs or semicolons are separators; decimal commas are accepted. GAIN is
-    in dBd unless its line contains dBi, as the format defines.
+    Each cut states its number of lines. Each line has an angle [deg] and an attenuation [dB]; the lines, in any order,
+    cover a full turn in steps of at most 15 degrees. Blanks, tabs or semicolons are separators; decimal commas are
+    accepted. GAIN is in dBd unless its line contains dBi, as the format defines.
 
     Raises:
-        InputError: The file cannot be read, lacks the gain or a cut, or a line is malformed; the message names the
-            line.
+        InputError: The file cannot be read, lacks the gain or a cut, or has a malformed line, which the message names.
     """
     try:
         lines = Path(path).read_text(encoding="latin-1").splitlines()
@@ -103,7 +102,7 @@ def read_two_cuts(path: str | Path) -> TwoCuts:
         number += 1
     for key in ("HORIZONTAL", "VERTICAL"):
         if key not in cuts:
-            raise InputError(f"{path}: no line {key} with the number of its angles; export both cuts")
+            raise InputError(f"{path}: no line {key} with its number of angles; export both cuts")
     if gain is None:
         raise InputError(f"{path}: no line GAIN; add the antenna's gain, such as 'GAIN 17.5 dBi'")
     return TwoCuts(gain, cuts["HORIZONTAL"], cuts["VERTICAL"])
@@ -115,7 +114,7 @@ def _gain_dbi(place: str, words: list[str]) -> float:
     if joined is None:
         raise InputError(f"{place}: GAIN {shortened(text)!r}: must be a number, such as 'GAIN 17.5 dBi'")
     value = float(joined.group(1).replace(",", "."))
-    # The unit after the number counts before one in a comment, and may be in brackets.
+    # A unit directly after the number, possibly in brackets, takes precedence over one in a comment.
     unit = (joined.groups()[-1] or ("dbi" if "dbi" in text.lower() else "dbd")).lower()
     return _cut_in_range(place, "GAIN", value if unit == "dbi" else value + DIPOLE_GAIN_DBI)
 
@@ -129,7 +128,7 @@ def _count(place: str, key: str, words: list[str]) -> int:
 
 
 def _cut(path: str | Path, first: int, lines: list[str], count: int, key: str) -> NDArray[np.float64]:
-    """Attenuation at whole degrees [360], [dB]; `first` is the number of lines before these."""
+    """Attenuation at whole degrees [360], [dB]; `first` is the number of lines of the file before `lines`."""
     if len(lines) < count:
         raise InputError(
             f"{path}: {key} states {count} lines, but the file ends after {len(lines)}; export it again"
@@ -147,13 +146,13 @@ def _cut(path: str | Path, first: int, lines: list[str], count: int, key: str) -
             )
         angle, attenuation = (float(word.replace(",", ".")) for word in words[:2])
         pairs[index] = _cut_in_range(place, "angle", angle), _cut_in_range(place, "attenuation", attenuation)
-    # Angles of a full turn may be stated at both of its ends; the first one counts.
+    # A direction may be stated at both ends of a full turn; the first value is used.
     angle, order = np.unique(np.round(pairs[:, 0] % 360.0, 6), return_index=True)
     largest = float(np.diff([*angle, angle[0] + 360.0]).max())
     if largest > LARGEST_STEP_DEG:
         raise InputError(
-            f"{path}: {key} leaves {largest:g} degrees without a value, must be at most {LARGEST_STEP_DEG:g}; export a "
-            "full turn"
+            f"{path}: {key} has a gap of {largest:g} degrees without a value, must be at most {LARGEST_STEP_DEG:g}; "
+            "export a full turn"
         )
     return np.interp(np.arange(360.0), angle, pairs[order, 1], period=360.0)
 
@@ -171,11 +170,11 @@ def _cut_in_range(place: str, name: str, value: float) -> float:
 COLUMNS: Final = ("azimuth_deg", "elevation_deg", "gain_dbi")
 RANGES: Final = {"azimuth_deg": (-180.0, 360.0), "elevation_deg": (-90.0, 90.0), "gain_dbi": (-200.0, 60.0)}
 LARGEST_EFFICIENCY: Final = 1.5
-"""Ratio of radiated to accepted power above which the values cannot be absolute gains."""
+"""Largest ratio of radiated to accepted power for which the values can be absolute gains."""
 SEAM_TOLERANCE_DB: Final = 0.1
-"""Largest difference of the gains at the first azimuth and at the same direction a full turn later."""
+"""Largest difference between the gain at the first azimuth and that of the same direction a full turn later [dB]."""
 _STEP_TOLERANCE: Final = 0.01
-"""Largest relative difference of a step from the others."""
+"""Largest relative difference between a step and the other steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,13 +196,13 @@ class GainTable:
 
     @property
     def steps_deg(self) -> tuple[float, float]:
-        """The steps of elevation and azimuth [deg]."""
+        """Step sizes in elevation and azimuth [deg]."""
         elevations, azimuths = self.gain_dbi.shape
         return 180.0 / (elevations - 1), 360.0 / azimuths
 
     @property
     def efficiency(self) -> float:
-        """Ratio of radiated to accepted power [1]: the mean of the gain over the sphere; 1 for a lossless antenna."""
+        """Ratio of radiated to accepted power [1]: the mean gain over the sphere; 1 for a lossless antenna."""
         step = np.radians(self.steps_deg[0])
         elevation = np.radians(np.linspace(-90, 90, len(self.gain_dbi)))
         # Integrals of cos(elevation) times the hat functions of linear interpolation, so that gain 0 dBi gives 1.
@@ -212,7 +211,7 @@ class GainTable:
         return round(float(weight @ (10 ** (self.gain_dbi / 10)).mean(axis=1)) / 2, 12)
 
     def gain(self, azimuth_deg: ArrayLike, elevation_deg: ArrayLike, xp: Any = np) -> Any:
-        """Interpolate the gain [...], [dBi], at azimuths and elevations [...], [deg]; elevations from -90 to 90.
+        """Interpolate the gain [...], [dBi], at azimuths and elevations [...], [deg]; elevations are from -90 to 90.
 
         `xp` is the array library: NumPy, or `jax.numpy` within a JAX function.
         """
@@ -222,7 +221,7 @@ class GainTable:
         row = (xp.asarray(elevation_deg, dtype=float) + 90) / elevation_step
         column = ((xp.asarray(azimuth_deg, dtype=float) - self.first_azimuth_deg) / azimuth_step) % columns
         i = xp.clip(row.astype(int), 0, rows - 2)
-        # The remainder of a tiny negative number rounds to `columns`, the end of the last interval.
+        # For tiny negative numbers, the remainder rounds to `columns`, the end of the last interval.
         j = xp.minimum(column.astype(int), columns - 1)
         next_j = (j + 1) % columns
         u, v = row - i, column - j
@@ -237,7 +236,7 @@ class GainTable:
 
 
 def is_gain_file(pattern: str) -> bool:
-    """Whether the name of a pattern is a file of gains: it ends in ".csv", ".msi", ".pln" or ".ant"."""
+    """Whether a pattern is the name of a gain file: it ends in ".csv", ".msi", ".pln" or ".ant"."""
     return pattern.lower().endswith((".csv", *TWO_CUT_SUFFIXES))
 
 
@@ -246,12 +245,12 @@ def read_gain_table(path: str | Path) -> GainTable:
 
     The CSV file has the columns azimuth_deg, elevation_deg and gain_dbi, one row per direction, in any order. Azimuths
     cover a full turn (-180 to 180 or 0 to 360, with or without the end), and elevations -90 to 90, both in equal steps
-    of at most 15 degrees; every pair of them has its row. Principal cuts alone are not sufficient.
+    of at most 15 degrees; every pair of azimuth and elevation has a row. Principal cuts alone are not sufficient.
 
     Raises:
         InputError: The file or a column is missing or malformed, a number is out of range, a direction is missing or
             given twice, the steps are unequal, the sphere is not covered, the gains of one direction at both ends of
-            the azimuth axis differ, or the antenna would radiate more than 1.5 times its power.
+            the azimuth axis differ, or the antenna would radiate more than 1.5 times its accepted power.
     """
     if str(path).lower().endswith(TWO_CUT_SUFFIXES):
         cuts = read_two_cuts(path)
@@ -313,7 +312,7 @@ def _in_range(table: SourceTable, name: str) -> NDArray[np.float64]:
 def _axis(
     table: SourceTable, name: str, values: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], float, float]:
-    """Index of every row on an axis of equal steps [rows], and the ends of the axis [deg]."""
+    """Index of every row on an axis with equal steps [rows], and the ends of the axis [deg]."""
     axis = np.unique(values)
     if len(axis) < 2:
         raise InputError(
@@ -338,7 +337,7 @@ def _axis(
 
 
 def _refuse_repeats(table: SourceTable, cell: NDArray[np.int64]) -> None:
-    """Refuse two rows for one cell of the grid [rows]."""
+    """Raise an error if two rows [rows] have the same grid cell."""
     order = np.argsort(cell, kind="stable")
     repeats = np.flatnonzero(np.diff(cell[order]) == 0)
     if len(repeats):
@@ -352,7 +351,7 @@ def _refuse_repeats(table: SourceTable, cell: NDArray[np.int64]) -> None:
 def _refuse_gaps(
     table: SourceTable, row: NDArray[np.int64], column: NDArray[np.int64], gains: NDArray[np.float64]
 ) -> None:
-    """Refuse cells of the grid without a row."""
+    """Raise an error if a grid cell has no row."""
     missing = np.argwhere(np.isnan(gains))
     if len(missing):
         elevation = table.numbers("elevation_deg")[row == missing[0, 0]][0]

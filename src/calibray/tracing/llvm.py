@@ -1,8 +1,8 @@
 """Chooses the compiler library of the ray tracer: which libLLVM, or which GPU, Dr.Jit uses.
 
 Without CUDA, Dr.Jit compiles its kernels with the newest libLLVM that it finds, and an incompatible version aborts the
-whole process. The choice is therefore made here, before Dr.Jit is imported: every library is opened in a separate
-process, and `DRJIT_LIBLLVM_PATH` is set to the best one.
+whole process. The choice is therefore made here, before Dr.Jit is imported. Every library is opened in a separate
+process, and `DRJIT_LIBLLVM_PATH` is set to the best library.
 
 `python -m calibray.tracing.llvm` prints what the ray tracer will use, or what to install, and then exits with 2.
 """
@@ -26,8 +26,8 @@ PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 OLDEST_MAJOR = 17
 """Oldest accepted major version.
 
-Dr.Jit 1.5 refuses 14 and older and aborts on x86 with 15 and 16 ("Cannot select: fminimum"): LLVM has compiled
-`llvm.minimum` for x86 since 17 (reviews.llvm.org D145634 and D148691).
+Dr.Jit 1.5 rejects version 14 and older, and aborts on x86 with 15 and 16 ("Cannot select: fminimum"): LLVM has compiled
+`llvm.minimum` for x86 since version 17 (reviews.llvm.org D145634 and D148691).
 """
 
 TESTED_MAJORS = frozenset({19, 22})
@@ -52,7 +52,7 @@ _FOLDERS = (
 # libLLVMSupport.so, which are parts of LLVM.
 _NAME = re.compile(r"libLLVM(?:-(\d+)[\d.]*)?\.(?:so(?:\.(\d+)[\d.]*)?|dylib)")
 
-# LLVMGetVersion exists since LLVM 16; without it nothing is printed.
+# LLVMGetVersion has existed since LLVM 16; without it, nothing is printed.
 _VERSION_PROBE = """
 import ctypes, sys
 library = ctypes.CDLL(sys.argv[1])
@@ -79,8 +79,8 @@ class Llvm:
 
     Attributes:
         path: The file, or a bare name that the dynamic loader resolves.
-        version: Major, minor and patch number; only the major number, or nothing, if less is known.
-        problem: The reason why Dr.Jit cannot use it; None if it can.
+        version: Major, minor and patch number, as far as known; empty if unknown.
+        problem: The reason why Dr.Jit cannot use it; None if Dr.Jit can use it.
     """
 
     path: str
@@ -89,12 +89,12 @@ class Llvm:
 
     @property
     def usable(self) -> bool:
-        """Whether Dr.Jit can compile with it."""
+        """Whether Dr.Jit can compile with this library."""
         return self.problem is None
 
     @property
     def tested(self) -> bool:
-        """Whether it is usable and its major version was tested."""
+        """Whether the library is usable and its major version was tested."""
         return self.usable and self.version[0] in TESTED_MAJORS
 
     @property
@@ -120,7 +120,7 @@ def version_in_name(path: str) -> tuple[int, ...]:
 
 
 def judge(path: str, reported: tuple[int, ...]) -> Llvm:
-    """Decide whether Dr.Jit can use a library that opens and reports a version; empty if it reports none."""
+    """Decide whether Dr.Jit can use a library that can be opened; `reported` is empty if it reports no version."""
     version = reported or version_in_name(path)
     if not reported and (not version or version[0] >= 16):
         return Llvm(path, (), "it reports no LLVM version, as every libLLVM since 16 does")
@@ -130,7 +130,7 @@ def judge(path: str, reported: tuple[int, ...]) -> Llvm:
 
 
 def inspect(path: str) -> Llvm:
-    """Open a library, given by path or bare name, in a separate process, which a broken library may abort."""
+    """Open a library, given by path or bare name, in a separate process, because a broken library may abort it."""
     output, problem = _probe(_VERSION_PROBE, path)
     if problem is not None:
         return Llvm(path, version_in_name(path), f"it cannot be opened ({problem})")
@@ -138,7 +138,7 @@ def inspect(path: str) -> Llvm:
 
 
 def library_paths() -> tuple[str, ...]:
-    """Find each libLLVM file once: in the loader's cache, the usual folders of Linux and Homebrew, and conda's."""
+    """Find each libLLVM file once: in the loader's cache and in the usual folders of Linux, Homebrew and conda."""
     folders = [*_FOLDERS, f"{sys.base_prefix}/lib"]
     listed = [path for folder in folders for path in sorted(Path("/").glob(f"{folder[1:]}/libLLVM*"))]
     by_file: dict[Path, str] = {}
@@ -149,7 +149,7 @@ def library_paths() -> tuple[str, ...]:
 
 
 def installed_libraries() -> tuple[Llvm, ...]:
-    """Inspect every libLLVM on this machine: usable, tested and newer versions come first."""
+    """Inspect every libLLVM on this machine; usable, tested and newer versions come first."""
     libraries = map(inspect, library_paths())
     return tuple(
         sorted(libraries, key=lambda library: (library.usable, library.tested, library.version), reverse=True)
@@ -157,14 +157,14 @@ def installed_libraries() -> tuple[Llvm, ...]:
 
 
 def select() -> Llvm:
-    """Set Dr.Jit's libLLVM, to be called before Dr.Jit is imported; return the library in use.
+    """Set Dr.Jit's libLLVM and return it; call this before Dr.Jit is imported.
 
-    A library named by `DRJIT_LIBLLVM_PATH` is either used or refused, never ignored. Without one, the best installed
-    library is chosen and `DRJIT_LIBLLVM_PATH` set to it, for this process and its children.
+    A library named by `DRJIT_LIBLLVM_PATH` is either used or refused, never ignored. If the variable is not set, the
+    best installed library is chosen, and the variable is set to it for this process and its children.
 
     Raises:
-        InputError: No library is usable, `DRJIT_LIBLLVM_PATH` names one that is missing or unusable, Dr.Jit was
-            imported before without a usable one, or libatomic is missing.
+        InputError: No library is usable, `DRJIT_LIBLLVM_PATH` names one that is missing or unusable, Dr.Jit has
+            already been imported without a usable one, or libatomic is missing.
     """
     require_libatomic()
     requested = os.environ.get(PATH_VARIABLE)
@@ -191,18 +191,18 @@ def select() -> Llvm:
 
 
 def cuda_device_count() -> int:
-    """Number of GPUs with a CUDA driver and OptiX; 0 if `CUDA_VISIBLE_DEVICES` hides all of them."""
+    """Number of CUDA GPUs if OptiX is installed; 0 if `CUDA_VISIBLE_DEVICES` hides all GPUs."""
     output, problem = _probe(_CUDA_PROBE)
     return int(output) if problem is None and output else 0
 
 
 def mitsuba_variant() -> str:
-    """The Mitsuba variant for tracing: CUDA if there is a GPU, as in Sionna RT, otherwise LLVM."""
+    """The Mitsuba variant for tracing: as in Sionna RT, CUDA if there is a GPU, otherwise LLVM."""
     return "cuda_ad_mono_polarized" if cuda_device_count() else "llvm_ad_mono_polarized"
 
 
 def prepare() -> str:
-    """Make Dr.Jit safe to import: return the Mitsuba variant to set first, and choose the LLVM that it needs.
+    """Make Dr.Jit safe to import: choose the libLLVM if it needs one, and return the Mitsuba variant to set first.
 
     Raises:
         InputError: libatomic is missing, or there is no usable GPU and `select` finds no usable library.
@@ -215,7 +215,7 @@ def prepare() -> str:
 
 
 def require_libatomic() -> None:
-    """Refuse a Linux without libatomic; Dr.Jit links to it, and a minimal Debian lacks it.
+    """Raise an error on Linux without libatomic: Dr.Jit links to it, and minimal Debian installations lack it.
 
     Raises:
         InputError: The library cannot be opened.
@@ -230,7 +230,7 @@ def require_libatomic() -> None:
 
 
 def install_command() -> str:
-    """One line for a shell that installs the system libraries, or advice if the package manager is not known."""
+    """One-line shell command that installs the system libraries, or advice if the package manager is unknown."""
     sudo = "" if getattr(os, "geteuid", int)() == 0 else "sudo "
     if sys.platform == "darwin":
         return "brew install llvm"
@@ -242,7 +242,7 @@ def install_command() -> str:
 
 
 def _refuse_loaded() -> None:
-    """Refuse a Dr.Jit that was imported with an unusable library, because it cannot be exchanged."""
+    """Raise an error if Dr.Jit was already imported with an unusable library, which can no longer be replaced."""
     drjit = sys.modules.get("drjit")
     if drjit is None:
         return
@@ -257,7 +257,7 @@ def _refuse_loaded() -> None:
 
 def _loader_cache() -> list[Path]:
     """Files in the dynamic loader's cache that may be a libLLVM; empty if there is no such cache."""
-    # Some distributions keep ldconfig off the PATH of ordinary users.
+    # On some distributions, ldconfig is not on the PATH of ordinary users.
     ldconfig = shutil.which("ldconfig", path=f"{os.environ.get('PATH', '')}:/sbin:/usr/sbin")
     if ldconfig is None:
         return []

@@ -39,7 +39,7 @@ class Links(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class LinkPositions:
-    """The ends of links: transmitters and receivers [L, 3] each, [m]."""
+    """Positions of the transmitters and receivers of links, each [L, 3], [m]."""
 
     tx: NDArray[np.float64]
     rx: NDArray[np.float64]
@@ -50,7 +50,7 @@ class Solution:
     """Path gains of links from the tracer's own field computation.
 
     Attributes:
-        gain: Complex gain of every path, without the phase of its delay [P, R, T].
+        gain: Complex gain of every path, without the phase due to its delay [P, R, T].
         link: Link of every path, non-decreasing [P].
         delay: Propagation delay [P], [s].
     """
@@ -82,7 +82,7 @@ class Tracer(Protocol):
         ...
 
     def with_settings(self, settings: TraceSettings) -> Tracer:
-        """Copy the tracer with other settings; the loaded scene is shared."""
+        """Copy the tracer with different settings; the loaded scene is shared."""
         ...
 
     def plan(self, links: Links) -> TracePlan:
@@ -96,13 +96,13 @@ class Tracer(Protocol):
     def trace(
         self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None
     ) -> Paths:
-        """Find the paths of every link, with other materials by name in place of the scene's.
+        """Find the paths of every link; `materials` replace the scene's by name.
 
-        `progress` is called with ("tracing", receivers traced, receivers in all).
+        `progress` is called with ("tracing", receivers traced, number of receivers).
 
         Raises:
-            InputError: There is no link, a position is not finite, the ends of a link coincide, or the scene lacks a
-                material.
+            InputError: There is no link, a position is not finite, the ends of a link coincide, or a material is not
+                in the scene.
             EngineError: The paths do not fit into memory.
         """
         ...
@@ -110,8 +110,8 @@ class Tracer(Protocol):
     def solve(self, links: Links, materials: Mapping[str, Material]) -> Solution:
         """Find the paths of every link and compute their gains with the tracer's own field computation.
 
-        A tracer without its own field computation can replay the paths: `calibray.path_gains`. Materials replace the
-        scene's by name.
+        A tracer without its own field computation can replay the paths with `calibray.path_gains`. `materials` replace
+        the scene's by name.
 
         Raises:
             InputError: As for `trace`.
@@ -129,7 +129,7 @@ class TracerFactory(Protocol):
 
     @property
     def versions(self) -> Mapping[str, str]:
-        """Versions of the tracer's programs by name; a stored trace is reused only with the same ones."""
+        """Versions of the tracer's programs by name; a stored trace is reused only with the same versions."""
         ...
 
     def __call__(
@@ -141,7 +141,7 @@ class TracerFactory(Protocol):
         rx_antenna: Antenna,
         /,
     ) -> Tracer:
-        """Open a scene with the materials for the trace.
+        """Open a scene, which has the materials for the trace.
 
         Raises:
             InputError: The tracer cannot load the scene, or does not support a setting or an antenna.
@@ -160,8 +160,8 @@ def compile_paths(
 ) -> Paths:
     """Compile the paths that a tracer found, in any order, into a path program.
 
-    Materials are in the order of the material numbers of `chains`; `link` [P] is the link of every path, and
-    `ends` are those of all links. The program's paths are ordered by link, and within a link as given.
+    The order of `materials` defines the material indices in `chains`. `link` [P] is the link of every path, and `ends`
+    has the positions of all links. The program's paths are ordered by link, and within a link as given.
     """
     geometry = compile_chains(chains)
     departure, arrival = geometry.departure_direction, geometry.arrival_direction
@@ -175,10 +175,10 @@ def compile_paths(
         delay=geometry.delay,
         spreading=geometry.spreading,
         departure=zenith_azimuth(departure),
-        # The wave travels along `arrival`; the receiver sees it come from the opposite direction.
+        # The wave travels along `arrival`; from the receiver, it comes from the opposite direction.
         arrival=zenith_azimuth(-arrival),
         tx_field=rotate_jones(tx_pattern.jones_vectors(departure), geometry.departure_rotation),
-        # The receive pattern goes from the basis of arrival back into the last frame: the inverse rotation.
+        # The inverse rotation transforms the receive pattern from the basis of arrival into the last frame.
         rx_field=rotate_jones(
             rx_pattern.jones_vectors(-arrival, arriving=True), geometry.arrival_rotation * [1, -1]
         ),
@@ -195,14 +195,14 @@ def compile_paths(
 
 
 def link_positions(links: Links) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions of transmitters and receivers [L, 3] each, [m], checked.
+    """Check and return the positions of transmitters and receivers, each [L, 3], [m].
 
     Raises:
         InputError: There is no link, a position is not finite or too far away, or the ends of a link coincide.
     """
     if not (hasattr(links, "tx") and hasattr(links, "rx")):
         raise InputError(
-            f"links: is a {type_name(links)}, must have positions tx and rx, as Measurements(tx, rx, path_loss_db)"
+            f"links: is a {type_name(links)}, must have positions tx and rx, such as Measurements(tx, rx, path_loss_db)"
         )
     tx, rx = np.asarray(links.tx, dtype=float), np.asarray(links.rx, dtype=float)
     if tx.shape != rx.shape or tx.ndim != 2 or tx.shape[1:] != (3,) or not len(tx):
@@ -225,12 +225,12 @@ def link_positions(links: Links) -> tuple[NDArray[np.float64], NDArray[np.float6
 
 @dataclass(frozen=True)
 class EnclosedAntennas:
-    """Antennas inside closed bodies of the scene, usually because of a wrong position.
+    """Antennas inside closed bodies of the scene, usually because of wrong positions.
 
     Attributes:
         tx: Rows of the source file whose transmitter is enclosed.
         rx: Rows of the source file whose receiver is enclosed.
-        indoors: Whether most links are enclosed, as in an indoor scene; then none of them is suspicious.
+        indoors: Whether most links are enclosed, as in an indoor scene; then no enclosed antenna is suspicious.
     """
 
     tx: tuple[int, ...] = ()
@@ -239,6 +239,6 @@ class EnclosedAntennas:
 
     @classmethod
     def of(cls, row: NDArray[np.integer], tx: NDArray[np.bool_], rx: NDArray[np.bool_]) -> EnclosedAntennas:
-        """Collect the rows of the source file [L] whose transmitter or receiver is enclosed [L]."""
+        """Collect the rows of the source file, from the row of each link and the masks of enclosed antennas [L]."""
         indoors = bool(np.mean(tx | rx) > 0.5)
         return cls(tuple(row[tx].tolist()), tuple(row[rx].tolist()), indoors)

@@ -14,17 +14,17 @@ from calibray.tracing.gain_table import is_gain_file, read_gain_table
 PATTERNS: Final = ("iso", "dipole", "hw_dipole", "tr38901")
 POLARIZATIONS: Final = ("V", "H", "VH", "cross")
 LARGEST_ARRAY: Final = 64
-"""Largest number of rows, and of columns, of an array."""
+"""Largest number of rows or columns of an array."""
 LARGEST_SPACING: Final = 10.0
-"""Largest distance between the antennas of an array [wavelengths]."""
+"""Largest spacing between the antennas of an array [wavelengths]."""
 
 AUTO: Final = "auto"
-"""Value of `samples` with which the tracer chooses the number of rays."""
+"""Value of `samples` that lets the tracer choose the number of rays."""
 RAYS_PER_ROUND: Final = 250_000
-"""Number of rays of one launch if rays are added in rounds."""
+"""Number of rays per launch if rays are added in rounds."""
 
 RANGES: Final = {"max_depth": (0, 100), "samples": (1, 10**12), "seed": (0, 2**32 - 1)}
-"""Allowed ranges of the numbers: no machine traces more, and Sionna RT's seeds have 32 bits."""
+"""Allowed ranges of the numbers: no machine can trace more, and Sionna RT's seeds have 32 bits."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,10 @@ class TraceSettings:
         refraction: Follow transmission through surfaces.
         diffraction: Follow first-order diffraction at wedges.
         edge_diffraction: Whether free edges diffract as well.
-        diffraction_lit_region: Keep diffraction where the edge is in sight of the source or its image.
+        diffraction_lit_region: Keep diffraction also at targets in the lit region, not only in the shadow.
         diffuse_reflection: Follow diffuse reflections.
-        samples: Rays per transmitter, 1 to 10^12; or "auto": rays are added in rounds until path loss converges,
-            without diffuse reflection.
+        samples: Rays per transmitter, 1 to 10^12; with "auto", rays are added in rounds until path loss converges,
+            which excludes diffuse reflection.
         seed: Seed of the tracer's random numbers, 0 to 2^32 - 1.
 
     Raises:
@@ -87,7 +87,7 @@ class TraceSettings:
 
     @property
     def rays(self) -> int:
-        """Rays per transmitter; if rays are added in rounds, rays per launch."""
+        """Number of rays per transmitter; per launch if rays are added in rounds."""
         return RAYS_PER_ROUND if self.samples == "auto" else self.samples
 
     def record(self) -> dict[str, int | bool | str]:
@@ -97,16 +97,16 @@ class TraceSettings:
 
 @dataclass(frozen=True)
 class Antenna:
-    """An antenna of Sionna RT, or one with a measured gain.
+    """An antenna with a pattern of Sionna RT, or with measured gains.
 
     Attributes:
-        pattern: "iso", "dipole", "hw_dipole" or "tr38901", or a CSV file of gains (see `read_gain_table`).
+        pattern: "iso", "dipole", "hw_dipole" or "tr38901", or a gain file (see `read_gain_table`).
         polarization: "V", "H", or dual "VH" or "cross". The field has this polarization in every direction of the
             antenna's frame (3GPP TR 38.901, eq. 7.3-4/5), with the gain of the pattern.
         orientation: Rotation about z, y and x [rad]: yaw, pitch, roll.
-        rows: Rows of a planar array of these antennas along its z axis, which one signal feeds.
-        columns: Columns along its y axis.
-        spacing: Horizontal and vertical distance of its antennas [wavelengths].
+        rows: Number of rows of a planar array of these antennas along its z axis; one signal feeds all of them.
+        columns: Number of columns along its y axis.
+        spacing: Horizontal and vertical spacing of its antennas [wavelengths].
 
     Raises:
         InputError: The pattern or polarization is unknown, the orientation is not three numbers, or the array size is
@@ -126,7 +126,7 @@ class Antenna:
         ):
             raise InputError(
                 f"antenna pattern = {self.pattern!r}: must be one of {', '.join(PATTERNS)}, or a file of gains, "
-                "as 'horn.csv'"
+                "such as 'horn.csv'"
             )
         if self.polarization not in POLARIZATIONS:
             raise InputError(
@@ -170,11 +170,11 @@ class Antenna:
 
     @property
     def gain_file(self) -> str | None:
-        """The CSV file of gains, or None."""
+        """The gain file, or None."""
         return self.pattern if is_gain_file(self.pattern) else None
 
     def record(self) -> dict[str, object]:
-        """The antenna by attribute, for digests; a gain table counts by its content, not by its file name."""
+        """The antenna by attribute, for digests; a gain table is represented by its content, not its file name."""
         record: dict[str, object] = asdict(self)
         if self.gain_file is not None:
             record["pattern"] = read_gain_table(self.gain_file).digest()

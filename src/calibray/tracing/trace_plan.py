@@ -1,10 +1,11 @@
 """Splits a trace into launches that fit into memory, for any number of rays and receivers.
 
-A launch sends rays from one transmitter and searches paths to some receivers, or the other way round
-(`starts_at_receivers`); *transmitter* below means the end that sends. The tracer stores some numbers for every
+A launch sends rays from one transmitter and searches for paths to several receivers, or the other way round
+(`starts_at_receivers`); below, *transmitter* means the end that sends the rays. The tracer stores data for every
 combination of ray, interaction and receiver, a *lane*. The receivers of a transmitter are therefore split over
-launches; if one receiver is already too much, so are the rays. Sionna's rays form a lattice of directions that no seed
-changes: each launch gets a share of the lattice, so that all launches together send the same rays as a single one.
+launches; if one receiver needs too many lanes, the rays are split as well. Sionna's rays form a lattice of directions
+that does not depend on the seed. Each launch gets a share of the lattice, so all launches together send the same rays
+as a single launch.
 """
 
 from __future__ import annotations
@@ -20,36 +21,36 @@ from calibray.support.messages import duration
 from calibray.tracing.settings import TraceSettings
 
 LONG_TRACE_SECONDS: Final = 30.0
-"""Traces longer than this are announced before they start [s]."""
+"""Duration above which a trace is announced before it starts [s]."""
 SHORT_TRACE_SECONDS: Final = 1.0
-"""A trace of one launch shorter than this needs no announcement [s]."""
+"""Duration below which a trace with one launch needs no announcement [s]."""
 LANE_BYTES: Final = 40
-"""Bytes of a lane at the peak of tracing, measured by benchmarks/memory.py --lanes."""
+"""Peak memory of a lane during tracing [bytes], measured by benchmarks/memory.py --lanes."""
 PATH_BYTES: Final = (650, 260)
-"""Bytes of a path, and of each interaction, until it is compiled; measured by benchmarks/memory.py --paths."""
+"""Memory of a path and of each interaction until compilation [bytes], measured by benchmarks/memory.py --paths."""
 BUFFER_BYTES: Final = (50, 30)
-"""Bytes of a path, and of each interaction, in the tracer's buffer."""
+"""Memory of a path and of each interaction in the tracer's buffer [bytes]."""
 LANES_PER_SECOND: Final = 3e7
 """Number of lanes that two processor cores trace per second, to estimate the duration of a trace."""
 ADAPTIVE_SECONDS: Final = 3.0
 """Approximate duration on two cores for one transmitter if rays are added in rounds [s]."""
 SMALL_LAUNCH: Final = 5_000_000
-"""Largest number of lanes of a small launch, which finds some thousand candidates at most and takes 0.4 s at most."""
+"""Largest number of lanes of a small launch, which finds at most a few thousand candidates and takes at most 0.4 s."""
 POINT_TOLERANCE: Final = 0.01
-"""Interaction points closer than this are equal; points of different paths seldom are [m]."""
+"""Distance below which interaction points are equal [m]; points of different paths are seldom so close."""
 
 
 @dataclass(frozen=True)
 class Launch:
-    """Rays from one transmitter to some receivers.
+    """Rays from one transmitter, and the receivers to which they find paths.
 
     Attributes:
         source: Position of the transmitter [3], [m].
-        links: Links that end at the receivers [n].
-        first: Number of the first ray within the lattice of all rays.
+        links: Indices of the links that end at these receivers [n].
+        first: Index of the first ray in the lattice of all rays.
         rays: Number of rays.
         seed: Seed of the tracer's random numbers.
-        last: Whether this launch sends the last rays to these receivers.
+        last: Whether this is the last launch to these receivers.
     """
 
     source: NDArray[np.float64]
@@ -89,7 +90,7 @@ class Launches(Sequence[Launch]):
             return [self[number] for number in range(*index.indices(len(self)))]
         receiver_set, share = divmod(range(len(self))[index], self._shares)
         source, links = self._receivers[receiver_set]
-        # Shares differ by one ray at most, and together are all rays.
+        # Shares differ by at most one ray and together contain all rays.
         first, end = (self._settings.rays * k // self._shares for k in (share, share + 1))
         seed = launch_seed(self._settings.seed, share)
         return Launch(source, links, first, end - first, seed, last=share == self._shares - 1)
@@ -102,7 +103,7 @@ class TracePlan:
     Attributes:
         launches: The launches; those to the same receivers are consecutive.
         lanes: Rays x interactions x receivers of the largest launch.
-        buffer: Bytes of the buffer for the paths of a launch.
+        buffer: Size of the buffer for the paths of a launch [bytes].
         adaptive: Whether each launch is the first of several, because rays are added until path loss converges.
     """
 
@@ -122,7 +123,7 @@ class TracePlan:
         return len(self.launches) * (ADAPTIVE_SECONDS if self.adaptive else self.lanes / LANES_PER_SECOND)
 
     def announcement(self, links: int) -> str:
-        """One line on the expected cost of tracing a number of links; empty for a single small launch."""
+        """One line on the expected cost of tracing `links` links; empty for a single short launch."""
         if len(self.launches) == 1 and self.seconds < SHORT_TRACE_SECONDS:
             return ""
         if self.adaptive:
@@ -138,11 +139,11 @@ class TracePlan:
 
 
 def starts_at_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64], settings: TraceSettings) -> bool:
-    """Whether the receivers send the rays: they do if there are fewer of them than transmitters.
+    """Whether the receivers send the rays: they do if there are fewer receivers than transmitters.
 
-    A path is the same in both directions, and is reversed after it was found. Diffuse reflection is not: the scattered
-    direction, and the probability with which the tracer chose it, belong to one direction of travel. Traces with
-    diffuse reflection therefore start at the transmitters.
+    A path is the same in both directions, so it can be reversed after it was found. Diffuse reflection is not
+    reversible: the scattered direction, and the probability with which the tracer chose it, belong to one direction of
+    travel. Traces with diffuse reflection therefore start at the transmitters.
     """
     return not settings.diffuse_reflection and len(np.unique(rx, axis=0)) < len(np.unique(tx, axis=0))
 
@@ -150,11 +151,11 @@ def starts_at_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64], settin
 def plan_trace(source: NDArray[np.float64], settings: TraceSettings, lanes: int, buffer: int) -> TracePlan:
     """Split a trace into launches, given the end of every link that sends the rays [L, 3], [m].
 
-    A launch may have `lanes` rays x interactions x receivers, and its buffer has room for `buffer` paths at first.
+    A launch may have up to `lanes` rays x interactions x receivers; its buffer initially has room for `buffer` paths.
     """
     depth = max(settings.max_depth, 1)
     rays, adaptive = settings.rays, settings.adaptive
-    # Adaptive rays are independent of the receivers: one search per source serves all of them.
+    # Adaptive rays are independent of the receivers: one search per source serves all receivers.
     receivers_together = len(source) if adaptive else max(1, lanes // (rays * depth))
     shares = 1
     if settings.max_depth and not adaptive:
@@ -174,14 +175,14 @@ def plan_trace(source: NDArray[np.float64], settings: TraceSettings, lanes: int,
 
 
 def launch_seed(seed: int, number: int) -> int:
-    """Seed of launch `number` of several to the same receivers; the first one has the seed of the trace."""
+    """Seed of launch `number` among the launches to the same receivers; the first launch has the seed of the trace."""
     return seed if number == 0 else int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
 
 
 def lattice_directions(first: int, count: int, samples: int) -> NDArray[np.float64]:
-    """Points [2, count] of the Fibonacci lattice of `samples` points, from the number `first` on.
+    """Points [2, count] of the Fibonacci lattice of `samples` points, starting at index `first`.
 
-    Sionna RT maps the unit square to the directions of its rays.
+    Sionna RT maps these points of the unit square to the directions of its rays.
 
     Example:
         >>> lattice_directions(0, 3, 3)[1].tolist()
@@ -195,10 +196,10 @@ def lattice_directions(first: int, count: int, samples: int) -> NDArray[np.float
 
 
 def pad_receivers(position: NDArray[np.float64], lanes_per_receiver: int) -> NDArray[np.float64]:
-    """Repeat the last receiver [n, 3], so that launches have few different numbers of receivers.
+    """Repeat the last receiver [n, 3], so that few different numbers of receivers occur in launches.
 
     The tracer compiles its code for each number, which takes 1 to 3 s. The number becomes a power of two, or a multiple
-    of the largest power of two with which a launch is small.
+    of the largest power of two for which a launch is small.
 
     Example:
         >>> [len(pad_receivers(np.zeros((n, 3)), 1_000_000)) for n in (1, 2, 3, 4, 5, 6)]
@@ -221,8 +222,8 @@ def find_repeats(
     """Find the paths that an earlier launch to the same receivers has already found [P].
 
     A deterministic path is the same for any ray that finds it: it meets the same objects at the same points. Paths with
-    a diffuse reflection are random samples, and each counts. The numbers of the launches ascend [P]; kinds of
-    interaction are 0 beyond the last one [P, D]; interaction points are [P, D, 3], [m].
+    a diffuse reflection are random samples, and all of them count. Launch indices are ascending [P]; kinds of
+    interaction are 0 after the last interaction [P, D]; interaction points are [P, D, 3], [m].
     """
     repeats = np.zeros(len(link), dtype=bool)
     rows = np.flatnonzero(~is_sample)
@@ -231,8 +232,8 @@ def find_repeats(
     present = kind[rows] != 0
     cell = np.where(present[..., None], vertex[rows], 0) / POINT_TOLERANCE
     head = np.hstack([link[rows, None], kind[rows], np.where(present, shape[rows], 0)])
-    # Points are compared by their grid cells. A second grid, shifted by half a cell, joins those that a cell boundary
-    # of the first one separates, unless a boundary of the second one separates them along another axis.
+    # Points are compared by their grid cells. A second grid, shifted by half a cell, joins points that a cell boundary
+    # of the first grid separates, unless a boundary of the second grid separates them along another axis.
     for offset in (0.0, 0.5):
         grid = np.floor(cell + offset).astype(np.int64).reshape(len(rows), -1)
         _, first, group = np.unique(np.hstack([head, grid]), axis=0, return_index=True, return_inverse=True)
@@ -241,5 +242,5 @@ def find_repeats(
 
 
 def paths_that_fit(memory: int, depth: int) -> int:
-    """Number of paths of up to `depth` interactions that can be traced and compiled in some memory [bytes]."""
+    """Number of paths with up to `depth` interactions that can be traced and compiled in `memory` [bytes]."""
     return memory // (PATH_BYTES[0] + PATH_BYTES[1] * depth)

@@ -1,4 +1,4 @@
-"""Path tracing with Sionna RT; the only room that imports it."""
+"""Path tracing with Sionna RT; the only package that imports it."""
 
 from calibray.tracing import llvm
 

@@ -1,9 +1,9 @@
 """Rays are added in rounds until path loss converges (`trace.samples = "auto"`).
 
-Each round launches as many rays as all earlier rounds, in other directions. The interaction sequences that they find
-belong to the source; new sequences are tried for every receiver by the method of images (`image_method`). The search
-ends after two successive rounds that change the path loss of no link by more than `CONVERGED_DB`. The last round is
-equivalent to a second trace with twice the rays (`calibray.tracing.convergence`).
+Each round launches as many rays as all earlier rounds together, in other directions. The interaction sequences that
+they find belong to the source; new sequences are tried for every receiver by the method of images (`image_method`). The
+search ends after two successive rounds in which no link's path loss changes by more than `CONVERGED_DB`. The last round
+is equivalent to a second trace with twice as many rays (`calibray.tracing.convergence`).
 """
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
@@ -38,19 +38,19 @@ from calibray.tracing.sionna.solver import Rays, Solver
 from calibray.tracing.trace_plan import Launch, TracePlan, lattice_directions, launch_seed
 
 CONVERGED_DB: Final = 0.05
-"""Largest change of a link's path loss with twice the rays that counts as converged [dB]."""
+"""Largest change of a link's path loss in a round that counts as converged [dB]."""
 QUIET_ROUNDS: Final = 2
-"""Number of consecutive rounds without a larger change after which the search ends."""
+"""Number of consecutive rounds without a larger change that ends the search."""
 MAX_LAUNCHES: Final = 256
-"""Number of launches of a source after which the search ends in any case: 64 million rays."""
+"""Largest number of launches per source: 64 million rays."""
 GEOMETRY_BATCH: Final = 500_000
-"""Largest number of sequences x receivers whose geometry is computed together; it limits the memory."""
+"""Largest number of pairs of sequence and receiver whose geometry is computed together; it limits the memory."""
 
 _LOG: Final = logging.getLogger(__name__)
 
 
 class SequenceCache:
-    """Interaction sequences of the sources traced last.
+    """Interaction sequences of the most recently traced sources.
 
     Sequences apply to all receivers, so rays are launched once for all chunks of links that are traced on one worker.
     """
@@ -62,16 +62,16 @@ class SequenceCache:
         return len(self._sequences)
 
     def clear(self) -> None:
-        """Forget all sequences."""
+        """Remove all sequences."""
         self._sequences.clear()
 
     def of_source(
         self, solver: Solver, source: NDArray[np.float64], materials: Mapping[str, Material]
     ) -> SourceSequences:
-        """The sequences of a source [3], [m], found with the same materials, which determine how rays continue."""
+        """The sequences of a source [3], [m], for these materials, because materials determine how rays continue."""
         key = source.tobytes(), solver.settings, tuple(materials.items())
         if key not in self._sequences:
-            while len(self._sequences) >= 4:  # some are kept for the next links
+            while len(self._sequences) >= 4:  # the latest four are kept for the next links
                 del self._sequences[next(iter(self._sequences))]
             self._sequences[key] = SourceSequences(solver, source)
         return self._sequences[key]
@@ -87,7 +87,7 @@ class SourceSequences:
         self._new_by_launch: list[PathsBuffer | None] = []
 
     def new_in_launch(self, number: int, max_paths: int) -> PathsBuffer | None:
-        """The sequences that launch `number` is the first to find, None if there are none; run the launch if needed."""
+        """The sequences that launch `number` finds first, or None; run the launch if needed."""
         while len(self._new_by_launch) <= number:
             sequences = self._launch(len(self._new_by_launch), max_paths)
             self._keys, new = _merge(self._keys, sequence_keys(sequences, self.meshes))
@@ -97,9 +97,9 @@ class SourceSequences:
         return self._new_by_launch[number]
 
     def _launch(self, number: int, max_paths: int) -> PathsBuffer:
-        """Launch the rays of one launch."""
+        """Launch the rays of launch `number`."""
         seed = self._solver.settings.seed
-        # Each launch after the first shifts the lattice at random, modulo the unit square.
+        # Each launch after the first shifts the lattice by a random vector, modulo the unit square.
         shift = np.random.default_rng([seed, number]).random((2, 1)) * (number > 0)
         rays = Rays(
             count=RAYS_PER_ROUND,
@@ -109,7 +109,7 @@ class SourceSequences:
             buffer_size=100_000,
             max_paths=max_paths,
         )
-        # Sionna needs a target; in an unobstructed scene any will do.
+        # Sionna needs a target; in an unobstructed scene, any target will do.
         any_target = to_points(np.zeros((1, 3)))
         scene = Unobstructed(self._solver.mitsuba_scene)
         return self._solver.find_candidates(scene, to_points(self._source[None]), any_target, rays)
@@ -117,14 +117,14 @@ class SourceSequences:
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveSearch:
-    """A search for the paths of links with rays added in rounds.
+    """A search for the paths of links, with rays added in rounds.
 
     Attributes:
-        solver: The solver, its materials set.
-        cache: Sequences found before.
-        materials: The constants traced with.
-        backwards: Whether the receivers send.
-        max_paths: Paths that fit into memory.
+        solver: The solver, with its materials set.
+        cache: Sequences that earlier searches found.
+        materials: Material constants of the trace.
+        backwards: Whether the receivers send the rays.
+        max_paths: Number of paths that fit into memory.
     """
 
     solver: Solver
@@ -136,10 +136,10 @@ class AdaptiveSearch:
     def run(
         self, plan: TracePlan, targets: NDArray[np.float64], progress: Progress | None
     ) -> tuple[tuple[TracedBuffer, ...], dict[str, object]]:
-        """Find the paths from the sources, a launch for each, to the other ends of the links [L, 3], [m].
+        """Find the paths from the sources, one launch of the plan for each, to the other ends of the links [L, 3], [m].
 
         Returns the paths, the largest number of rays of a source, and the largest change of a link in the last round.
-        `progress` is called before the first source and after each.
+        `progress` is called before the first source and after each source.
 
         Raises:
             EngineError: The paths do not fit into memory.
@@ -191,20 +191,20 @@ class _SourceSearch:
         launches, quiet = 0, 0
         while quiet < QUIET_ROUNDS and launches < MAX_LAUNCHES:
             parts: list[TracedBuffer] = []
-            # As many launches as in all rounds before.
+            # As many launches as in all previous rounds.
             for _ in range(max(launches, 1)):
                 sequences = self._sequences.new_in_launch(launches, self._max_paths)
                 launches += 1
                 if sequences is not None:
                     parts += self._paths_of(sequences)
             gained = self._keep(parts)
-            # A link that had no path before gives inf, one that gained none gives 0.
+            # The change is inf for a link without an earlier path, and 0 for a link that gained no path.
             with np.errstate(divide="ignore", invalid="ignore"):
                 change_db = np.where(gained > 0, 10 * np.log10((power + gained) / power), 0.0)
             self.rays, self.change_db = launches * RAYS_PER_ROUND, float(change_db.max())
             power += gained
             quiet = quiet + 1 if self.change_db <= CONVERGED_DB else 0
-        # The limit of launches may also be reached after one quiet round, in which nothing was missing.
+        # The launch limit may also be reached after one quiet round; then no warning is needed.
         if quiet < QUIET_ROUNDS and self.change_db > CONVERGED_DB:
             _LOG.warning(
                 "%s rays from %s still changed path loss by up to %.2f dB: paths may be missing",
@@ -226,7 +226,7 @@ class _SourceSearch:
         return self._trace_candidates(candidates)
 
     def _paths_of(self, sequences: PathsBuffer) -> list[TracedBuffer]:
-        """Find the paths that run along interaction sequences to any receiver."""
+        """Find the paths to all receivers that follow interaction sequences."""
         unfolded = unfold_sequences(sequences, self._launch.source, self._sequences.meshes)
         pairs = list(possible_pairs(unfolded, self._targets))
         sequence, target = (np.concatenate(part) for part in zip(*pairs, strict=True))
@@ -241,7 +241,7 @@ class _SourceSearch:
         return traced
 
     def _trace_candidates(self, candidates: PathsBuffer) -> TracedBuffer:
-        """Compute the paths of candidates, in the direction of the wave."""
+        """Compute the paths of candidates, directed from transmitter to receiver."""
         source, target = to_points(self._launch.source[None]), to_points(self._targets)
         if self._backwards:
             candidates, source, target = reverse(candidates, target), target, source
@@ -250,12 +250,12 @@ class _SourceSearch:
         return TracedBuffer(candidates, source, target, self._launch.links[np.array(end, dtype=np.int64)])
 
     def _keep(self, parts: list[TracedBuffer]) -> NDArray[np.float64]:
-        """Keep the paths that are new and return the power that every link gained [R]."""
+        """Keep the new paths, and return the power that each link gained [R]."""
         is_first = not self.traced
         # The first buffer holds the direct paths and is kept even if empty: it defines the ends of the links.
         new = [part for part in parts if len(part.link) or is_first]
         if new and not is_first:
-            # Rounding may split a plane in two, so that its sequence is tried twice.
+            # Rounding may split a plane in two, so that a sequence is tried twice.
             earlier = self.traced[1:]
             new = drop_repeats([*earlier, *new])[len(earlier) :]
         self.traced += new
@@ -265,7 +265,7 @@ class _SourceSearch:
                 "trace.max_depth, or trace fewer links at once"
             )
         gained = np.zeros(len(self._targets))
-        # Paths name their link; powers are kept by the place of the link in this launch.
+        # `link` numbers all links; powers are stored by the position of the link in this launch.
         order = np.argsort(self._launch.links)
         for part in new:
             gain = self._solver.compute_fields(part)
@@ -279,6 +279,6 @@ class _SourceSearch:
 def _merge(
     known: NDArray[np.int64], candidates: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Merge the keys of sequences; return all keys [n, k] and the candidates that are new [m]."""
+    """Merge the keys of sequences; return all keys [n, k] and the indices of the new candidates [m]."""
     merged, first = np.unique(np.vstack([known, candidates]), axis=0, return_index=True)
     return merged, np.sort(first[first >= len(known)] - len(known))

@@ -1,4 +1,4 @@
-"""Sionna's path buffers, without empty entries and duplicates, and reversed; arrays between NumPy and Dr.Jit."""
+"""Operations on Sionna's path buffers: remove empty entries and duplicates, reverse paths, convert to NumPy."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from calibray.tracing.trace_plan import find_repeats
 
 
 def aligned(values: NDArray[Any], dtype: type) -> NDArray[Any]:
-    """Copy numbers [n] to memory that starts at a multiple of 64 bytes, converted to a type.
+    """Copy numbers [n], converted to a data type, to memory aligned to 64 bytes.
 
     Dr.Jit uses NumPy's memory without copying it and compiles a separate kernel for each alignment. With random
-    alignment, its kernel cache rarely hits, and every process compiles for seconds.
+    alignment, its kernel cache rarely hits, and every process spends seconds on compilation.
     """
     memory = np.empty(values.size * np.dtype(dtype).itemsize + 64, dtype=np.uint8)
     start = -memory.ctypes.data % 64
@@ -32,7 +32,7 @@ def aligned(values: NDArray[Any], dtype: type) -> NDArray[Any]:
 
 
 def to_points(position: NDArray[np.float64]) -> mi.Point3f:
-    """Convert positions [n, 3], [m], to points; opaque, so that no kernel is compiled for their values."""
+    """Convert positions [n, 3], [m], to opaque points, so that no kernel is compiled for their values."""
     points = mi.Point3f(*(aligned(axis, np.float32) for axis in position.T))
     dr.make_opaque(points)
     return points
@@ -40,7 +40,7 @@ def to_points(position: NDArray[np.float64]) -> mi.Point3f:
 
 def to_numpy(vectors: Any) -> NDArray[np.float64]:
     """Convert points or vectors to double precision [n, 3]."""
-    # NumPy would get them from one kernel that computes, interleaves and contains their number.
+    # Otherwise, one kernel computes and interleaves the values, and is compiled anew for each number of vectors.
     dr.eval(vectors)
     return np.stack([np.array(axis, dtype=float) for axis in vectors], axis=-1)
 
@@ -75,8 +75,8 @@ class TracedBuffer:
 
     Attributes:
         buffer: The P paths.
-        source: Transmitters that they start at.
-        target: Receivers that they end at.
+        source: Transmitters at which they start.
+        target: Receivers at which they end.
         link: Link of every path [P].
     """
 
@@ -87,10 +87,10 @@ class TracedBuffer:
 
 
 def drop_empty_entries(buffer: PathsBuffer) -> PathsBuffer:
-    """Remove the entries that Sionna RT 2.2 counts but does not fill; refraction produces some.
+    """Remove the entries that Sionna RT 2.2 counts but does not fill, which occur with refraction.
 
-    An empty entry has no interaction and refers to the first source and target. The geometry stage would convert each
-    into another direct path between these two.
+    An empty entry has no interaction and refers to the first source and target. The geometry stage would turn each
+    empty entry into a further direct path between these two.
     """
     if not buffer.buffer_size:
         return buffer
@@ -102,7 +102,7 @@ def drop_empty_entries(buffer: PathsBuffer) -> PathsBuffer:
 def drop_repeats(traced: list[TracedBuffer]) -> list[TracedBuffer]:
     """Remove paths that several launches to the same receivers found; keep random samples of diffuse reflection.
 
-    The buffers of the launches, in order, lose the paths that an earlier buffer contains.
+    Buffers are in the order of the launches; paths that an earlier buffer contains are removed from later buffers.
     """
     if len(traced) == 1:
         return traced
@@ -128,25 +128,24 @@ def drop_repeats(traced: list[TracedBuffer]) -> list[TracedBuffer]:
 
 
 def reverse(buffer: PathsBuffer, sources: mi.Point3f) -> PathsBuffer:
-    """Reverse candidate paths, so that those found from the receivers start at the transmitters.
+    """Reverse candidate paths, so that paths found from the receivers start at the transmitters.
 
     Mirror images, straight lines through walls and the shortest path over an edge are the same in both directions, so
-    candidates of one direction are candidates of the other. They are reversed before their geometry is computed, so
-    that paths searched from either end are identical to the last digit. Three things depend on the direction: the
-    order of the interactions, the two ends, and the faces of an edge, because Sionna calls the illuminated face the
-    0-face.
+    candidates for one direction are also candidates for the other. They are reversed before their geometry is computed,
+    so that paths searched from either end are identical to the last digit. Three things depend on the direction: the
+    order of the interactions, the two ends, and the faces of an edge, because Sionna's 0-face is the illuminated face.
     """
     if not buffer.buffer_size:
         return buffer
     reversed_buffer = buffer.reverse()
-    # Sionna does not type the wedges; they are None unless diffraction was asked for.
+    # Sionna has no type annotations for the wedges; they are None without diffraction.
     wedges: Any = reversed_buffer.diffracting_wedges
     if wedges is not None:
         start = to_numpy(sources)[np.array(reversed_buffer.source_indices, dtype=np.int64)]
         kind = per_interaction(reversed_buffer, "interaction_types")
         wedges.swap_faces(mi.Bool(aligned(_zero_face_is_dark(reversed_buffer, kind, start), np.bool_)))
         at_edge = kind == Kind.DIFFRACTION
-        # Sionna counts interactions from 1; 0 is a path without an edge.
+        # Sionna numbers interactions from 1; 0 denotes a path without an edge.
         depth = np.where(at_edge.any(axis=1), at_edge.argmax(axis=1) + 1, 0)
         edge_depth = mi.UInt(aligned(depth, np.uint32))
         reversed_buffer.set_primitive(edge_depth, wedges.prim0, edge_depth > 0)
@@ -159,7 +158,7 @@ def _zero_face_is_dark(
     buffer: PathsBuffer, kind: NDArray[np.int64], source: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Whether the 0-face of each candidate's edge faces away from the incident wave [P]."""
-    # The wave comes from the image of the source in the planes before the edge, whichever point of the edge it meets.
+    # For any point of the edge, the wave comes from the image of the source in the planes before the edge.
     image, vertex = source.copy(), vertices_of(buffer)
     before_edge = np.ones(len(kind), dtype=bool)
     for step in range(kind.shape[1]):

@@ -4,11 +4,11 @@ Sionna keeps an interaction sequence (the objects that a path meets in order) on
 ray hit, so it compares every hit of every ray with every receiver. Here rays are launched in a scene where nothing
 hides a receiver (`Unobstructed`), so the sequences depend only on the source and apply to all receivers.
 
-Unfolding a sequence gives the points at which its paths must aim. By the method of images, a path through mirrors is a
+Unfolding a sequence gives the points at which its paths must aim. By the method of images, a path with reflections is a
 straight line to the image of the source (ITU-R P.1411). An edge is mirrored in the planes that follow it; the
-diffracting point makes the unfolded path shortest (Keller, J. Opt. Soc. Am. 52(2), 1962). Most pairs of sequence and
-receiver can be excluded immediately, because the line would meet a plane where the scene has no surface. Sionna's own
-image method computes the paths of the rest.
+diffraction point minimizes the length of the unfolded path (Keller, J. Opt. Soc. Am. 52(2), 1962). Most pairs of
+sequence and receiver can be excluded immediately, because the line would meet a plane where the scene has no surface.
+Sionna's own image method computes the paths of the remaining pairs.
 """
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
@@ -34,15 +34,15 @@ from calibray.tracing.sionna.buffers import aligned, per_interaction, to_numpy
 from calibray.tracing.sionna.scene import shape_ids
 
 SAME_PLANE: Final = 2e-3
-"""Planes are equal if their offsets differ by less than this [m] and their normals by less than a fiftieth of it."""
+"""Largest difference of the offsets of equal planes [m]; their normals differ by at most a fiftieth of this number."""
 CONFUSABLE_PLANE: Final = 0.05
-"""The same for planes that the tracer may confuse in single precision."""
+"""The same limit for planes that the tracer may confuse in single precision."""
 MARGIN: Final = 0.1
-"""Largest distance of a point outside a surface, for single precision and rounded corners [m]."""
+"""Largest distance of a valid point outside a surface [m]; it allows for single precision and rounded corners."""
 NEAR_PLANE: Final = 0.01
-"""A point nearer to a plane than this may be on either side of it [m]."""
+"""Distance from a plane below which a point may be on either side of the plane [m]."""
 PAIRS_PER_BATCH: Final = 8_000_000
-"""Largest number of sequences x receivers that are tested together; it limits the memory."""
+"""Largest number of pairs of sequence and receiver that are tested together; it limits the memory."""
 
 
 class Surfaces:
@@ -53,7 +53,7 @@ class Surfaces:
         length = np.linalg.norm(cross, axis=1, keepdims=True)
         self.normal: NDArray[np.float64] = cross / np.where(length > 0, length, 1)
         self.offset: NDArray[np.float64] = np.einsum("ti,ti->t", self.normal, corner[:, 0])
-        # Offsets and normals on one scale, on which planes are equal within `SAME_PLANE`.
+        # Offsets and normals on a common scale; planes are equal if they agree within `SAME_PLANE`.
         feature = np.c_[50 * self.normal, self.offset]
         # Both sides of a surface are one plane: the first component of the normal that is not 0 is made positive.
         leading = np.argmax(np.abs(feature[:, :3]) > SAME_PLANE, axis=1)
@@ -65,7 +65,7 @@ class Surfaces:
         self._high = np.full((len(grid), 3), -np.inf)
         np.minimum.at(self._low, self.plane, corner.min(axis=1))
         np.maximum.at(self._high, self.plane, corner.max(axis=1))
-        # Planes that nearly coincide may have got normals of opposite signs.
+        # Planes that nearly coincide may have normals of opposite signs.
         self._tree = KDTree(np.vstack([self._feature, -self._feature])) if len(grid) else None
 
     def bounding_boxes(self, plane: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -105,16 +105,16 @@ class Unfolded:
     """Unfolded sequences of one source; C sequences of at most D interactions.
 
     Traced back from the receiver, a path aims at `aim` + x `slide` at every interaction, where x is the distance of the
-    diffracting point from the edge's origin [m].
+    diffraction point from the edge's origin [m].
 
     Attributes:
-        kind: Kinds of interaction, 0 beyond the last one [C, D].
+        kind: Kinds of interaction, 0 after the last interaction [C, D].
         normal: Normals of the planes [C, D, 3].
         offset: Distances of the planes from the origin of coordinates [C, D], [m].
         low: Smallest coordinates of the surfaces in the planes [C, D, 3], [m].
         high: Largest coordinates of the surfaces in the planes [C, D, 3], [m].
-        aim: Image of the source, or of the edge's origin after the edge [C, D, 3], [m].
-        slide: Image of the edge's direction after the edge, 0 before it [C, D, 3].
+        aim: Image of the source; after the edge, image of the edge's origin [C, D, 3], [m].
+        slide: Image of the edge's direction after the edge, 0 before the edge [C, D, 3].
         image: Image of the source in all planes [C, 3], [m].
         edges: Images of the edges in all planes that follow them.
     """
@@ -139,7 +139,7 @@ def unfold(
 ) -> Unfolded:
     """Unfold the interaction sequences of a source at `source` [3], [m].
 
-    Kinds of interaction [C, D] are 0 beyond the last one; `triangle` [C, D] is any number if none is met.
+    Kinds of interaction [C, D] are 0 after the last interaction; `triangle` [C, D] is arbitrary if none is met.
     """
     mirrors = kind == Kind.SPECULAR
     met = np.where(mirrors, triangle, 0)
@@ -173,7 +173,7 @@ def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class Unobstructed:
-    """A scene of Mitsuba in which nothing hides a receiver from the points that rays hit."""
+    """A Mitsuba scene in which nothing hides a receiver from the points that rays hit."""
 
     def __init__(self, scene: Any) -> None:
         self.ray_intersect = scene.ray_intersect
@@ -198,7 +198,7 @@ class Meshes:
             if not shape.is_mesh():
                 raise InputError(
                     f"trace.samples = 'auto': the shape {shape.id()!r} is not made of triangles; give a number, or "
-                    "export the scene with meshes alone"
+                    "export the scene with meshes only"
                 )
             values = mi.traverse(shape)
             vertex = np.array(values["vertex_positions"], dtype=float).reshape(-1, 3)
@@ -209,22 +209,22 @@ class Meshes:
         self.surfaces = Surfaces(np.concatenate(corners) if corners else np.zeros((0, 3, 3)))
 
     def triangles(self, shape: NDArray[np.int64], primitive: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Numbers of triangles in the scene [...], from their shapes and numbers in these shapes; 0 without a shape."""
+        """Indices of triangles in the scene [...], from their shapes and their indices in these; 0 without a shape."""
         distinct, position = np.unique(shape, return_inverse=True)
         starts = np.array([self._first.get(key, -1) for key in distinct.tolist()], dtype=np.int64)
         first = starts[position.reshape(shape.shape)]
         return np.where(first >= 0, first + primitive, 0)
 
     def triangles_of(self, sequences: PathsBuffer) -> NDArray[np.int64]:
-        """Numbers within the scene of the triangles that sequences meet [C, D]; 0 if none is met."""
+        """Indices in the scene of the triangles that sequences meet [C, D]; 0 if none is met."""
         return self.triangles(per_interaction(sequences, "shapes"), per_interaction(sequences, "primitives"))
 
 
 def sequence_keys(sequences: PathsBuffer, meshes: Meshes) -> NDArray[np.int64]:
-    """Describe interaction sequences by whole numbers [C, k] that are equal for equal sequences.
+    """Keys of interaction sequences: integers [C, k] that are equal for equal sequences.
 
-    The numbers are the kinds of interaction, the planes that mirror and the faces of the edge. Walls that a ray passes
-    through do not count: the path is straight whichever they are.
+    A key contains the kinds of interaction, the reflecting planes and the faces of the edge. It omits the walls that a
+    ray passes through, because they do not bend the path.
     """
     kind = per_interaction(sequences, "interaction_types")
     plane = np.where(kind == Kind.SPECULAR, meshes.surfaces.plane[meshes.triangles_of(sequences)], 0)
@@ -258,7 +258,7 @@ def possible_pairs(
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Find the sequences that may connect the source to each receiver [R, 3], [m].
 
-    Yields numbers of sequences and of receivers, pair by pair [n] each; omitted pairs have no path.
+    Yields the indices of the sequence and the receiver of each pair, each [n]; pairs that are not yielded have no path.
     """
     count, depth = unfolded.kind.shape
     kinds = mi.UInt(aligned(unfolded.kind.reshape(-1), np.uint32))
@@ -275,7 +275,7 @@ def possible_pairs(
         sequence = lane // num_receivers + dr.opaque(mi.UInt, start)
         vertex = dr.gather(mi.Point3f, receiver, lane % num_receivers)
         edge_length = dr.gather(mi.Float, length, sequence)
-        # Distance of the diffracting point from the edge's origin.
+        # Distance of the diffraction point from the edge's origin.
         along_edge = first_order_diffraction_point(
             dr.gather(mi.Point3f, image, sequence),
             vertex,
@@ -284,7 +284,7 @@ def possible_pairs(
         )
         good = (edge_length == 0) | ((along_edge > -MARGIN) & (along_edge < edge_length + MARGIN))
         along_edge = dr.select(edge_length > 0, along_edge, 0)
-        # Back from the receiver: each plane must be crossed where the scene has a surface.
+        # Going back from the receiver, each plane must be crossed where the scene has a surface.
         for step in reversed(range(depth)):
             at = sequence * depth + step
             kind = dr.gather(mi.UInt, kinds, at)

@@ -1,4 +1,4 @@
-"""Scenes as plain Sionna RT has them in memory: converted to data, assigned materials, and compared with an export."""
+"""Scenes in the memory of plain Sionna RT: reads them, sets their materials, and compares them with an export."""
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false
@@ -42,16 +42,16 @@ DIRECTIONS: Final = 64
 
 @dataclass(frozen=True, eq=False)
 class LiveScene:
-    """What a scene in memory states.
+    """The content of a scene in memory.
 
     Attributes:
         frequency: Carrier frequency [Hz].
         objects: One mesh per connected surface, because Sionna merges objects.
         materials: The materials that objects use, by name.
         antennas: Transmit and receive antenna.
-        tx: Positions by name of the transmitters [3], [m].
-        rx: Positions by name of the receivers [3], [m].
-        tx_power_dbm: Transmitted power by name of the transmitters [dBm].
+        tx: Positions of the transmitters by name [3], [m].
+        rx: Positions of the receivers by name [3], [m].
+        tx_power_dbm: Transmitted power by name of the transmitter [dBm].
     """
 
     frequency: float
@@ -91,18 +91,18 @@ class LiveScene:
 def apply_materials(scene: object, materials: Mapping[str, Material], frequency: float | None = None) -> None:
     """Set the constants of a scene's materials by name.
 
-    They hold at one carrier, `frequency` [Hz]; a scene at another one causes a warning. ITU materials no longer compute
-    theirs when `scene.frequency` is set, which would replace the calibrated ones.
+    The constants are valid at one carrier, `frequency` [Hz]; a different carrier of the scene causes a warning. ITU
+    materials no longer recompute their constants when `scene.frequency` is set, which would replace calibrated ones.
 
     Raises:
-        InputError: The object is not a scene of Sionna RT, or the scene lacks a material; nothing is set then.
+        InputError: The object is not a scene of Sionna RT, or the scene lacks a material; then nothing is set.
     """
     live = _checked(scene)
     for name in materials:
         if name not in live.radio_materials:
             raise InputError(
-                f"the scene has no material {name!r}; {did_you_mean(name, live.radio_materials)}. Give objects with "
-                "materials of their own in the study ([objects]) these materials in the scene"
+                f"the scene has no material {name!r}; {did_you_mean(name, live.radio_materials)}. If the study "
+                "creates materials for objects ([objects]), assign them to these objects in the scene as well"
             )
     for name, material in materials.items():
         target = live.radio_materials[name]
@@ -112,7 +112,7 @@ def apply_materials(scene: object, materials: Mapping[str, Material], frequency:
         target.scattering_pattern = scattering_pattern(material)
     if frequency is not None and not np.isclose(carrier := _number(live.frequency), frequency, rtol=1e-6):
         _LOG.warning(
-            "scene.frequency is %s, but the calibrated constants hold at %s; set scene.frequency = %r",
+            "scene.frequency is %s, but the calibrated constants are for %s; set scene.frequency = %r",
             hertz(carrier), hertz(frequency), frequency,
         )  # fmt: skip
 
@@ -120,7 +120,7 @@ def apply_materials(scene: object, materials: Mapping[str, Material], frequency:
 def _checked(scene: object) -> Any:
     if not isinstance(scene, rt.Scene):
         raise InputError(
-            f"scene is a {type(scene).__name__}; must be a scene of sionna.rt, as load_scene gives"
+            f"scene is a {type(scene).__name__}; must be a scene of sionna.rt, as load_scene returns"
         )
     return scene
 
@@ -130,13 +130,13 @@ def _objects(item: Any) -> Iterator[MeshObject]:
     values = mi.traverse(item.mi_mesh)
     vertex = np.array(values["vertex_positions"], dtype=float).reshape(-1, 3)
     face = np.array(values["faces"], dtype=np.int64).reshape(-1, 3)
-    # Surfaces are connected through positions: files may repeat a corner for each face.
+    # Faces are connected by equal positions, because files may repeat a corner for each face.
     position, welded = np.unique(vertex, axis=0, return_inverse=True)
     face = welded.reshape(-1)[face]
     ends = face[:, [0, 1, 1, 2]].reshape(-1, 2).T
     links = coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(len(position),) * 2)
     count, part = connected_components(links, directed=False)
-    # Names become file names, and differ from those of materials.
+    # Names become file names and must differ from material names.
     name = re.sub(r"[^A-Za-z0-9_-]", "_", item.name)
     for number in np.unique(part[face[:, 0]]).tolist():
         used, faces = np.unique(face[part[face[:, 0]] == number], return_inverse=True)
@@ -147,7 +147,7 @@ def _objects(item: Any) -> Iterator[MeshObject]:
 
 
 def _check_precision(objects: Iterable[MeshObject]) -> None:
-    """Refuse a scene so far from its origin that single precision, which Sionna RT uses, rounds it."""
+    """Raise an error if a scene is so far from its origin that Sionna RT's single precision rounds it noticeably."""
     furthest = max((float(np.abs(item.mesh.vertices).max()) for item in objects), default=0.0)
     step = float(np.spacing(np.float32(furthest)))
     where = f"the scene reaches {furthest:.0f} m from its origin"
@@ -177,7 +177,7 @@ def _material(material: Any) -> Material:
 
 
 def _antenna(end: str, array: Any, devices: Mapping[str, Any]) -> Antenna:
-    """The antenna of all devices of one end."""
+    """The antenna of all devices at one end."""
     if array.array_size != 1:
         raise InputError(
             f"scene.{end}_array has {array.array_size} elements; a measured value belongs to one antenna: set an array "
@@ -189,7 +189,7 @@ def _antenna(end: str, array: Any, devices: Mapping[str, Any]) -> Antenna:
             f"the devices at the end {end} have different orientations; a study has one antenna per end: calibrate "
             "devices of one orientation at a time"
         )
-    # Uniform over the sphere except for its poles, where azimuths are undefined.
+    # Directions are uniform over the sphere, except for the poles, where azimuths are undefined.
     azimuth, cosine = np.random.default_rng(0).uniform(
         [[-np.pi], [-0.999]], [[np.pi], [0.999]], (2, DIRECTIONS)
     )
@@ -201,7 +201,7 @@ def _antenna(end: str, array: Any, devices: Mapping[str, Any]) -> Antenna:
             yaw, pitch, roll = orientation[0].tolist()
             return Antenna(pattern, polarization, (yaw, pitch, roll))
     raise InputError(
-        f"scene.{end}_array has a pattern of its own; a study supports {', '.join(PATTERNS)} with polarization "
+        f"scene.{end}_array has an unknown pattern; a study supports {', '.join(PATTERNS)} with polarization "
         f"{', '.join(POLARIZATIONS)}: give its gain as a table (antennas.{end}.pattern) in a study file"
     )
 
@@ -224,24 +224,24 @@ def _vector(value: Any) -> NDArray[np.float64]:
 
 
 LARGEST_DIFFERENCE_DB: Final = 0.01
-"""Largest difference of path loss at which two traces of one scene agree [dB]: constants are rounded in the file."""
+"""Largest path loss difference at which two traces of one scene agree [dB]; the file has rounded constants."""
 
 SAMPLES: Final = 20_000
-"""Number of rays of the comparison; both scenes use the same rays."""
+"""Number of rays for the comparison; both scenes use the same rays."""
 
 
 def verify_export(tracer: Tracer, materials: Mapping[str, Material], target: Path, links: Links) -> None:
-    """Load an exported scene into plain Sionna RT; compare materials, surfaces and the path loss of some links.
+    """Load an exported scene into plain Sionna RT; compare materials, surfaces and the path loss of `links`.
 
-    `tracer` has the scene as it was read. The comparison uses fewer rays than its settings state.
+    `tracer` has the original scene. The comparison uses few rays, at most two interactions and no diffuse reflection.
 
     Raises:
-        InputError: Sionna RT cannot load the exported scene, or it is another one.
+        InputError: Sionna RT cannot load the exported scene, or the exported scene differs.
     """
     scene, names = tracer.scene, exported_names(materials)
     try:
         loaded = rt.load_scene(str(target))
-    except Exception as error:  # Mitsuba and Sionna raise whatever they run into
+    except Exception as error:  # Mitsuba and Sionna raise errors of many types
         raise InputError(_failed(target, f"Sionna RT cannot load it ({first_line(error)})")) from None
     for name in scene.materials:
         held: Any = loaded.radio_materials.get(names[name])
@@ -262,14 +262,14 @@ def verify_export(tracer: Tracer, materials: Mapping[str, Material], target: Pat
             raise InputError(_failed(target, fault))
     if scene.local_origin.any():
         _LOG.warning(
-            "%s lies far from its origin: plain Sionna RT computes in single precision there and may lose paths; "
+            "%s lies far from its origin: plain Sionna RT computes in single precision and may lose paths there; "
             "move the origin into the scene", target,
         )  # fmt: skip
     settings = tracer.settings
     few_rays = replace(
         settings, samples=SAMPLES, max_depth=min(settings.max_depth, 2), diffuse_reflection=False
     )
-    # Scene files hold the Lambertian pattern only, so the constants are given again.
+    # Scene files contain only Lambertian patterns, so the constants are given again.
     constants = {name: materials[name] for name in scene.materials}
     written = read_scene(target, tracer.frequency, {names[name]: item for name, item in constants.items()})
     antennas = tracer.solver.tx_antenna, tracer.solver.rx_antenna

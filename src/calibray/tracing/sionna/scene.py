@@ -66,7 +66,7 @@ def _temporary_folder(path: Path) -> TemporaryDirectory[str]:
 
 def _load(xml: str, path: Path) -> rt.Scene:
     # Mitsuba looks for relative names in the working directory first, where another scene may have meshes of the same
-    # names: it gets absolute ones, of the files whose bytes the fingerprint of a trace covers.
+    # names. Absolute names ensure that it reads the files that the fingerprint of a trace covers.
     root, folder = ElementTree.fromstring(xml), path.parent.resolve()
     for filename in root.iterfind(".//string[@name='filename']"):
         filename.set("value", str(folder / filename.get("value", "")))
@@ -77,7 +77,7 @@ def _load(xml: str, path: Path) -> rt.Scene:
 
 
 def _check_surfaces(mitsuba_scene: Any, scene: Scene) -> None:
-    """Refuse a scene whose bounds or areas in Mitsuba's memory differ from those of its files.
+    """Raise an error if the bounds or areas of surfaces in Mitsuba's memory differ from those in the files.
 
     Mitsuba reads mesh files itself; a type or layout that it misreads would remove reflections without a message. It
     merges the objects of a material into one mesh, so the comparison is by material.
@@ -85,7 +85,7 @@ def _check_surfaces(mitsuba_scene: Any, scene: Scene) -> None:
     Raises:
         InputError: A surface differs.
     """
-    # The names of Sionna's materials end in the number of the material (`Scene.xml`).
+    # The names of Sionna's materials end with the index of the material (`Scene.xml`).
     held = surfaces_by_material(mitsuba_scene, lambda material: int(material.name.split("-")[-1]))
     for number, material in enumerate(scene.materials):
         stored = [
@@ -101,7 +101,7 @@ def _check_surfaces(mitsuba_scene: Any, scene: Scene) -> None:
 
 
 def surfaces_by_material(mitsuba_scene: Any, key: Callable[[Any], Any]) -> dict[Any, list[SurfaceSize]]:
-    """Measure the shapes in Mitsuba's memory, by a key of their materials."""
+    """Measure the shapes in Mitsuba's memory, grouped by a key of their materials."""
     held: dict[Any, list[SurfaceSize]] = {}
     for shape in mitsuba_scene.shapes():
         held.setdefault(key(shape.bsdf()), []).append(_size(shape))
@@ -109,10 +109,10 @@ def surfaces_by_material(mitsuba_scene: Any, key: Callable[[Any], Any]) -> dict[
 
 
 def _size(shape: Any) -> SurfaceSize:
-    """Measure one of Mitsuba's shapes."""
+    """Measure a Mitsuba shape."""
     values = mi.traverse(shape)
     if "vertex_positions" not in values:
-        # A rectangle: its shape answers in single precision.
+        # A rectangle returns its bounds and area in single precision.
         bounds, area = shape.bbox(), float(np.array(shape.surface_area()).item())
         return SurfaceSize(tuple(np.array(bounds.min)), tuple(np.array(bounds.max)), area, 0.0)
     vertex = np.array(values["vertex_positions"], dtype=float).reshape(-1, 3)
@@ -120,12 +120,12 @@ def _size(shape: Any) -> SurfaceSize:
 
 
 def surfaces_agree(traced: list[SurfaceSize], stored: list[SurfaceSize], origin: NDArray[np.float64]) -> bool:
-    """Whether a surface in the local frame equals, within single precision, that of objects in the scene frame."""
+    """Whether a surface in the local frame equals, in single precision, the surface of objects in the scene frame."""
     if not traced:
         return False
     low, high = np.min([size.low for size in stored], axis=0), np.max([size.high for size in stored], axis=0)
     bounds = np.array([low, high]) - origin
-    # A vertex is rounded when it is stored and once more when it is transformed.
+    # A vertex is rounded when it is stored and again when it is transformed.
     rounding = 4 * float(np.spacing(np.float32(np.abs(bounds).max())))
     area = sum(size.area for size in stored)
     area_rounding = 1e-5 * area + rounding * sum(size.sides for size in stored)
@@ -158,13 +158,13 @@ def scattering_pattern(material: Material) -> rt.ScatteringPattern:
             "lambda_": material.lambda_,
         },
     }[material.scattering_pattern]
-    # Sionna's registries are not typed.
+    # Sionna's registries have no type annotations.
     make: Any = scattering_pattern_registry.get(material.scattering_pattern)
     return make(**constants)
 
 
 def antenna_patterns(antenna: Antenna) -> list:
-    """Make an antenna's pattern functions of zenith and azimuth [rad] for Sionna's field stage, one per port."""
+    """Make an antenna's patterns for Sionna's field stage: functions of zenith and azimuth [rad], one per port."""
     if antenna.gain_file is None and not antenna.is_array:
         make: Any = antenna_pattern_registry.get(antenna.pattern)
         return make(polarization=antenna.polarization).patterns
@@ -184,7 +184,7 @@ def _array_pattern(
 
 
 def tabulated_pattern(table: GainTable) -> Callable[[mi.Float, mi.Float], mi.Complex2f]:
-    """Make a function of zenith and azimuth [rad] that gives the field amplitude, interpolated as `GainTable.gain`."""
+    """Make a function of zenith and azimuth [rad]: the field amplitude, interpolated as in `GainTable.gain`."""
     (rows, columns), (elevation_step, azimuth_step) = table.gain_dbi.shape, np.radians(table.steps_deg)
     first_azimuth = np.radians(table.first_azimuth_deg)
     gain = mi.Float(aligned(table.gain_dbi.ravel(), np.float32))
@@ -194,7 +194,7 @@ def tabulated_pattern(table: GainTable) -> Callable[[mi.Float, mi.Float], mi.Com
         column = (azimuth - first_azimuth) / azimuth_step
         column = dr.clip(column - dr.floor(column / columns) * columns, 0, columns)
         i, j = dr.minimum(mi.UInt(row), rows - 2), dr.minimum(mi.UInt(column), columns - 1)
-        # The column after the last one is the first: the azimuth closes on itself.
+        # The first column follows the last one, because the azimuth is periodic.
         next_j = dr.select(j == columns - 1, 0, j + 1)
         u, v = row - mi.Float(i), column - mi.Float(j)
         low, high = (

@@ -1,6 +1,6 @@
 """Sionna RT's solver, stage by stage: candidate paths by rays, exact geometry by the method of images, fields.
 
-The first two stages do not depend on the materials' constants beyond the choice of the ray's next interaction, so their
+The first two stages depend on the material constants only through the choice of a ray's next interaction, so their
 result is kept and compiled into a path program. The field stage is the reference against which replay is tested.
 """
 
@@ -50,10 +50,10 @@ from calibray.tracing.sionna.scene import antenna_patterns, load_scene, scatteri
 from calibray.tracing.trace_plan import SMALL_LAUNCH
 
 HASHES: Final = (16_777_213, 67_108_859)
-"""Number of entries of Sionna's table of hashes in small and in large launches. Sionna drops candidates whose hashes
-collide. Of 31,430 candidates of a launch to 25 receivers, it drops 1,067 with its own million entries, 36 with 16
-million, and 4 with 67 million, which take 0.5 GB and 0.3 s per launch. The numbers are primes, because the lowest bits
-of its hashes vary least."""
+"""Number of entries in Sionna's hash table for small and for large launches. Sionna drops candidates whose hashes
+collide. Of 31,430 candidates in a launch to 25 receivers, it drops 1,067 with its default of one million entries, 36
+with 16 million, and 4 with 67 million, which take 0.5 GB and 0.3 s per launch. The numbers are primes, because the
+lowest bits of the hashes vary least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +61,12 @@ class Rays:
     """The rays to launch, and the size of the buffer for the candidate paths that they find.
 
     Attributes:
-        count: Number of rays; with 0, only direct paths are searched.
+        count: Number of rays; with 0, only direct paths are searched for.
         seed: Seed of the random numbers.
         directions: Directions as points of the unit square [2, count]; Sionna's own lattice if None.
-        direct: Whether direct paths are searched as well.
-        buffer_size: Initial number of candidates in the buffer; a full buffer is replaced by a larger one.
-        max_paths: Candidates that fit into memory.
+        direct: Whether direct paths are searched for as well.
+        buffer_size: Initial size of the buffer [candidates]; a full buffer is replaced by a larger one.
+        max_paths: Number of candidates that fit into memory.
     """
 
     count: int
@@ -78,7 +78,7 @@ class Rays:
 
 
 class Solver:
-    """The stages of Sionna RT's solver on one loaded scene; its arguments and errors are those of `Tracer`."""
+    """The stages of Sionna RT's solver for one loaded scene; arguments and errors are those of `Tracer`."""
 
     def __init__(
         self,
@@ -92,11 +92,11 @@ class Solver:
         self.tx_antenna, self.rx_antenna = tx_antenna, rx_antenna
         self._patterns = AntennaPattern.of(tx_antenna), AntennaPattern.of(rx_antenna)
         self._tx_functions, self._rx_functions = antenna_patterns(tx_antenna), antenna_patterns(rx_antenna)
-        # Everything below is in this local frame (`Scene.local_origin`).
+        # All positions below are in this local frame (`Scene.local_origin`).
         self.origin = scene.local_origin
         self._scene = load_scene(scene)
         self._scene.frequency = self.frequency
-        # The names of Sionna's materials end in the number of the material (`Scene.xml`).
+        # The names of Sionna's materials end with the index of the material (`Scene.xml`).
         self._material_of_shape = {
             key: int(shape.bsdf().name.split("-")[-1]) for key, shape in shape_ids(self.mitsuba_scene).items()
         }
@@ -110,19 +110,19 @@ class Solver:
         return self._scene.mi_scene
 
     def with_settings(self, settings: TraceSettings) -> Solver:
-        """Copy the solver with other settings; the loaded scene is shared."""
+        """Copy the solver with different settings; the loaded scene is shared."""
         other = copy(self)
         other.settings = settings
         return other
 
     def set_materials(self, materials: Mapping[str, Material]) -> dict[str, Material]:
-        """Set the constants of Sionna's materials: the scene's, except those given by name; return all of them."""
+        """Set the constants of Sionna's materials: those given by name, otherwise the scene's; return all constants."""
         for name in materials:
             check_material_name(name, self.scene.materials, "materials")
         constants = {**self.scene.materials, **materials}
         for index, material in enumerate(constants.values()):
             target = self._scene.radio_materials[f"calibray-{index}"]
-            # Opaque: Dr.Jit would compile a literal into its kernels.
+            # Opaque, because Dr.Jit would compile a literal into its kernels.
             for constant in SCALAR_CONSTANTS:
                 setattr(target, constant, dr.opaque(mi.Float, getattr(material, constant)))
             target.scattering_pattern = scattering_pattern(material)
@@ -133,13 +133,13 @@ class Solver:
     ) -> PathsBuffer:
         """Launch rays from the sources and collect candidate paths to the targets.
 
-        The scene is Mitsuba's, or an object with its ray queries.
+        `mitsuba_scene` is a Mitsuba scene, or an object with the same ray queries.
 
         Raises:
             EngineError: The candidates do not fit into memory.
         """
         settings, size = self.settings, rays.buffer_size
-        # At most one candidate per ray, interaction and target, and the direct paths.
+        # At most one candidate per ray, interaction and target, plus the direct paths.
         most = (rays.count * settings.max_depth + 1) * dr.width(targets) + 2
         while True:
             with _ray_directions(rays.directions), _hash_table(HASHES[most > SMALL_LAUNCH]):
@@ -162,12 +162,12 @@ class Solver:
             dr.eval()
             num_candidates = int(np.array(buffer.paths_counter).item())
             if num_candidates > rays.max_paths:
-                num_receivers = len(np.unique(to_numpy(targets), axis=0))  # without those that are repeated
+                num_receivers = len(np.unique(to_numpy(targets), axis=0))  # without the repeated receivers
                 raise EngineError(
                     f"more paths than fit into memory, with {num_receivers} receivers at once; "
                     "lower trace.samples or trace.max_depth, or trace fewer links at once"
                 )
-            # The counter ends at the size of the buffer, so a full one may have lost candidates.
+            # The counter stops at the size of the buffer, so a full buffer may have lost candidates.
             if num_candidates < size - 1:
                 break
             size = min(4 * size, most)
@@ -180,8 +180,8 @@ class Solver:
     ) -> None:
         """Compute the exact geometry of candidates by the method of images, in place.
 
-        Candidates that are not paths are dropped, as are those of receivers that `pad_receivers` has added after the
-        first `num_receivers`, which are targets, or sources of reversed candidates.
+        Candidates that are not paths are dropped, as are candidates of receivers that `pad_receivers` added after the
+        first `num_receivers`. Receivers are the targets, or the sources if candidates were reversed.
         """
         if not buffer.buffer_size:
             return
@@ -197,11 +197,11 @@ class Solver:
         buffer.valid &= (buffer.source_indices < limit) & (buffer.target_indices < limit)
         buffer.discard_invalid()
         buffer.schedule()
-        # Evaluated at once: pending results would keep all candidates and the whole buffer in memory.
+        # Evaluated immediately: pending results would keep all candidates and the whole buffer in memory.
         dr.eval()
 
     def compute_fields(self, traced: TracedBuffer) -> NDArray[np.complex128]:
-        """Compute path gains [P, R, T] with Sionna's field stage and the constants that were set last."""
+        """Compute path gains [P, R, T] with Sionna's field stage and the most recently set constants."""
         if not len(traced.link):
             return np.zeros((0, self.rx_antenna.ports, self.tx_antenna.ports), dtype=complex)
         buffer = traced.buffer
@@ -219,9 +219,9 @@ class Solver:
             src_antenna_patterns=self._tx_functions,
             tgt_antenna_patterns=self._rx_functions,
         )
-        # Evaluated at once: reading each array would run the whole stage again.
+        # Evaluated together: otherwise, reading each array would run the whole stage again.
         dr.eval(fields.a, fields.tau)
-        # The field stage clears the flag of some paths; restored, so that it can run again.
+        # The field stage clears the flags of some paths; they are restored, so that it can run again.
         buffer.valid = valid
         return np.array([[to_numpy_complex(gain) for gain in row] for row in fields.a]).transpose(2, 0, 1)
 
@@ -248,7 +248,7 @@ class Solver:
             if self.settings.diffraction:
                 source = dr.gather(mi.Point3f, traced.source, buffer.source_indices)
                 target = dr.gather(mi.Point3f, traced.target, buffer.target_indices)
-                # Sionna's own lengths, so that replay follows its known error in them (docs/explanation/fidelity.md).
+                # Sionna's own lengths, so that replay reproduces their known error (docs/explanation/fidelity.md).
                 after, before = self._calculate_fields._diffraction_compute_s_s_prime(buffer, source, target)
                 wedges: Any = buffer.diffracting_wedges
                 edge, normal_n = to_numpy(wedges.e_hat), to_numpy(wedges.nn)
@@ -270,7 +270,7 @@ class Solver:
 
 @contextmanager
 def _hash_table(entries: int) -> Iterator[None]:
-    """Give Sionna's table of hashes a number of entries."""
+    """Set the number of entries in Sionna's hash table."""
     own = SBCandidateGenerator.MIN_SPEC_COUNT_SIZE
     SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = entries
     try:
@@ -281,8 +281,8 @@ def _hash_table(entries: int) -> Iterator[None]:
 
 @contextmanager
 def _ray_directions(directions: NDArray[np.float64] | None) -> Iterator[None]:
-    """Make Sionna launch its rays into directions, points of the unit square [2, rays]; its own lattice if None."""
-    # Sionna has no argument for them, so the function that makes its lattice is replaced.
+    """Set the directions of Sionna's rays, as points of the unit square [2, rays]; Sionna's own lattice if None."""
+    # Sionna has no argument for directions, so the function that makes its lattice is replaced.
     sionna_lattice = sb_deterministic.fibonacci_lattice
     if directions is not None:
         sb_deterministic.fibonacci_lattice = lambda _: mi.Point2f(

@@ -1,8 +1,8 @@
 """Sionna RT as a `Tracer`: finds the paths of links and compiles them.
 
-Receivers, and rays if needed, are split over launches (`calibray.tracing.trace_plan`): all receivers of a source share
-Sionna's path buffer, whose memory grows with samples x depth x receivers (NVlabs/sionna#1172). A launch that fills its
-buffer is repeated with a larger one.
+Receivers, and rays if needed, are split over launches (`calibray.tracing.trace_plan`), because all receivers of a
+source share Sionna's path buffer, whose memory grows with samples x depth x receivers (NVlabs/sionna#1172). A launch
+that fills its buffer is repeated with a larger buffer.
 """
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
@@ -42,9 +42,9 @@ from calibray.tracing.trace_plan import (
 )
 
 LANES: Final = 20_000_000
-"""Largest product of rays, interactions and receivers of one launch."""
+"""Largest product of rays, interactions and receivers in one launch."""
 BUFFER: Final = 1_000_000
-"""Initial number of paths in the buffer of one launch."""
+"""Initial capacity of the buffer of one launch [paths]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +52,8 @@ class Trace:
     """The traced paths of links in Sionna's buffers, ready to be compiled or evaluated.
 
     Attributes:
-        solver: The solver that found them.
-        materials: The constants with which they were found, by name.
+        solver: The solver that found the paths.
+        materials: The constants with which the paths were found, by material name.
         tx: Transmitter of every link [L, 3], [m].
         rx: Receiver of every link [L, 3], [m].
         buffers: The paths.
@@ -73,7 +73,7 @@ class Trace:
         ends = LinkPositions(self.tx - origin, self.rx - origin)
         paths = concatenate([self.solver.compile(part, ends, self.materials) for part in self.buffers])
         if origin.any():
-            # In double precision, because single precision would round vertices by up to half a metre.
+            # Double precision, because single precision would round vertices by up to half a metre.
             paths = replace(paths, tx_position=self.tx, rx_position=self.rx, vertex=paths.vertex + origin)
         return replace(paths, settings={**paths.settings, **self.record})
 
@@ -89,7 +89,7 @@ class Trace:
         return np.concatenate(delays)[self._order()]
 
     def path_gains(self, materials: Mapping[str, Material] | None = None) -> NDArray[np.complex128]:
-        """Path gains [P, R, T] by Sionna's field stage in the order of `paths()`, for other materials by name."""
+        """Path gains [P, R, T] from Sionna's field stage, in the order of `paths()`; `materials` replace by name."""
         self.solver.set_materials({**self.materials, **(materials or {})})
         return np.concatenate([self.solver.compute_fields(part) for part in self.buffers])[self._order()]
 
@@ -111,7 +111,7 @@ class Tracer:
         rx_antenna: Receive antenna.
 
     Raises:
-        InputError: Sionna cannot load the scene, the frequency is no carrier, or an antenna's gain table cannot be
+        InputError: Sionna cannot load the scene, the frequency is out of range, or an antenna's gain table cannot be
             used.
     """
 
@@ -142,7 +142,7 @@ class Tracer:
         return self.solver.settings
 
     def with_settings(self, settings: TraceSettings) -> Tracer:
-        """Copy the tracer with other settings; the loaded scene is shared."""
+        """Copy the tracer with different settings; the loaded scene is shared."""
         other = copy(self)
         other.solver = self.solver.with_settings(settings)
         return other
@@ -173,7 +173,7 @@ class Tracer:
     def find_paths(
         self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None
     ) -> Trace:
-        """Find the paths of every link and leave them in Sionna's buffers; arguments as for `trace`."""
+        """Find the paths of every link and keep them in Sionna's buffers; arguments as for `trace`."""
         tx, rx = link_positions(links)
         backwards = starts_at_receivers(tx, rx, self.settings)
         targets = (tx if backwards else rx) - self.solver.origin
@@ -188,7 +188,7 @@ class Tracer:
         traced: list[TracedBuffer] = []
         same_receivers: list[
             TracedBuffer
-        ] = []  # of consecutive launches that share the rays to some receivers
+        ] = []  # of consecutive launches that share the rays to the same receivers
         num_paths = done = 0
         if progress is not None:
             progress("tracing", 0, len(rx))
@@ -215,7 +215,7 @@ class Tracer:
             count=launch.rays,
             seed=launch.seed,
             directions=share,
-            # One of the launches to the same receivers finds the direct paths.
+            # Only the first of the launches to the same receivers finds the direct paths.
             direct=settings.line_of_sight and launch.first == 0,
             buffer_size=BUFFER,
             max_paths=max_paths,
@@ -235,8 +235,8 @@ class Tracer:
         """Whether points [n, 3], [m], lie inside closed bodies of the scene, such as buildings [n].
 
         A ray from inside a closed body crosses its surface an odd number of times. Scenes have gaps, so the
-        majority of rays in several directions decides. All of them point upwards, because buildings often lack a floor.
-        A room is a body as well.
+        majority of rays in several directions decides. All rays point upwards, because buildings often lack a floor.
+        A room is a closed body as well.
         """
         azimuth, elevation = np.meshgrid(np.linspace(0.1, 2 * np.pi, 6), np.radians([25.0, 50.0, 75.0]))
         directions = np.stack(
@@ -246,7 +246,7 @@ class Tracer:
         origin = np.repeat(local, directions.shape[1], axis=0)
         ray = mi.Ray3f(mi.Point3f(*origin.T), mi.Vector3f(*np.tile(directions, len(points))))
         odd, active = np.zeros(len(origin), dtype=bool), np.ones(len(origin), dtype=bool)
-        # Every surface that a ray meets changes its side.
+        # At every surface, a ray passes from inside to outside or back.
         for _ in range(64):
             hit = self.solver.mitsuba_scene.ray_intersect(ray, mi.Bool(active))
             active &= np.array(hit.is_valid(), dtype=bool)
