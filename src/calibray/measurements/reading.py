@@ -241,8 +241,7 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     uncertainty then exceeds `MAX_UNCERTAINTY_DB` are left out, because the samples above the floor are only the strong
     ones. The steps `averaging`, `keep`, `held_out`, `transmitter` and `noise_floor_dbm` are used. Returns the row of
     the first sample of each average, with the mean receiver position, the mean value, and the columns `std_db`
-    (standard deviation of the samples [dB], NaN for one sample) and `count`. Weights and further observables are also
-    averaged.
+    (standard deviation of the samples [dB], NaN for one sample) and `count`; weights and further observables are means.
 
     Raises:
         InputError: A column is missing or not numeric, a time cannot be read, or no average remains.

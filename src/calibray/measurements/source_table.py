@@ -152,8 +152,7 @@ class SourceTable:
         """Positions [rows, 3], [m], in the scene's frame, from three numbers or columns; `end` is "tx" or "rx".
 
         Raises:
-            InputError: The number of coordinates is not three, or a column is missing, not numeric or named like
-                degrees.
+            InputError: The coordinates are not three, or a column is missing, not numeric or named like degrees.
         """
         if isinstance(coordinates, str) or len(coordinates) != 3:
             raise InputError(f"{end} = {coordinates!r}: must be x, y and z, each a number [m] or a column")

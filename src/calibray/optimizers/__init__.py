@@ -131,8 +131,7 @@ def make(
             itself.
         start: Starting points, [d] or [k, d], for methods that use them.
         starts: Number of further starting points, for the same methods; the method's default if None.
-        objective: Function that converts residuals to the value, for methods that use residuals; root mean square if
-            None.
+        objective: Function from residuals to the value, for methods that use residuals; root mean square if None.
         cheap_model: A cheap model of the engine, for methods that use one.
         options: Settings of the method, which override the arguments above.
 

@@ -5,9 +5,8 @@ repeats the same candidates, uses their stored answers, and continues where the 
 propose (enqueued, or from another sampler) join the archive and can become leaders of the pack. A failed trial counts
 as a failed evaluation.
 
-The pack cannot move before the iteration is complete. If workers are already evaluating every open candidate, a
-candidate taken by another process is returned again, because that process may have ended. If there is none, the next
-trial is a random point.
+The pack cannot move before the iteration is complete. If workers are evaluating every open candidate, a candidate of
+another process is returned again, because that process may have ended. If there is none, the trial is a random point.
 """
 
 from __future__ import annotations

@@ -260,9 +260,7 @@ def better(first: str, second: str, folder: Path) -> str:
     (model, one), (other_model, other) = (errors for errors in results.values() if errors is not None)
     same = [(one.position, other.position), (one.measured_db, other.measured_db)]
     if not all(np.array_equal(*pair) for pair in same):
-        return (
-            f"{first} and {second} were validated on different links, so nothing shows which predicts better."
-        )
+        return f"{first} and {second} were validated on different links, so nothing shows which is better."
     judged = (one.block >= 0) & (other.block >= 0)
     if not judged.any():
         return f"{first} and {second} have no held-out link in common. Validate both with the same blocks."

@@ -114,9 +114,7 @@ def show_scene(desk: Desk) -> None:
     scenes = desk.folder.scenes()
     if of_study := desk.folder.valid_content().get("scene", {}).get("file", ""):
         ui.label(f"Scene of the study: {of_study}")
-        ui.label("To change it, use the section scene of the step Measurements, or Draft again.").classes(
-            "quiet"
-        )
+        ui.label("To change it, use Measurements: the section scene, or Draft again.").classes("quiet")
         return
     if desk.scene not in scenes:
         desk.scene = scenes[0] if scenes else None
