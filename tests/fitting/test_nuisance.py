@@ -10,7 +10,7 @@ from scipy.optimize import lsq_linear
 from calibray.errors import EngineError, InputError
 from calibray.fitting import elimination as elimination_module
 from calibray.fitting.elimination import DENSE, Elimination
-from calibray.fitting.nuisance import Nuisance, make_term
+from calibray.fitting.nuisance import Nuisance, make_term, transmitters
 from calibray.fitting.objective import Objective, make_objective
 from calibray.measurements import Measurements, SourceTable
 
@@ -280,3 +280,13 @@ def test_incompatible_terms_are_refused():
         Nuisance(5, (make_term(links, "x"), make_term(links, "x", "log_distance")))
     with pytest.raises(InputError, match="'x': 5 links, must be 6"):
         Nuisance(6, (make_term(links, "x"),))
+
+
+def test_a_transmitter_on_an_axis_is_one_transmitter():
+    """Conversions of coordinates leave rounding errors of both signs around zero."""
+    links = Measurements(
+        tx=[[0.0, 5.0, 10.0], [-0.0, 5.0, 10.0], [1e-12, 5.0, 10.0], [-1e-12, 5.0, 10.0]],
+        rx=[[30.0, 40.0, 1.5]] * 4,
+        path_loss_db=[85.0] * 4,
+    )
+    assert set(transmitters(links)) == {"0.00,5.00,10.00"}
