@@ -154,7 +154,7 @@ def test_a_conflict_is_reported_with_both_answers(tmp_path, table, engine):
     ("section", "message"),
     [
         (SPREAD | {"unit": "dB"}, "given in s or ms"),
-        (SPREAD | {"path": "first"}, "only a time of flight"),
+        (SPREAD | {"path": "first"}, "only for a time of flight"),
         (SPREAD | {"kind": "doppler"}, "rms_delay_spread"),
         (SPREAD | {"std": 0.0}, "std"),
         (SPREAD | {"file": "multipath.csv"}, "give exactly one of column"),

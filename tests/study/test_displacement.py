@@ -217,12 +217,12 @@ def test_predictions_have_the_calibrated_height_at_exact_receivers(folder: Path,
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"objective": {"combining": "coherent"}}, r"does not go with objective.combining = 'coherent'"),
-        ({"engine": {"name": "retrace"}}, r"does not go with engine.name = 'retrace'"),
-        ({"engine": {"name": "replay", "chunk_links": 5}}, r"does not go with engine.chunk_links"),
+        ({"objective": {"combining": "coherent"}}, r"cannot be combined with objective.combining = 'coherent'"),
+        ({"engine": {"name": "retrace"}}, r"cannot be combined with engine.name = 'retrace'"),
+        ({"engine": {"name": "replay", "chunk_links": 5}}, r"cannot be combined with engine.chunk_links"),
         (
             {"parameters": {"tx:A.height": {"bounds": [-1, 1]}, "ground.itu_a": {"bounds": [2, 9]}}},
-            r"'tx:A.height': .* does not go with coefficients of laws",
+            r"'tx:A.height': .* cannot be combined with coefficients of laws",
         ),
         ({"parameters": {"tx:C.height": {"bounds": [-1, 1]}}}, r"no link has the transmitter 'C'"),
         ({"parameters": {"rx:PHONE.dx": {"bounds": [-1, 1]}}}, r"no link has the device 'PHONE' in column 'device'"),

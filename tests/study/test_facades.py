@@ -225,8 +225,8 @@ def test_a_facade_is_like_the_walls_that_it_is_part_of(tmp_path):
 @pytest.mark.parametrize(
     ("prior", "message"),
     [
-        ({"like": "marbel.relative_permittivity"}, "no other parameter"),
-        ({"like": SHOP}, "no other parameter"),
+        ({"like": "marbel.relative_permittivity"}, "is not another parameter"),
+        ({"like": SHOP}, "is not another parameter"),
         ({"like": "marble.relative_permittivity", "itu": "glass"}, "one of itu, value and like"),
         ({"std": 1.0, "like": "marble.relative_permittivity"}, "remove itu, value, like"),
     ],

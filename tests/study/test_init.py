@@ -140,7 +140,7 @@ def test_receivers_with_numbers_are_devices_and_the_directions_of_their_antennas
     assert found.study.offset.per == ("rx_id",)
     reasons = {each.what: each.reason for each in found.assumptions}
     assert reasons["links.noise_floor_dbm"].endswith("none of rx_id 1, the least sensitive, is lower")
-    assert reasons["links.rx_antenna.azimuth_deg"].startswith("column rx_azimuth_deg may be")
+    assert reasons["links.rx_antenna.azimuth_deg"].startswith("column rx_azimuth_deg may describe")
 
 
 def test_the_noise_floor_is_that_of_the_least_sensitive_receiver_that_states_it(scene, tmp_path):
@@ -381,7 +381,7 @@ def test_quantities_are_told_by_name_and_sign(column, values, kind):
         ({"x": [1.0], "y": [2.0], "temperature": [20.0]}, "no column looks like path loss"),
         ({"a": [1.0], "pl_db": [90.0]}, "no columns of receiver positions"),
         ({"x": [1.0], "y": [2.0], "pl_db": [90.0]}, "--tx X,Y,Z"),
-        ({"lon": [9.99], "lat": [50.01], "tx_x": [0.0], "tx_y": [0.0], "pl_db": [90.0]}, "in other units"),
+        ({"lon": [9.99], "lat": [50.01], "tx_x": [0.0], "tx_y": [0.0], "pl_db": [90.0]}, "different units"),
     ],
 )
 def test_what_cannot_be_told_is_asked_for(scene, tmp_path, columns, message):

@@ -133,7 +133,7 @@ def test_delays_of_paths_far_longer_than_the_scene_are_named(town, unit, is_name
     """Delay spreads of some 30 ns in a town of 200 m; in microseconds they are those of paths of 9 km."""
     frame = links().assign(spread=np.linspace(5.0, 60.0, 60))
     observables = {"ds": {"kind": "rms_delay_spread", "column": "spread", "unit": unit}}
-    named = "column 'spread' [us] is as long as light takes for 9743 m"
+    named = "column 'spread' [us] is the time light takes for 9743 m"
     assert (named in suspicions(town, frame, observables=observables)) == is_named
     assert is_named or suspicions(town, frame, observables=observables) == ""
 

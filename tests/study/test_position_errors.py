@@ -173,12 +173,12 @@ def test_a_study_with_errors_is_calibrated(exact: Study) -> None:
     ("change", "message"),
     [
         ({"noise": {}}, r"give links.std or noise.std_db"),
-        ({"objective": {"combining": "coherent"}}, r"does not go with objective.combining = 'coherent'"),
-        ({"engine": {"name": "retrace"}}, r"does not go with engine.name = 'retrace'"),
-        ({"parameters": {"ground.itu_a": {"bounds": [2, 9]}}}, r"does not go with coefficients of laws"),
+        ({"objective": {"combining": "coherent"}}, r"combined with objective.combining = 'coherent'"),
+        ({"engine": {"name": "retrace"}}, r"combined with engine.name = 'retrace'"),
+        ({"parameters": {"ground.itu_a": {"bounds": [2, 9]}}}, r"combined with coefficients of laws"),
         (
             {"observables": {"k": {"kind": "k_factor", "column": "k", "unit": "dB"}}},
-            r"does not go with \[observables\]",
+            r"combined with \[observables\]",
         ),
     ],
 )

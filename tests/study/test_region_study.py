@@ -108,7 +108,7 @@ def test_a_file_of_polygons_gives_the_same_as_a_box(tmp_path, opened, engine, co
     ("sections", "message"),
     [
         ({"regions": {}}, r"no \[regions\.trees\]"),
-        ({"regions": {"trees": REGIONS["trees"] | {"boxes": []}}}, "by a canopy or by boxes"),
+        ({"regions": {"trees": REGIONS["trees"] | {"boxes": []}}}, "a canopy or boxes"),
         ({"regions": {"trees": REGIONS["trees"] | {"canopy": "c.tif"}}}, "give exactly one of them"),
         ({"regions": {"trees": {"boxes": [BOX], "specific_attenuation": 0.3}}}, r"needs top \[m\]"),
         ({"regions": {"trees": REGIONS["trees"] | {"boxes": [[5, 0, 1, 2]]}}}, "west less than east"),

@@ -218,7 +218,7 @@ TRACE = "max_depth = 4"
         ("version = 1", "", "study.toml: version: is required"),
         # Values
         ("version = 1", "version = 2", "study.toml: version = 2: this Calibray reads version 1"),
-        ("frequency = 4e9", "frequency = 4", "scene.frequency = 4: must be in 1e+06 to 1e+12 Hz"),
+        ("frequency = 4e9", "frequency = 4", "scene.frequency = 4: must be from 1e+06 to 1e+12 Hz"),
         ("frequency = 4e9", "frequency = '4e9'", "scene.frequency = '4e9': must be a number"),
         ("frequency = 4e9", "frequency = inf", "scene.frequency = inf: must be a finite number"),
         ("bandwidth = 2e8", "bandwidth = 0", "scene.bandwidth = 0: must be greater than 0"),
@@ -417,7 +417,7 @@ def test_settings_of_methods_are_read(folder, method, options):
         ("gwo", "{ population = nan }", "population = nan: must be a finite number"),
         ("gwo", "{ population = 10000000 }", "population = 10000000: must be at most 1,000,000"),
         ("gwo", "{ population = -9999999999999999 }", "must be at most 1,000,000"),
-        ("gwo", "{ population = { a = 1 } }", "must be a number, a text, true, false, or a list of them"),
+        ("gwo", "{ population = { a = 1 } }", "must be a number, text, true, false, or a list of these"),
         ("gwo", "{ population = 2024-01-01 }", "must be a whole number"),
         ("sgwo-im", "{ w_min = nan }", "w_min = nan: must be a finite number"),
         ("sgwo-im", "{ w_max = -inf }", "w_max = -inf: must be a finite number"),

@@ -134,5 +134,5 @@ def _directions(zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
 
 def test_antennas_of_one_end_have_as_many_ports() -> None:
     pose = Pose(*np.zeros((4, 2)))
-    with pytest.raises(InputError, match=r"'V' and 'cross'.*one port, or two"):
+    with pytest.raises(InputError, match=r"'V' and 'cross'.*one port each, or two each"):
         Mounting((Antenna(), SECTOR), np.array([0, 1]), pose)

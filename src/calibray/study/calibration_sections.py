@@ -1,4 +1,4 @@
-"""The sections of a study file on what is calibrated and how, each a closed model: an unknown key is an error."""
+"""The sections of a study file that state what is calibrated and how. They are closed: unknown keys are errors."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from calibray.support.strict_models import Section, Text
 
 
 class ObjectiveSection(Section):
-    """``[objective]``: how paths are combined to a path loss, and how a link without a path counts.
+    """``[objective]``: how paths are combined into a path loss, and how links without a path are treated.
 
     Attributes:
         combining: "power" (sum of path powers), "coherent" (sum of fields) or "band" (coherent power averaged
             over the bandwidth).
         no_path: "exclude" leaves a link without a path out of the objective; "censor" counts it with `ceiling_db`.
-        ceiling_db: Largest path loss that can be measured [dB], with "censor" only.
+        ceiling_db: Largest measurable path loss [dB]; only with "censor".
     """
 
     combining: Literal["power", "coherent", "band"] = "power"
@@ -50,9 +50,9 @@ class PriorSection(Section):
     Attributes:
         itu: ITU-R P.2040 material that gives the value, with or without "@REVISION".
         value: The value itself, in the field's unit, in place of `itu`.
-        like: Another parameter around which this one scatters, in place of `itu`: both belong to one population.
-        spread: Standard deviation of the logarithm: 0.3 is about 30 %.
-        std: Standard deviation of a Gaussian prior around the start value, in the field's unit, in place of the others.
+        like: Another parameter on which the prior is centred, in place of `itu`: both belong to one population.
+        spread: Standard deviation of the natural logarithm: 0.3 is about 30 %.
+        std: Standard deviation of a Gaussian prior around the start value, in the field's unit, in place of all others.
         shared: Whether `std` is the spread of a population of transmitters; it is estimated if their spread is "auto".
     """
 
@@ -89,8 +89,8 @@ class ParameterSection(Section):
         start: Value before calibration, a number, "itu:NAME" or "itu:NAME@REVISION"; if absent, the scene's value.
         scale: "linear" or "log".
         prior: Its prior; uniform within the bounds if absent.
-        spread: Standard deviation, in the field's unit, of the values of single transmitters around the common value of
-            a parameter such as "tx:*.azimuth", or "auto" to estimate it. If absent, only the common value is
+        spread: Standard deviation, in the field's unit, of individual transmitters' values around the common value of a
+            parameter such as "tx:*.azimuth", or "auto" to estimate it. If absent, only the common value is
             calibrated.
     """
 
@@ -101,11 +101,11 @@ class ParameterSection(Section):
     spread: Literal["auto"] | Annotated[float, Field(gt=0)] | None = None
 
     def centre(self, name: str, frequency: float) -> float:
-        """The centre of a parameter's prior at a carrier [Hz], in the field's unit; 1 if it is like another parameter.
+        """The centre of the prior at a carrier [Hz], in the field's unit; 1 if it is centred on another parameter.
 
         Raises:
-            InputError: There is no prior, ITU-R P.2040 gives no value of this kind, or a bound or the value is not
-                positive.
+            InputError: There is no prior, ITU-R P.2040 does not give this constant, or the lower bound or the value is
+                not positive.
         """
         if self.prior is None:
             raise InputError(f"{name}: has no prior")
@@ -122,22 +122,22 @@ class ParameterSection(Section):
 
 def _ordered(value: tuple[float, float] | None) -> tuple[float, float] | None:
     if value is not None and value[0] >= value[1]:
-        raise InputError("the lower bound must be less than the upper")
+        raise InputError("the lower bound must be less than the upper bound")
     return value
 
 
 @dataclass(frozen=True)
 class NuisanceTerm:
-    """A column of the links times an unknown coefficient, for all links or one per group.
+    """A column of the links times an unknown coefficient, one for all links or one per group.
 
     Attributes:
-        by: "constant", "log_distance" (decades of distance), a column that follows from the scene ("out_of_sight",
+        by: "constant", "log_distance" (decades of distance), a column computed from the scene ("out_of_sight",
             "walls_crossed", "obstruction_m", "knife_edge_db", "region_m", "clutter_db"), or a numeric column of the
             links.
-        per: Columns whose joined labels are the groups; without columns, one coefficient for all links.
+        per: Columns whose joined labels define the groups; without columns, one coefficient for all links.
         bounds: Lower and upper bound of the coefficient, [dB] per unit of the column; unbounded if None.
-        prior: Standard deviation of a Gaussian prior around zero, in the same unit; flat if None; "auto" for a prior
-            around the mean of the groups with an estimated standard deviation.
+        prior: Standard deviation of a Gaussian prior around zero, in the same unit; a flat prior if None; "auto" for a
+            prior around the mean of the groups with an estimated standard deviation.
     """
 
     by: str
@@ -152,7 +152,7 @@ class OffsetSection(Section):
     Attributes:
         per: Column of group labels, or several columns whose labels are joined; one offset for all links if absent.
         bounds: Lower and upper bound [dB]; unbounded if absent.
-        prior_db: Standard deviation of a Gaussian prior around zero [dB]; flat if absent.
+        prior_db: Standard deviation of a Gaussian prior around zero [dB]; a flat prior if absent.
     """
 
     per: Text | tuple[Text, ...] | None = None
@@ -162,24 +162,24 @@ class OffsetSection(Section):
     _ordered = field_validator("bounds")(_ordered)
 
     def term(self) -> NuisanceTerm:
-        """The nuisance term of which this section is the short form."""
+        """The nuisance term that this section abbreviates."""
         per = (self.per,) if isinstance(self.per, str) else self.per or ()
         return NuisanceTerm("constant", per, self.bounds, self.prior_db)
 
 
 class NuisanceSection(Section):
-    """``[nuisance.NAME]``: a column of the links times an unknown coefficient, for all links or one per group.
+    """``[nuisance.NAME]``: a column of the links times an unknown coefficient, one for all links or one per group.
 
     Attributes:
-        by: "constant", "log_distance" (decades of distance), a column that follows from the scene ("out_of_sight",
+        by: "constant", "log_distance" (decades of distance), a column computed from the scene ("out_of_sight",
             "walls_crossed", "obstruction_m", "knife_edge_db", "region_m", "clutter_db"), or a numeric column of the
             links.
         per: Column of group labels; one coefficient for all links if absent. "cluster" needs no column if `cluster_m`
             is stated.
-        cluster_m: Side of the squares in which receivers form the groups of "cluster" [m].
+        cluster_m: Side length of the squares whose receivers form the groups of "cluster" [m].
         bounds: Lower and upper bound of the coefficient, [dB] per unit of the column; unbounded if absent.
-        prior: Standard deviation of a Gaussian prior around zero, in the same unit; flat if absent. "auto" is a prior
-            around the mean of the groups with an estimated standard deviation (a random effect).
+        prior: Standard deviation of a Gaussian prior around zero, in the same unit; a flat prior if absent. "auto" is a
+            prior around the mean of the groups with an estimated standard deviation (a random effect).
     """
 
     by: Text
@@ -195,7 +195,7 @@ class NuisanceSection(Section):
         if self.prior == "auto" and (self.per is None or self.bounds is not None):
             raise InputError("prior = 'auto' needs per, the column of the groups, and no bounds")
         if self.cluster_m is not None and self.per != CLUSTER:
-            raise InputError(f"cluster_m needs per = {CLUSTER!r}, the squares of that side")
+            raise InputError(f"cluster_m needs per = {CLUSTER!r}, squares of that side length")
         return self
 
     def term(self) -> NuisanceTerm:
@@ -207,13 +207,13 @@ class NoiseSection(Section):
     """``[noise]``: the errors of measured links.
 
     Attributes:
-        std_db: Standard deviation of a link's error [dB], which scales the priors; estimated if absent.
+        std_db: Standard deviation of a link's error [dB], which sets the weight of the priors; estimated if absent.
         kind: "gaussian", "student-t", or "auto" for intervals that account for both.
         range_m: Correlation distance of neighbouring links' errors [m], 0 for none, or "auto".
         heterogeneity: Between-building spread of a material's constants, 0 for none, or "auto".
-        constants_spread: Standard deviation of the logarithm of thickness, conductivity and scattering coefficient of
-            calibrated materials that are not parameters: how well the scene's values are known; 0 if they are exact.
-            A scattering coefficient of 0 has a prior of its own, unless this is 0.
+        constants_spread: Standard deviation of the logarithm of those constants of calibrated materials (thickness,
+            conductivity, scattering coefficient) that are not parameters; 0 if the scene's values are exact. A
+            scattering coefficient of 0 has its own prior, unless this is 0.
     """
 
     std_db: Annotated[float, Field(gt=0)] | None = None
@@ -239,17 +239,17 @@ class NoiseSection(Section):
 
 
 DEFAULT_BLOCKS: Final = 4
-"""Number of spatial blocks, each held out in turn, of a drafted study and of a validation that states none."""
+"""Number of spatial blocks, each held out in turn, in a drafted study and in a validation that states no number."""
 
 MOST_BLOCKS: Final = 100
 """Largest number of spatial blocks: each needs a calibration."""
 
 
 class HoldoutSection(Section):
-    """``[holdout]``: links that are not used for calibration but for validation; chosen in one of three ways.
+    """``[holdout]``: links that are used for validation instead of calibration; chosen in one of three ways.
 
     Attributes:
-        where: Row filter; links that pass it are held out.
+        where: Row filter; links that satisfy it are held out.
         blocks: Number of spatial blocks, each held out in turn.
         by: Column of labels; the links of each label are held out in turn.
     """
@@ -269,8 +269,8 @@ class FidelitySection(Section):
     """``[fidelity]``: a second trace with the calibrated materials, because paths may depend on them.
 
     Attributes:
-        tolerance_db: Largest change of a link's path loss [dB] that is accepted.
-        rounds: Largest number of traces, 0 for none; 3 if absent, or 4 if positions are parameters.
+        tolerance_db: Largest accepted change of a link's path loss [dB].
+        rounds: Largest number of traces, 0 for none; if absent, 3, or 4 if positions are parameters.
     """
 
     tolerance_db: Annotated[float, Field(gt=0)] = 0.5
@@ -282,9 +282,9 @@ class MethodSection(Section):
 
     Attributes:
         name: "auto", "sgwo-im", "gwo" or another registered method.
-        seed: Seed of its random numbers.
+        seed: Seed of the method's random numbers.
         model: The cheap model of an expensive engine: "replay" of the study's scene, or "none".
-        options: Settings of the named method.
+        options: Settings of the method `name`.
     """
 
     name: Text = "auto"
@@ -299,10 +299,10 @@ class MethodSection(Section):
 
 
 LARGEST: Final = 10**6
-"""Largest whole number of a setting: no method can keep more candidates in memory."""
+"""Largest integer value of a setting: no method can keep more candidates in memory."""
 
 LONGEST: Final = 10**4
-"""Largest number of entries of a list, and of characters of a text."""
+"""Largest number of entries in a list, and of characters in a string."""
 
 _TYPES: Final[Mapping[str, tuple[tuple[type, ...], str]]] = {
     "bool": ((bool,), "true or false"),
@@ -313,12 +313,12 @@ _TYPES: Final[Mapping[str, tuple[tuple[type, ...], str]]] = {
 
 
 def check_options(name: str, options: Mapping[str, Any]) -> None:
-    """Refuse settings that a method does not have; the method itself checks their values.
+    """Raise an error for settings that a method does not have; the method itself checks their values.
 
-    If the method is unknown or chosen later, only the size of values is checked.
+    If the method is unknown or chosen later, only the sizes of the values are checked.
 
     Raises:
-        InputError: A setting is unknown, of another type, not finite or too large; the message begins with its key.
+        InputError: A setting is unknown, of a wrong type, not finite or too large; the message begins with its key.
     """
     if not options:
         return
@@ -342,13 +342,13 @@ def check_options(name: str, options: Mapping[str, Any]) -> None:
 
 
 def _check_type(prefix: str, argument: Parameter, value: Any) -> None:
-    """Check the annotation of the constructor's argument; other types, such as arrays, are not checked."""
+    """Check a value against the annotation of the constructor's argument; types such as arrays are not checked."""
     types = [part.strip() for part in str(argument.annotation).split("|")]
     if not set(types) - {"None"} <= set(_TYPES):
         return
     for name in types:
         allowed, _ = _TYPES.get(name, ((), ""))
-        # In Python, True and False are integers as well.
+        # In Python, True and False are also integers.
         if isinstance(value, allowed) and (isinstance(value, bool) == (name == "bool")):
             return
     wanted = " or ".join(_TYPES[name][1] for name in types if name in _TYPES)
@@ -369,8 +369,8 @@ def _check_size(prefix: str, value: Any, depth: int = 2) -> None:
             for entry in value:
                 _check_size(prefix, entry, depth - 1)
         case list() | tuple():
-            raise InputError(f"{prefix}: must be a list of at most {LONGEST:,} entries, or of such lists")
+            raise InputError(f"{prefix}: must be a list of at most {LONGEST:,} entries or such lists")
         case int() | float() | str():
             pass
         case _:
-            raise InputError(f"{prefix}: must be a number, a text, true, false, or a list of them")
+            raise InputError(f"{prefix}: must be a number, text, true, false, or a list of these")

@@ -1,4 +1,4 @@
-"""The sections of a study file together: a closed model, and the checks of keys that cannot be combined."""
+"""All sections of a study file as a closed model, and checks for keys that cannot be combined."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ BUNDLED: Final = "sionna:"
 """Prefix of the name of a scene bundled with Sionna RT."""
 
 OFFSET: Final = "offset"
-"""Name of the nuisance term of which ``[offset]`` is the short form."""
+"""Name of the nuisance term that ``[offset]`` abbreviates."""
 
 
 def _first_stated(keys: Mapping[str, bool]) -> str | None:
@@ -40,7 +40,7 @@ def _first_stated(keys: Mapping[str, bool]) -> str | None:
 
 
 class StudyContent(Section, ABC):
-    """The sections of a study file, with the checks of keys that cannot be combined."""
+    """The sections of a study file, with checks for keys that cannot be combined."""
 
     version: int
     scene: SceneSection
@@ -108,8 +108,8 @@ class StudyContent(Section, ABC):
             self.links.mountings or self.links.position_error_m is not None
         ):
             raise InputError(
-                "engine.rays contains paths of one position and one antenna: leave links.tx_antenna, rx_antenna and "
-                "position_error_m out"
+                "engine.rays contains paths for one position and one antenna at each end: remove links.tx_antenna, "
+                "rx_antenna and position_error_m"
             )
         if self.links.mountings and self.engine.name != "replay":
             end = next(iter(self.links.mountings))
@@ -136,18 +136,18 @@ class StudyContent(Section, ABC):
             )
         if self.engine.exports_rays and key is not None:
             raise InputError(
-                "engine.rays = true: powers of rays are compared at one carrier and add up, so it does not go with "
+                "engine.rays = true: powers of rays are added and compared at one carrier; it cannot be combined with "
                 f"{key}; remove one of them"
             )
 
     def _laws(self) -> dict[str, bool]:
-        """Whether parameters are coefficients of laws over frequency."""
+        """Whether parameters are coefficients of frequency laws."""
         return {
             "coefficients of laws": any(split_name(name)[1].startswith("itu_") for name in self.parameters)
         }
 
     def _without_replay(self) -> dict[str, bool]:
-        """Whether keys are stated that do not go with replay of sums of powers at one carrier."""
+        """Keys that are incompatible with replay of sums of powers at one carrier, and whether each is stated."""
         return {
             "links.frequency": self.links.frequency is not None,
             f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",
@@ -160,8 +160,8 @@ class StudyContent(Section, ABC):
             return
         if getattr(self.engine, "compress_db", None) is not None:
             raise InputError(
-                "engine.compress_db: few weighted paths keep path loss, not the delays and angles of [observables]; "
-                "remove one of them"
+                "engine.compress_db: few weighted paths keep path loss, but not the delays and angles of "
+                "[observables]; remove one of them"
             )
         if self.engine.name == "retrace":
             raise InputError("[observables] with engine.name = 'retrace': use 'replay' or 'command'")
@@ -203,7 +203,7 @@ class StudyContent(Section, ABC):
                 )
             if used and getattr(self.engine, "compress_db", None) is not None:
                 raise InputError(
-                    f"engine.compress_db: few weighted paths do not go with {key}; remove one of them"
+                    f"engine.compress_db: few weighted paths cannot be combined with {key}; remove one of them"
                 )
 
     def _check_position_errors(self) -> None:
@@ -214,8 +214,8 @@ class StudyContent(Section, ABC):
         key = _first_stated(stated | self._without_replay())
         if key is not None:
             raise InputError(
-                f"links.position_error_m: powers at displaced receivers are averaged on replay, at one carrier; it "
-                f"does not go with {key}"
+                f"links.position_error_m: powers at displaced receivers are averaged in replay, at one carrier; it "
+                f"cannot be combined with {key}"
             )
         if links.std is None and self.noise.std_db is None:
             raise InputError(
@@ -239,15 +239,15 @@ class StudyContent(Section, ABC):
         key = _first_stated(self._without_replay() | stated)
         if names and key is not None:
             raise InputError(
-                f"parameters: {names[0]!r}: path loss between traced positions is interpolated on replay, at one "
-                f"carrier; it does not go with {key}"
+                f"parameters: {names[0]!r}: path loss between traced positions is interpolated in replay, at "
+                f"one carrier; it cannot be combined with {key}"
             )
         own = [
             name for name in names if name.startswith(RECEIVER) and not name.startswith(f"{RECEIVER}{EVERY}.")
         ]
         if own and links.device is None:
             raise InputError(
-                f"parameters: {own[0]!r} needs links.device, the column of the devices' names; or displace all, as "
+                f"parameters: {own[0]!r} needs links.device, the column of device names; or displace all devices, as "
                 f"'{RECEIVER}{EVERY}.dx'"
             )
 
@@ -261,7 +261,7 @@ class StudyContent(Section, ABC):
                     raise InputError(f"{dotted(('materials', name))}: {error}") from None
 
     def _check_parameters(self) -> None:
-        """Check everything that does not need the scene; `parameter_set` checks the rest."""
+        """Check the parameters as far as possible without the scene; `parameter_set` checks the rest."""
         frequency, parameters = self.scene.frequency, []
         for name, entry in self.parameters.items():
             start = itu_start(name, entry.start, frequency) if isinstance(entry.start, str) else entry.start
@@ -269,7 +269,7 @@ class StudyContent(Section, ABC):
             parameters.append(Parameter(name, lower, upper, lower if start is None else start, entry.scale))
             if entry.spread is not None and not name.startswith(f"{POSE}{EVERY}."):
                 raise InputError(
-                    f"{name}: spread is that of a population of transmitters; give it to '{POSE}{EVERY}.azimuth' or "
+                    f"{name}: spread describes a population of transmitters; give it to '{POSE}{EVERY}.azimuth' or "
                     f"another field, or remove it"
                 )
             if entry.prior is not None and entry.prior.std is not None:
@@ -286,11 +286,11 @@ class StudyContent(Section, ABC):
         other, others = self.parameters.get(like), [known for known in self.parameters if known != name]
         if other is None or like == name:
             raise InputError(
-                f"{name}: prior.like = {like!r}: no other parameter; {did_you_mean(like, others)}"
+                f"{name}: prior.like = {like!r}: is not another parameter; {did_you_mean(like, others)}"
             )
         if split_name(like)[1] != split_name(name)[1]:
             raise InputError(f"{name}: prior.like = {like!r}: must be of the same constant")
         if other.prior is not None and other.prior.like is not None:
-            raise InputError(f"{name}: prior.like = {like!r}: is itself like another; name that one")
+            raise InputError(f"{name}: prior.like = {like!r}: has its own prior.like; name that one")
         if not other.bounds[0] > 0:
             raise InputError(f"{name}: prior.like = {like!r}: its lower bound must be greater than 0")

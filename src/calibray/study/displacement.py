@@ -1,7 +1,7 @@
-"""Positions that are parameters, heights of transmitters and shifts of devices, and errors of receivers' positions.
+"""Positions as parameters (heights of transmitters, displacements of devices), and errors of receiver positions.
 
-Path loss is traced at the stated positions and at displaced ones. Between them its change [dB] is a monotone cubic of
-the displacement, for every link and axis.
+Path loss is traced at the stated positions and at displaced positions. Between them, its change [dB] is a monotone
+cubic function of the displacement, for every link and axis.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ if TYPE_CHECKING:
 
 
 RECEIVER: Final = "rx:"
-"""Beginning of the names of the parameters of receivers."""
+"""Prefix of the names of receivers' parameters."""
 
 AXES: Final = {"dx": 0, "dy": 1, "height": 2}
 """Axis of the scene along which each field displaces an antenna."""
 
 LEAST: Final = 0.01
-"""Least distance of the last neighbour [m], which keeps knots apart at the bounds."""
+"""Smallest distance of the outermost neighbour [m], which keeps knots apart at the bounds."""
 
 ACROSS: Final = (0.25, 0.5, 0.75, 1.0)
-"""Traced displacements on each side before the calibration, as shares of the largest one. Of panels of eight rows, path
-loss between heights 2 m apart is then wrong by 0.1 dB in the median and 2 dB RMS; by a parabola through both bounds of
-8 m, 5 dB RMS."""
+"""Displacements on each side that are traced before the calibration, as shares of the largest displacement. With panels
+of eight rows and traced heights 2 m apart, the interpolated path loss has an error of 0.1 dB (median) and 2 dB (RMS); a
+parabola through both bounds of 8 m has 5 dB RMS."""
 
 
 def displaces(name: str) -> bool:
@@ -52,13 +52,13 @@ def displaces(name: str) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Displacement:
-    """What parameters displace links along one axis.
+    """The displacement of links along one axis, as a function of parameters.
 
     Attributes:
         field: "height" of the transmitters, or "dx" or "dy" of the receivers.
         weights: 1 where a parameter displaces a group of links [G, parameters].
         group: Group of every link [L].
-        reach: Largest displacement of every group by one of its parameters [G], [m]; sums count up to it.
+        reach: Largest displacement of every group by one of its parameters [G], [m]; it also limits sums.
         ground: The ground that receivers follow; None if their heights are not measured from it.
     """
 
@@ -69,7 +69,7 @@ class Displacement:
     ground: Ground | None = None
 
     def moved(self, links: Measurements, displacement: NDArray[np.float64]) -> Measurements:
-        """The links with displaced ends [L], [m]."""
+        """The links with ends displaced by `displacement` [L], [m]."""
         end = "tx" if self.field == "height" else "rx"
         stated = getattr(links, end)
         position = np.array(stated)
@@ -79,16 +79,16 @@ class Displacement:
         return replace(links, **{end: position})
 
     def knots(self, values: NDArray[np.float64], neighbours: Sequence[float]) -> NDArray[np.float64]:
-        """Displacements of the links from those by values of the parameters [d], ascending [2n + 1, L], [m].
+        """Displacements of the links at which they are traced, ascending [2n + 1, L], [m].
 
         Args:
-            values: Values of the parameters, where the displacement is 0.
-            neighbours: Displacements on each side, as shares of the largest one. Where this leads out of the bounds,
-                they are equidistant up to the bounds.
+            values: Values of the parameters [d] at which the displacement is 0.
+            neighbours: Displacements on each side, as shares of the largest displacement. Where these exceed the
+                bounds, displacements are equidistant up to the bounds.
         """
         shares = np.array(neighbours)
         equidistant = np.arange(1, len(shares) + 1) / max(len(shares), 1)
-        # Links are displaced by sums of parameters; the room to the bounds is what the present values leave.
+        # Links are displaced by sums of parameters; `room` is the distance from the present sum to the bounds.
         present, knots = self.weights @ values, [np.zeros((1, len(self.reach)))]
         for side in (1, -1):
             room = np.maximum(self.reach - side * present, LEAST)
@@ -99,7 +99,7 @@ class Displacement:
 
 
 def follow(ground: Ground | None, before: NDArray[np.float64], after: NDArray[np.float64]) -> None:
-    """Keep the height above the ground of displaced positions [n, 3], [m]; where there is no ground, keep z."""
+    """Keep the height of displaced positions [n, 3], [m], above the ground; where there is no ground, keep z."""
     if ground is None:
         return
     with np.errstate(invalid="ignore"):  # inf - inf where there is no ground
@@ -113,10 +113,10 @@ def displacements(
     columns: Mapping[str, str | None],
     ground: Ground | None = None,
 ) -> tuple[Displacement, ...]:
-    """The displacements of links, one for each axis that parameters displace them along.
+    """The displacements of links, one for each axis along which parameters displace them.
 
-    Receivers of links without measured values are exact, and not displaced. `columns` name the transmitters ("tx:")
-    and the devices ("rx:").
+    Receivers of links without measured values have exact positions and are not displaced. `columns` has the columns of
+    the names of transmitters ("tx:") and devices ("rx:").
 
     Raises:
         InputError: A column is missing.
@@ -146,10 +146,10 @@ def displacements(
 def check_labels(
     source: str, names: Mapping[str, object], links: Measurements, kind: str, column: str | None
 ) -> None:
-    """Refuse parameters of transmitters ("tx:") or devices ("rx:") that no link has.
+    """Raise an error for parameters of transmitters ("tx:") or devices ("rx:") that no link has.
 
     Raises:
-        InputError: One is unknown, or the column of their names is missing.
+        InputError: A transmitter or device is unknown, or the column of their names is missing.
     """
     stated = {name.removeprefix(kind).rpartition(".")[0]: name for name in names if name.startswith(kind)}
     for label in (EVERY, NEW):
@@ -181,10 +181,10 @@ def displacement_loss(
         placed: The study's parameters, and their values at which the paths are traced [d].
         neighbours: Distances of the n neighbours on each side, as shares of the largest displacement, ascending.
         links: The L links at these values.
-        here: Their paths, and other effects on them.
-        traced: Gives the same of displaced links, which may be fewer or more than these.
+        here: Their paths, and other effects on the paths.
+        traced: Gives paths and effects for displaced links, whose number may differ from L.
     """
-    # JAX is slow to import, and every study file that is read imports this module.
+    # JAX is slow to import, and this module is imported whenever a study file is read.
     from calibray.engines.replay import Computation, Replay
     from calibray.fields import DisplacementLoss
 
@@ -202,7 +202,7 @@ def displacement_loss(
     if moved.any():
         axis, _, link = np.nonzero(moved)
         there, offset = at_index(links, link), knots[moved]
-        # Each copy of a link is displaced along one axis.
+        # Each copy of a link is displaced along a single axis.
         for number, each in enumerate(displacements):
             there = each.moved(there, np.where(axis == number, offset, 0.0))
         with np.errstate(invalid="ignore"):  # inf - inf where no path reaches
@@ -218,7 +218,7 @@ def displacement_loss(
 
 
 def at_index(links: Measurements, index: NDArray[np.int64]) -> Measurements:
-    """Links by their numbers, each as often as it is named."""
+    """Select links by index; indices may be repeated."""
     table = links.table
     return Measurements(
         tx=links.tx[index],
@@ -229,7 +229,7 @@ def at_index(links: Measurements, index: NDArray[np.int64]) -> Measurements:
 
 
 def reached(change_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Changes of path loss [K, 2n + 1, L], [dB]; where no path reaches, that of the next position inwards."""
+    """Changes of path loss [K, 2n + 1, L], [dB]; where there is no path, the change at the next position inwards."""
     change_db, middle = change_db.copy(), change_db.shape[1] // 2
     for step in range(1, middle + 1):
         for side in (1, -1):
@@ -241,10 +241,10 @@ def reached(change_db: NDArray[np.float64]) -> NDArray[np.float64]:
 def cubics(knots: NDArray[np.float64], change_db: NDArray[np.float64]) -> NDArray[np.float64]:
     """Coefficients [4, N - 1, L] of monotone cubics through changes of path loss [N, L] at knots [N, L], [m].
 
-    They do not overshoot where paths appear or vanish between two positions (Fritsch and Carlson 1980).
+    The cubics do not overshoot where paths appear or vanish between two positions (Fritsch and Carlson 1980).
     """
     coefficients = np.empty((4, len(knots) - 1, knots.shape[1]))
-    # SciPy wants the same knots for all columns; links of a group have the same ones.
+    # SciPy needs the same knots for all columns; the links of a group have the same knots.
     distinct, group = np.unique(knots, axis=1, return_inverse=True)
     for number, column in enumerate(distinct.T):
         links = group.reshape(-1) == number
@@ -253,14 +253,14 @@ def cubics(knots: NDArray[np.float64], change_db: NDArray[np.float64]) -> NDArra
 
 
 DIRECTIONS: Final = np.sqrt(2.0) * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-"""Displacements in units of the error: means over them equal those of a Gaussian error up to cubic terms (Stroud, the
-spherical rule of degree three in the plane)."""
+"""Displacements in units of the error's standard deviation: means over them equal means over a Gaussian error up to
+cubic terms (Stroud's spherical rule of degree three in the plane)."""
 
 
 def displaced(
     links: Measurements, error_m: NDArray[np.float64], ground: Ground | None = None
 ) -> Measurements:
-    """Links to displaced receivers, all those in one direction after the other; errors are standard deviations [L].
+    """Links to displaced receivers, one direction after another; `error_m` has standard deviations [L], [m].
 
     If there is a `ground`, receivers keep their height above it.
     """
@@ -273,35 +273,35 @@ def displaced(
 
 
 def averaged(paths: Paths, links: Measurements) -> Paths:
-    """Paths to displaced receivers as paths of their links, whose power sum is the mean over the displaced receivers.
+    """Assign paths to displaced receivers to the original links, with power sums equal to the mean over the receivers.
 
-    Displaced receivers that no path reaches do not count.
+    Displaced receivers without a path are left out of the mean.
     """
     count, directions = len(links), len(DIRECTIONS)
     reached = np.bincount(paths.link, minlength=paths.num_links).reshape(directions, count) > 0
     parts = []
     for direction in range(directions):
         part = take_links(paths, np.arange(count) + direction * count)
-        # Amplitudes, so that powers are divided by the number of displaced receivers.
+        # The square root, because `spreading` is an amplitude and powers are divided by the number of receivers.
         spreading = part.spreading / np.sqrt(reached.sum(axis=0)[part.link])
         parts.append(replace(part, spreading=spreading, tx_position=links.tx, rx_position=links.rx))
     return concatenate(parts)
 
 
 def mounted_at_displaced(mountings: Mapping[str, Mounting], count: int) -> dict[str, Mounting]:
-    """The antennas of displaced links, from those of the links."""
+    """The antennas of displaced links, from the antennas of the original links."""
     link = np.tile(np.arange(count), len(DIRECTIONS))
     return {end: mounting.of_paths(link) for end, mounting in mountings.items()}
 
 
 def spread_db(path_loss_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard deviation of the path loss of displaced links between the displacements of each link [L], [dB].
+    """Standard deviation of path loss over the displacements of each link [L], [dB].
 
-    It is 0 if a path reaches only one of them.
+    It is 0 if only one displaced receiver has a path.
     """
     loss = path_loss_db.reshape(len(DIRECTIONS), -1)
     reached = np.isfinite(loss)
     number = np.maximum(reached.sum(axis=0), 1)
     mean = np.where(reached, loss, 0.0).sum(axis=0) / number
-    # The directions are the whole distribution of the error, not a sample of it: no n - 1.
+    # The directions represent the whole distribution of the error, not a sample, so the divisor is n, not n - 1.
     return np.sqrt((np.where(reached, loss - mean, 0.0) ** 2).sum(axis=0) / number)

@@ -1,6 +1,6 @@
-"""Draft of a study from a scene and a table of links: TOML, with every assumption and its reason as a comment.
+"""Drafts a study from a scene and a table of links: TOML with the reason of every assumption as a comment.
 
-Names of columns, groups and files come from foreign tables; `study_text` quotes them, so that none becomes TOML.
+Names of columns, groups and files come from foreign tables; `study_text` quotes them, so that no name becomes TOML.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ from calibray.support.output_files import exists
 from calibray.tracing.gain_table import TWO_CUT_SUFFIXES, read_gain_table
 
 AVERAGING_WAVELENGTHS: Final = 40
-"""Width of the cells over which fading is averaged (Lee 1985; see `calibray.measurements.reading`)."""
+"""Width of the cells over which fading is averaged [wavelengths] (Lee 1985; see `calibray.measurements.reading`)."""
 
 PLACE_SAMPLES: Final = 20
 """Median number of samples at one position above which samples are averaged by position: a stationary scan. The
 logarithm of the mean of 20 samples of Rayleigh fading is biased by 0.1 dB."""
 
 CLIPPED_SHARE: Final = 0.03
-"""Smallest share of the values that equal the lowest one if the receiver clips them."""
+"""Smallest share of values equal to the lowest value that indicates a receiver that clips them."""
 
 CLIPPED_RATIO: Final = 10
-"""Smallest ratio of their number to the median number of values that equal another one."""
+"""Smallest ratio of the number of values equal to the lowest to the median count of any other value."""
 
 MISSING_SHARE: Final = 0.1
-"""Share of a device's powers that are missing above which its lowest power is taken for its noise floor."""
+"""Share of missing powers of a device above which its lowest power is taken as its noise floor."""
 
 FEWEST_OF_DEVICE: Final = 20
-"""Smallest number of its powers: the lowest of 20 is in the lowest tenth of the received ones in 88 % of the cases."""
+"""Smallest number of powers of such a device: in 88 % of cases, the lowest of 20 is in the lowest tenth."""
 
 
 def draft_links(scene: str, links: Path, target: Path, given: Given) -> LinksDraft:
@@ -91,14 +91,14 @@ def _value(draft: LinksDraft) -> ValueColumn:
 
 
 def _powers(draft: LinksDraft, value: ValueColumn) -> dict[str, str]:
-    """Column of EIRP or transmitted power by the key of ``[links]``; empty if there is none.
+    """Column of EIRP or transmitted power by its key in ``[links]``; empty if there is none.
 
-    Tables of transmitters state the power of the whole carrier, but a reference signal is only a part of it.
+    Tables of transmitters state the power of the whole carrier, of which a reference signal is only a part.
     """
     power = column_names.find_transmit_power(draft.table.frame)
     if power is not None:
         return {"eirp_dbm" if column_names.matches(power, "EIRP") else "tx_power_dbm": power}
-    # A reference signal has the power of one subcarrier; tables of transmitters state that of the whole carrier.
+    # A reference signal has the power of one subcarrier; tables of transmitters state the power of the whole carrier.
     if draft.sites is None or column_names.matches(value.column, "reference signal"):
         return {}
     return find_powers(draft.transmitter_rows)
@@ -127,7 +127,7 @@ def _offset_groups(draft: LinksDraft, value: ValueColumn) -> list[str]:
 
 
 def _carriers_of_transmitters(draft: LinksDraft) -> list[str]:
-    """The column of carriers, if transmitters do not have one carrier each."""
+    """The column of carriers, if a transmitter has several carriers."""
     frame, name, carrier = draft.table.frame, draft.section.get("transmitter"), draft.section.get("frequency")
     if (
         carrier is None
@@ -154,7 +154,7 @@ def _add_noise_floor(draft: LinksDraft, value: ValueColumn) -> None:
         floor, reason = float(column.min()), f"{share:.0%} of the values equal the lowest one"
     elif some_missing:
         floor, reason = float(np.floor(column.min())), f"{missing}, and none is lower"
-    # A floor below that of the least sensitive device would count what it does not receive as weaker than it is.
+    # With a floor below that of the least sensitive device, powers that this device misses would count as too weak.
     for name in transmitter_columns.find_devices(draft.table.frame):
         for device, values in column.groupby(draft.table.frame[name]):
             if values.notna().sum() < FEWEST_OF_DEVICE:
@@ -173,7 +173,7 @@ def _add_noise_floor(draft: LinksDraft, value: ValueColumn) -> None:
 
 
 def _leave_out_saturated(draft: LinksDraft, value: ValueColumn, column: pd.Series) -> None:
-    """Leave out rows with the largest power that a receiver can state, if it states it for all stronger powers."""
+    """Leave out rows at the largest power that a saturated receiver reports for all stronger powers."""
     share = _share_at_lowest(-column)
     if share > 0:
         name, highest = value.column, float(column.max())
@@ -183,7 +183,7 @@ def _leave_out_saturated(draft: LinksDraft, value: ValueColumn, column: pd.Serie
 
 
 def _share_at_lowest(values: pd.Series) -> float:
-    """Share of the values that equal the lowest one if a receiver states it for all weaker powers; otherwise 0."""
+    """Share of the values that equal the lowest one, if a receiver reports it for all weaker powers; otherwise 0."""
     counts = values.value_counts().sort_index()
     share = counts.iloc[0] / counts.sum()
     if share >= CLIPPED_SHARE and counts.iloc[0] >= CLIPPED_RATIO * counts.iloc[1:].median():
@@ -192,7 +192,7 @@ def _share_at_lowest(values: pd.Series) -> float:
 
 
 def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
-    """Average along tracks, and if most positions or some values repeat; by position if scans are stationary."""
+    """Average samples along tracks and where positions repeat; by position if scans are stationary."""
     frame, name = draft.table.frame, draft.section.get("transmitter")
     heights = [] if rx.height is None else [rx.height]
     keys = [rx.x, rx.y, *heights, *draft.groups, *([name] if name and name not in draft.groups else [])]
@@ -203,7 +203,7 @@ def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
         return
     rows = f"{len(frame)} rows " + ("along a track" if draft.given.track else f"at {positions} positions")
     samples = int(frame.groupby(keys, dropna=False).size().median())
-    # Cells are areas in plan, and would average the heights of a profile or of several storeys.
+    # Cells are areas in plan, and would average over the heights of a profile or of several storeys.
     stacked = any(frame.groupby([rx.x, rx.y])[height].nunique().median() > 1 for height in heights)
     if draft.given.track is None and (samples >= PLACE_SAMPLES or stacked):
         few = samples < PLACE_SAMPLES
@@ -222,7 +222,7 @@ def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
 
 def _add_flight_times(draft: LinksDraft) -> None:
     flight_time = column_names.find_flight_time(draft.table.frame)
-    # A wide table has powers of several transmitters in a row, but one time.
+    # A row of a wide table has the powers of several transmitters, but only one flight time.
     if flight_time is None or "wide" in draft.section:
         return
     column, kind, unit = flight_time
@@ -260,7 +260,7 @@ class Draft:
 def draft(scene: str, links: str | Path, target: str | Path, given: Given | None = None) -> Draft:
     """Draft a study of a scene, its XML file or `sionna:NAME`, and a table of links; nothing is written.
 
-    Other files are named relative to the folder of `target`, the future study file. `given` is what else is known.
+    Files are named relative to the folder of `target`, the future study file. `given` states what else is known.
 
     Raises:
         InputError: A file cannot be read, or a value is neither given nor in the files.
@@ -285,7 +285,7 @@ def _content(links: LinksDraft) -> dict[str, Any]:
         links.assume("links.inside", "move", reason)
     antenna_section = add_antennas(links)
     trace: dict[str, Any] = {"max_depth": _depth(links) if indoors else 3, "samples": "auto"}
-    # Behind buildings most links have no other path.
+    # Behind buildings, most links have only diffracted paths.
     trace["refraction" if indoors else "diffraction"] = True
     scene, constants = _scene(links)
     regions, attenuation = _trees(links)
@@ -305,7 +305,7 @@ def _content(links: LinksDraft) -> dict[str, Any]:
 
 
 def _hold_out_blocks(links: LinksDraft, content: dict[str, Any]) -> None:
-    """Hold blocks of neighbours out in turn, if there are enough links and places to fit to three of four blocks."""
+    """Hold out blocks of neighbouring links in turn, if three of four blocks have enough links and places for a fit."""
     study = Study.from_content(content, links.target)
     measured = study.measurements()
     places = len(np.unique(measured.rx[:, :2], axis=0))
@@ -326,7 +326,7 @@ def _indoors(links: LinksDraft) -> bool:
 
 
 def _depth(links: LinksDraft) -> int:
-    """Interactions for the walls on the straight line of nearly all links, plus two reflections."""
+    """Number of interactions: the walls on the straight lines of nearly all links, plus two reflections."""
     measured = links.measurements()
     walls = int(np.quantile(count_crossings(links.overhead.walls, measured.tx, measured.rx), 0.95))
     lowest, highest = INDOOR_DEPTHS
@@ -337,14 +337,14 @@ def _depth(links: LinksDraft) -> int:
 
 
 def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
-    """The scene, and the constants of materials for which ITU-R P.2040 has no law at the carrier.
+    """The scene, and constants for materials for which ITU-R P.2040 has no law at the carrier.
 
-    These are the constants of the law at the nearest frequency that it covers.
+    The constants are those of the law at the nearest frequency that it covers.
     """
     try:
         return read_scene(links.scene, links.frequency), {}
     except InputError:
-        # Every material of Table 3 that scenes have is covered from 1 to 10 GHz.
+        # Table 3 covers every material that occurs in scenes from 1 to 10 GHz.
         covered = read_scene(links.scene, float(np.clip(links.frequency, 1e9, 10e9)))
     constants = {}
     for name, law in covered.laws.items():
@@ -361,7 +361,7 @@ def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
 def _trees(links: LinksDraft) -> tuple[dict[str, Any], dict[str, Any]]:
     """The region of the trees next to the scene, and its parameter if they are on the straight line of a link."""
     file = Path(links.scene).parent / TREES_FILE
-    # A file of this name next to another scene need not have the columns of `calibray scene`.
+    # Next to other scenes, a file of this name need not have the columns that `calibray scene` writes.
     if links.scene.startswith(BUNDLED) or read_frame(links.scene) is None or not exists(file):
         return {}, {}
     specific = round(dense_trees(links.frequency), 2)
@@ -377,14 +377,14 @@ def _trees(links: LinksDraft) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dict[str, Any]]:
-    """The entries of ``[parameters]``: permittivities, and indoors also conductivities, which attenuate walls."""
+    """The entries of ``[parameters]``: permittivities, and indoors also conductivities, which determine wall losses."""
     materials = {
         name: material
         for name, material in scene.materials.items()
-        # Neither metal, which reflects nearly everything, nor air.
+        # Leave out metal, which reflects nearly everything, and air.
         if material.conductivity < 1e6 and material.relative_permittivity > 1.5
     }
-    # Links seldom identify more materials.
+    # Links can seldom identify more than six materials.
     names = list(materials)[:6]
     if not names:
         raise InputError(f"{links.scene}: no material to calibrate; all are metal or air")
@@ -407,7 +407,7 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
     """Add the columns of transmit antennas to ``[links]``, and return the section ``[antennas]``.
 
     Raises:
-        InputError: The folder of antennas has no such file, or none for some antenna.
+        InputError: The folder of antennas cannot be used, or has no file for an antenna.
     """
     folder = links.given.antennas
     frame, of_transmitters = links.transmitter_rows, links.given.transmitters is not None
@@ -429,7 +429,7 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
             continue
         mount[key] = column
         low, high = frame[column].min(), frame[column].max()
-        links.assume(f"links.tx_antenna.{key}", column, f"a column named so, {low:g} to {high:g} degrees")
+        links.assume(f"links.tx_antenna.{key}", column, f"by its name, {low:g} to {high:g} degrees")
     if folder is None and "azimuth_deg" in mount:
         antennas["tx"]["pattern"] = "tr38901"
     if mount:
@@ -438,7 +438,7 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
         name for name in links.table.frame if matches(name, "receiver") and matches(name, "azimuth")
     ):
         reason = (
-            f"column {column} may be that of a phone; state it, and the pattern, of a directional antenna"
+            f"column {column} may describe a phone; state it and the pattern if the antenna is directional"
         )
         links.assume("links.rx_antenna.azimuth_deg", "none", reason)
     name = transmitter_columns.find_antenna_names(frame) if of_transmitters else None
@@ -457,7 +457,7 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
 
 
 def _patterns(links: LinksDraft, folder: Path, mount: dict[str, str]) -> dict[str, Any]:
-    """Antennas by the names of a column, with the files of these names; a single file is used for all transmitters."""
+    """Antennas by their names in a column, with the files of these names; a single file is for all transmitters."""
     try:
         files = sorted(file for file in folder.iterdir() if file.suffix.lower() in TWO_CUT_SUFFIXES)
     except OSError as error:
@@ -486,13 +486,13 @@ def _patterns(links: LinksDraft, folder: Path, mount: dict[str, str]) -> dict[st
 
 
 def _antenna(links: LinksDraft, file: Path) -> dict[str, str]:
-    """An antenna with a pattern that can be read."""
+    """An antenna with the pattern of a file, which must be readable."""
     read_gain_table(file)
     return {"pattern": links.relative(file), "polarization": "V"}
 
 
 def schema_text() -> str:
-    """The schema as JSON text with a line break at its end."""
+    """The schema as JSON text that ends with a line break."""
     return json.dumps(schema(), indent=2, ensure_ascii=False) + "\n"
 
 
@@ -506,7 +506,7 @@ def schema() -> dict[str, Any]:
 
 
 def _shorten(node: Any) -> None:
-    """Keep the first line of descriptions; the rest describes the attributes of Python classes."""
+    """Keep only the first line of each description; the rest describes the attributes of Python classes."""
     if isinstance(node, dict):
         if isinstance(node.get("description"), str):
             node["description"] = node["description"].split("\n\n")[0].replace("\n", " ").replace("``", "")

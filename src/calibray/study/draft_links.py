@@ -1,4 +1,4 @@
-"""Draft of a study's ``[links]``: its track, transmitters, carrier and positions, with a reason for each assumption."""
+"""Drafts a study's ``[links]``: its track, transmitters, carrier and positions, with a reason for each assumption."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ RECEIVER_HEIGHT: Final = 1.5
 """Height of a receiver without a column of heights [m]: a phone in the hand."""
 
 ALTITUDES: Final = frozenset({"alt", "altitude", "altitud", "amsl", "asl", "msl", "nhn"})
-"""Words of columns of altitudes, which satellite receivers measure from sea level and drones also from the ground."""
+"""Words in names of altitude columns. Satellite receivers measure altitudes from sea level, drones also from ground."""
 
 TRANSMITTER_HEIGHT: Final = 10.0
 """Height of a transmitter without a column of heights [m]: a small cell on a mast."""
 
 SAME_CARRIER: Final = 0.01
-"""Largest relative difference of carriers that count as one: free-space loss changes by 0.09 dB."""
+"""Largest relative difference between carriers that count as one: free-space loss changes by 0.09 dB."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Assumption:
     """One assumption of a draft.
 
     Attributes:
-        what: Key of the study that it concerns.
+        what: Key of the study to which it applies.
         value: The assumed value.
         reason: The reason.
     """
@@ -64,7 +64,7 @@ class Assumption:
 
 @dataclass(frozen=True)
 class Given:
-    """What a user states besides the scene and the table of links.
+    """What a user states in addition to the scene and the table of links.
 
     Attributes:
         transmitters: Table of the transmitters' positions, unless the links have them.
@@ -85,7 +85,7 @@ class Given:
 
 @dataclass
 class LinksDraft:
-    """The draft of ``[links]``. Each method adds the keys of its subject and records its assumptions.
+    """The draft of ``[links]``. Each method adds the keys of one topic and records its assumptions.
 
     Attributes:
         scene: Mitsuba XML file, or `sionna:NAME`.
@@ -99,7 +99,7 @@ class LinksDraft:
         sites: The transmitters of the links; None without their table.
         rx: Columns of the receivers' positions.
         tx: Columns of the transmitters' positions; None without columns.
-        groups: The columns that group the offset.
+        groups: The columns whose labels group the offset.
         observables: The sections of ``[observables]``.
     """
 
@@ -125,7 +125,7 @@ class LinksDraft:
 
     @cached_property
     def overhead(self) -> SceneSurfaces:
-        """The ground below and the roofs above positions in the scene."""
+        """Surfaces of the scene: the ground below and the roofs above positions."""
         return SceneSurfaces.read(self.scene)
 
     @cached_property
@@ -141,7 +141,7 @@ class LinksDraft:
 
     @property
     def transmitter_rows(self) -> pd.DataFrame:
-        """The table of transmitters, its columns named as in the links; the links if there is none."""
+        """The table of transmitters, with columns named as in the links; the links if there is no such table."""
         if self.sites is None:
             return self.table.frame
         return self.sites.frame.rename(columns=self._name_in_links)
@@ -151,19 +151,19 @@ class LinksDraft:
         self.assumptions.append(Assumption(what, str(value), reason))
 
     def measurements(self) -> Measurements:
-        """The links by the keys drafted so far."""
+        """The links, read with the keys drafted so far."""
         content = {
             "version": VERSION,
             "scene": self.scene_section | {"frequency": 1e9},
             "links": self.section,
-            # Neither the carrier nor the parameters change positions, but a study has both.
+            # Neither the carrier nor the parameters affect positions, but a study needs both.
             "parameters": {"any.relative_permittivity": {"bounds": [1.5, 12.0]}},
             "offset": {},
         }
         return Study.from_content(content, self.target).measurements()
 
     def relative(self, file: Path) -> str:
-        """A file, relative to the study file's folder."""
+        """The name of a file relative to the study file's folder."""
         return Path(os.path.relpath(file, self.target.absolute().parent)).as_posix()
 
     def _columns(self) -> str:
@@ -176,7 +176,7 @@ class LinksDraft:
         name = column_names.find_time(self.table.frame)
         if name is None:
             raise InputError(
-                f"{self.links}: no column of times, which {self.given.track} needs ({self._columns()}); name it time"
+                f"{self.links}: no column of times, which {self.given.track} needs ({self._columns()}); name one 'time'"
             )
         self.section["track"] = {"file": self.relative(self.given.track), "time": name}
         rows = len(self.table)
@@ -187,7 +187,7 @@ class LinksDraft:
         self.assume("links.track", f"{self.given.track.name} by {name}", reason)
 
     def _add_transmitters(self) -> None:
-        """Transmitters from their table, by a common column or by one column of values per transmitter."""
+        """Match transmitters with their table, by a common column or by one column of values per transmitter."""
         if self.sites is None or self.given.transmitters is None:
             return
         self.section["transmitters"] = self.relative(self.given.transmitters)
@@ -226,7 +226,7 @@ class LinksDraft:
         self.table = select_rows(self.table, steps, transmitter_columns.name_melted_values(columns))
 
     def _keep_used_transmitters(self, key: str, names: Iterable[object]) -> None:
-        """Keep the transmitters of the links: a network's table has others, with other carriers and antennas."""
+        """Keep only the transmitters of the links: a network's table also has others, with different antennas."""
         if self.sites is not None:
             compared = comparison(self.sites.frame[key])
             self.sites = self.sites.select(np.isin(compared(self.sites.frame[key]), compared(names)))
@@ -238,7 +238,7 @@ class LinksDraft:
         if not lacking.any():
             return
         names = column[lacking].dropna().unique().tolist()
-        # The known ones: rows without a name are left out too.
+        # The filter lists the known names, so rows without a name are left out too.
         self.add_filter(f"`{key}` in {column[~lacking].unique().tolist()}")
         named = ", ".join(map(str, names[:10])) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
         source = (
@@ -251,7 +251,7 @@ class LinksDraft:
     def add_filter(self, condition: str) -> None:
         """Add a condition to the row filter."""
         where = self.section.get("where")
-        # In parentheses, because the first condition may contain `or`.
+        # Parentheses, because the first condition may contain `or`.
         self.section["where"] = condition if where is None else f"({where}) and {condition}"
 
     def assume_codes(self, codes: Sequence[float], columns: str) -> None:
@@ -262,7 +262,7 @@ class LinksDraft:
             self.assume("links.missing", listed, f"far from all other values of {columns}: not measured")
 
     def _frequency(self) -> float:
-        """The study's carrier: the given one, or that of a column of the links or of the transmitters."""
+        """The study's carrier: the given one, or one stated in a column of the links or the transmitters."""
         given, stated = self.given.frequency, self._stated_frequency()
         if given is not None:
             differs = stated is not None and abs(stated[0] - given) >= SAME_CARRIER * given
@@ -277,7 +277,7 @@ class LinksDraft:
         return stated[0]
 
     def _stated_frequency(self) -> tuple[float, str] | None:
-        """A carrier that a table states [Hz] and what it is; several carriers become ``links.frequency``."""
+        """A carrier stated in a table [Hz] and a description of it; several carriers become ``links.frequency``."""
         rows, file = self.table.frame, self.links
         if column_names.find_frequency(rows) is None and self.given.transmitters is not None:
             rows, file = self.transmitter_rows, self.given.transmitters
@@ -289,11 +289,11 @@ class LinksDraft:
         if carriers[-1] - carriers[0] < SAME_CARRIER * carriers[0]:
             return float(np.nanmedian(values)), f"median of column {name}"
         read = rows[name].to_numpy(dtype=float) * column_names.find_frequency_unit(name)
-        # `links.frequency` is in the unit of the column's name; a guessed unit cannot be stated.
+        # The unit of `links.frequency` is stated by the column's name; a guessed unit cannot be stated.
         if np.array_equal(read, values, equal_nan=True) and len(carriers) <= MAX_CARRIERS:
             self.section["frequency"] = name
             self.assume("links.frequency", name, f"{len(carriers)} carriers in {file.name}")
-            # The tracer samples paths through walls at this carrier, for which walls are most transparent.
+            # The tracer samples paths through walls at this carrier, at which walls are most transparent.
             return float(carriers[0]), f"lowest carrier of column {name}"
         if self.given.frequency is None:
             raise InputError(
@@ -304,7 +304,7 @@ class LinksDraft:
         return float(np.nanmedian(values)), f"median of column {name}"
 
     def _position_columns(self) -> tuple[PositionColumns, PositionColumns | None]:
-        """Columns of the receivers' and the transmitters' positions; None if the transmitter has no columns."""
+        """Columns of receiver and transmitter positions; None for the transmitters if they have no columns."""
         if self.given.track is None:
             rx = column_names.find_position(self.table.frame, "rx", unnamed=True)
         else:
@@ -330,13 +330,13 @@ class LinksDraft:
     def _projected(
         self, rx: PositionColumns, tx: PositionColumns | None
     ) -> tuple[PositionColumns, PositionColumns | None]:
-        """The columns; their numbers are on the globe if they are far from the scene, but on it in a projection."""
+        """The columns, read as degrees or projected coordinates if only these place most positions on the scene."""
         frame = self.frame if rx.position == "scene" else None
         if frame is None or (tx is not None and tx.position != "scene"):
             return rx, tx
         x, y = (pd.to_numeric(self.table.frame[name], errors="coerce").dropna() for name in (rx.x, rx.y))
         low, high = self.overhead.bounds[:2], self.overhead.bounds[3:5]
-        # Exports of geodata call longitude and latitude x and y.
+        # Exports of geodata may call longitude and latitude x and y.
         if x.abs().max() <= 180 and y.abs().max() <= 90:
             placed = frame.to_scene(x.to_numpy(), y.to_numpy())[:, :2]
             if ((placed >= low) & (placed <= high)).mean() > 0.5:
@@ -352,7 +352,7 @@ class LinksDraft:
         return replace(rx, position="geographic"), tx and replace(tx, position="geographic")
 
     def _name_in_links(self, column: str | None) -> str | None:
-        """A column of transmitters is renamed if the links have a column of the same name."""
+        """Name of a transmitter column in the links: it is renamed if the links have a column of the same name."""
         taken = column in self.table.frame and column != self._transmitter_key
         return f"{self._transmitter_key}_{column}" if taken else column
 
@@ -417,8 +417,8 @@ class LinksDraft:
         if tx is not None:
             if tx.position != rx.position:
                 raise InputError(
-                    f"{self.links}: the transmitter's position ({tx.x}, {tx.y}) is in other units than the receiver's "
-                    f"({rx.x}, {rx.y}); give both in degrees, or both in metres"
+                    f"{self.links}: the transmitter's position ({tx.x}, {tx.y}) and the receiver's ({rx.x}, {rx.y}) "
+                    "have different units; give both in degrees, or both in metres"
                 )
             positions = (
                 1 if self.given.transmitters else len(self.table.frame[[tx.x, tx.y]].drop_duplicates())
@@ -446,7 +446,7 @@ class LinksDraft:
         return [float(part) for part in self.given.tx]
 
     def _name_transmitters(self, tx: PositionColumns) -> None:
-        """The column that names transmitters whose positions are in the links."""
+        """Add the column that names the transmitters, if their positions are in the links."""
         if len(self.table.frame[[tx.x, tx.y]].drop_duplicates()) < 2:
             return
         name = transmitter_columns.find_transmitter_of_positions(self.table.frame, [tx.x, tx.y])
@@ -455,7 +455,7 @@ class LinksDraft:
             self.assume("links.transmitter", name, "each of its names has one transmitter position")
 
     def _transmitter_at_origin(self, rx: PositionColumns) -> list[float | str]:
-        """A transmitter at the scene's origin, if the table's distances are measured from there."""
+        """Place the transmitter at the scene's origin, if the table's distances are measured from there."""
         frame, name = self.table.frame, column_names.find_distance(self.table.frame)
         height = column_names.find_transmitter_height(frame)
         if (
@@ -476,7 +476,7 @@ class LinksDraft:
         )
 
     def add_heights(self) -> None:
-        """Heights above the ground, if the ground is not at z = 0 and no height is in the scene's frame."""
+        """Measure heights from the ground, if the ground is not at z = 0 and no height is in the scene's frame."""
         in_scene_frame = any(
             columns is not None and columns.position == "scene" and columns.height is not None
             for columns in (self.tx, self.rx)

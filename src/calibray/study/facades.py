@@ -1,4 +1,4 @@
-"""``[facades.NAME]``: materials of parts of one mesh by the place of an interaction: storey, side, place, windows."""
+"""``[facades.NAME]``: materials for parts of one mesh, by storey, side or place of an interaction, or for windows."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 
 
 NEAR: Final = 0.5
-"""Largest distance of a wall from the polygon to which it belongs [m]: walls are on the outlines of buildings."""
+"""Largest distance of a wall from its polygon [m]: walls are on the outlines of buildings."""
 
 BESIDE: Final = 0.1
-"""Distance from a wall at which its sides are distinguished, and within which a point is on it [m]."""
+"""Distance from a wall at which its two sides are distinguished, and below which a point is on the wall [m]."""
 
 
 class FacadeSection(Section):
@@ -45,13 +45,13 @@ class FacadeSection(Section):
         storeys: First and last storey, counted from 1 at the ground.
         storey_height: Height of a storey [m].
         facing: Compass bearings [deg] between which the outward normal of the wall lies, clockwise. The inside of a
-            wall is under a roof; without a roof, the order of the corners of its triangles determines it.
+            wall is the side under a roof; without a roof, the order of the triangles' corners determines the inside.
         boxes: Rectangles that contain the wall: west, south, east, north [m] in the scene's frame.
         file: GeoJSON file, Shapefile, GeoPackage or FlatGeobuf file of polygons with the wall on their outlines.
-        column: Column of the file; the polygons are those whose value is NAME. All of them if absent.
+        column: Column of the file; only polygons with the value NAME are used. If absent, all polygons.
         position: "geographic" or "scene", as for ``[regions]``.
-        share: Share of the wall that strips of this material cover, such as windows.
-        module: Distance between the middles of two strips [m]; rounded so that a wall has a whole number of them.
+        share: Share of the wall covered by strips of this material, such as windows.
+        module: Distance between the centres of two strips [m]; rounded so that a wall has a whole number of strips.
     """
 
     of: Text
@@ -84,11 +84,11 @@ def with_facade_materials(
     constants: Mapping[str, Mapping[str, object]],
     frequency: float,
 ) -> Scene:
-    """The scene with the materials of facades after its own, with the constants that ``[materials]`` states for them.
+    """The scene with the materials of facades after its own; `constants` are stated for them in ``[materials]``.
 
     Raises:
-        InputError: A facade has the name of a material, or divides one that the scene lacks; or ITU-R P.2040 has no
-            such material at the carrier [Hz].
+        InputError: A facade has the name of a material, or divides a material that the scene lacks; or ITU-R P.2040 has
+            no such material at the carrier [Hz].
     """
     materials, laws = dict(scene.materials), dict(scene.laws)
     for name, section in facades.items():
@@ -113,7 +113,7 @@ def with_facade_materials(
 
 
 def without_facade_materials(scene: Scene, facades: Mapping[str, FacadeSection]) -> Scene:
-    """The scene as it is traced."""
+    """The scene without the materials of facades, as it is traced."""
     if not facades:
         return scene
     materials, laws = (
@@ -130,9 +130,9 @@ def with_facades(
     place: Place,
     materials: Mapping[str, Material],
 ) -> Paths:
-    """The paths with the materials of facades at their interactions; if several facades apply, the first one counts.
+    """The paths with the materials of facades at their interactions; if several facades apply, the first one is used.
 
-    `files` are those of the facades, resolved; `materials` are those of the scene and of the facades.
+    `files` are the resolved files of the facades; `materials` are those of the scene and of the facades.
 
     Raises:
         InputError: A file cannot be used, or there is no ground below a wall.
@@ -165,7 +165,7 @@ def _applies(
         # Storeys are numbered from 1, the ground floor.
         storey = np.floor(height / section.storey_height) + 1
         applies &= (storey >= section.storeys[0]) & (storey <= section.storeys[1])
-        # The ground is no storey, even if it has the material of the walls.
+        # The ground is not part of a storey, even if it has the material of the walls.
         applies &= height > MILLIMETRE
     if section.facing is not None or section.share is not None:
         if not len(surfaces.walls):
@@ -175,11 +175,11 @@ def _applies(
         applies &= beside < BESIDE
         if section.facing is not None:
             start, end = section.facing
-            # Clockwise from start to end, also across north; equal ends are the full turn.
+            # Clockwise from start to end, also across north; equal ends mean a full turn.
             applies &= (bearing - start) % 360 <= ((end - start) % 360 or 360)
         if section.share is not None:
             strips = np.maximum(np.round(length / section.module), 1)
-            # A strip in the middle of each module.
+            # One strip in the middle of each module.
             applies &= np.abs((along * strips) % 1 - 0.5) < section.share / 2
     outlines = [shapely.box(*box) for box in section.boxes]
     if file is not None:
@@ -201,9 +201,9 @@ def _applies(
 
 
 def _walls(surfaces: SceneSurfaces, point: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """The wall nearest to each point in plan: bearing [deg], place along it from west or south, 0 to 1, length [m].
+    """The wall nearest to each point in plan: bearing [deg], position along it (0 to 1), length [m] and distance [m].
 
-    The last one is its distance from the point [m]. Each is [n]; the compass bearing is that of its outward normal.
+    Each is [n]. The compass bearing is that of the outward normal; the position starts at the west or south end.
     """
     shapely, walls = library("shapely", "scenes"), surfaces.walls
     # In plan, an upright triangle is a line: from its first to its last corner in order of x and y.
@@ -218,11 +218,11 @@ def _walls(surfaces: SceneSurfaces, point: NDArray[np.float64]) -> tuple[NDArray
     start, step = ends[nearest, 0], ends[nearest, 1] - ends[nearest, 0]
     length = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
     along = np.clip(((point[:, :2] - start) * step).sum(axis=1) / length**2, 0.0, 1.0)
-    # The inside is under a roof; where both sides or neither are, the order of the corners tells.
+    # The inside is under a roof; if both sides are or neither is, the order of the corners decides.
     outward = normal[nearest] / np.linalg.norm(normal[nearest], axis=1, keepdims=True)
     front, back = (surfaces.under_roof(point + side * BESIDE * outward) for side in (1, -1))
     outward = np.where((front & ~back)[:, None], -outward, outward)
-    # East over north: clockwise from north.
+    # The arctangent of east over north is measured clockwise from north.
     bearing = np.degrees(np.arctan2(outward[:, 0], outward[:, 1])) % 360
     return bearing, along, length, distance
 
@@ -241,7 +241,7 @@ def roughness_effects(stated: Mapping[str, float], parameters: Parameters, paths
     rough = [name for name in paths.materials if stated.get(name) or name in number]
     if not rough:
         return ()
-    # JAX is slow to import, and every study file that is read imports this module.
+    # JAX is slow to import, and this module is imported whenever a study file is read.
     from calibray.fields import RoughSurfaces
 
     path = np.repeat(np.arange(paths.num_paths), np.diff(paths.first))
@@ -253,7 +253,7 @@ def roughness_effects(stated: Mapping[str, float], parameters: Parameters, paths
         )
         for name in rough
     ]
-    # The factor 8 (pi / lambda)^2 of `RoughSurfaces`, for heights in millimetres.
+    # Factor 8 (pi / lambda)^2 of `RoughSurfaces`, for heights in millimetres.
     per_mm = 8 * (np.pi * 1e-3 * paths.frequency / speed_of_light) ** 2
     heights = np.array([stated.get(name, 0.0) for name in rough])
     exponent = np.asarray(per_mm * np.stack(square, axis=1), dtype=np.float64)

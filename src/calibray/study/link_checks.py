@@ -1,6 +1,6 @@
 """Checks of links for common mistakes in positions, units and angles, before time is spent on tracing.
 
-Each finding is a suspicion with its evidence, not a proof. Only links that are all far from the scene are refused.
+Each finding is a suspicion with evidence, not a proof. Links are refused only if all of them are far from the scene.
 """
 
 from __future__ import annotations
@@ -25,35 +25,35 @@ from calibray.tracing.gain_table import read_gain_table
 from calibray.tracing.settings import Antenna
 
 BELOW_FREE_SPACE_DB: Final = 6.0
-"""Path loss more than this below free space is suspicious [dB]; a ground reflection alone gains up to 6 dB."""
+"""Margin below free-space loss beyond which path loss is suspicious [dB]; a ground reflection gains up to 6 dB."""
 
 GUIDED_DB: Final = 12.0
-"""The same under a roof [dB]: along a corridor of 40 m by 2.4 m, four reflections gain up to 11 dB at 60 GHz."""
+"""The same margin under a roof [dB]: in a corridor of 40 m by 2.4 m, four reflections gain up to 11 dB at 60 GHz."""
 
 FAR: Final = 10.0
 """Distance from the scene, in scene sizes, at which links cannot belong to it."""
 
 CELL_SHARE: Final = 0.05
-"""Largest width of the areas over which samples are averaged, as a share of the scene's shorter side."""
+"""Largest width of averaging areas, as a share of the scene's shorter side."""
 
 HIGH: Final = 300.0
-"""Height above the whole scene [m] at which an altitude above sea level was probably counted from the ground: drones
-fly up to 120 m above it (Regulation (EU) 2019/947), and few masts are higher than 300 m."""
+"""Height above the whole scene [m] above which an altitude above sea level was probably read as one above ground:
+drones fly up to 120 m above ground (Regulation (EU) 2019/947), and few masts are higher than 300 m."""
 
 DOMINATED: Final = 0.5
-"""Effective share of the positions below which a few with many rows dominate the fit. In district 383, three of about
-47 positions with 60 rows each (effectively 10 %) raise the error of predictions from 3.0 to 3.5 dB, and 90 % intervals
-cover 0.86 instead of 0.93 of the links; ten rows at each (100 %) change neither."""
+"""Effective share of the positions below which a few positions with many rows dominate the fit. In district 383, with
+60 rows at each of three out of about 47 positions (effectively 10 %), predictions have errors of 3.5 instead of 3.0 dB,
+and 90 % intervals cover 0.86 instead of 0.93 of the links; ten rows at every position (100 %) change neither."""
 
 SPREAD: Final = 5.0
-"""Width of the cells [m] in which positions of a parked GPS receiver lie: phones are accurate to 4.9 m under an open
-sky (GPS.gov, GPS accuracy)."""
+"""Width of the cells that contain the positions of a parked GPS receiver [m]: phones are accurate to 4.9 m under an
+open sky (GPS.gov, GPS accuracy)."""
 
 LOSSY: Final = 0.5
-"""Mean gain [1] below which a table whose largest gain is exactly 0 dBi probably contains relative levels."""
+"""Mean gain [1] below which a table with a largest gain of exactly 0 dBi probably contains relative levels."""
 
 LINKS_PER_UNKNOWN: Final = 5
-"""Number of links per unknown below which a fit hardly constrains its unknowns."""
+"""Smallest number of links per unknown at which a fit constrains its unknowns."""
 
 _Turn = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 _TURNS: Final[dict[str, _Turn]] = {
@@ -67,7 +67,7 @@ _TURNS: Final[dict[str, _Turn]] = {
 
 
 def suspicions(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
-    """As `examine`, but a scene that only an external program reads is not checked, nor positions without shapely.
+    """As `examine`, but without checks of a scene that only an external program reads, or of positions without shapely.
 
     Raises:
         InputError: The links are far from the scene, or the scene cannot be read.
@@ -85,7 +85,7 @@ def suspicions(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
 
 
 def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
-    """Check links for common mistakes; returns the suspicions and their remedies.
+    """Check links for common mistakes, and return the suspicions with their remedies.
 
     Raises:
         InputError: All links are far from the scene, the scene cannot be read, or shapely is not installed.
@@ -108,7 +108,7 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
 
 
 def count_unknowns(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
-    """The suspicion and its remedy if there are fewer than `LINKS_PER_UNKNOWN` links per unknown."""
+    """A suspicion with its remedy if there are fewer than `LINKS_PER_UNKNOWN` links per unknown."""
     grouped = len(links.group_names) if links.group is not None else 1
     offsets = 0 if study.offset is None else grouped
     unknowns = len(study.parameters) + offsets
@@ -146,11 +146,11 @@ def _clock(links: Measurements) -> Iterator[tuple[str, str]]:
 
 
 def _dominant_positions(links: Measurements, is_geographic: bool) -> Iterator[tuple[str, str]]:
-    """Whether rows at a few positions, such as those of a log while parked, outweigh all others (Kish, 1965)."""
+    """Check whether rows at a few positions, such as rows logged while parked, outweigh all others (Kish, 1965)."""
     cell = SPREAD if is_geographic else 0.01
     ends = np.round(np.hstack([links.tx, links.rx]) / cell)
     count = np.unique(ends, axis=0, return_counts=True)[1]
-    # The number of positions if all are equally frequent, and nearly 1 if one has nearly all rows.
+    # This is the number of positions if all are equally frequent, and nearly 1 if one position has nearly all rows.
     effective = len(links) ** 2 / float(np.sum(count.astype(float) ** 2))
     if effective < DOMINATED * len(count):
         within = f" within {cell:g} m" if is_geographic else ""
@@ -190,7 +190,7 @@ def _positions(
             )
     roofed = overhead.under_roof(rx)
     if roofed.mean() > 0.8 and (through_walls or overhead.under_roof(tx).any()):
-        return  # an indoor scene, or receivers indoors of transmitters outdoors
+        return  # an indoor scene, or indoor receivers with outdoor transmitters
     wrong = _misplaced(overhead, rx)
     turn = _better_turn(overhead, rx, wrong)
     if turn is not None:
@@ -231,19 +231,19 @@ def _positions(
 def refuse_far_receivers(
     bounds: NDArray[np.float64], rx: NDArray[np.float64], source: str, is_geographic: bool
 ) -> None:
-    """Refuse receivers that are all farther from the scene than `FAR` times its size.
+    """Raise an error if all receivers are farther from the scene than `FAR` times its size.
 
     Args:
         bounds: West, south, bottom, east, north and top of the scene [6], [m].
         rx: Positions of the receivers [n, 3], [m].
         source: The table that contains them.
-        is_geographic: Whether it contains degrees.
+        is_geographic: Whether the table contains degrees.
 
     Raises:
-        InputError: All receivers are that far.
+        InputError: All receivers are farther away.
     """
     low, high = bounds[:2], bounds[3:5]
-    # At least a kilometre: the scene may be a room.
+    # The limit is at least one kilometre, because the scene may be a room.
     furthest = FAR * max(float(np.max(high - low)), 100.0)
     if ((rx[:, :2] < low - furthest) | (rx[:, :2] > high + furthest)).any(axis=1).all():
         centre = rx.mean(axis=0)
@@ -264,7 +264,7 @@ def _misplaced(overhead: SceneSurfaces, rx: NDArray[np.float64]) -> int:
 
 
 def _better_turn(overhead: SceneSurfaces, rx: NDArray[np.float64], wrong: int) -> tuple[str, int] | None:
-    """Rotations of the axes after which at most a quarter of the receivers are misplaced, and the number of these."""
+    """Changes of the axes that leave at most a quarter of the receivers misplaced, and the number that remain so."""
     if len(rx) < FEW or wrong < 0.15 * len(rx):
         return None
     misplaced = {name: _misplaced(overhead, turn(rx)) for name, turn in _TURNS.items()}
@@ -274,14 +274,14 @@ def _better_turn(overhead: SceneSurfaces, rx: NDArray[np.float64], wrong: int) -
 
 
 def _units(study: StudyModel) -> Iterator[tuple[str, str]]:
-    """Whether names of columns state other units than the study."""
+    """Check whether column names state units that differ from the study's."""
     links = study.links
     unit = 1.0 if links.position == "geographic" else links.position_unit
     for name in dict.fromkeys(name for name in (*links.tx, *links.rx) if isinstance(name, str)):
         if words(name) & {*LENGTH_UNITS, "m"} and (stated := find_length_unit([name])) != unit:
             yield (
                 f"the name of column {name!r} implies a unit of {stated:g} m, but it is read in units of {unit:g} m",
-                # Degrees have no length, so that positions on the globe have no unit to state.
+                # Degrees have no length, so positions on the globe have no unit to state.
                 "convert it"
                 if links.position == "geographic"
                 else "convert it, or set links.position_unit if all positions have its unit",
@@ -315,7 +315,7 @@ def _levels(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> 
         max(largest_gain_dbi(antenna) for antenna in link_antennas(study, end, links.table)[0])
         for end in ("tx", "rx")
     )
-    # The least loss in free space: in the main directions of the best antennas of both ends.
+    # The smallest possible free-space loss: along the main directions of the best antennas at both ends.
     excess = free_space - gain - links.path_loss_db
     roofed = overhead.under_roof(links.tx) & overhead.under_roof(links.rx)
     below = excess > np.where(roofed, GUIDED_DB, BELOW_FREE_SPACE_DB)
@@ -328,17 +328,17 @@ def _levels(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> 
 
 
 def _delays(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> Iterator[tuple[str, str]]:
-    """Whether most measured delays are those of paths that are far longer than the scene is wide."""
+    """Check whether most measured delays belong to paths that are far longer than the scene is wide."""
     longest = FAR * max(float(np.max(overhead.bounds[3:5] - overhead.bounds[:2])), 100.0)
     for name, section in study.observables.items():
-        # Devices add unknown delays to times of flight, which are stated as a bias.
+        # Devices add unknown delays to times of flight; a bias accounts for them.
         if KINDS[section.kind] != "s" or section.column is None or section.bias is not None:
             continue
         measured = links.table.numbers(section.column, gaps=True) * section.scale
         length = float(np.nanmedian(measured)) * speed_of_light if np.isfinite(measured).any() else 0.0
         if length > longest:
             yield (
-                f"the median of column {section.column!r} [{section.unit}] is as long as light takes for {length:.0f} "
+                f"the median of column {section.column!r} [{section.unit}] is the time light takes for {length:.0f} "
                 f"m, more than {FAR:g} times the size of the scene",
                 f"check observables.{name}.unit",
             )
@@ -354,13 +354,13 @@ def _angles(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str]]
         gain = _horizontal_gain(antenna)
         if gain is None or len(links) < FEW or not links.measured:
             continue
-        # A compass bearing counts from north clockwise; yaw counts from east counter-clockwise.
+        # A compass bearing is measured clockwise from north; yaw is measured counter-clockwise from east.
         compass = np.pi / 2 - yaw
         spread, spread_compass = (_spread(links, gain, own, other, angle) for angle in (yaw, compass))
         if spread_compass < 0.7 * spread:
             yield (
-                f"the values fit antennas.{name} better with a yaw of {compass:.2f} rad: {spread_compass:.1f} dB "
-                f"from a log-distance line (standard deviation) instead of {spread:.1f} dB",
+                f"the values fit antennas.{name} better with a yaw of {compass:.2f} rad: their standard deviation from "
+                f"a log-distance line is {spread_compass:.1f} dB instead of {spread:.1f} dB",
                 "yaw is measured from x (east) towards y (north); a compass bearing b is pi/2 - b",
             )
 
@@ -369,10 +369,10 @@ def _antennas(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str
     antennas = [*study.stated_antennas.values(), *study.antenna_types.values()]
     for file in dict.fromkeys(antenna.gain_file for antenna in antennas if antenna.gain_file is not None):
         table = read_gain_table(file)
-        # A lossless antenna has a mean gain of 1, so that its largest gain is above 0 dBi.
+        # A lossless antenna has a mean gain of 1, so its largest gain is above 0 dBi.
         if table.gain_dbi.max() == 0 and table.efficiency < LOSSY:
             yield (
-                f"the largest gain in {file} is 0 dBi and the mean {table.efficiency:.0%}, as if gains were "
+                f"the largest gain in {file} is 0 dBi and the mean gain is {table.efficiency:.0%}, as if gains were "
                 "relative to the main direction",
                 "give absolute gains [dBi]",
             )
@@ -383,12 +383,12 @@ def _antennas(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str
             yield (
                 f"all downtilts of links.tx_antenna are negative, {tilt.min():g} to {tilt.max():g} degrees: the "
                 "antennas point upwards",
-                "give the angles below the horizon, which are positive",
+                "give angles below the horizon as positive numbers",
             )
 
 
 def _horizontal_gain(antenna: Antenna) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
-    """Gain over azimuth from the main direction, at the horizon [dB]; None if it is the same in all directions."""
+    """Gain at the horizon by azimuth from the main direction [dB]; None if it is the same in all directions."""
     if antenna.pattern == "tr38901":
         # 3GPP TR 38.901, Table 7.3-1.
         return lambda azimuth: -np.minimum(12 * (np.degrees(azimuth) / 65) ** 2, 30.0)
@@ -405,10 +405,10 @@ def _spread(
     other: NDArray[np.float64],
     yaw: float,
 ) -> float:
-    """Standard deviation of path loss without the antenna's gain from a log-distance line [dB]."""
+    """Standard deviation of path loss, without the antenna's gain, from a log-distance line [dB]."""
     away = other - own
     azimuth = (np.arctan2(away[:, 1], away[:, 0]) - yaw + np.pi) % (2 * np.pi) - np.pi
-    # Measured losses contain the antenna's gain; adding it leaves what does not depend on the azimuth.
+    # Measured losses contain the antenna's gain; adding the gain removes the dependence on azimuth.
     level = links.path_loss_db + gain(azimuth)
     design = np.column_stack([np.ones(len(links)), np.log10(links.distance)])
     residual = level - design @ np.linalg.lstsq(design, level)[0]

@@ -1,4 +1,4 @@
-"""The content of a study file, and everything that follows from it without another file."""
+"""The content of a study file, and everything that follows from it without reading other files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from calibray.tracing.settings import Antenna
 
 
 class StudyModel(StudyContent, ABC):
-    """A study file that has been read; use the class `calibray.Study`."""
+    """A study file that has been read; use it as `calibray.Study`."""
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -50,9 +50,9 @@ class StudyModel(StudyContent, ABC):
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any], path: str | Path = "study.toml") -> Self:
-        """A study from sections in the form of TOML; the existence of its files is not checked.
+        """Make a study from sections in the form of TOML; whether its files exist is not checked.
 
-        Other files are relative to the folder of `path`, which need not exist.
+        File names are relative to the folder of `path`, which need not exist.
 
         Raises:
             InputError: A key is unknown or a value impossible; one line for each error.
@@ -65,7 +65,7 @@ class StudyModel(StudyContent, ABC):
         engine, other_engines = split_engine_keys(content.get("engine", {}), str(path))
         content = {**content, "engine": engine}
         try:
-            # In JSON, a list passes for a tuple, but nothing else is converted: "4" is not a number.
+            # From JSON, a list is accepted as a tuple, but nothing else is converted: "4" is not a number.
             text = json.dumps(content, default=str)
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: a value cannot be used ({error}); correct it") from None
@@ -88,7 +88,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def allows_blocks(self) -> bool:
-        """Whether blocks of links can be held out in turn: each takes a calibration, too expensive without replay."""
+        """Whether blocks of links can be held out in turn: each needs a calibration, too expensive without replay."""
         replaced = self.engine.exports_rays and self.method.name == "auto"
         return self.engine.name == "replay" or replaced
 
@@ -131,7 +131,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def observable_paths(self) -> dict[str, Path]:
-        """The files of the observables that are computed from files, by name."""
+        """The files of those observables that are computed from files, by the name of the observable."""
         return {
             name: self._resolve(f"observables.{name}.file", section.file)
             for name, section in self.observables.items()
@@ -148,7 +148,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def facade_paths(self) -> dict[str, Path | None]:
-        """The file of every facade by name; None without one."""
+        """The file of every facade by name; None for a facade without a file."""
         return {
             name: None if section.file is None else self._resolve(f"facades.{name}.file", section.file)
             for name, section in self.facades.items()
@@ -158,7 +158,7 @@ class StudyModel(StudyContent, ABC):
     def antenna_pair(self) -> tuple[Antenna, Antenna]:
         """The transmit and the receive antenna with which links are traced, with resolved paths of gain tables.
 
-        If the antennas of an end differ between links, it is traced with an isotropic vertical antenna.
+        If the antennas at an end differ between links, this end is traced with an isotropic vertical antenna.
         """
         mounted, (tx, rx) = self.links.mountings, self.stated_antennas.values()
         return Antenna() if "tx" in mounted else tx, Antenna() if "rx" in mounted else rx
@@ -201,7 +201,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def roughness_mm(self) -> dict[str, float]:
-        """Standard deviation of the surface heights by material, where ``[materials]`` states it [mm]."""
+        """Standard deviation of the surface height by material [mm], where ``[materials]`` states it."""
         stated = {name: material.roughness_mm for name, material in self.materials.items()}
         return {name: height for name, height in stated.items() if height is not None}
 
@@ -213,23 +213,23 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def uses_obstruction(self) -> bool:
-        """Whether a nuisance uses a column that follows from the scene, or has groups by cluster of receivers."""
+        """Whether a nuisance term uses a column computed from the scene, or has clusters of receivers as groups."""
         by_scene = any(section.by in OBSTRUCTION for section in self.nuisance.values())
         return by_scene or self.cluster_m is not None
 
     @property
     def cluster_m(self) -> float | None:
-        """Side of the squares in which receivers form the groups of a nuisance [m]; None without such a nuisance."""
+        """Side of the squares whose receivers form the groups of a nuisance term [m]; None without such a term."""
         return next((item.cluster_m for item in self.nuisance.values() if item.cluster_m is not None), None)
 
     @property
     def uses_clutter(self) -> bool:
-        """Whether a nuisance uses the clutter loss of ITU-R P.2108."""
+        """Whether a nuisance term uses the clutter loss of ITU-R P.2108."""
         return any(section.by == CLUTTER for section in self.nuisance.values())
 
     @property
     def offset_groups(self) -> tuple[str, ...]:
-        """The columns whose labels group the offset; none for one offset, or without an offset."""
+        """The columns whose labels group the offset; empty for a single offset, or without an offset."""
         return () if self.offset is None else self.offset.term().per
 
     @property
@@ -238,8 +238,8 @@ class StudyModel(StudyContent, ABC):
         priors, linear = [], []
         for index, (name, entry) in enumerate(self.parameters.items()):
             if entry.prior is not None and entry.prior.std is not None:
-                # Of antennas: additive errors around the stated pose; constants of materials are positive, with priors
-                # of the logarithm.
+                # Antennas have additive errors around the stated pose; material constants are positive and have priors
+                # on the logarithm.
                 priors.append((index, float(entry.start or 0.0), entry.prior.std))
                 linear.append(index)
             elif entry.prior is not None:
@@ -258,7 +258,7 @@ class StudyModel(StudyContent, ABC):
     ) -> Parameters:
         """The free parameters of a scene with materials `base`, with their start values, in the order of the file.
 
-        Materials without a law over frequency in `laws` are constant.
+        Materials without a frequency law in `laws` have constant values.
 
         Raises:
             InputError: The scene lacks a parameter's material, or a start value is outside its bounds.
@@ -276,7 +276,7 @@ class StudyModel(StudyContent, ABC):
             all_laws = {name: frequency_independent_law(material) for name, material in base.items()} | dict(
                 laws or {}
             )
-            # A parameter that is a coefficient of a law, not a constant, needs its material's law.
+            # A parameter that is a coefficient of a frequency law needs its material's law.
             needed = {item.material: all_laws[item.material] for item in items if item.field != item.constant}
             parameters = Parameters(items, frequency, needed)
             parameters.check_carriers([frequency])
@@ -285,7 +285,7 @@ class StudyModel(StudyContent, ABC):
         return parameters
 
     def _effect_parameter(self, name: str, materials: Collection[str]) -> Parameter:
-        """The parameter of a region, rough surface or transmit antenna; for an antenna, 0 is the stated pose."""
+        """The parameter of a region, a rough surface or an antenna; for an antenna, 0 is the stated pose."""
         entry = self.parameters[name]
         if name.endswith(f".{ROUGHNESS}"):
             check_material(name, materials)
@@ -294,7 +294,7 @@ class StudyModel(StudyContent, ABC):
                 name, *entry.bounds, stated if entry.start is None else float(entry.start), entry.scale
             )
         region = self.regions.get(name.removeprefix(PREFIX).rpartition(".")[0]) if PREFIX in name else None
-        # Antennas start at their stated pose, the error 0.
+        # Antennas start at their stated pose, with an error of 0.
         start = 0.0 if region is None else region.specific_attenuation
         return Parameter(
             name, *entry.bounds, start if entry.start is None else float(entry.start), entry.scale
@@ -303,15 +303,15 @@ class StudyModel(StudyContent, ABC):
     def content(self) -> dict[str, Any]:
         """The study as a dictionary with all defaults; `Study.from_content` reads it."""
         content = self.model_dump(mode="json", exclude_none=True)
-        # `replace` may choose another engine, to which these keys then belong.
+        # These keys belong to other engines, one of which `replace` may choose.
         content["engine"] |= self._other_engines
         return content
 
     def digest(self) -> str:
         """Fingerprint of the study: SHA-256 of its content, independent of the layout of the file.
 
-        The order of the parameters counts, because it is the order of a candidate's values. The content of the files
-        that it names is not included.
+        The order of the parameters matters, because it is the order of a candidate's values. The content of the named
+        files is not included.
         """
         content = self.content() | {"parameters": list(self.content()["parameters"].items())}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -324,7 +324,7 @@ class StudyModel(StudyContent, ABC):
         """Check that the files exist.
 
         Raises:
-            InputError: One does not exist.
+            InputError: A file does not exist.
         """
         for name, stated, file in self._named_files():
             if not exists(file):
@@ -367,13 +367,13 @@ class StudyModel(StudyContent, ABC):
             raise InputError(f"{self._path}: {name} = {file!r}: {error}") from None
 
     def held_out(self, links: Measurements) -> NDArray[np.bool_]:
-        """Mask of the held-out links [L]: none without ``[holdout]``, or if blocks are held out in turn.
+        """Mask of the held-out links [L]: all False without ``[holdout]``, or if links are held out in turn.
 
         Raises:
-            InputError: The filter is malformed, lacks a column, or selects all links or none; or the links have no
-                column of labels by which they are held out in turn.
+            InputError: The filter is malformed, names a missing column, or selects all links or none; or the links lack
+                the column of labels by which they are held out in turn.
         """
-        # A missing column is refused here, before anything is traced.
+        # A missing column raises an error here, before anything is traced.
         if self.holdout is not None and self.holdout.by not in (None, "tx", *OBSTRUCTION):
             links.table.labels(self.holdout.by)
         if self.holdout is None or self.holdout.where is None:
@@ -381,7 +381,7 @@ class StudyModel(StudyContent, ABC):
         return links.held_out(self.holdout.where)
 
     def replace(self, method: str | None = None, seed: int | None = None, engine: str | None = None) -> Self:
-        """The study with another method, seed or engine; a method's options are dropped with it.
+        """The study with another method, seed or engine; the options of a replaced method are dropped.
 
         Raises:
             InputError: A value is impossible.

@@ -1,4 +1,4 @@
-"""From a study and the columns of its links: the antenna of every link, its direction, and the power at its port."""
+"""The antenna of every link, its direction and the power at its port, from a study and the columns of its links."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 
 
 PORT_POWER: Final = "tx_port_power_dbm"
-"""Column of the links: the power that their transmitters feed into the antenna [dBm]."""
+"""Column of the links with the power that their transmitters feed into the antenna [dBm]."""
 
 LEAST_GAIN: Final = 1e-3
-"""Smallest gain along the straight line. In nulls, paths in other directions carry the power; the patterns of 3GPP TR
-38.901 end 30 dB below their largest gain."""
+"""Smallest gain along the straight line [1]. In nulls, paths in other directions carry the power; the patterns of 3GPP
+TR 38.901 are limited to 30 dB below their largest gain."""
 
 
 def mounting_columns(study: StudyModel) -> tuple[str, ...]:
-    """The columns that state the antenna of a link and its direction, and those whose parameters change it."""
+    """The columns that state the antenna of a link, its direction, and the names to which its parameters refer."""
     columns = [name for section in study.links.mountings.values() for name in section.columns]
     own = [
         name for name in study.parameters if name.startswith(POSE) and not name.startswith(POSE + EVERY + ".")
@@ -60,9 +60,9 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
     yaw, downtilt, electrical, steering = degrees
     if section.aim is not None:
         yaw = np.arctan2(away[:, 1], away[:, 0])
-        # Positive downwards.
+        # Downtilt is positive downwards.
         downtilt = -np.arctan2(away[:, 2], np.hypot(away[:, 0], away[:, 1]))
-    # A bearing counts from north clockwise, yaw from east counter-clockwise; steering turns the same way.
+    # A bearing is measured clockwise from north, yaw counter-clockwise from east; steering has the same sense.
     elif section.azimuth_deg is not None and section.azimuth_from == "north":
         yaw = np.pi / 2 - yaw
     if section.azimuth_from == "north":
@@ -79,7 +79,7 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
 def direct_gain(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
     """Gain of the stated antennas of both ends along the straight line of each link [L], [dBi].
 
-    For an end with one of Sionna's patterns without a main direction for all links, the gain is 0.
+    The gain of an end is 0 if all its links have the same one of Sionna's patterns without a main direction.
 
     Raises:
         InputError: A column is missing or malformed, or names an unknown antenna.
@@ -107,14 +107,14 @@ def pose_effects(
     parameters: Parameters,
     paths: tuple[Paths, NDArray[np.int64]],
 ) -> Effects:
-    """Errors of transmit antennas on paths, if parameters such as "tx:CELL.azimuth" state any.
+    """Effects of transmit antennas' errors on paths, if there are parameters such as "tx:CELL.azimuth".
 
-    `mountings` and `table` are those of all links; `paths` are those of some links, with the indices of these links.
+    `mountings` and `table` belong to all links; `paths` has the paths of selected links, and the indices of these.
 
     Raises:
         InputError: The column of transmitters is missing.
     """
-    # JAX is slow to import, and every study file that is read imports this module.
+    # JAX is slow to import, and this module is imported whenever a study file is read.
     from calibray.engines.pose import pose_error
 
     items = [parameters.items[index] for index in parameters.of_effects]
@@ -130,7 +130,7 @@ def pose_effects(
 
 
 def transmitter_labels(study: StudyModel, table: SourceTable, items: Sequence[Parameter]) -> NDArray[np.str_]:
-    """Name of every row's transmitter [rows]; empty names if all parameters apply to every transmitter.
+    """Name of every row's transmitter [rows]; empty strings if all parameters apply to every transmitter.
 
     Raises:
         InputError: The column of transmitters is missing.
@@ -143,10 +143,10 @@ def transmitter_labels(study: StudyModel, table: SourceTable, items: Sequence[Pa
 def link_antennas(
     study: StudyModel, end: str, table: SourceTable
 ) -> tuple[tuple[Antenna, ...], NDArray[np.int64]]:
-    """The different antennas at one end, "tx" or "rx", and the antenna of every row [rows].
+    """The distinct antennas at one end, "tx" or "rx", and the index of every row's antenna [rows].
 
     Raises:
-        InputError: The column of antennas is missing, or names an unknown one.
+        InputError: The column of antennas is missing, or names an unknown antenna.
     """
     section = study.links.mountings.get(end)
     if section is None or section.type is None:
@@ -173,7 +173,7 @@ def _degrees(table: SourceTable, key: str, stated: float | str, limit: int) -> N
 
 
 def states_port_power(study: StudyModel) -> bool:
-    """Whether the power at the antenna's port follows from other columns than the transmitted power."""
+    """Whether the power at the antenna's port is computed from columns other than the transmitted power alone."""
     return study.links.eirp_dbm is not None or study.links.cable_loss_db is not None
 
 
@@ -201,13 +201,12 @@ def port_power(study: StudyModel, table: SourceTable, optional: bool = False) ->
 def largest_gain_dbi(antenna: Antenna) -> float:
     """Largest gain of an antenna over all directions on a grid of one degree [dBi]."""
     zenith, azimuth = np.meshgrid(np.radians(np.arange(181.0)), np.radians(np.arange(-180.0, 180.0)))
-    # In side lobes, the amplitude of an array can be negative.
+    # The amplitude of an array can be negative in side lobes.
     return float(20 * np.log10(np.abs(AntennaPattern.of(antenna).amplitude(zenith, azimuth)).max()))
 
 
 FIRST_SPREAD: Final = 0.25
-"""Initial spread before it is estimated, as a share of the width of the bounds: nearly that of a uniform distribution,
-0.29."""
+"""Initial value of an estimated spread, as a share of the width of the bounds; a uniform distribution has 0.29."""
 
 
 def estimated_fields(study: StudyModel) -> tuple[str, ...]:
@@ -218,9 +217,9 @@ def estimated_fields(study: StudyModel) -> tuple[str, ...]:
 
 
 def with_population(study: StudyModel, links: Measurements) -> dict[str, Any]:
-    """The content of a study with a parameter of every transmitter for each `spread`.
+    """The content of a study with one parameter per transmitter for each `spread`.
 
-    A further parameter represents transmitters without measured links: its prior, which no link narrows, is the
+    A further parameter represents transmitters without measured links. No link narrows its prior, which describes the
     population.
 
     Raises:
@@ -235,7 +234,7 @@ def with_population(study: StudyModel, links: Measurements) -> dict[str, Any]:
         std = FIRST_SPREAD * (upper - lower) if entry.spread == "auto" else entry.spread
         for label in (*labels, NEW):
             own = {"bounds": [lower, upper], "prior": {"std": std, "shared": True}}
-            # A transmitter with an entry of its own keeps it.
+            # A transmitter with its own entry keeps it.
             content["parameters"].setdefault(f"{POSE}{label}.{name.rpartition('.')[2]}", own)
     return content
 

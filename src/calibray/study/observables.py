@@ -20,7 +20,7 @@ UNITS: Final = {
     "dB": {"dB": 1.0},
     "rad": {"rad": 1.0, "deg": float(np.pi / 180)},
 }
-"""Units in which values of a dimension may be given, in SI units."""
+"""Units in which values of each dimension may be given, with their values in SI units."""
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -34,21 +34,21 @@ class ObservableSection(Section):
         columns: Columns of the bins of a profile, in place of `column`.
         file: Measured multipath or impulse responses, from which the values are computed, in place of columns.
         id: Column of the links' labels, also in a multipath table.
-        where: Row filter: the links that have this observable; all if absent.
+        where: Row filter that selects the links with this observable; all links if absent.
         compass: Whether azimuths in the file are bearings, clockwise from north.
         sample_rate: Sample rate of impulse responses without delays [Hz].
-        margin_db: Distance above its noise from which a sample of an impulse response counts [dB].
+        margin_db: Level above the noise from which a sample of an impulse response is used [dB].
         unit: Unit of the values: "s", "ms", "us" or "ns"; "dB"; "rad" or "deg".
         std: Standard deviation of a value's error, in the unit; estimated if absent.
         bias: "all" for one unknown bias of all values, or a column of labels for one bias per label; none if absent.
-        path: Path of a time of flight: "mean" of all, "first" or "strongest".
-        dynamic_range_db: Largest level below the strongest path at which the receiver detects paths [dB]; all paths if
-            absent.
-        floor_db: Path gain below which it detects no paths [dB]; no limit if absent.
+        path: Path of a time of flight: "mean" of all paths, "first" or "strongest".
+        dynamic_range_db: Range below the strongest path in which the receiver detects paths [dB]; all paths if absent.
+        floor_db: Path gain below which the receiver detects no paths [dB]; no limit if absent.
         window: Longest delay after the first path [s]; no limit if absent.
-        bandwidth: Bandwidth of the receiver [Hz]; if absent, it resolves all paths.
-        edges: Ends of the bins of a power delay profile, one more than bins: delays after the first path [s].
-        edges_deg: Ends of angular sectors: azimuths, counterclockwise from the x axis [deg].
+        bandwidth: Bandwidth of the receiver [Hz]; if absent, the receiver resolves all paths.
+        edges: Edges of the bins of a power delay profile, one more than the number of bins: delays after the first
+            path [s].
+        edges_deg: Edges of angular sectors: azimuths, counter-clockwise from the x axis [deg].
     """
 
     kind: Literal[
@@ -88,10 +88,10 @@ class ObservableSection(Section):
     def _consistent(self) -> Self:
         allowed = UNITS[KINDS[self.kind]]
         if self.unit not in allowed:
-            raise InputError(f"unit = {self.unit!r}: a {self.kind} is given in {' or '.join(allowed)}")
+            raise InputError(f"unit = {self.unit!r}: a {self.kind} must be given in {' or '.join(allowed)}")
         if self.path != "mean" and self.kind not in FLIGHTS:
             raise InputError(
-                f"path = {self.path!r}: only a time of flight or a round-trip time is that of one path"
+                f"path = {self.path!r}: only for a time of flight or a round-trip time; remove it"
             )
         if (self.column is not None) + bool(self.columns) + (self.file is not None) != 1:
             raise InputError(
@@ -125,12 +125,12 @@ class ObservableSection(Section):
 
     @property
     def scale(self) -> float:
-        """The unit in SI units."""
+        """Value of the unit in SI units."""
         return UNITS[KINDS[self.kind]][self.unit]
 
     @property
     def statistic(self) -> Statistic:
-        """The statistic of the modelled paths."""
+        """The statistic to compute from the modelled paths."""
         edges = None
         if self.kind in PROFILES:
             low, high = self.edges or np.radians(self.edges_deg).tolist()
@@ -145,10 +145,10 @@ class ObservableSection(Section):
 
 
 def by_column(sections: Mapping[str, ObservableSection]) -> dict[str, ObservableSection]:
-    """The sections with those of several columns split into one per column, named NAME_1, NAME_2, ...
+    """The sections, with each section of several columns split into one per column, named NAME_1, NAME_2, ...
 
     Raises:
-        InputError: Two of them have one name.
+        InputError: Two sections have the same name.
     """
     split: dict[str, ObservableSection] = {}
     for name, section in sections.items():
@@ -161,7 +161,7 @@ def by_column(sections: Mapping[str, ObservableSection]) -> dict[str, Observable
             parts = {
                 f"{name}_{number}": section.model_copy(update={
                     "column": column, "columns": (),
-                    # Both ends of this bin; of the two keys, the unused one stays empty.
+                    # Both edges of this bin; the unused key of the two stays empty.
                     "edges": section.edges[number - 1 : number + 1],
                     "edges_deg": section.edges_deg[number - 1 : number + 1],
                 })

@@ -30,17 +30,17 @@ if TYPE_CHECKING:
     from calibray.scenes.checks import SceneSurfaces
 
 PREFIX: Final = "region:"
-"""Beginning of the names of a region's parameters."""
+"""Prefix of the names of a region's parameters."""
 
 WOODLAND: Final = (1.15, 0.43)
-"""A_1 [dB] and alpha of the largest loss A_1 f^alpha in woodland, f in MHz (ITU-R P.833-10, section 2, Mulhouse)."""
+"""A_1 [dB] and alpha of the maximum loss A_1 f^alpha in woodland, f in MHz (ITU-R P.833-10, section 2, Mulhouse)."""
 
 EXPONENT: Final = 0.284
-"""Exponent of the specific attenuation over frequency: Weissberger 1982, 0.45 f^0.284 dB/m on paths of up to 14 m in
-dense, dry, in-leaf trees, f in GHz from 0.23 to 95."""
+"""Frequency exponent of the specific attenuation: Weissberger 1982, 0.45 f^0.284 dB/m for paths of up to 14 m in dense,
+dry, in-leaf trees, with f in GHz from 0.23 to 95."""
 
 MOST_CELLS: Final = 400
-"""Largest number of cells of the grid of the ground along either side; 160,000 heights take a second."""
+"""Largest number of cells along either side of the ground's grid; 160,000 heights take a second."""
 
 Height = float | str
 
@@ -59,15 +59,15 @@ class RegionSection(Section):
         boxes: Rectangles in place of a file: west, south, east, north [m] in the scene's frame.
         position: "geographic" if the file's coordinates are those of its reference system, "scene" for metres in the
             scene's frame.
-        heights: "ground" for heights above the scene's ground, which the region follows, as those of a canopy are;
-            above z = 0 of the scene if absent.
-        bottom: Height at which the region begins [m], a number or a column of the file, in metres or the unit in its
-            name.
-        top: Height at which it ends, in the same form; a canopy defines it.
-        specific_attenuation: Loss per length of a short path inside at the study's carrier [dB/m]; the start value if
-            it is a parameter.
-        frequency_exponent: Exponent [1] of the specific attenuation over frequency, for links of other carriers.
-        maximum_db: Loss of a very long path inside [dB]; that of woodland in ITU-R P.833 if absent.
+        heights: "ground" for heights above the scene's ground, which the region follows (always for a canopy); if
+            absent, heights are above z = 0 of the scene.
+        bottom: Height at which the region begins [m], a number or a column of the file, in metres or the unit in the
+            column's name.
+        top: Height at which the region ends, in the same form; a canopy defines it.
+        specific_attenuation: Loss per unit length of a short path inside, at the study's carrier [dB/m]; the start
+            value if it is a parameter.
+        frequency_exponent: Frequency exponent [1] of the specific attenuation, for links at other carriers.
+        maximum_db: Loss of a very long path inside [dB]; if absent, the value for woodland in ITU-R P.833.
     """
 
     file: Text | None = None
@@ -84,7 +84,7 @@ class RegionSection(Section):
     @model_validator(mode="after")
     def _one_source(self) -> Self:
         if sum((self.file is not None, self.canopy is not None, bool(self.boxes))) != 1:
-            raise InputError("a region is given by a file, by a canopy or by boxes: give exactly one of them")
+            raise InputError("a region is defined by a file, a canopy or boxes: give exactly one of them")
         for box in self.boxes:
             west, south, east, north = box
             if not (west < east and south < north):
@@ -144,11 +144,11 @@ class RegionSection(Section):
         if self.heights is None and self.canopy is None:
             return Region(outline, bottom, top)
         surfaces = place.surfaces()
-        # Outside of the scene, no height of the ground is known.
+        # Outside the scene, the height of the ground is unknown.
         outline = shapely.intersection(outline, shapely.box(*surfaces.bounds[[0, 1, 3, 4]]))
         inside = np.flatnonzero(~shapely.is_empty(outline))
         outline, bottom, top = outline[inside], bottom[inside], top[inside]
-        # One point inside each polygon; the centroid of a bent one can be outside of it.
+        # One point inside each polygon; the centroid of a non-convex polygon can be outside.
         ground = surfaces.lowest_surface(*shapely.get_coordinates(shapely.point_on_surface(outline)).T)
         if (missing := inside[np.isinf(ground)]).size:
             raise InputError(
@@ -175,7 +175,7 @@ def _terrain(surfaces: SceneSurfaces) -> Terrain:
 def read_polygons(path: Path, position: str, frame: Frame | None) -> tuple[NDArray[Any], dict[str, NDArray]]:
     """Polygons of a vector file in the scene's frame [n], and the columns of its table.
 
-    `position` is "geographic" if its coordinates are those of its reference system, "scene" for the scene's frame.
+    `position` is "geographic" if the file's coordinates are in its reference system, "scene" for the scene's frame.
 
     Raises:
         InputError: The file cannot be read or contains no polygon, or the scene's position on the globe is unknown.
@@ -185,7 +185,7 @@ def read_polygons(path: Path, position: str, frame: Frame | None) -> tuple[NDArr
     from calibray.scenes.authoring.geodata import read_features
 
     features = read_features(path, None)
-    # Polygons, of one or several parts.
+    # Polygons and multipolygons.
     polygon = np.isin(shapely.get_type_id(features.outline), (3, 6))
     if not polygon.any():
         raise InputError(f"{path}: none of its {len(polygon)} features is a polygon; give outlines")
@@ -249,11 +249,11 @@ def region_effects(
     *,
     displaced: bool = False,
 ) -> Effects:
-    """The extra loss of paths through regions; `frequency` [Hz] is the carrier of specific attenuations.
+    """The extra loss of paths through regions; specific attenuations are stated at the carrier `frequency` [Hz].
 
-    If `displaced`, paths end at displaced receivers instead of those of their links.
+    If `displaced`, paths end at displaced receivers instead of their links' receivers.
     """
-    # JAX is slow to import, and every study file that is read imports this module.
+    # JAX is slow to import, and this module is imported whenever a study file is read.
     from calibray.fields import ExtraLoss
 
     path, start, end = _segments(paths, displaced)
@@ -265,7 +265,7 @@ def region_effects(
         np.add.at(length, path, regions[name].length_inside(start, end))
         effects.append(
             ExtraLoss(
-                # Attenuations are stated at the study's carrier; links may have others.
+                # Attenuations are stated at the study's carrier; links may have other carriers.
                 length * (paths.frequency / frequency) ** section.frequency_exponent,
                 section.largest_loss_db(paths.frequency),
                 names.index(parameter) if parameter in names else None,
@@ -278,10 +278,10 @@ def region_effects(
 def _segments(
     paths: Paths, displaced: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """The straight pieces of all paths: number of the path [k], and both ends [k, 3], [m]."""
+    """The straight segments of all paths: index of the path [k], and both ends [k, 3], [m]."""
     number = np.arange(paths.num_paths)
     path = np.repeat(number, np.diff(paths.first) + 1)
-    # A path of n interactions has n + 1 pieces: the pieces of path p begin p places later than its interactions.
+    # A path of n interactions has n + 1 segments, so the segments of path p start p places after its interactions.
     begins, ends = paths.first[:-1] + number, paths.first[1:] + number
     start = np.empty((len(path), 3))
     end = np.empty((len(path), 3))
@@ -292,7 +292,7 @@ def _segments(
     inner[begins], inner[ends] = True, False
     end[inner] = paths.vertex
     if displaced:
-        # The last piece follows from its direction and from the length that the others leave.
+        # The last segment follows from its direction and the remaining length of the path.
         before = np.bincount(path[inner], np.linalg.norm(end - start, axis=1)[inner], paths.num_paths)
         last = paths.delay * speed_of_light - before
         # The arrival direction points from the receiver back along the ray.

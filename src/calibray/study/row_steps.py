@@ -1,4 +1,4 @@
-"""The steps that convert the rows of a study's table to links."""
+"""The steps that convert the rows of a study's table into links."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def study_links(study: StudyModel) -> Measurements:
 
 
 def link_columns(study: StudyModel) -> LinkColumns:
-    """The columns of a study's table of links, with the groups of the offset.
+    """The columns of a study's table of links, including the offset's group columns.
 
     Raises:
         InputError: Keys of ``[links]`` contradict each other.
@@ -60,7 +60,7 @@ def link_columns(study: StudyModel) -> LinkColumns:
 
 
 def row_steps(study: StudyModel) -> Preparation:
-    """The steps from rows to links that a study states.
+    """The steps from rows to links, as a study states them.
 
     Raises:
         InputError: The scene's position on the globe is unknown, or the scene cannot be read.
@@ -71,7 +71,7 @@ def row_steps(study: StudyModel) -> Preparation:
     groups += [item.bias for item in study.observables.values() if item.bias not in (None, "all")]
     # A file names its links by this label.
     groups += [item.id for item in study.observables.values() if item.file is not None]
-    # Columns that follow from the scene are added later, to the links.
+    # Columns computed from the scene are added to the links later.
     keep = [label for label in groups if label not in (*OBSTRUCTION, CLUSTER)]
     keep += [links.frequency] if links.frequency else []
     return replace(
@@ -96,9 +96,9 @@ def row_steps(study: StudyModel) -> Preparation:
 
 
 def _held_out_parts(holdout: HoldoutSection, value: str, table: SourceTable) -> NDArray[Any]:
-    """Labels [rows] of the parts of a table that are held out separately; 0 for all rows where links decide.
+    """Labels [rows] of the parts of a table that are held out separately; 0 for all rows if links determine the parts.
 
-    Only links, after averages and merging, decide by the measured value and by the columns of averages.
+    Links, after averaging and merging, determine parts that depend on the measured value or on columns of averages.
     """
     table, none = replace(table, frame=table.frame.drop(columns=value, errors="ignore")), np.zeros(len(table))
     if holdout.by is not None:
@@ -116,7 +116,7 @@ def row_track(study: StudyModel) -> Track | None:
 
 
 def position_steps(study: StudyModel) -> Preparation:
-    """The steps that position a row's antennas; they leave out no row.
+    """The steps that position the antennas of rows; they keep all rows.
 
     Raises:
         InputError: As for `row_steps`.
@@ -133,7 +133,7 @@ def position_steps(study: StudyModel) -> Preparation:
     )
 
 
-# Code that reads a scene's meshes imports SciPy; only studies that need it load it.
+# Code that reads a scene's meshes imports SciPy, so it is imported only for studies that need it.
 
 
 def _ground(study: StudyModel) -> Ground:

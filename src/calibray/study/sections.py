@@ -1,4 +1,4 @@
-"""The sections of a study file that state the scene, the links and the antennas, each a closed model."""
+"""The sections of a study file that state the scene, the links and the antennas; unknown keys are errors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class SceneSection(Section):
     Attributes:
         file: Mitsuba XML file, relative to the study file's folder, or "sionna:NAME" for a bundled scene.
         frequency: Carrier frequency [Hz].
-        bandwidth: Bandwidth [Hz], for combining over the band.
+        bandwidth: Bandwidth [Hz], for averaging over the band.
         origin: Longitude and latitude [deg] of the scene's origin, for geographic positions.
         crs: Projection of the scene's x and y, for instance "EPSG:32632"; a local projection at the origin if absent.
     """
@@ -43,12 +43,12 @@ class SceneSection(Section):
     def _in_hertz(cls, value: float) -> float:
         lowest, highest = FREQUENCIES
         if not lowest <= value <= highest:
-            raise InputError(f"must be in {lowest:g} to {highest:g} Hz; 28.5 GHz is written 28.5e9")
+            raise InputError(f"must be from {lowest:g} to {highest:g} Hz; write 28.5 GHz as 28.5e9")
         return value
 
 
 class MaterialSection(Section):
-    """``[materials]``, one entry: constants in place of the scene's.
+    """``[materials]``, one entry: constants that replace the scene's.
 
     Attributes:
         itu: ITU-R P.2040 material that gives permittivity and conductivity.
@@ -56,13 +56,13 @@ class MaterialSection(Section):
         relative_permittivity: Real part of the relative permittivity [1].
         conductivity: Conductivity [S/m].
         thickness: Thickness [m].
-        scattering_coefficient: Scattering coefficient [1]; 0 is exact, unlike that of a scene.
+        scattering_coefficient: Scattering coefficient [1]; unlike a scene's value of 0, a stated 0 is exact.
         xpd_coefficient: Cross-polarization discrimination coefficient [1].
         scattering_pattern: "lambertian", "directive" or "backscattering".
         alpha_r: Exponent [1] of the lobe around the specular direction.
         alpha_i: Exponent [1] of the lobe back towards the source.
         lambda_: Share [1] of the diffuse energy in the lobe around the specular direction.
-        roughness_mm: Standard deviation of the heights of the surface [mm], which weakens specular reflections.
+        roughness_mm: Standard deviation of the surface height [mm]; it weakens specular reflections.
     """
 
     itu: Text | None = None
@@ -90,15 +90,15 @@ class MaterialSection(Section):
 
 
 class AverageSection(Section):
-    """``[links.average]``: samples that are close together are averaged to one link, in linear power.
+    """``[links.average]``: samples that are close together are averaged into one link, in linear power.
 
     Attributes:
-        by: "place" of equal receiver positions, "cell" of a square grid, "distance" travelled in the order of the
-            rows, or window of "time".
+        by: "place" averages over equal receiver positions, "cell" over cells of a square grid, "distance" over the
+            distance travelled in the order of the rows, and "time" over time windows.
         size: Width or length [m], or duration [s]; required except for "place".
         time: Column of times; only for "time".
         unbiased: Whether to correct the bias of the logarithm of a mean of few samples.
-        minimum_count: Smallest number of samples of an average; averages of fewer samples are left out.
+        minimum_count: Smallest number of samples in an average; averages of fewer samples are left out.
     """
 
     by: Literal["place", "cell", "distance", "time"]
@@ -135,8 +135,8 @@ class TrackSection(Section):
     Attributes:
         file: GPX file, relative to the study file's folder.
         time: Column of the rows' times: ISO 8601, or seconds since 1970.
-        longest_gap: Longest time between two points of the track [s]; rows in a longer gap are left out.
-        clock: Time by which the table's clock is ahead of the track's [s].
+        longest_gap: Longest time between two track points [s]; rows in a longer gap are left out.
+        clock: Time by which the table's clock is ahead of the track's clock [s].
     """
 
     file: Text
@@ -149,13 +149,13 @@ class MountingSection(Section):
     """``[links.tx_antenna]`` or ``[links.rx_antenna]``: the antenna of each link at this end, and its direction.
 
     Attributes:
-        type: Column of names of ``[antennas.types]``; if absent, all links have the antenna of ``[antennas]``.
-        azimuth_deg: Azimuth [deg], a number or a column; along x if absent. The azimuth rotates the antenna's own
-            orientation.
+        type: Column with names from ``[antennas.types]``; if absent, all links have the antenna of ``[antennas]``.
+        azimuth_deg: Azimuth [deg], a number or a column; along x if absent. It is added to the antenna's own
+            orientation as a rotation.
         azimuth_from: "north" for compass bearings (clockwise from y), "east" for angles counter-clockwise from x.
         downtilt_deg: Mechanical downtilt [deg], a number or a column.
-        electrical_downtilt_deg: Downward shift of the pattern in the antenna's frame [deg], a number or a column; for
-            an array, of its beam.
+        electrical_downtilt_deg: Downward shift of the pattern in the antenna's frame, or of an array's beam [deg], a
+            number or a column.
         steering_deg: Direction to which an array's beam is steered electrically, relative to the antenna [deg], a
             number or a column; clockwise if azimuths are compass bearings.
         aim: "other end" points every antenna at the other end of its link, in place of azimuth and downtilt.
@@ -179,7 +179,7 @@ class MountingSection(Section):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The columns of the links that it names."""
+        """The columns of the links that this section names."""
         stated = (
             self.type,
             self.azimuth_deg,
@@ -203,17 +203,17 @@ class LinksSection(Section):
             unknown transmitted power.
         position: "scene" for metres in the scene's frame, "geographic" for longitude and latitude.
         crs: Reference system of positions that are "geographic", such as EPSG:32632; longitude and latitude if absent.
-        position_unit: Length of one unit of position columns [m], in the scene's frame.
+        position_unit: Unit of the position columns in the scene's frame [m].
         where: Row filter.
         weight: Column of relative weights [1].
         std: Standard deviation [dB] of the values, a number or a column.
         tx_power_dbm: Transmitted power [dBm], a number or a column; needed with a received power.
         eirp_dbm: Radiated power [dBm] in the main direction, in place of the transmitted power.
-        cable_loss_db: Loss between transmitter and antenna [dB], a number or a column, with a transmitted power.
+        cable_loss_db: Loss between transmitter and antenna [dB], a number or a column; needs a transmitted power.
         tx_antenna: Antennas of the transmitters, if they differ.
         rx_antenna: Antennas of the receivers, if they differ.
         device: Column of the names of receiving devices, which parameters such as "rx:PHONE.dx" displace.
-        position_error_m: Standard deviation of the receivers' positions along x and y [m], a number or a column.
+        position_error_m: Standard deviation of receiver position errors along x and y [m], a number or a column.
         frequency: Column of carrier frequencies, in Hz or the unit in its name; if absent, all links have the scene's
             carrier.
         wide: Name of the transmitter by column, for a table with one column per transmitter.
@@ -221,7 +221,7 @@ class LinksSection(Section):
         heights: "ground" for heights above the scene's ground; above the datum of the scene's frame if absent.
         transmitters: Table with one row per transmitter, relative to the study file's folder.
         transmitter: Column of both tables with the name of the transmitter.
-        missing: Numbers that mean that nothing was measured, in addition to usual ones such as 100 or -999.
+        missing: Numbers that mean that nothing was measured, in addition to common codes such as 100 or -999.
         noise_floor_dbm: Noise floor [dBm]; a missing received power counts as below it.
         below_floor: How rows at or below the noise floor are treated: "exclude" leaves them out, and "censor" keeps
             them as upper bounds of the received power, which the intervals account for.
@@ -268,7 +268,7 @@ class LinksSection(Section):
             )
         if self.crs is not None and (self.position != "geographic" or self.track is not None):
             raise InputError(
-                f"links.crs = {self.crs!r}: it is the reference system of columns with positions on the globe; set "
+                f"links.crs = {self.crs!r}: is the reference system of columns of positions on the globe; set "
                 "links.position = 'geographic', without a track"
             )
         if self.eirp_dbm is not None and (self.tx_power_dbm is not None or self.cable_loss_db is not None):
@@ -296,7 +296,7 @@ class LinksSection(Section):
 
     @property
     def mountings(self) -> dict[str, MountingSection]:
-        """The ends, "tx" and "rx", whose antennas differ between links."""
+        """The sections of the ends, "tx" and "rx", whose antennas differ between links."""
         stated = {"tx": self.tx_antenna, "rx": self.rx_antenna}
         return {end: section for end, section in stated.items() if section is not None}
 
@@ -308,7 +308,7 @@ class AntennasSection(Section):
         tx: The transmit antenna.
         rx: The receive antenna.
         types: Further antennas by name, for ``links.tx_antenna.type`` and ``links.rx_antenna.type``.
-        known: Whether an engine that exports rays used these antennas. By default, isotropic vertical ones at both
+        known: Whether an engine that exports rays used these antennas. By default, isotropic vertical antennas at both
             ends, which a draft assumes, count as unknown.
     """
 

@@ -1,4 +1,4 @@
-"""The opened study: one calibration problem with its links, scene and parameters read, and the paths of its links."""
+"""The opened study: one calibration problem with its links, scene and parameters, and the paths of its links."""
 
 from __future__ import annotations
 
@@ -69,12 +69,12 @@ class Setup:
 
     Attributes:
         study: The study.
-        links: All its links, including held-out links.
-        scene: Its scene with the parameters' start values, because the tracer chooses rays according to the materials.
+        links: All links of the study, including held-out links.
+        scene: Its scene with the parameters' start values, because the tracer's choice of rays depends on materials.
         parameters: The parameters whose values a candidate contains.
         held_out: Mask of the held-out links [L].
         factory: Opens the scene in a ray tracer.
-        placed: Values of the parameters at which paths are traced, if some displace antennas; start values if absent.
+        placed: Values of the parameters at which paths are traced, if any displace antennas; start values if absent.
         neighbours: Distances of the neighbouring positions that are traced, as shares of the largest displacement.
     """
 
@@ -103,13 +103,13 @@ class Setup:
         """
         if not isinstance(study, StudyModel):
             raise InputError(
-                f"study: is a {type_name(study)}, must be a Study; read a file by Study.load(file)"
+                f"study: is a {type_name(study)}, must be a Study; read a file with Study.load(file)"
             )
         held_out = None
         if links is None:
             links = study_links(study)
             if any(entry.spread is not None for entry in study.parameters.values()):
-                # Which transmitters there are is known only from the links.
+                # The transmitters are known only from the links.
                 study = type(study).from_content(with_population(study, links), study.path)
             held_out = study.held_out(links)
             columns = {POSE: study.links.transmitter, RECEIVER: study.links.device}
@@ -118,7 +118,7 @@ class Setup:
         scene = _scene_of(study, study.scene.frequency)
         parameters = study.parameter_set(scene.materials, scene.laws)
         parameters.check_carriers([frequency for frequency, _ in links.carriers])
-        # The tracer samples reflection and refraction by the constants of the scene: by the start values.
+        # The tracer samples reflection and refraction with the scene's constants, which are the start values here.
         scene = replace(scene, materials=parameters.materials(parameters.start, scene.materials))
         if held_out is None:
             held_out = np.zeros(len(links), dtype=bool)
@@ -126,11 +126,11 @@ class Setup:
         return setup.with_obstruction() if study.uses_obstruction else setup
 
     def opened(self) -> Setup:
-        """Itself, so that functions accept a study, opened or not."""
+        """This setup; the method lets functions accept both a study and an opened study."""
         return self
 
     def replace(self, method: str | None = None, seed: int | None = None, engine: str | None = None) -> Setup:
-        """The same with another method, seed or engine; no file is read again (see `Study.replace`).
+        """The setup with another method, seed or engine; no file is read again (see `Study.replace`).
 
         Raises:
             InputError: A value is impossible.
@@ -138,12 +138,12 @@ class Setup:
         return self._with_tracer(replace(self, study=self.study.replace(method, seed, engine)))
 
     def at(self, links: Measurements) -> Setup:
-        """The same with other links, none of them held out; no file is read again."""
+        """The setup with other links, none of them held out; no file is read again."""
         setup = self._with_tracer(replace(self, links=links, held_out=np.zeros(len(links), dtype=bool)))
         return setup.with_obstruction() if self.study.uses_obstruction else setup
 
     def with_obstruction(self) -> Setup:
-        """The same with the columns of the links' table that follow from the scene (`obstruction.COLUMNS`)."""
+        """The setup with the links' columns that are computed from the scene (`obstruction.COLUMNS`)."""
         study = self.study
         links = with_obstruction(
             self.links,
@@ -156,9 +156,9 @@ class Setup:
         return self if links is self.links else self._with_tracer(replace(self, links=links))
 
     def effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
-        """Effects on paths that are not material constants: wrong directions of antennas, regions, and rough surfaces.
+        """Effects on paths other than those of material constants: antenna errors, regions, and rough surfaces.
 
-        `links` are the indices of the paths' links among all links; all if None.
+        `links` are the indices of the paths' links among all links; all links if None.
         """
         effects = self._pose_and_region_effects(paths, links)
         return effects + self._displacement_effects(paths, effects)
@@ -169,7 +169,7 @@ class Setup:
         return poses + self._path_effects(paths)
 
     def _path_effects(self, paths: Paths) -> Effects:
-        """The effects that depend on the path alone: the loss in regions and on rough surfaces."""
+        """The effects that depend only on the path: the loss in regions and on rough surfaces."""
         study, parameters, frequency = self.study, self.parameters, self.study.scene.frequency
         displaced = self._position_error_m is not None
         extra = region_effects(study.regions, self.regions, parameters, paths, frequency, displaced=displaced)
@@ -193,10 +193,10 @@ class Setup:
         return np.array([self.placed.get(item.name, item.start) for item in self.parameters])
 
     def placed_at(self, values: Mapping[str, float], neighbours: tuple[float, ...] = ()) -> Setup:
-        """The same, traced with antennas at the positions that values of the parameters state.
+        """The setup, traced with antennas at the positions given by values of the parameters.
 
-        Unchanged if no parameter displaces antennas. Path loss is interpolated between `neighbours` on each side of
-        these positions, shares of the largest displacement; without any, it does not depend on displacements.
+        It is unchanged if no parameter displaces antennas. Path loss is interpolated between `neighbours` on each side
+        of these positions, shares of the largest displacement; without any, it does not depend on displacements.
         """
         if not any(displaces(item.name) for item in self.parameters):
             return self
@@ -228,7 +228,7 @@ class Setup:
 
     @property
     def radio(self) -> RadioSettings:
-        """Carrier, bandwidth, combining and antennas."""
+        """Carrier, bandwidth, way of combining paths, and antennas."""
         study = self.study
         wanted = tuple(section.wanted(name) for name, section in study.observables.items())
         return RadioSettings(
@@ -241,9 +241,9 @@ class Setup:
 
     @property
     def known_antennas(self) -> tuple[Antenna, Antenna] | None:
-        """Transmit and receive antenna, if the study states them; otherwise those of an engine are unknown.
+        """Transmit and receive antenna of an engine that exports rays; None if the study does not state them.
 
-        Antennas that differ between links are not a pair.
+        The result is also None if antennas differ between links.
         """
         section = self.study.antennas
         known = section != AntennasSection() if section.known is None else section.known
@@ -279,7 +279,7 @@ class Setup:
 
     @cached_property
     def _loaded(self) -> dict[str, Any]:
-        """The tracer once it is loaded and the digest of its files, shared by all setups of one scene."""
+        """The tracer, once it is loaded, and the digest of its files; shared by all setups of one scene."""
         return {}
 
     def _files_digest(self) -> str:
@@ -301,7 +301,7 @@ class Setup:
 
     @cached_property
     def enclosed(self) -> EnclosedAntennas | None:
-        """Antennas inside closed bodies of the scene; None if an external program answers."""
+        """Antennas inside closed bodies of the scene; None if an external program computes path loss."""
         if self.study.engine.external:
             return None
         tracer, links = self.tracer, self.links
@@ -327,9 +327,9 @@ class Setup:
     def trace(
         self, materials: Mapping[str, Material] | None = None, progress: Progress | None = None
     ) -> Paths:
-        """The paths of the links, from the cache if they were traced before, or from the ray table of the study.
+        """The paths of the links, from the cache if they were traced before, or from the study's ray table or program.
 
-        A program that answers with rays is called once. Links that differ only in their carrier are traced once.
+        A program that returns rays is called once. Links that differ only in their carrier are traced once.
         `materials` replace the scene's by name; `progress` is called with "tracing" after every launch.
 
         Raises:
@@ -345,7 +345,7 @@ class Setup:
         scene = replace(self.scene, materials={**self.scene.materials, **(materials or {})})
         if self.links.frequency is None:
             return self._mounted(self._trace_links(self._links_in_place, scene, progress), scene)
-        # Paths do not depend on the carrier: ends that several carriers share are traced once.
+        # Paths do not depend on the carrier, so pairs of ends that several carriers share are traced once.
         ends = np.hstack([self.links.tx, self.links.rx])
         _, first, pair = np.unique(ends, axis=0, return_index=True, return_inverse=True)
         distinct = replace(self.links.select(np.isin(np.arange(len(ends)), first)), frequency=None)
@@ -356,7 +356,7 @@ class Setup:
         )
 
     def _trace_links(self, links: Measurements, scene: Scene, progress: Progress | None) -> Paths:
-        """Paths of the links, or the mean over displaced receivers if positions have errors."""
+        """Paths of the links; if positions have errors, paths whose power is the mean over displaced receivers."""
         errors = self._position_error_m
         if errors is None:
             return self._trace(links, scene, progress)
@@ -364,12 +364,12 @@ class Setup:
 
     @cached_property
     def _ground(self) -> Ground | None:
-        """Heights of the lowest surfaces, +inf where there is none; None if heights are not relative to the ground."""
+        """Height of the lowest surface, +inf where there is none; None if heights are not relative to the ground."""
         return None if self.study.links.heights is None else scene_place(self.study).surfaces().lowest_surface
 
     @cached_property
     def _position_error_m(self) -> NDArray[np.float64] | None:
-        """Standard deviation of the receivers' positions along x and y [L], [m]; None for exact or predicted ones."""
+        """Standard deviation of receiver position errors along x and y [L], [m]; None for exact positions."""
         stated = self.study.links.position_error_m
         if stated is None or not self.links.measured:
             return None
@@ -383,9 +383,9 @@ class Setup:
         return errors
 
     def with_position_noise(self) -> Setup:
-        """The same, its links weighted by the noise that errors of their positions add; itself without such errors.
+        """The setup with links weighted by the noise due to position errors; unchanged without such errors.
 
-        The noise is the spread of path loss between displaced receivers at the start values.
+        The noise is the spread of path loss over displaced receivers at the start values.
         """
         errors, links, study = self._position_error_m, self.links, self.study
         if errors is None:
@@ -398,13 +398,13 @@ class Setup:
         effects = self._pose_and_region_effects(paths, np.tile(np.arange(len(links)), len(DIRECTIONS)))
         replay = Replay(paths, self.parameters, effects=effects, computation=Computation(batch=1))
         loss = replay.path_loss(self.parameters.start[None])[0]
-        # With stated standard deviations, weights are inverse variances.
+        # If standard deviations are stated, weights are inverse variances.
         variance = 1 / links.weight if study.links.std is not None else (study.noise.std_db or 0.0) ** 2
         weight = 1 / (variance + spread_db(loss) ** 2)
         return self._with_tracer(replace(self, links=replace(links, weight=weight)))
 
     def _mounted(self, paths: Paths, scene: Scene, mountings: Mapping[str, Mounting] | None = None) -> Paths:
-        """The paths with the fields of the antennas that differ between links, and the materials of facades."""
+        """The paths with the fields of antennas that differ between links, and with the materials of facades."""
         study, mountings = self.study, self.mountings if mountings is None else mountings
         paths = mount(paths, mountings) if mountings else paths
         if not study.facades:
@@ -431,13 +431,13 @@ class Setup:
             if plan.seconds > LONG_TRACE_SECONDS:
                 _LOG.warning("%s", plan.announcement(len(links)))
             paths = self.tracer.trace(links, progress, scene.materials)
-            # The fingerprint is that of the files now; the tracer may have read them before they changed.
+            # Store the trace only if the files have not changed since the tracer read them.
             if self._files_digest() == self._loaded["files"]:
                 cache.store_trace(digest, paths)
         return paths
 
     def with_trace(self, settings: TraceSettings) -> Setup:
-        """The same with other settings of the ray tracer, whose scene is not loaded again."""
+        """The setup with other settings of the ray tracer; the scene is not loaded again."""
         changed = replace(self, study=self.study.model_copy(update={"trace": settings}))
         tracer = self.tracer.with_settings(settings)
         changed.__dict__["_loaded"] = {**self._loaded, "tracer": tracer}
@@ -468,7 +468,7 @@ def _scene_of(study: StudyModel, frequency: float) -> Scene:
 
 
 def _paths_of_table(setup: Setup, file: Path, materials: Mapping[str, Material]) -> Paths:
-    """The paths of the study's ray table, whose powers apply at the start values."""
+    """The paths of the study's ray table, whose powers are valid at the start values."""
     from calibray.engines.rays.compile import RaySetting, compile_rays
     from calibray.engines.rays.table import RayTable, read_ray_file
 
@@ -477,7 +477,7 @@ def _paths_of_table(setup: Setup, file: Path, materials: Mapping[str, Material])
 
 
 def _paths_of_program(setup: Setup, materials: Mapping[str, Material], progress: Progress | None) -> Paths:
-    """The paths that the study's program returns, whose powers apply at these materials."""
+    """The paths that the study's program returns, whose powers are valid for `materials`."""
     from calibray.engines.rays.export import Exporting
 
     scene = replace(setup.scene, materials={**setup.scene.materials, **materials})

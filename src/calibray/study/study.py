@@ -50,14 +50,14 @@ class Study(StudyModel):
     Attributes:
         version: Version of the file format.
         scene: The scene and the carrier.
-        objects: Materials that are created for some objects, by name: a pattern of the objects' names.
-        materials: Constants in place of the scene's, by material name.
+        objects: Materials that are created for objects, by name: a pattern of the objects' names.
+        materials: Constants that replace the scene's, by material name.
         links: The measured links.
         antennas: The antennas.
         trace: Settings of the ray tracer.
-        objective: How paths are combined to a path loss.
+        objective: How paths are combined into a path loss.
         parameters: The free parameters by name, in the order of a candidate's values.
-        offset: The short form of the nuisance term "offset", or None.
+        offset: The nuisance term "offset" in its short form, or None.
         nuisance: Further nuisance terms by name; `nuisance_terms` contains all terms.
         noise: The errors of measured links.
         holdout: The held-out links, or None.
@@ -77,19 +77,19 @@ class Study(StudyModel):
         overwrite: bool = False,
         **sections: Mapping[str, Any],
     ) -> Study:
-        """A study of a Sionna RT scene in memory, with its carrier, transmitters, receivers, arrays and materials.
+        """Make a study of a Sionna RT scene in memory, with its carrier, transmitters, receivers, arrays and materials.
 
         Args:
             scene: The `sionna.rt.Scene`.
             measured: Path loss [tx, rx], [dB], in the order of the scene's transmitters and receivers, with NaN where
                 nothing was measured; or a pandas DataFrame with names of transmitters as rows and of receivers as
                 columns. Masked values and pd.NA count as NaN.
-            folder: Folder to write the scene, the links and `study.toml` into, for `Study.load`; a temporary folder if
+            folder: Folder for the scene, the links and `study.toml`, which `Study.load` reads; a temporary folder if
                 None.
             overwrite: Replace files in the folder that Calibray did not write.
-            **sections: Sections of the study file in place of the defaults, such as ``trace={"max_depth": 5}`` or
-                ``links={"quantity": "received_power"}``. Without `parameters`, the permittivity of every material is
-                calibrated.
+            **sections: Sections of the study file that replace the defaults, such as ``trace={"max_depth": 5}`` or
+                ``links={"quantity": "received_power"}``. Without `parameters`, the permittivities of all materials
+                except air and metal are calibrated.
 
         Returns:
             The study; `Result.apply` sets the calibrated materials in the scene.
@@ -144,7 +144,7 @@ class Study(StudyModel):
         links, columns = self.links, {*table.frame}
         group: str | Sequence[str] | None = self.offset_groups or None
         if columns >= {*POSITION_COLUMNS}:
-            # Tables of links that Calibray writes have one column of groups, and one of carriers.
+            # Tables of links that Calibray writes have one column of groups and one column of carriers.
             if "group" in columns and not columns & {*self.offset_groups}:
                 group = "group"
             carrier = "frequency" if links.frequency not in columns else links.frequency
@@ -165,7 +165,7 @@ class Study(StudyModel):
             rows, table = len(table), select_rows(table, Preparation(track=row_track(self)))
             if len(table) < rows:
                 raise InputError(
-                    f"{table.source}: {rows - len(table)} of {rows} rows are outside the times of the track, and have "
+                    f"{table.source}: {rows - len(table)} of {rows} rows are outside the times of the track and have "
                     f"no position; remove them"
                 )
         elif not wide and not columns & {*links.tx, *links.rx}:
@@ -212,18 +212,18 @@ def summary(study: StudyModel) -> tuple[Table, Table]:
 
 VALUE: Final = "measured"
 LARGEST_PERMITTIVITY: Final = 15.0
-"""Upper bound of a permittivity that is calibrated by default, twice that of any building material of ITU-R P.2040."""
+"""Default upper bound of a calibrated permittivity, twice that of any building material in ITU-R P.2040."""
 
 
 def permittivity_bounds(start: float) -> list[float]:
-    """Bounds of a permittivity that is calibrated by default; that of wet ground is far above those of buildings."""
+    """Default bounds of a calibrated permittivity; wet ground has a far higher permittivity than buildings."""
     return [1.5, max(LARGEST_PERMITTIVITY, round(2 * start))]
 
 
 def _write_live_study(
     scene: object, measured: Any, folder: Path, sections: Mapping[str, Any], overwrite: bool
 ) -> dict[str, Any]:
-    """Write the files of a scene in memory and its measured values; returns the content of the study.
+    """Write the files of a scene in memory and its measured values, and return the content of the study.
 
     Raises:
         InputError: The scene or the measured values cannot be used, or the folder cannot be written.
@@ -231,7 +231,7 @@ def _write_live_study(
     from calibray.tracing.sionna.live_scene import LiveScene
 
     if "scene" in sections:
-        raise InputError("scene: is the scene in memory, which states the carrier; set scene.frequency there")
+        raise InputError("scene: the scene in memory states the carrier; set scene.frequency there")
     live = LiveScene.of(scene)
     links = dict(sections.get("links", {}))
     table = _links(live, measured)
@@ -275,7 +275,7 @@ def _write_live_study(
 
 
 def _links(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> pd.DataFrame:
-    """One row for each measured value, with the ends by name."""
+    """One row for each measured value, with the names of both ends."""
     values = _matrix(live, measured)
     tx, rx = (np.array(list(ends.values())) for ends in (live.tx, live.rx))
     row, column = np.nonzero(~np.isnan(values))

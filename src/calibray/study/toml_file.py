@@ -1,4 +1,4 @@
-"""The text of a study file: its TOML, environment variables in file names, and keys of several engines."""
+"""The text of a study file: TOML, environment variables in file names, and keys of several engines."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from calibray.support.strict_models import CLOSED, describe_fault
 SCHEMA_FILE: Final = "study.schema.json"
 HEADING: Final = (
     f"#:schema {SCHEMA_FILE}\n"
-    "# Drafted by `calibray init`. Comments give the reason of each assumption: check antennas and heights first.\n"
+    "# Drafted by `calibray init`. Comments give the reason for each assumption: check antennas and heights first.\n"
 )
 
 
@@ -43,12 +43,12 @@ def read_content(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError:
         raise InputError(f"{path}: not UTF-8 text; save it as UTF-8") from None
     except (ValueError, RecursionError) as error:
-        # Besides malformed TOML: a number with thousands of digits, or lists nested thousands deep.
+        # In addition to malformed TOML: a number with thousands of digits, or lists nested thousands of levels deep.
         raise InputError(f"{path}: not valid TOML: {shortened(str(error), 300)}") from None
 
 
 def study_text(content: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
-    """The text of a study file, with reasons of assumptions, by the dotted name of a section or key, as comments.
+    """The text of a study file; comments state `reasons` of assumptions, given by dotted name of a section or key.
 
     Raises:
         InputError: A name has characters that TOML cannot contain.
@@ -61,7 +61,7 @@ def study_text(content: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
         agrees = tomllib.loads(text) == _with_lists(content)
     except ValueError:  # a lone surrogate, which no TOML file can contain
         pass
-    # Whatever names a table has, the file must say what was drafted and nothing else.
+    # For any names in a table, the file must state exactly what was drafted.
     if not agrees:
         raise InputError(
             "draft: a column or group has a name that a study cannot contain; rename it in the table"
@@ -94,12 +94,12 @@ def _section(name: str, section: Any, reasons: Mapping[str, str]) -> Any:
 
 
 def _commented(item: Any, reason: str | None) -> Any:
-    """An item with a comment of one line: a line break in a column's name would end it, and TOML would follow."""
+    """An item with a one-line comment: a line break in a column's name would end it, and the rest would be TOML."""
     return item.comment(printable(reason)) if reason else item
 
 
 def _item(value: Any) -> Any:
-    """A value in TOML, tables in one line; 3.5e9 Hz is easier to read than 3500000000."""
+    """A value in TOML, with inline tables; large numbers become 3.5e9, for instance, instead of 3500000000."""
     if isinstance(value, Mapping):
         table = tomlkit.inline_table()
         table.update({key: _item(part) for key, part in value.items()})
@@ -125,7 +125,7 @@ def _with_lists(value: Any) -> Any:
 
 
 def refuse_unquoted_names(parameters: Any, path: str | Path) -> None:
-    """Refuse ``walls.thickness = ...``: TOML reads it as a table "walls" with a key "thickness"."""
+    """Raise an error for ``walls.thickness = ...``: TOML reads it as a table "walls" with a key "thickness"."""
     for name, entry in parameters.items() if isinstance(parameters, Mapping) else ():
         for key, value in entry.items() if isinstance(entry, Mapping) else ():
             if isinstance(value, Mapping) and key not in ParameterSection.model_fields:
@@ -135,7 +135,7 @@ def refuse_unquoted_names(parameters: Any, path: str | Path) -> None:
 
 
 def expand(text: str, environment: Mapping[str, str]) -> str:
-    """Replace environment variables: ``${NAME}``, or ``${NAME:-default}`` if one may be unset or empty.
+    """Replace environment variables: ``${NAME}``, or ``${NAME:-default}`` if it may be unset or empty.
 
     Raises:
         InputError: A variable without default is not set, or a ``${`` is malformed.
@@ -160,14 +160,14 @@ def expand(text: str, environment: Mapping[str, str]) -> str:
 
 
 def split_engine_keys(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
-    """Split the table ``[engine]`` into the keys of the engine that it names and those of other engines.
+    """Split the table ``[engine]`` into the keys of the engine that it names and the keys of other engines.
 
     A study may state how its program is called and still use replay; `calibray run --engine command` then calls it.
 
     Raises:
         InputError: Another engine cannot use the value of its key.
     """
-    # The study's own validation refuses a value that is not a table, or names no engine.
+    # The study's own validation rejects a value that is not a table or does not name an engine.
     name = content.get("name", DEFAULT) if isinstance(content, dict) else None
     if not isinstance(name, str) or name not in KINDS:
         return content, {}
@@ -186,7 +186,7 @@ def split_engine_keys(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
 
 def _fault(field: FieldInfo, value: Any) -> str | None:
     """The error in the value of a key; None if there is none."""
-    # The type is composed at run time, which type checkers cannot follow.
+    # The type is composed at run time, which type checkers do not support.
     annotated: Any = Annotated
     checker = TypeAdapter[Any](annotated[field.annotation, Field(), *field.metadata], config=CLOSED)
     try:

@@ -1,4 +1,4 @@
-"""`calibray.trace`: paths of a study, or of a scene and links."""
+"""`calibray.trace`: the paths of a study, or of links in a scene."""
 
 from __future__ import annotations
 
@@ -64,14 +64,14 @@ def trace(
     Args:
         scene: Mitsuba XML file, `sionna:NAME` for a bundled scene, or a scene already read. Alternatively a study,
             which states its links, carrier, antennas and settings; its trace is cached.
-        measurements: The links; their values and carriers do not matter (use `Paths.at` for another carrier). With a
-            study, links in place of the study's.
+        measurements: The links; their values and carriers are not used (use `Paths.at` for another carrier). With a
+            study, these links replace the study's.
         frequency: Carrier frequency [Hz].
         tx_antenna: Transmit antenna, as `Antenna` or a mapping with its attributes.
-        rx_antenna: Receive antenna.
-        materials: Constants by material name, which replace the scene's; with a study, whose start values they replace,
-            or with a scene already read, each is a `Material`.
-        progress: Called with ("tracing", receivers traced, receivers in all) after every launch.
+        rx_antenna: Receive antenna, in the same form.
+        materials: Constants by material name, which replace the scene's or a study's start values. With a study or a
+            scene already read, each must be a `Material`.
+        progress: Called with ("tracing", receivers traced, number of receivers) after every launch.
         **settings: The attributes of `TraceSettings`.
 
     Returns:
@@ -79,7 +79,7 @@ def trace(
 
     Raises:
         InputError: The study, the scene, an antenna, a setting or a position cannot be used; or an argument is missing,
-            or given although the study states it.
+            or is given although the study states it.
         EngineError: The paths do not fit into memory.
     """
     if isinstance(scene, Study):
@@ -138,26 +138,26 @@ def read_rays(
 ) -> Paths:
     """Read the paths of any engine (docs/reference/ray-table.md).
 
-    If the table states the power of the paths, the program has a correction: at the materials of the scene, or at the
-    study's start values, every path then has the power of the table.
+    If the table states the powers of the paths, the program has a correction: with the materials of the scene, or the
+    study's start values, every path then has the power stated in the table.
 
     Args:
         rays: The table: a .csv, .parquet, .json or .h5 file, or its rows. Alternatively the paths of another program: a
             .p2m file of Wireless InSite, the folder of an AODT run or of a DeepMIMO scenario, or Sionna RT's `Paths`.
         scene: Mitsuba XML file, `sionna:NAME`, or a scene already read, with the constants that the engine used.
             Alternatively a study, which states carrier and links; its start values must be those that the engine used.
-        frequency: Carrier frequency [Hz]; without a study.
-        antennas: Transmit and receive antenna, if the engine used these. By default those of the study, if it states
-            them; otherwise the correction contains the antennas.
+        frequency: Carrier frequency [Hz]; only without a study.
+        antennas: Transmit and receive antenna that the engine used. By default, those of the study, if it states them;
+            otherwise the correction contains the antennas.
         axes: The table's axes along x, y and z of the scene, such as "x -z y" for a table whose y axis points up.
-        tx_power_dbm: Transmitted power of a file that states received power [dBm]: Wireless InSite.
+        tx_power_dbm: Transmitted power [dBm], for a file that states received power (Wireless InSite).
 
     Returns:
         The path program. With a study, the links are those of the study; without one, those of the table by label or
         position.
 
     Raises:
-        InputError: The table, the scene or an antenna cannot be used, or they do not agree.
+        InputError: The table, the scene or an antenna cannot be used, or they are inconsistent.
 
     Example:
         >>> from calibray.scenarios import demo_study_path
@@ -192,9 +192,9 @@ def read_rays(
 
 
 def write_rays(paths: Paths, file: str | Path, *, overwrite: bool = False) -> None:
-    """Write paths as a ray table, for other engines and programs; powers are computed with its materials.
+    """Write paths as a ray table for other engines and programs; powers are computed with the paths' materials.
 
-    The file ends in .csv, .parquet, .json or .h5; `overwrite` replaces one that Calibray did not write.
+    The file name ends in .csv, .parquet, .json or .h5; `overwrite` replaces a file that Calibray did not write.
 
     Raises:
         InputError: The file cannot be written, or a path has no power.
