@@ -51,8 +51,8 @@ _GRAZING: Final = 1e-9
 """Smallest cosine at a node. At exactly 0, even air would reflect everything."""
 
 _EXTRA_NODES: Final = 3
-"""Number of nodes of a row in addition to its number of intervals: one before the first interval, one at the end of the
-last, and one after it."""
+"""Number of nodes minus number of intervals of a row: one node before the first interval, one at the end of the last
+interval, and one after it."""
 
 _STENCIL: Final = 3
 """Nodes on either side that `table_error` needs."""

@@ -105,7 +105,7 @@ class DiffuseArguments:
         cos_scattered: Cosine of the angle between the scattered direction and the normal [D].
         cos_incidence: Cosine of the angle of incidence [D]; empty if every material is Lambertian.
         cos_specular: Cosine of the angle between the scattered and specular directions [D]; empty in the same case.
-        cos_backward: Cosine of the angle between the scattered direction and the direction to the source [D]; likewise.
+        cos_backward: Cosine of the angle between scattered direction and direction to the source [D]; empty likewise.
         patterns: Scattering pattern of every material.
     """
 

@@ -194,7 +194,7 @@ class Paths:
             path: The HDF5 file.
 
         Returns:
-            The path program, equal to the one saved.
+            The path program, equal to the saved one.
 
         Raises:
             InputError: The file does not exist, is not a path file, has a different version, or is damaged.

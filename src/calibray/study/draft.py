@@ -248,7 +248,7 @@ class Draft:
 
     Attributes:
         text: The study file.
-        study: The study in it.
+        study: The study that the text states.
         assumptions: The assumptions, in the order of the file.
     """
 
@@ -457,7 +457,7 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
 
 
 def _patterns(links: LinksDraft, folder: Path, mount: dict[str, str]) -> dict[str, Any]:
-    """Antennas by their names in a column, with the files of these names; a single file is for all transmitters."""
+    """Antennas by name in a column, with the files of these names; a single file is used for all transmitters."""
     try:
         files = sorted(file for file in folder.iterdir() if file.suffix.lower() in TWO_CUT_SUFFIXES)
     except OSError as error:

@@ -25,7 +25,7 @@ from calibray.tracing.gain_table import read_gain_table
 from calibray.tracing.settings import Antenna
 
 BELOW_FREE_SPACE_DB: Final = 6.0
-"""Margin below free-space loss beyond which path loss is suspicious [dB]; a ground reflection gains up to 6 dB."""
+"""Largest plausible margin of path loss below free-space loss [dB]; a ground reflection alone gains up to 6 dB."""
 
 GUIDED_DB: Final = 12.0
 """The same margin under a roof [dB]: in a corridor of 40 m by 2.4 m, four reflections gain up to 11 dB at 60 GHz."""
@@ -217,7 +217,7 @@ def _positions(
             "leave out wrong positions with links.where, or make a larger scene",
         )
     if through_walls:
-        return  # some antennas may be indoors
+        return  # antennas may be indoors
     inside = roofed & ~overhead.underground(rx)
     if inside.any():
         problem = f"{int(inside.sum())} of {len(rx)} receivers are inside buildings"

@@ -57,7 +57,7 @@ class RegionSection(Section):
         file: GeoJSON file, Shapefile, GeoPackage or FlatGeobuf file with the polygons, relative to the study file.
         canopy: GeoTIFF with the height of the trees above the ground, in place of polygons.
         boxes: Rectangles in place of a file: west, south, east, north [m] in the scene's frame.
-        position: "geographic" if the file's coordinates are those of its reference system, "scene" for metres in the
+        position: "geographic" if the file's coordinates are in its reference system, "scene" if they are metres in the
             scene's frame.
         heights: "ground" for heights above the scene's ground, which the region follows (always for a canopy); if
             absent, heights are above z = 0 of the scene.

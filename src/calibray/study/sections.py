@@ -150,8 +150,8 @@ class MountingSection(Section):
 
     Attributes:
         type: Column with names from ``[antennas.types]``; if absent, all links have the antenna of ``[antennas]``.
-        azimuth_deg: Azimuth [deg], a number or a column; along x if absent. It is added to the antenna's own
-            orientation as a rotation.
+        azimuth_deg: Azimuth [deg], a number or a column; along x if absent. It rotates the antenna in
+            addition to the antenna's own orientation.
         azimuth_from: "north" for compass bearings (clockwise from y), "east" for angles counter-clockwise from x.
         downtilt_deg: Mechanical downtilt [deg], a number or a column.
         electrical_downtilt_deg: Downward shift of the pattern in the antenna's frame, or of an array's beam [deg], a
@@ -197,7 +197,7 @@ class LinksSection(Section):
         file: CSV, Parquet or Excel file, relative to the study file's folder.
         tx: Transmitter position (x, y, z) [m], each a number or a column; longitude, latitude [deg] and height [m]
             if positions are "geographic".
-        rx: Receiver position, likewise.
+        rx: Receiver position, in the same form.
         value: Column of the measured values.
         quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm], a received power with
             unknown transmitted power.

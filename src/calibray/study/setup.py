@@ -69,7 +69,7 @@ class Setup:
 
     Attributes:
         study: The study.
-        links: All links of the study, including held-out links.
+        links: All links of the study, including the held-out links.
         scene: Its scene with the parameters' start values, because the tracer's choice of rays depends on materials.
         parameters: The parameters whose values a candidate contains.
         held_out: Mask of the held-out links [L].
@@ -96,7 +96,7 @@ class Setup:
         Args:
             study: The study.
             tracer: Opens the scene in a ray tracer.
-            links: Links in place of the study's; none of them is held out.
+            links: Links that replace the study's; none of them is held out.
 
         Raises:
             InputError: The links, the scene, the parameters or the hold-out cannot be used.
@@ -196,7 +196,7 @@ class Setup:
         """The setup, traced with antennas at the positions given by values of the parameters.
 
         It is unchanged if no parameter displaces antennas. Path loss is interpolated between `neighbours` on each side
-        of these positions, shares of the largest displacement; without any, it does not depend on displacements.
+        of these positions (shares of the largest displacement); without any, it does not depend on displacements.
         """
         if not any(displaces(item.name) for item in self.parameters):
             return self
@@ -481,7 +481,7 @@ def _paths_of_program(setup: Setup, materials: Mapping[str, Material], progress:
     from calibray.engines.rays.export import Exporting
 
     scene = replace(setup.scene, materials={**setup.scene.materials, **materials})
-    # The program gets the constants of the materials in the order of a candidate.
+    # The program receives the material constants in the order of a candidate.
     candidate = [getattr(scene.materials[item.material], item.constant) for item in setup.parameters]
     program = cast(Answering, setup.study.engine.open(setup, None, progress, None))
     return Exporting(program, replace(setup, scene=scene)).export(np.array(candidate)).paths

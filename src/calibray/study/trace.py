@@ -153,8 +153,8 @@ def read_rays(
         tx_power_dbm: Transmitted power [dBm], for a file that states received power (Wireless InSite).
 
     Returns:
-        The path program. With a study, the links are those of the study; without one, those of the table by label or
-        position.
+        The path program. With a study, it has the study's links; without a study, it has the table's links, identified
+        by label or position.
 
     Raises:
         InputError: The table, the scene or an antenna cannot be used, or they are inconsistent.

@@ -42,7 +42,7 @@ POINT_TOLERANCE: Final = 0.01
 
 @dataclass(frozen=True)
 class Launch:
-    """Rays from one transmitter, and the receivers to which they find paths.
+    """Rays from one transmitter, and the receivers to which paths are searched for.
 
     Attributes:
         source: Position of the transmitter [3], [m].

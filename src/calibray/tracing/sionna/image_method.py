@@ -34,7 +34,7 @@ from calibray.tracing.sionna.buffers import aligned, per_interaction, to_numpy
 from calibray.tracing.sionna.scene import shape_ids
 
 SAME_PLANE: Final = 2e-3
-"""Largest difference of the offsets of equal planes [m]; their normals differ by at most a fiftieth of this number."""
+"""Largest difference between the offsets of equal planes [m]; their normals differ by at most a fiftieth of it."""
 CONFUSABLE_PLANE: Final = 0.05
 """The same limit for planes that the tracer may confuse in single precision."""
 MARGIN: Final = 0.1

@@ -221,7 +221,7 @@ class Solver:
         )
         # Evaluated together: otherwise, reading each array would run the whole stage again.
         dr.eval(fields.a, fields.tau)
-        # The field stage clears the flags of some paths; they are restored, so that it can run again.
+        # The field stage may clear the flags of paths; they are restored, so that it can run again.
         buffer.valid = valid
         return np.array([[to_numpy_complex(gain) for gain in row] for row in fields.a]).transpose(2, 0, 1)
 
