@@ -239,6 +239,24 @@ def test_dependent_columns_are_held_at_zero():
     assert target.determined.tolist() == [False, True, True, True, True, False]
 
 
+def test_a_dependent_column_moves_where_bounds_keep_the_others_from_the_minimum():
+    """Levels of 11, 9 and 10 dB: an offset of 8 dB or more explains them with terms of at most 3 dB."""
+    links = campaign(60, 3)
+    terms = (
+        make_term(links, "all", bounds=(-20.0, 20.0)),
+        make_term(links, "offset", labels=links.group, bounds=(-3.0, 3.0)),
+    )
+    nuisance = Nuisance(60, terms)
+    elimination = Elimination.of(nuisance, links.weight, np.zeros(4))
+    gap = np.array([11.0, 9.0, 10.0])[terms[1].group][None]
+    found = elimination.coefficients(gap)
+    assert nuisance.design @ found[0] == pytest.approx(gap[0], abs=1e-5)
+    # The change of a level changes the coefficients, and nothing of it is left.
+    slope = (terms[1].group == 0)[None, :, None].astype(float)
+    elimination.remove(slope, elimination.projection(slope, found))
+    assert slope == pytest.approx(0.0, abs=1e-5)
+
+
 def test_terms_at_other_links_keep_centre_and_columns():
     links = campaign(50, 3)
     slope = make_term(links, "slope", "log_distance", labels=links.group)

@@ -35,6 +35,10 @@ DEPENDENT: Final = 1e-10
 """A column is linearly dependent if the columns before it leave at most this share of its squared norm. Rounding leaves
 some 1e-16 per column."""
 
+PRIOR: Final = 1e-6
+"""Weight of the prior on a linearly dependent column, relative to its squared norm. In 600 random problems with bounds,
+three sums of squares are then 3e-5 to 4e-4 above the minimum; with 1e-7, coefficients lose a digit."""
+
 ROUNDING: Final = 1e-11
 """Tolerance for a bound violation or a gradient, relative to the size of the right-hand side: rounding of double
 precision."""
@@ -88,7 +92,7 @@ class Elimination:
         order, groups, width = nuisance.layout
         normal = (data + sparse.diags_array(ridge**2)).tocsr()[order][:, order].tocoo()
         arrowhead, determined = Arrowhead.of(normal, groups, width), np.zeros(len(order), dtype=bool)
-        determined[order] = ~arrowhead.held
+        determined[order] = ~arrowhead.dependent
         small = np.count_nonzero(counted) * len(order) <= DENSE
         return cls(
             design=design.toarray() if small else design,
@@ -107,7 +111,7 @@ class Elimination:
         """The best coefficients [n, q], [dB] per unit of the column.
 
         The gap is measured minus modelled path loss at the links with weight [n, m], [dB]. An undetermined coefficient
-        takes the value within its bounds that is nearest to 0.
+        is the value within its bounds nearest to 0, unless a bound keeps the others from the minimum.
 
         Raises:
             EngineError: No minimum within the bounds was found.
@@ -124,7 +128,7 @@ class Elimination:
         best = np.empty_like(side)
         if self.separable:
             # One column per link: the normal equations are diagonal, so each clipped mean is the minimum.
-            best[:, self.order] = side / np.where(self.normal.held, np.inf, self.normal.scale**2)
+            best[:, self.order] = side / np.where(self.normal.dependent, np.inf, self.normal.scale**2)
             return np.clip(best, self.lower, self.upper)
         best[:, self.order] = self.normal.minimum(side, self.lower[self.order], self.upper[self.order])
         return best
@@ -150,7 +154,7 @@ class Elimination:
         # A coefficient at its bound does not follow the parameters.
         free = ((coefficients > self.lower) & (coefficients < self.upper))[:, self.order]
         projection = np.empty_like(side)
-        projection[:, self.order] = self.normal.solve(free & ~self.normal.held, side[:, self.order])
+        projection[:, self.order] = self.normal.solve(free, side[:, self.order])
         return projection
 
     def remove(self, slope: NDArray[np.float64], projection: NDArray[np.float64]) -> None:
@@ -171,15 +175,15 @@ class Arrowhead:
         blocks: The g diagonal blocks [g, b, b].
         border: Products of the block columns with the p border columns [g, b, p].
         corner: Products of the border columns with each other [p, p].
-        held: Undetermined components: their column is zero or a combination of the columns before it, blocks before
-            border [q].
+        dependent: Components whose column is zero or a combination of the columns before it, blocks before border [q].
+            The matrix includes a small prior on them: they are zero unless a bound keeps the others from the minimum.
     """
 
     scale: NDArray[np.float64]
     blocks: NDArray[np.float64]
     border: NDArray[np.float64]
     corner: NDArray[np.float64]
-    held: NDArray[np.bool_]
+    dependent: NDArray[np.bool_]
 
     @classmethod
     def of(cls, matrix: sparse.coo_array, blocks: int, width: int) -> Arrowhead:
@@ -200,12 +204,14 @@ class Arrowhead:
         in_corner = (row >= split) & (column >= split)
         corner[row[in_corner] - split, column[in_corner] - split] = value[in_corner]
         inner, border = inner.reshape(blocks, width, width), border.reshape(blocks, width, edge)
-        held = np.concatenate([_dependent(inner).ravel(), np.zeros(edge, dtype=bool)])
-        arrowhead = cls(scale, inner, border, corner, held)
+        dependent = np.concatenate([_dependent(inner).ravel(), np.zeros(edge, dtype=bool)])
+        arrowhead = cls(scale, inner, border, corner, dependent)
         # Border columns count as dependent if the blocks leave nothing of them.
-        free, tip, outer = arrowhead._restricted(~held[None])
+        free, tip, outer = arrowhead._restricted(~dependent[None])
         left = outer - np.einsum("mgbp,mgbr->mpr", tip, np.linalg.solve(free, tip), optimize=True)
-        held[split:] = _dependent(left[0])
+        dependent[split:] = _dependent(left[0])
+        inner += PRIOR * dependent[:split].reshape(blocks, width, 1) * np.eye(width)
+        corner += np.diag(PRIOR * dependent[split:])
         return arrowhead
 
     def solve(self, free: NDArray[np.bool_], side: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -225,8 +231,6 @@ class Arrowhead:
     ) -> NDArray[np.float64]:
         """Minima [m, q] within bounds [q] for right-hand sides [m, q].
 
-        Fixed components take the value within their bounds that is nearest to zero.
-
         Raises:
             EngineError: The exchanges did not terminate.
         """
@@ -234,8 +238,7 @@ class Arrowhead:
         lower, upper = lower * self.scale, upper * self.scale
         # Blocks without a border are independent problems.
         independent = 1 if self.border.shape[2] else len(self.blocks)
-        free = np.tile(~self.held, (len(side), 1))
-        value = np.tile(np.where(self.held, np.clip(0.0, lower, upper), 0.0), (len(side), 1))
+        free, value = np.ones(side.shape, dtype=bool), np.zeros_like(side)
         fewest = np.full((len(side), independent), len(lower) + 1)
         patience = np.full((len(side), independent), PATIENCE)
         pending = np.arange(len(side))
@@ -247,7 +250,7 @@ class Arrowhead:
             outside = active & ((trial < lower - slack) | (trial > upper + slack))
             inwards = ((trial <= lower) & (descent > slack)) | ((trial >= upper) & (descent < -slack))
             # Free components beyond a bound, and fixed ones that would descend into the box.
-            infeasible = outside | (~active & ~self.held & inwards)
+            infeasible = outside | (~active & inwards)
             value[pending] = np.clip(trial, lower, upper)
             unfinished = infeasible.any(axis=1)
             pending, infeasible = pending[unfinished], infeasible[unfinished]
