@@ -76,7 +76,7 @@ def test_a_validation_of_another_study_or_of_other_measurements_is_refused(valid
     content = STUDY.content()
     content["scene"]["frequency"] = 7e9
     for study, measured in ((Study.from_content(content), MEASURED), (STUDY, MEASURED + 0.1)):
-        with pytest.raises(InputError, match="belongs to another study or other measurements"):
+        with pytest.raises(InputError, match="belongs to a different study or measurements"):
             read_validation(tmp_path, study, measured)
 
 
@@ -91,7 +91,7 @@ def test_a_validation_of_other_links_is_refused_before_it_replaces_that_of_a_res
     content["scene"]["frequency"] = 7e9
     for other, study, words in (
         (twice, result.study, r"of other links \(12"),
-        (validation, Study.from_content(content), "of another study"),
+        (validation, Study.from_content(content), "belongs to another study"),
     ):
         with pytest.raises(InputError, match=words):
             write_validation(other, study, tmp_path, {})
