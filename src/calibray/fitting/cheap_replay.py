@@ -1,4 +1,4 @@
-"""The replay of a study's scene as the cheap model of an engine without derivatives.
+"""The replay of a study's scene as a cheap model of an engine without derivatives.
 
 We trace the study's scene once; evaluating a candidate on its paths then takes microseconds. The constants of the cheap
 model are the material constants that the study does not calibrate: above all thickness, then conductivity and
@@ -35,7 +35,7 @@ BOUND: Final = 3.0
 """Distance of a constant's bounds from its declared value, in standard deviations."""
 
 METAL: Final = 1e4
-"""Conductivity above which a material reflects everything, whatever its other constants [S/m]."""
+"""Conductivity above which a material reflects almost all power, whatever its other constants [S/m]."""
 
 
 class StoredPaths(Protocol):
@@ -53,7 +53,7 @@ class StoredPaths(Protocol):
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss, and its derivatives by the parameters [n, L, d]."""
+        """Path loss, and its derivatives with respect to the parameters [n, L, d]."""
         ...
 
 
@@ -113,7 +113,7 @@ class ReplayedModel:
 
     def __post_init__(self) -> None:
         start = self.engine.parameters.start
-        # The paths are stored, so a link without any gets none for other candidates.
+        # The paths are stored, so a link without a path has none for any other candidate either.
         self._reached = np.isfinite(self.engine.path_loss(start[None])[0])
 
     @property
@@ -239,9 +239,9 @@ class CheapReplay:
 def make_cheap_replay(
     problem: Problem, progress: Progress | None = None, scene: Setup | None = None
 ) -> CheapReplay:
-    """Trace a problem's scene for a cheap model, if its method uses one; otherwise the reason why there is none.
+    """Trace a problem's scene for a cheap model, if its method uses one; give the reason if this fails.
 
-    `scene` is a study of the same links to trace instead. The stage of `progress` is "tracing".
+    `scene` is another study of the same links, traced instead. The stage of `progress` is "tracing".
     """
     setup = problem.setup
     section = setup.study.method

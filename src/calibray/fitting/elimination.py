@@ -33,7 +33,7 @@ DENSE: Final = 2**18
 
 DEPENDENT: Final = 1e-10
 """A column is linearly dependent if the columns before it leave at most this share of its squared norm. Rounding leaves
-some 1e-16 per column."""
+about 1e-16 per column."""
 
 PRIOR: Final = 1e-6
 """Weight of the prior on a linearly dependent column, relative to its squared norm. In 600 random problems with bounds,
@@ -44,10 +44,10 @@ ROUNDING: Final = 1e-11
 precision."""
 
 PATIENCE: Final = 3
-"""Full exchanges without progress before single exchanges start."""
+"""Number of full exchanges without progress before single exchanges start."""
 
 MAX_EXCHANGES: Final = 1000
-"""Limit on the exchanges; tested problems need far fewer."""
+"""Largest number of exchanges; tested problems need far fewer."""
 
 Matrix = NDArray[np.float64] | sparse.csr_array
 
@@ -81,7 +81,7 @@ class Elimination:
 
     @classmethod
     def of(cls, nuisance: Nuisance, weight: NDArray[np.float64], ridge: NDArray[np.float64]) -> Elimination:
-        """Set up the normal equations with weights of all links [L], of which 0 leaves a link out.
+        """Set up the normal equations with the weights of all links [L]; a weight of 0 leaves a link out.
 
         `ridge` is the square root of the prior's term on their diagonal [q].
         """
@@ -111,7 +111,7 @@ class Elimination:
         """The best coefficients [n, q], [dB] per unit of the column.
 
         The gap is measured minus modelled path loss at the links with weight [n, m], [dB]. An undetermined coefficient
-        is the value within its bounds nearest to 0, unless a bound keeps the others from the minimum.
+        is the value within its bounds nearest to 0, unless bounds prevent the others from reaching the minimum.
 
         Raises:
             EngineError: No minimum within the bounds was found.
@@ -176,7 +176,7 @@ class Arrowhead:
         border: Products of the block columns with the p border columns [g, b, p].
         corner: Products of the border columns with each other [p, p].
         dependent: Components whose column is zero or a combination of the columns before it, blocks before border [q].
-            The matrix includes a small prior on them: they are zero unless a bound keeps the others from the minimum.
+            The matrix has a small prior on them: they are zero unless bounds keep the others from the minimum.
     """
 
     scale: NDArray[np.float64]
@@ -189,7 +189,7 @@ class Arrowhead:
     def of(cls, matrix: sparse.coo_array, blocks: int, width: int) -> Arrowhead:
         """Split a positive semidefinite matrix [q, q] into blocks, border and corner.
 
-        The blocks, each of one width, come first and do not overlap.
+        The blocks come first, have the same width, and do not overlap.
         """
         diagonal, split = matrix.diagonal(), blocks * width
         scale = np.where(diagonal > 0, np.sqrt(diagonal), 1.0)
@@ -206,7 +206,7 @@ class Arrowhead:
         inner, border = inner.reshape(blocks, width, width), border.reshape(blocks, width, edge)
         dependent = np.concatenate([_dependent(inner).ravel(), np.zeros(edge, dtype=bool)])
         arrowhead = cls(scale, inner, border, corner, dependent)
-        # Border columns count as dependent if the blocks leave nothing of them.
+        # Border columns are dependent if eliminating the blocks reduces them to zero.
         free, tip, outer = arrowhead._restricted(~dependent[None])
         left = outer - np.einsum("mgbp,mgbr->mpr", tip, np.linalg.solve(free, tip), optimize=True)
         dependent[split:] = _dependent(left[0])
@@ -217,7 +217,7 @@ class Arrowhead:
     def solve(self, free: NDArray[np.bool_], side: NDArray[np.float64]) -> NDArray[np.float64]:
         """Unbounded minima [m, q, k] over the free components for right-hand sides [m, q, k]; the others are zero.
 
-        None of the free components [m, q] is fixed.
+        `free` is the mask of the free components [m, q].
         """
         problems, count, sides = side.shape
         if problems > 1 and (free == free[0]).all():  # all problems share one matrix
@@ -249,13 +249,13 @@ class Arrowhead:
             slack = ROUNDING * (1.0 + np.abs(side[pending]).max(axis=1, initial=0.0))[:, None]
             outside = active & ((trial < lower - slack) | (trial > upper + slack))
             inwards = ((trial <= lower) & (descent > slack)) | ((trial >= upper) & (descent < -slack))
-            # Free components beyond a bound, and fixed ones that would descend into the box.
+            # Free components outside their bounds, and fixed ones whose descent direction points inwards.
             infeasible = outside | (~active & inwards)
             value[pending] = np.clip(trial, lower, upper)
             unfinished = infeasible.any(axis=1)
             pending, infeasible = pending[unfinished], infeasible[unfinished]
             if not len(pending):
-                # Values at a bound are the given bound itself, without the rounding of the scale.
+                # Values at a bound equal the given bound exactly, without rounding by the scale.
                 inside = np.clip(value / self.scale, given_lower, given_upper)
                 return np.where(value == lower, given_lower, np.where(value == upper, given_upper, inside))
             free[pending] ^= _to_exchange(infeasible, fewest, patience, pending)
@@ -280,7 +280,7 @@ class Arrowhead:
         inner = side[:, :split].reshape(len(side), groups, width, -1)
         solved = np.linalg.solve(blocks, np.concatenate([border, inner], axis=-1))
         across, within = solved[..., :edge], solved[..., edge:]
-        # Schur complement: the border with the blocks eliminated.
+        # Schur complement: the corner with the blocks eliminated.
         schur = corner - np.einsum("mgbp,mgbr->mpr", border, across, optimize=True)
         outer = np.linalg.solve(schur, side[:, split:] - np.einsum("mgbp,mgbk->mpk", border, within))
         within = within - across @ outer[:, None]
@@ -313,7 +313,7 @@ def _dependent(matrix: NDArray[np.float64]) -> NDArray[np.bool_]:
     for k in range(matrix.shape[-1]):
         pivot = remainder[..., k, k].copy()
         dependent[..., k] = pivot <= DEPENDENT
-        # A dependent column eliminates nothing.
+        # A dependent column does not change the later ones.
         root = np.where(dependent[..., k], np.inf, np.sqrt(np.maximum(pivot, DEPENDENT)))
         column = remainder[..., :, k] / root[..., None]
         remainder -= column[..., :, None] * column[..., None, :]
@@ -328,8 +328,8 @@ def _to_exchange(
 ) -> NDArray[np.bool_]:
     """Components to exchange [r, q]: all infeasible ones while their number decreases, else the last of each part.
 
-    Infeasible components [r, q] belong to the unsolved problems `pending` [r]. The fewest so far, and the remaining
-    full exchanges without progress, of each independent part [m, i] are updated.
+    Infeasible components [r, q] belong to the unsolved problems `pending` [r]. For each independent part [m, i], the
+    smallest number so far and the remaining full exchanges without progress are updated in place.
     """
     parts = infeasible.reshape(len(infeasible), fewest.shape[1], -1)
     count = parts.sum(axis=2)

@@ -28,14 +28,13 @@ def retrace(
 ) -> tuple[Problem, Trail, NDArray[np.float64] | None]:
     """Trace with the calibrated materials, and calibrate again while the path loss changes by more than the tolerance.
 
-    The tracer samples refraction and diffuse reflection by the materials, so the set of paths can depend on them; and
-    path loss at displaced antennas is interpolated. A trace without all of these needs no check. Only the method `auto`
-    calibrates again; other methods have a fixed budget of RT calls. The stage of `progress` is "checking".
+    The tracer samples refraction and diffuse reflection according to the materials, so the set of paths can depend on
+    them. Path loss at displaced antennas is interpolated. A trace with none of these needs no check. Only the method
+    `auto` calibrates again; other methods have a fixed budget of RT calls. The stage of `progress` is "checking".
 
     Returns:
-        The problem on the last trace that was calibrated on, its search, and the gap of every link: path loss on paths
-        traced with the calibrated materials minus path loss on the paths of the calibration [L], [dB]; None if not
-        checked.
+        The problem of the last calibration, its search, and the gap of every link: path loss on paths traced with the
+        calibrated materials minus path loss on the paths of the calibration [L], [dB]; None if not checked.
     """
     study, parameters = problem.setup.study, problem.parameters
     section = study.engine
@@ -43,7 +42,7 @@ def retrace(
     displaced = any(displaces(name) for name in parameters.names)
     rounds = study.fidelity.rounds
     if rounds is None:
-        # One wrong height of 5 m is approached in 2 traces, five wrong positions in 2 to 4.
+        # A height that is wrong by 5 m is corrected in 2 traces, five wrong positions in 2 to 4.
         rounds = 4 if displaced else 3
     if not isinstance(section, ReplaySection) or section.rays or rounds == 0 or not (sampled or displaced):
         return problem, trail, None
@@ -64,7 +63,7 @@ def retrace(
         gap = path_loss_change(engine.path_loss(best[None])[0], trail.best_modelled)
         objective = problem.objective
         settled = np.abs(gap[objective.weight > 0]).max() <= study.fidelity.tolerance_db
-        # Nearer to the traced position than its neighbours, path loss is known as well as it gets.
+        # Closer to the traced position than the nearest displacement, a further trace gains nothing.
         settled |= displaced and bool((np.abs(best - before) <= near).all())
         if settled or study.method.name != AUTO or turn == rounds - 1:
             break
@@ -74,7 +73,7 @@ def retrace(
         if displaced and paths is not None:
             setup = setup.placed_at(parameters.named(best), AROUND)
             engine, before = replay(setup, paths), best
-            # From the stated weights, because errors of earlier positions no longer apply.
+            # Start from the stated weights, because errors of earlier positions no longer apply.
             weight, error_db = np.where(objective.weight > 0, stated.weight, 0.0), gap
             for effect in getattr(engine, "effects", ()):
                 if isinstance(effect, DisplacementLoss):
@@ -88,20 +87,20 @@ def retrace(
 def with_interpolation_error(
     objective: Objective, modelled: NDArray[np.float64], error_db: NDArray[np.float64]
 ) -> Objective:
-    """The objective with errors of interpolated path loss [L], [dB], in the weights of the links.
+    """The objective with weights of the links that include errors of interpolated path loss [L], [dB].
 
-    Interpolation errs most where paths appear or vanish between the traced positions. Its error at the last check,
-    infinite for links that are left out, and that between the new positions at the modelled path loss [L], [dB], count
-    as standard deviations, in addition to that of the link's other errors.
+    Interpolation errors are largest where paths appear or vanish between the traced positions. `error_db` is a standard
+    deviation in addition to that of a link's other errors, and infinite for links that are left out. The other errors
+    are estimated from the residuals at the modelled path loss [L], [dB].
     """
     counted = (objective.weight > 0) & np.isfinite(error_db)
     residual = (objective.model(modelled[None])[0] - objective.measured)[counted]
-    # Relative to the mean weight; the median is not moved by the links whose interpolation is bad.
+    # Relative to the mean weight; the median is robust against links with large interpolation errors.
     relative = objective.weight[counted] / objective.weight[counted].mean()
     variance = np.median(residual**2 * relative) / chdtri(1, 0.5) / relative
     weight = objective.weight.copy()
     weight[counted] *= variance / (variance + error_db[counted] ** 2)
-    # The standard deviation at the mean weight follows that weight.
+    # The mean weight has changed, and with it the standard deviation that it stands for.
     noise_db = objective.noise_db * np.sqrt(objective.weight[counted].mean() / weight[counted].mean())
     return replace(objective, weight=weight, noise_db=float(noise_db))
 
@@ -113,7 +112,7 @@ def path_loss_change(after: NDArray[np.float64], before: NDArray[np.float64]) ->
 
 
 def traced_again(path_loss_db: NDArray[np.float64], gap: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Path loss [L], [dB], on the paths of the new trace; unchanged at links that had no path before."""
+    """Path loss [L], [dB], on the paths of the new trace; unchanged for links that had no path before."""
     return np.where(np.isneginf(gap), path_loss_db, path_loss_db + np.where(np.isneginf(gap), 0.0, gap))
 
 

@@ -36,7 +36,7 @@ START_SPREAD: Final = 6.0
 """Standard deviation between the groups of a random effect before it is estimated [dB per unit of the column]."""
 
 ROUNDING: Final = 1e-9
-"""Difference of distances, in decades, that is rounding."""
+"""Largest difference between distances that is attributed to rounding [decades]."""
 
 UNBOUNDED: Final = (-np.inf, np.inf)
 
@@ -46,11 +46,11 @@ class Term:
     """A column of the links with one unknown coefficient, or one coefficient per group of links.
 
     Attributes:
-        name: Its name.
+        name: Name of the term.
         by: The column: "constant", "log_distance", or a column of the links' table.
         value: The values of the column [L]: 1 for a constant; decades of distance relative to `centre` for
             "log_distance"; otherwise in the unit of the table.
-        group: Index of each link's group in `labels` [L]; -1 for a link of another group.
+        group: Index of each link's group in `labels` [L]; -1 for a link in none of these groups.
         labels: Labels of the groups; one empty label if all links share one coefficient.
         bounds: Lower and upper bound of every coefficient, [dB] per unit of the column.
         prior: Standard deviation of the coefficients' Gaussian prior around zero, in the same unit; +inf for none.
@@ -89,7 +89,7 @@ class Term:
         if labels is None:
             return replace(self, value=value, group=np.zeros(len(links), dtype=np.int64))
         link_labels = _labels(self.name, links, labels)
-        # The labels are sorted. An unknown one finds a neighbour, which it does not equal.
+        # The labels are sorted, so the index of an unknown label is that of a neighbour with a different label.
         index = np.minimum(np.searchsorted(self.labels, link_labels), len(self.labels) - 1)
         matches = np.array(self.labels)[index] == link_labels
         return replace(self, value=value, group=np.where(matches, index, -1))
@@ -148,10 +148,10 @@ def make_term(
 
 
 def random_effect(links: Measurements, name: str, by: str, labels: ArrayLike) -> tuple[Term, Term]:
-    """The terms of a random effect by a column, as for `make_term`, with the labels of the links' groups [L].
+    """The two terms of a random effect: a shared coefficient, and the deviation of each group from it.
 
-    They are a coefficient that all links share, and the deviation of each group from it, whose prior `estimate_noise`
-    replaces by the estimated spread.
+    The column is as in `make_term`, and `labels` are those of the links' groups [L]. `estimate_noise` replaces the
+    prior of the deviations by the estimated spread.
     """
     deviations = make_term(links, deviations_of(name), by, labels=labels, prior=START_SPREAD)
     return make_term(links, name, by), replace(deviations, around=name)
@@ -196,7 +196,7 @@ class Nuisance:
         terms: Its terms; may be empty.
 
     Raises:
-        InputError: A term has another number of links, or two terms have the same name.
+        InputError: A term has a different number of links, or two terms have the same name.
     """
 
     num_links: int
@@ -214,7 +214,7 @@ class Nuisance:
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns [q], term after term."""
+        """Names of the columns [q], term by term."""
         return tuple(name for term in self.terms for name in term.columns)
 
     @cached_property
@@ -234,10 +234,10 @@ class Nuisance:
 
     @cached_property
     def design(self) -> sparse.csr_array:
-        """The design [L, q]: a row has one entry for each term with a group of the link."""
+        """The design [L, q]: a link's row has one entry for each term with a group that contains the link."""
         parts = [sparse.csr_array((self.num_links, 0))]
         for term in self.terms:
-            # A link of another group has no entry.
+            # A link in none of the groups has no entry.
             row = np.flatnonzero(term.group >= 0)
             entries = (term.value[row], (row, term.group[row]))
             parts.append(sparse.csr_array(entries, shape=(self.num_links, len(term.labels))))
@@ -269,7 +269,7 @@ class Nuisance:
         return (self.design @ coefficients.T).T
 
     def filled(self, coefficients: NDArray[np.float64], determined: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Coefficients [n, q], with the mean of a term's determined ones [q] for its others.
+        """Coefficients [n, q]; those not determined [q] have the mean of the determined ones of their term.
 
         Undetermined deviations of a random effect keep their value, 0.
         """
@@ -283,13 +283,13 @@ class Nuisance:
         return filled
 
     def new_group_spread(self, block: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Standard deviation of random effects at links whose group is only in one block, if it is left out [L], [dB].
+        """Standard deviation of the random effects of each link that no other block determines [L], [dB].
 
-        The block of a link that is not used is -1 [L].
+        `block` is the block of each link, and -1 for a link that is not used [L].
         """
         variance = np.zeros(self.num_links)
         for term in self.terms:
-            # A group of a single block has no other link that determines its coefficient.
+            # If a group is in one block only, no link of another block determines its coefficient.
             pairs = np.unique(np.stack([term.group, block])[:, block >= 0], axis=1)
             alone = np.bincount(pairs[0], minlength=len(term.labels)) == 1
             variance += (
@@ -300,7 +300,7 @@ class Nuisance:
     def by_term(
         self, coefficients: NDArray[np.float64], determined: NDArray[np.bool_]
     ) -> dict[str, dict[str, float]]:
-        """Determined coefficients [q] by term and group; a random effect counts as one term, with its groups' sums."""
+        """Determined coefficients [q] by term and group; a random effect is one term, mean plus deviation."""
         coefficient: dict[str, dict[str, float]] = {}
         first = 0
         for term in self.terms:

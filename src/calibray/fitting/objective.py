@@ -1,8 +1,8 @@
 """The objective that a calibration minimises.
 
-It is the paper's RMSE (eq. 1) over the links with weight, weighted by their weights. Nuisances, an offset or other
-columns of a linear design, enter the model as path loss + design x coefficients. For every candidate, the best
-coefficients follow in closed form (variable projection), so optimizers search only the parameters.
+It is the paper's weighted RMSE (eq. 1) over the links with nonzero weight. Nuisances (an offset or other columns of a
+linear design) enter the model as path loss + design x coefficients. For every candidate, the best coefficients follow
+in closed form (variable projection), so optimizers search only the parameters.
 
 A Gaussian prior of a coefficient adds the row (noise / prior) x coefficient to the residuals. Up to constants, the sum
 of squares is then minus twice the log posterior, in units of the noise variance. `value` includes these rows, `rmse` is
@@ -15,7 +15,7 @@ normal equations with the nuisance eliminated. With A = [J g] and the best coeff
     (A - Z X)' w (A - Z X) = A'wA - X'Z'wA - A'wZ X + X'Z'wZ X.
 
 From these products we build a few rows with the same squares and products as the residuals of all links, for methods
-that use residuals in no other way.
+that use only these squares and products.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Sums:
     """Sums over links for n candidates and k columns: the derivatives, if requested, then the gap.
 
     Attributes:
-        square: Columns' products A'wA [n, k, k]; infinite for the gap if a candidate loses the path of a link.
+        square: Columns' products A'wA [n, k, k]; infinite for the gap if a link has no path.
         side: Products with the design Z'wA [n, q, k].
     """
 
@@ -78,7 +78,7 @@ class Share:
         at_ceiling = loss >= (np.inf if self.ceiling_db is None else self.ceiling_db)
         gap = self.measured - (loss if self.ceiling_db is None else np.minimum(loss, self.ceiling_db))
         lost = np.asarray(~np.isfinite(gap).all(axis=1))
-        # A candidate that loses a path is marked below; its sums must stay finite.
+        # Candidates for which a link has no path are marked below; their sums must stay finite here.
         columns = np.where(lost[:, None], 0.0, gap)[..., None]
         if derivative is not None:
             slope = np.where((at_ceiling | lost[:, None])[..., None], 0.0, derivative[:, self.links])
@@ -110,7 +110,7 @@ class Objective:
     noise_db: float = 1.0
 
     def reweighted(self, weight: NDArray[np.float64]) -> Objective:
-        """The objective with other weights [L]; the noise at the mean weight follows, so errors of links stay."""
+        """The objective with other weights [L]; the noise is rescaled, so that the errors of links do not change."""
         if not (weight > 0).any():
             return replace(self, weight=weight)
         before, after = (float(each[each > 0].mean()) for each in (self.weight, weight))
@@ -130,7 +130,7 @@ class Objective:
     def completed(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """The `coefficients` with which other links are predicted [n, q], for path loss [n, L], [dB].
 
-        One that is not `determined` has the mean of its term's other groups, and the rest fit best with these.
+        One that is not `determined` is the mean of the determined ones of its term, which are then fitted again.
         """
         gap = self.measured - self.capped(path_loss)
         coefficients = self._fitted(gap)
@@ -141,14 +141,14 @@ class Objective:
         return np.where(self.determined, self._fitted(gap - added_db), filled)
 
     def _fitted(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The coefficients [n, q] that explain measured minus modelled path loss best [n, L], [dB]."""
+        """The coefficients [n, q] that best fit the gap, measured minus modelled path loss [n, L], [dB]."""
         if not self.nuisance.terms:
             return np.zeros((len(gap), 0))
         gap = gap[:, self._counted]
         reached = np.isfinite(gap)
         if reached.all():
             return self._elimination.coefficients(gap)
-        # Candidates that lose the same links share one elimination.
+        # Candidates with paths at the same links share one elimination.
         coefficients = np.empty((len(gap), len(self.nuisance.columns)))
         patterns, pattern_of = np.unique(reached, axis=0, return_inverse=True)
         for number, pattern in enumerate(patterns):
@@ -168,7 +168,7 @@ class Objective:
         return -self._elimination.projection(slope, self.coefficients(path_loss))
 
     def coefficient_root(self) -> NDArray[np.float64]:
-        """Root R of the covariance R R' of the coefficients given path loss [q, q]; wide if not `determined`."""
+        """Root R of the covariance R R' of the coefficients given path loss [q, q]; large if not `determined`."""
         wide_prior = np.where(self.determined, np.inf, UNKNOWN_DB)
         gram = self._elimination.data.toarray() + np.diag(self._ridge**2 + (self.noise_db / wide_prior) ** 2)
         return self.noise_db * np.linalg.cholesky(np.linalg.inv(gram))
@@ -186,7 +186,7 @@ class Objective:
 
     @property
     def fitted(self) -> float:
-        """Number of coefficients that the links determine; with a prior, by the links' share in its precision.
+        """Number of coefficients that links determine; one with a prior counts by the links' share of its precision.
 
         Coefficients that their priors keep at zero explain no residuals, however many groups there are.
         """
@@ -222,7 +222,7 @@ class Objective:
     def jacobian(
         self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Derivatives of the residuals [n, links with weight + priors, d], from path loss and its own [n, L, d]."""
+        """Derivatives of the residuals [n, links with weight + priors, d], from those of path loss [n, L, d]."""
         slope, prior_rows = self._slopes(path_loss, derivative), None
         if self.nuisance.terms:
             projection = self._elimination.projection(slope, self.coefficients(path_loss))
@@ -247,7 +247,7 @@ class Objective:
         return np.sqrt(np.mean(links**2, axis=1))
 
     def shares(self, chunks: Sequence[NDArray[np.int64]]) -> list[Share]:
-        """The shares of the objective by chunks of links, each of which can be summed separately."""
+        """The objective's share of each chunk of links, which can be summed separately."""
         weight, shares = np.zeros(len(self.weight)), []
         weight[self._counted] = self._scale**2
         for chunk in chunks:
@@ -269,7 +269,7 @@ class Objective:
     def products(self, sums: Sums) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Squares and products of residuals and their derivatives, from sums over all links.
 
-        They are the products of the k columns [derivatives, -residuals], rows of priors included [n, k, k], and the sum
+        They are the products of the k columns [derivatives, -residuals], with rows of priors [n, k, k], and the sum
         of squares of the links only [n], [dB^2].
 
         Raises:
@@ -303,7 +303,7 @@ class Objective:
         return path_loss if self.ceiling_db is None else np.minimum(path_loss, self.ceiling_db)
 
     def with_nuisance(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss [L], [dB], plus the nuisance fitted to links with weight; a group without any gets the mean."""
+        """Path loss [L], [dB], plus the nuisance fitted to links with weight; a group without them gets the mean."""
         return self.capped(path_loss) + self.nuisance.contribution(self.completed(path_loss[None]))[0]
 
     def _model(
@@ -363,7 +363,7 @@ def make_objective(
         noise_db: Standard deviation of a link's error [dB]; required if a coefficient has a prior.
 
     Raises:
-        InputError: No link is left, the nuisance has another number of links, or a prior is given without noise_db.
+        InputError: No link is left, the nuisance has a different number of links, or a prior is given without noise_db.
     """
     counted = calibrated & (reached if ceiling_db is None else True)
     if not counted.any():
@@ -407,7 +407,7 @@ def rows(products: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     size = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), 0.0))
     size = np.where(size > 0, size, 1.0)
-    # Scale to a unit diagonal first: otherwise small columns drown in the rounding of large ones.
+    # Scale to a unit diagonal first: otherwise rounding errors of large columns exceed the small ones.
     values, vectors = np.linalg.eigh(products / (size[:, :, None] * size[:, None, :]))
     root = np.sqrt(np.maximum(values, 0.0))
     return root[:, :, None] * vectors.transpose(0, 2, 1) * size[:, None, :]

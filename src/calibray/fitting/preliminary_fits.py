@@ -6,12 +6,13 @@ the prediction is independent of the link's error (selection on the explanatory 
 Analysis of Cross Section and Panel Data, 2nd ed., MIT Press 2010, chapter 19). We fit the model to all links above the
 floor, then to the links predicted well above it, until the selection is stable.
 
-Residuals follow y = X b + Z u + e with u ~ N(0, lambda sigma^2) per group and e ~ N(0, sigma^2). X has what is fitted
-besides. The restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971) accounts for the scatter that
-the fit of b removes, unlike maximum likelihood, which takes it for a smaller spread.
+Residuals follow y = X b + Z u + e with u ~ N(0, lambda sigma^2) per group and e ~ N(0, sigma^2). X has the columns of
+all other fitted terms. The restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971) accounts for
+the scatter that the fit of b removes; maximum likelihood does not, and underestimates the spread.
 
-Expectation maximization with a Gaussian approximation at the optimum (D. Bates and S. DebRoy, J. Multivariate Analysis
-91, 2004, section 5): the square of the spread is the mean of the transmitters' squared values plus their variances.
+Spreads of transmitters follow by expectation maximization with a Gaussian approximation at the optimum (D. Bates and
+S. DebRoy, J. Multivariate Analysis 91, 2004, section 5): the squared spread is the mean over the transmitters of the
+squared value plus its variance.
 """
 
 from __future__ import annotations
@@ -43,9 +44,9 @@ MARGIN: Final = 8.0
 Position errors make paths appear and vanish, which gives the errors heavy tails: a margin of four leaves some bias."""
 
 SMALL_MARGIN: Final = 4.0
-"""The same if `MARGIN` leaves fewer links than `LINKS_PER_UNKNOWN`, or an offset without links. With errors of 5.5 dB
-over a range of 35 dB, a slope is 12 % too low if all links stay, and 2 % too high (standard error 2 %) with this
-margin."""
+"""Margin used if `MARGIN` leaves fewer links per unknown than `LINKS_PER_UNKNOWN`, or an offset without links. With
+errors of 5.5 dB over a range of 35 dB, a slope is 12 % too low if all links stay, and 2 % too high (standard error 2 %)
+with this margin."""
 
 SELECTIONS: Final = 4
 """Largest number of selections."""
@@ -70,7 +71,7 @@ def leave_out_near_floor(problem: Problem, progress: Progress | None = None) -> 
     """Give the links whose predicted path loss is near the noise floor weight 0, and mark them in `faint`.
 
     The problem is unchanged without a noise floor, and on an engine without derivatives, because its calls are
-    expensive. It is also unchanged, with a warning, if the other links determine fewer unknowns. The stage of
+    expensive. It is also unchanged, with a warning, if the remaining links determine fewer unknowns. The stage of
     `progress` is "choosing links".
     """
     limit, objective = problem.setup.links.limit_db, problem.objective
@@ -84,7 +85,7 @@ def leave_out_near_floor(problem: Problem, progress: Progress | None = None) -> 
         fit = least_squares(problem, SEARCHES if turn == 0 else 1, starts)
         starts = fit.minima[:SEARCHES]
         rmse_db = float(problem.squares(fit.best.x[None]).rmse_db[0])
-        # The fit absorbs the errors of as many links as there are unknowns.
+        # Each unknown removes a degree of freedom, so the RMSE underestimates the error of a link.
         error_db = rmse_db * np.sqrt(objective.num_counted / max(problem.freedom, 1))
         predicted = objective.model(problem.modelled(fit.best.x[None]))[0]
         before, selected = faint, _far_from(limit - margin * error_db, predicted, objective, all_weights)
@@ -125,13 +126,14 @@ def _determines_as_much(problem: Problem, selected: Objective) -> bool:
 
 
 def _warn_of_bias(problem: Problem, selected: Objective, faint: NDArray[np.bool_]) -> None:
-    """Say that links near the noise floor stay, because those selected determine less, and what follows."""
+    """Warn of the bias if links near the noise floor are kept because the others determine fewer unknowns."""
     determined = selected.determined if (selected.weight > 0).any() else np.zeros(1, dtype=bool)
     lost = np.flatnonzero(problem.objective.determined & ~determined)
     names = ", ".join(problem.objective.nuisance.columns[column] for column in lost[:MAX_LISTED])
     _LOG.warning(
-        "%s: %s of %s links are expected near the noise floor, but stay, because the others do not determine %s; only "
-        "favourable errors are received there, so fitted offsets and path loss are too low; measure closer links",
+        "%s: %s of %s links are expected near the noise floor, but are kept, because the others do not determine %s; "
+        "weak links are received only if their errors are favourable, so fitted offsets and path loss are too low; "
+        "measure closer links",
         problem.setup.links.source, f"{faint.sum():,}", f"{problem.objective.num_counted:,}",
         names or "all unknowns",
     )  # fmt: skip
@@ -141,7 +143,7 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
     """Estimate the noise level that scales the priors, unless the study declares it, and the spread of random effects.
 
     The problem is unchanged without priors. On an engine without derivatives, whose calls are expensive, the spread is
-    that at the initial values. The stage of `progress` is "estimating noise".
+    estimated at the initial values. The stage of `progress` is "estimating noise".
 
     Raises:
         InputError: The noise is not declared and cannot be estimated.
@@ -198,8 +200,8 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
 def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tuple[Problem, float]:
     """The problem with the spreads of its random effects, estimated at a point of the search space [d].
 
-    Also the standard deviation of a link's error within the groups of the last effect [dB]. On an engine without
-    derivatives, the estimates are those at the initial values, whose path loss is known.
+    The second result is the standard deviation of a link's error within the groups of the last effect [dB]. On an
+    engine without derivatives, both are estimated at the initial values, whose path loss is known.
     """
     objective = problem.objective
     counted = np.flatnonzero(objective.weight > 0)
@@ -208,7 +210,7 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
     for index, term in enumerate(terms):
         if not term.around:
             continue
-        # Without the deviations, their scatter is in the residuals.
+        # Without the deviations in the model, the residuals contain their scatter.
         others = Nuisance(len(objective.weight), (*terms[:index], *terms[index + 1 :]))
         without = replace(problem, objective=replace(objective, nuisance=others))
         jacobian = None
@@ -217,8 +219,8 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
             residuals, jacobian = evaluation.residuals[0], evaluation.slopes[0]
         else:
             residuals = without.objective.residuals(problem.before[None])[0]
-        # Rows of priors follow those of the links, so that other effects are random, not fixed: streets would otherwise
-        # be explained by the places within them.
+        # Rows of priors follow those of the links, so that the other effects are random, not fixed: as fixed effects,
+        # places would explain the differences between the streets that contain them.
         ridge = objective.noise_db / others.prior
         priors = np.diag(ridge)[ridge > 0]
         columns = [np.vstack([others.design[counted].toarray() * scale[:, None], priors])]
@@ -236,7 +238,7 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
 
 
 def with_estimated_errors(problem: Problem, point: NDArray[np.float64]) -> Problem:
-    """The problem with errors of any further observables, estimated at a point of the search space [d]."""
+    """The problem with errors of its further observables, estimated at a point of the search space [d]."""
     if not problem.observed:
         return problem
     candidate = problem.parameters.from_search(point[None])
@@ -249,18 +251,18 @@ def _with_noise(problem: Problem, noise_db: float) -> Problem:
 
 
 RATIOS: Final = np.concatenate([[0.0], np.geomspace(1e-3, 1e3, 121)])
-"""Ratios of both variances that are compared."""
+"""Ratios lambda of the variance between groups to that within groups at which the likelihood is evaluated."""
 
 SINGULAR: Final = 1e-10
-"""Share of the largest singular value of the design below which its columns count as dependent."""
+"""Share of the largest singular value of the design below which its columns are treated as linearly dependent."""
 
 
 class GroupSpread(NamedTuple):
-    """Standard deviations.
+    """Standard deviations between and within groups.
 
     Attributes:
-        between: Between groups, in the unit of the residuals per unit of the column; 0 if no group differs, and
-            `UNKNOWN_DB` if the links cannot show it.
+        between: Between groups, in the unit of the residuals per unit of the column; 0 if the groups do not differ, and
+            `UNKNOWN_DB` if the links do not determine it.
         within: Of a single link, in the unit of the residuals.
     """
 
@@ -301,12 +303,12 @@ def group_spread(
     products, groups = all_columns.T @ all_columns, int(group.max()) + 1
     sums = np.stack([np.bincount(group, column * values, groups) for values in all_columns.T])
     square = np.bincount(group, column**2, groups)
-    # The design explains a single group's column completely, so any ratio is equally likely.
+    # If the design explains the column completely, as with a single group, all ratios are equally likely.
     explained = np.sum(sums[:-1] ** 2, axis=0)
     shown = (square - explained).max() > SINGULAR * square.max()
     best, spread = np.inf, GroupSpread(0.0, 0.0)
     for ratio in RATIOS:
-        # V = I + ratio Z Z' is a block per group, so that its inverse is a rank-one update (Sherman and Morrison).
+        # V = I + ratio Z Z' has one block per group, whose inverse is a rank-one update (Sherman and Morrison).
         weighted = products - (sums * (ratio / (1.0 + ratio * square))) @ sums.T
         inner, side = weighted[:-1, :-1], weighted[:-1, -1]
         variance = float(weighted[-1, -1] - side @ np.linalg.solve(inner, side)) / freedom
@@ -328,7 +330,7 @@ LEAST: Final = 1e-3
 def estimate_spreads(problem: Problem, progress: Progress | None = None) -> Problem:
     """Estimate the spread of every population of transmitters for which the study states none.
 
-    The spreads are in the study and the priors of the new problem. The stage of `progress` is "estimating spreads".
+    The returned problem has them in its study and its priors. The stage of `progress` is "estimating spreads".
     """
     fields, parameters = estimated_fields(problem.setup.study), problem.parameters
     if not fields or not problem.differentiable:
@@ -354,7 +356,7 @@ def estimate_spreads(problem: Problem, progress: Progress | None = None) -> Prob
         spreads = {}
         for field, numbers in members.items():
             width = parameters.upper[numbers[0]] - parameters.lower[numbers[0]]
-            # Fitted values are drawn towards 0 by their prior; their variances make up for it.
+            # The prior shrinks fitted values towards 0; adding their variances corrects for this.
             square = np.mean(fit.best.x[numbers] ** 2 + variance[numbers])
             spreads[field] = float(max(np.sqrt(square), LEAST * width))
         stated = problem.setup.study

@@ -111,7 +111,7 @@ class Problem:
         study, links, held_out = setup.study, setup.links, setup.held_out
         further = observed(setup, engine) if observable is PATH_LOSS else ()
         if further and isinstance(engine, Observing):
-            # On an expensive engine one call answers for path loss and all observables.
+            # A call can be expensive, so a single one returns path loss and all observables.
             statistics = tuple(observable.statistic for observable in further)
             before = engine.respond(engine.parameters.start[None], statistics).path_loss[0]
         else:
@@ -139,7 +139,7 @@ class Problem:
 
     @property
     def statistics(self) -> tuple[Statistic, ...]:
-        """What the further observables are."""
+        """Statistics that the engine computes for the further observables."""
         return tuple(observable.statistic for observable in self.observed)
 
     @property
@@ -190,9 +190,9 @@ class Problem:
         return Evaluation(value, residuals, jacobian, modelled, rmse_db, observed=observed)
 
     def respond(self, candidates: NDArray[np.float64], derivatives: bool = False) -> Responses:
-        """The engine's answer for candidates in the fields' units [n, d]: the links' values and further observables.
+        """The engine's response to candidates in the fields' units [n, d]: the links' values and further observables.
 
-        The engine must provide derivatives with respect to the parameters if these are wanted.
+        If derivatives are requested, the engine must provide them with respect to the parameters.
         """
         if self.observed:
             return self._observing.respond(candidates, self.statistics, derivatives)
@@ -206,8 +206,8 @@ class Problem:
     def squares(self, points: NDArray[np.float64], derivatives: bool = False) -> Evaluation:
         """Like `evaluate`, for methods that use only squares and products of the residuals.
 
-        If the engine has the links in chunks, each chunk returns sums, and d + 1 compressed residuals represent those
-        of all links. Otherwise the residuals are the full ones.
+        If the engine divides the links into chunks, each chunk returns sums, and d + 1 compressed residuals represent
+        those of all links. Otherwise the residuals are the full ones.
         """
         if self._chunks is None:
             return self.evaluate(points, derivatives)
@@ -259,7 +259,7 @@ class Problem:
 
     @cached_property
     def _chunks(self) -> tuple[Reduced, list[Share]] | None:
-        """The engine's chunks reduced to sums, with their shares; None if the engine has no chunks."""
+        """The engine reduced to sums of its chunks, and their shares of the objective; None if it has no chunks."""
         if not isinstance(self.engine, Chunked) or self.observable is not PATH_LOSS:
             return None
         shares = self.objective.shares(self.engine.chunks)
@@ -289,7 +289,7 @@ class Problem:
         slope: NDArray[np.float64],
         observed_slope: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
-        """Derivatives of `residuals` [n, m, k] with respect to k variables: the d search coordinates, then any others.
+        """Derivatives of `residuals` [n, m, k] with respect to k variables: the d search coordinates, then any more.
 
         They follow from the derivatives of the modelled values [n, L, k] and of further observables [n, K, L, k].
         """
@@ -304,7 +304,7 @@ class Problem:
         return np.concatenate(parts, axis=1)
 
     def _further(self, observed: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Rows of every further observable [n, m], in units of the errors of path loss."""
+        """Residuals of each further observable [n, m], scaled to the error of path loss."""
         weight, noise_db = self.objective.weight, self.objective.noise_db
         return [
             noise_db / observable.std * observable.residuals(observed[:, index], weight)[0]
@@ -312,7 +312,7 @@ class Problem:
         ]
 
     def _further_slopes(self, slope: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Derivatives of these rows [n, m, k] from those of the observables [n, K, L, k]."""
+        """Derivatives of `_further` [n, m, k], from those of the observables [n, K, L, k]."""
         weight, noise_db = self.objective.weight, self.objective.noise_db
         return [
             noise_db / observable.std * observable.slopes(slope[:, index], weight)
@@ -324,7 +324,7 @@ class Problem:
         """The engine, which computes further observables.
 
         Raises:
-            InputError: It gives path loss only.
+            InputError: The engine computes only path loss.
         """
         if not isinstance(self.engine, Observing):
             raise InputError(
@@ -344,12 +344,12 @@ def _noise(study: StudyModel, weight: NDArray[np.float64]) -> float:
             return study.noise.std_db
         if study.links.std is None:
             return 1.0
-    # Weights are inverse variances [1/dB^2] if errors of single links are known.
+    # Weights are inverse variances [1/dB^2] if the errors of individual links are known.
     return float(1.0 / np.sqrt(weight.mean()))
 
 
 def _check_groups(links: Measurements, objective: Objective, judged: NDArray[np.bool_]) -> None:
-    """Refuse held-out links with a coefficient of the nuisance that no calibration link determines."""
+    """Reject held-out links that need a coefficient of the nuisance that no calibration link determines."""
     unknown = np.flatnonzero(judged & ~objective.supported)
     if len(unknown):
         needed = objective.nuisance.design[unknown[:1]].toarray()[0] != 0
