@@ -37,14 +37,14 @@ class Observed:
     """One observable of the links.
 
     Attributes:
-        name: Its name in the study.
+        name: Name of the observable in the study.
         statistic: The modelled quantity.
-        measured: Measured values [L], in the unit; NaN for a link without a value.
-        scale: The unit in SI units.
+        measured: Measured values [L], in the study's unit; NaN for a link without a value.
+        scale: The study's unit, in SI units.
         group: Group of each link's bias, from 0 [L]; -1 without a bias.
         labels: Labels of the groups; empty without a bias.
-        std: Standard deviation of a value's error, in the unit.
-        stated: Whether the study states it.
+        std: Standard deviation of a value's error, in the study's unit.
+        stated: Whether the study states `std`.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Observed:
     stated: bool
 
     def used(self, weight: NDArray[np.float64]) -> NDArray[np.int64]:
-        """The links with a value and a weight [m]."""
+        """Indices of the links with a value and with weight [m]."""
         return np.flatnonzero(np.isfinite(self.measured) & (weight > 0))
 
     def freedom(self, weight: NDArray[np.float64]) -> int:
@@ -68,13 +68,13 @@ class Observed:
     def residuals(
         self, modelled: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Modelled minus measured values [n, m] in the unit, with the bias eliminated, and the biases [n, groups].
+        """Modelled minus measured values [n, m] in the study's unit, without the bias, and the biases [n, groups].
 
         Modelled values [n, L] are in SI units; the links have weights [L].
         """
         used = self.used(weight)
         gap = modelled[:, used] / self.scale - self.measured[used]
-        # A link without a path for a candidate has no statistic: its residual is 0, and no bias depends on it.
+        # A link without a path for a candidate has no statistic: its residual is 0, and the biases ignore it.
         found = np.isfinite(gap)
         gap = np.where(found, gap, 0.0)
         if not self.labels:
@@ -98,7 +98,7 @@ class Observed:
     def _means(
         self, values: NDArray[np.float64], found: NDArray[np.bool_], used: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Mean of the values found [..., m] over the links of each group [..., groups]; the others are 0."""
+        """Mean of the values found [..., m] over the links of each group [..., groups]; 0 for an empty group."""
         member = (self.group[used][:, None] == np.arange(len(self.labels))).astype(np.float64)
         return values @ member / np.maximum(found @ member, 1.0)
 
@@ -177,7 +177,7 @@ def _groups(links: Measurements, bias: str | None) -> tuple[NDArray[np.int64], t
 def with_errors(
     every: tuple[Observed, ...], modelled: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> tuple[Observed, ...]:
-    """The observables with errors estimated from their residuals, if the study states none.
+    """The observables, with errors estimated from the residuals where the study states none.
 
     Modelled values [K, L] are in SI units; the links have weights [L].
     """

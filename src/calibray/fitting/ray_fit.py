@@ -1,11 +1,11 @@
 """Identifies an engine's assumptions from ratios of its rays' powers: a global search over constants and polarizations.
 
-Materials are added one after the other. Each is scanned (`ray_scan.py`) on paths that meet no material that is added
-later. The best points, with several polarizations, are refined together with the values so far, by least squares with
-exact derivatives on all these paths. The best few go on. The study's constants are refined as well, with the
-polarizations that suit them best. If a misfit remains at the end, linear polarizations are searched with the materials
-fixed, and then each material is scanned again on all its paths. Basin hopping (Wales and Doye, 1997) comes last: it
-refines explanations in which one or two materials have other resonances.
+Materials are added one at a time. Each is scanned (`ray_scan.py`) on paths without materials that are added later. The
+best points, with several polarizations, are refined together with the values so far, by least squares with exact
+derivatives on all these paths. The best few are kept. The study's constants are refined as well, with the polarizations
+that fit best with them. If a misfit remains at the end, linear polarizations are searched with the materials fixed, and
+then each material is scanned again on all its paths. The last step is basin hopping (Wales and Doye, 1997): it refines
+explanations in which one or two materials are at different resonances.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ EXACT_DB: Final = 0.005
 """Misfit at which a search ends [dB]."""
 
 KNOWN_DB: Final = 0.02
-"""Misfit below which the explanation of earlier calls is kept for the next one [dB]; wrong minima had 0.1 dB and
-more."""
+"""Misfit below which the explanation of earlier calls is kept for the next one [dB]; wrong minima had at least
+0.1 dB."""
 
 EVALUATIONS: Final = (6, 12, 30)
-"""Number of evaluations of a trial, of a refinement between scans, and of the last one, with each loss."""
+"""Number of evaluations per loss of a trial, of a refinement between scans, and of the last refinement."""
 
 TRIALS: Final = 300
 """Largest number of trials of basin hopping; with 150 in a row without improvement, misfits were about the same."""
 
 TRIED_PATHS: Final = 500_000
-"""Target for trials times paths on a large program, which keeps the time of basin hopping constant."""
+"""Target for the product of trials and paths on a large program, which bounds the time of basin hopping."""
 
 PROMISING: Final = 3.0
-"""Ratio of a trial's misfit to that of the explanations so far up to which it is refined further."""
+"""Largest ratio of a trial's misfit to the worst one that is kept at which the trial is refined further."""
 
 MOST_HOPS: Final = 30
 """Largest change of a thickness in a trial [half wavelengths in the slab]."""
@@ -60,7 +60,7 @@ class Understanding:
     Attributes:
         model: The model of the last export's paths.
         values: The assumed values [k], as in `RayModel`.
-        linear: Whether the antennas are polarized linearly.
+        linear: Whether the antennas are linearly polarized.
         misfit_db: Weighted root mean square of the errors of the ratios [dB].
     """
 
@@ -72,18 +72,18 @@ class Understanding:
     def replay(self, parameters: Parameters, last: Call) -> Replay:
         """The replay of a call's paths, corrected so that it agrees with the call."""
         paths = self.model.replay_paths(last.candidate, self.values, self.linear)
-        # Power of every path in the engine over that of its replay.
+        # Power of every path in the engine, relative to its power in the replay.
         correction = 10 ** (last.export.level_db / 10) / np.maximum(powers(paths), 1e-300)
         return Replay(replace(paths, correction=correction), parameters)
 
 
 class Ratio(NamedTuple):
-    """Paths that the last call has in common with an earlier one.
+    """Power ratios of the n paths that the last call has in common with an earlier one.
 
     Attributes:
         call: The earlier call.
-        here: Their indices in the last call, ascending [n].
-        weight: Their weights, of sum 1 over all ratios [n].
+        here: Indices of the paths in the last call, ascending [n].
+        weight: Weights of the paths, whose sum over all ratios is 1 [n].
         level_db: Power in the last call [n], [dB].
         observed: Power in the last call over that in the earlier one [n], [dB].
     """
@@ -95,7 +95,7 @@ class Ratio(NamedTuple):
     observed: NDArray[np.float64]
 
     def on(self, kept: NDArray[np.bool_]) -> Ratio:
-        """The same where paths of the last call are kept [P]."""
+        """The ratios of those paths that `kept` selects among the paths of the last call [P]."""
         mine = kept[self.here]
         return Ratio(self.call, self.here[mine], self.weight[mine], self.level_db[mine], self.observed[mine])
 
@@ -103,9 +103,10 @@ class Ratio(NamedTuple):
 def understand(
     parameters: Parameters, calls: list[Call], known: bool, before: Understanding | None = None
 ) -> Understanding:
-    """Find the assumptions that explain the ratios of all calls, from those of all but the last one if available.
+    """Find the assumptions that explain the ratios of all calls.
 
-    The last call is modelled. `known` states whether the program's antennas are those of the engine.
+    The search starts from `before`, the assumptions for the earlier calls, if given. The last call is modelled. `known`
+    states whether the program's antennas are those of the engine.
     """
     last, ratios = calls[-1], ratios_of(calls)
     model = RayModel.of(parameters, last.export.paths, known)
@@ -126,7 +127,7 @@ def understand(
 def _search(
     first: Understanding, ratios: list[Ratio], last: Call, before: Understanding | None
 ) -> Understanding:
-    """Add one material after the other, then scan all of them again."""
+    """Add the materials one at a time, then scan all of them again."""
     meets, order = _meetings(first.model)
     fits, done = [first, *_with_the_constants_of(first, ratios, last)], np.zeros(meets.shape[1], dtype=bool)
     for material in order:
@@ -164,11 +165,11 @@ def _hopped(fits: list[Understanding], ratios: list[Ratio], last: Call) -> Under
 
 
 def _perturbed(fit: Understanding, last: Call, random: np.random.Generator) -> Understanding:
-    """An explanation with other constants of one or two materials.
+    """An explanation with different constants of one or two materials.
 
-    A thickness changes by some half wavelengths in the slab, after which it resonates again. The conductivity keeps its
-    value, keeps the attenuation through the slab, or changes at random. One of three trials has antennas with other
-    tilts, too.
+    A thickness changes by a number of half wavelengths in the slab, after which the slab resonates again. The
+    conductivity keeps its value, keeps the attenuation through the slab, or changes at random. One trial in three also
+    has different tilts of the antennas.
     """
     model, values = fit.model, fit.values.copy()
     materials = model.materials(last.candidate, fit.values)
@@ -193,7 +194,7 @@ def _perturbed(fit: Understanding, last: Call, random: np.random.Generator) -> U
 def _with_the_constants_of(fit: Understanding, ratios: list[Ratio], last: Call) -> list[Understanding]:
     """Explanations with the same constants and the best polarizations of upright antennas, if these are unknown.
 
-    Many engines differ from the study in their antennas only.
+    Many engines differ from the study only in their antennas.
     """
     if fit.model.known:
         return []
@@ -221,7 +222,7 @@ def _meetings(model: RayModel) -> tuple[NDArray[np.bool_], list[int]]:
 def _scanned(
     fits: list[Understanding], ratios: list[Ratio], last: Call, material: int, wanted: NDArray[np.bool_]
 ) -> list[Understanding]:
-    """Explanations with other constants of one material, from scans on some of the paths [P].
+    """Explanations with different constants of one material, from scans on the wanted paths [P].
 
     A scan with upright antennas of all polarizations starts from the first explanation. Other scans use the antennas of
     each explanation and so account for tilts.
@@ -267,7 +268,7 @@ def _scanned(
 
 
 def _turned(fit: Understanding, ratios: list[Ratio], last: Call) -> list[Understanding]:
-    """Explanations with other angles of the antennas, and the same materials."""
+    """Explanations with different angles of the antennas, and the same materials."""
     model, count = fit.model, len(fit.model.assumed)
     gains = model.gains(last.candidate, fit.values)
     parts = [
@@ -282,7 +283,7 @@ def _turned(fit: Understanding, ratios: list[Ratio], last: Call) -> list[Underst
 
 
 def _polarized(fit: Understanding, slants: tuple[float | None, float | None]) -> Understanding:
-    """The same with upright antennas of given slants."""
+    """The explanation with upright antennas of given slants."""
     angles = [part for slant in slants for part in (slant or 0.0, 0.0, 0.0)]
     values = np.concatenate([fit.values[: len(fit.model.assumed)], angles])
     return replace(fit, values=values, linear=(slants[0] is not None, slants[1] is not None))
@@ -310,7 +311,7 @@ def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: in
             kept[key] = errors, slopes[:, free]
         return kept[key]
 
-    # SciPy's stubs know no function as Jacobian.
+    # SciPy's stubs do not accept a function as Jacobian.
     slopes = cast(Any, lambda values: evaluate(values)[1])
     weights = np.concatenate([ratio.weight for ratio in ratios])
     scale = ray_scan.ROBUST_DB * float(np.sqrt(weights.mean()))
@@ -324,19 +325,19 @@ def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: in
 
 
 def _tables(model: RayModel, ratios: list[Ratio], last: Call) -> NDArray[np.float64]:
-    """Constants at the last call and at the earlier ones, which are replayed on the paths of the last one."""
+    """Constants at the last call and at the earlier ones, all for the paths of the last call."""
     return model.tables([last.candidate, *(ratio.call.candidate for ratio in ratios)])
 
 
 def _errors(
     fit: Understanding, ratios: list[Ratio], tables: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Weighted errors of the ratios [m], [dB], and their derivatives by the values [m, k].
+    """Weighted errors of the ratios [m], [dB], and their derivatives with respect to the values [m, k].
 
-    A path that the engine has and that loses all power in the model, whose correction could not give it back, has the
-    engine's power over the model's as its error.
+    If a path has power in the engine but none in the model, no correction can restore it. Its error is the model's
+    power relative to the engine's.
 
-    `tables` are those of the last call and of each ratio's call, see `_tables`.
+    `tables` are the constants of the last call and of each ratio's call, see `_tables`.
     """
     (level, *others), (slope, *other_slopes) = fit.model.levels_and_slopes(tables, fit.values, fit.linear)
     residuals, slopes = [], []
@@ -368,7 +369,7 @@ def ratios_of(calls: list[Call]) -> list[Ratio]:
 
 
 def common(one: Paths, other: Paths) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices of the paths that two programs share, in each of them: same link, kinds and points."""
+    """Indices, in each of two programs, of the paths that they share: same link, kinds and points."""
     rows, pairs = _by_kinds(other), []
     for key, members in _by_kinds(one).items():
         for index, points in members:
@@ -382,7 +383,7 @@ def common(one: Paths, other: Paths) -> tuple[NDArray[np.int64], NDArray[np.int6
 
 
 def _by_kinds(paths: Paths) -> dict[tuple[int, ...], list[tuple[int, Any]]]:
-    """Indices and points of paths by their link and kinds of interaction."""
+    """Indices and points of the paths, grouped by link and kinds of interaction."""
     groups: dict[tuple[int, ...], list[tuple[int, Any]]] = {}
     for index, (start, stop) in enumerate(pairwise(paths.first.tolist())):
         key = (int(paths.link[index]), *paths.kind[start:stop].tolist())

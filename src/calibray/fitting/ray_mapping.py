@@ -1,13 +1,13 @@
 """Ray mapping identifies the assumptions of an expensive engine that exports its rays, and replaces it by a replay.
 
-A few calls are enough. Each gives the power of each path. Ratios of a path's powers at two sets of constants do not
-depend on antenna gains and units. They therefore show what the engine assumes: thickness, conductivity, slabs or
-half-spaces, and the polarization of its antennas. We fit these to all ratios of the calls so far (`ray_fit.py`). The
-last call then corrects the power of every path. The next call is at the minimum of the replay of this corrected
-program, and checks it.
+A few calls are enough. Each call returns the power of each path. The ratio of a path's powers at two sets of constants
+does not depend on antenna gains or units. The ratios therefore show what the engine assumes: thickness, conductivity,
+slabs or half-spaces, and the polarization of its antennas. We fit these to all ratios of the calls so far
+(`ray_fit.py`). The last call then corrects the power of every path. The next call is at the minimum of the replay of
+this corrected program, and checks it.
 
 The first call is at the start values. The second call is where the ratios are most informative about the assumed
-constants: of some points of the box, the one with the largest mean log determinant of their information.
+constants: at the one of `PROBES` points with the largest mean log determinant of the information.
 """
 
 from __future__ import annotations
@@ -37,43 +37,43 @@ Ask = Callable[[NDArray[np.float64]], Export]
 """Calls the engine for a candidate [d]; returns its rays."""
 
 PROBES: Final = 32
-"""Number of points of the box from which the second call is chosen."""
+"""Number of points of the search space from which the second call is chosen."""
 
 DRAWS: Final = 3
-"""Sets of assumed constants over which the information is averaged."""
+"""Number of sets of assumed constants over which the information is averaged."""
 
 DRAWN: Final = 3.0
-"""Largest ratio of an assumed constant to the study's, or of the study's to it."""
+"""Largest factor between an assumed constant of such a set and the study's value."""
 
 SIGMA_DB: Final = 0.1
-"""Error of a ratio in the information [dB]."""
+"""Standard deviation of a ratio's error for the information [dB]."""
 
 LEFT_DB: Final = 0.05
-"""Largest gain that is left, and largest change of path loss to where it is left, if the optimum counts as reached
-[dB]."""
+"""Largest difference of the RMSE, and of path loss, between the best call and the minimum of the replay, if the optimum
+counts as reached [dB]."""
 
 GAP_DB: Final = 0.2
-"""Largest gap at the last call of such an optimum [dB]. After six calls, gaps of 0.06 to 0.17 dB left an excess of at
-most 0.016 dB in six runs, and gaps above 0.36 dB one of 0.020 to 0.15 dB in eight."""
+"""Largest gap at the last call if the optimum counts as reached [dB]. After six calls, the excess RMSE was at most
+0.016 dB in six runs with gaps of 0.06 to 0.17 dB, and 0.020 to 0.15 dB in eight runs with gaps above 0.36 dB."""
 
 MISFIT_DB: Final = 0.2
-"""Largest misfit of the ratios of such an engine [dB]. Wrong minima had 0.8 dB and more. With 0.07 to 0.19 dB, the
-optimum was reached to 0.006 dB (docs/measurements/expensive-engines.md)."""
+"""Largest misfit of the ratios if an engine counts as understood [dB]. Wrong minima had at least 0.8 dB. With 0.07 to
+0.19 dB, the optimum was reached within 0.006 dB (docs/measurements/expensive-engines.md)."""
 
 CHANGED_DB: Final = 0.5
-"""Largest change of a link's path loss without the paths that another call lacks, for such an engine [dB]. Paths that
-appear between calls may be missing at the optimum of their replay."""
+"""Largest change of a link's path loss without the paths that another call lacks, if an engine counts as understood
+[dB]. Paths that appear between calls may be missing at the minimum of the replay."""
 
 SEARCHES: Final = 4
-"""Ratio of the number of local searches to that of a calibration on replay: a call costs more than many searches. In a
+"""Ratio of the number of local searches to that of a calibration on replay; a call costs more than many searches. In a
 district with 557 interactions, 512 and 1,024 searches missed a minimum that is 0.076 dB lower with two of five seeds,
 2,048 searches with none."""
 
 LEAST_CALLS: Final = 3
-"""Number of calls of the shortest ray mapping: two that show the assumptions, and one at the minimum."""
+"""Smallest number of calls of ray mapping: two that show the assumptions, and one at the minimum."""
 
 MOST_CALLS: Final = 10
-"""Number of calls after which ray mapping ends in any case."""
+"""Largest number of calls of ray mapping."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,15 +83,16 @@ class RayMap:
     Attributes:
         engine: Replay that agrees with the engine at the best call.
         calls: The calls; from the third on, each is at the minimum of the program corrected by the earlier ones.
-        best: The call of least objective.
-        understanding: What explains the engine.
-        gap_db: Root mean square over the links of the answered minus the predicted path loss at the last call [dB].
-        changed: Largest number of paths that the best call or another one has alone.
-        changed_db: Largest change of a link's path loss without them, of links that keep a path [dB].
-        lost: Number of links that keep none, or have none in the replay at the best call.
+        best: The call with the lowest objective.
+        understanding: The assumptions that explain the engine.
+        gap_db: RMS over the links of the difference between the engine's and the predicted path loss at the last call
+            [dB].
+        changed: Largest number of paths that the best call lacks from another one, or the other one from it.
+        changed_db: Largest change of a link's path loss without these paths, over links that keep a path [dB].
+        lost: Number of links that keep no path, or have none in the replay at the best call.
         minima: Minima of the replay that replaces the engine, the lowest first, as points of the search space [k, d].
         remaining_db: RMSE at the best call minus that at the lowest of these minima [dB].
-        moved_db: Root mean square over the links of the replay's path loss there minus that at the best call [dB].
+        moved_db: RMS over the links of the replay's path loss there minus that at the best call [dB].
     """
 
     engine: Replay
@@ -108,7 +109,7 @@ class RayMap:
 
     @property
     def reached(self) -> bool:
-        """Whether the last call was predicted, and nothing is left to gain, at the best call or away from it.
+        """Whether the last call was predicted, and the replay has no better minimum than the best call.
 
         The optimum is then reached, even if the engine's assumptions are not identified.
         """
@@ -117,23 +118,23 @@ class RayMap:
 
     @property
     def understood(self) -> bool:
-        """Whether the model also explains all calls, which have the same strong paths.
+        """Whether the model also explains all calls, and these share their strong paths.
 
-        Its replay then stands for the engine elsewhere, too.
+        Its replay then represents the engine at other candidates as well.
         """
         explained = self.understanding.misfit_db <= MISFIT_DB
         return self.reached and explained and self.changed_db <= CHANGED_DB
 
 
 def maps_rays(setup: Setup) -> bool:
-    """Whether a study is calibrated by ray mapping: the method `auto` on a program that answers with rays."""
+    """Whether a study is calibrated by ray mapping: the method `auto` on a program that returns its rays."""
     return setup.study.engine.exports_rays and setup.study.method.name == AUTO
 
 
 def search_rays(
     problem: Problem, engine: Exporting, progress: Progress | None = None
 ) -> tuple[Problem, Trail, Remark]:
-    """Search by ray mapping, on an engine that answers with rays.
+    """Search by ray mapping, on an engine that returns its rays.
 
     The results are the problem on the replay that replaces the engine, the search, and how well the engine's
     assumptions are identified. The stage of `progress` is "calibrating".
@@ -167,11 +168,11 @@ def search_rays(
 def map_rays(
     problem: Problem, ask: Ask, *, tolerance_db: float = 0.01, most_calls: int = MOST_CALLS, seed: int = 0
 ) -> RayMap:
-    """Call an engine until the path loss at the minimum is predicted to the tolerance, or for most calls.
+    """Call an engine until the path loss at the minimum is predicted within the tolerance, or `most_calls` are made.
 
-    The result is the replay that replaces the engine, and its accuracy. If its minimum is not at the best call, calls
-    go on: after a short step, the last call does not show how well the model predicts. The engine of the problem is not
-    called.
+    The result is the replay that replaces the engine, and its accuracy. If the minimum is not at the best call, calls
+    continue: after a short step, the last call does not show how well the model predicts. The function calls the engine
+    only by `ask`, not that of the problem.
     """
     parameters, known = problem.parameters, problem.setup.known_antennas is not None
     understanding: Understanding | None = None
@@ -195,15 +196,15 @@ def map_rays(
         mapped = _finish(problem, calls, known, understanding, gap)
         if mapped.moved_db <= LEFT_DB or len(calls) >= most_calls:
             return mapped
-        # The rays of the last call in this order are the ones that are modelled.
+        # The rays of the last call in this order are modelled.
         ordered, understanding = _best_last(problem, calls), mapped.understanding
         further = mapped.minima[:1]
 
 
 def _search_replay(problem: Problem, replay: Replay, starts: NDArray[np.float64], calls: int) -> LeastSquares:
-    """Search the replay from many points, other ones after each call, and from given ones [k, d].
+    """Search the replay from many random points, which differ after each call, and from given ones [k, d].
 
-    A search can miss the lowest minimum. The search after the last call, from other points, can then find it.
+    A search can miss the lowest minimum. The search after the last call, from different points, can then find it.
     """
     searches = SEARCHES * local_searches(replay.interactions)
     return least_squares(with_engine(problem, replay), searches, starts, seed=calls)
@@ -249,7 +250,7 @@ def _objective(problem: Problem, call: Call) -> float:
 
 
 def _gap(replay: Replay, call: Call) -> float:
-    """Root mean square over the links of the answered minus the predicted path loss [dB]."""
+    """RMS over the links of the difference between the engine's and the predicted path loss [dB]."""
     return _distance(call.export.path_loss_db, replay.path_loss(call.candidate[None])[0])
 
 
@@ -273,15 +274,16 @@ def _most_informative(problem: Problem, call: Call, random: np.random.Generator)
         _, (first, *slopes) = model.levels_and_slopes(tables, values, (False, False))
         for number, slope in enumerate(slopes):
             part = ((slope - first) * weight)[:, :count]
-            # The identity is a prior: each constant is known to a factor of e.
+            # The identity is a prior: each constant is known within a factor of e.
             information[number] += np.linalg.slogdet(np.eye(count) + part.T @ part)[1]
     return probes[int(np.argmax(information))]
 
 
 def _changes(calls: list[Call]) -> tuple[int, float, int]:
-    """Largest number of paths that the last call or another one has alone, and what links lose without them.
+    """Largest number of paths that the last call lacks from another one, or vice versa, and their effect on links.
 
-    The second result is the largest change of path loss [dB], and the third one the number of links without any path.
+    The second result is the largest change of path loss without these paths [dB], the third the number of links that
+    lose all paths.
     """
     last, changed, change_db, lost = calls[-1].export, 0, 0.0, 0
     for call in calls[:-1]:

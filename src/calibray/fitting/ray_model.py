@@ -1,9 +1,9 @@
 """The powers of an engine's rays as a function of the parameters and of the engine's assumptions.
 
-An engine assumes thickness, conductivity and permittivity of the materials that the study does not calibrate, and the
-antennas. The gain of an antenna cancels in ratios of powers, but its polarization does not. An antenna without
-polarization receives both components of a wave. Any other one is polarized linearly: along a slant angle in the frame
-of its axis (3GPP TR 38.901, eq. 7.3-4/5), which may be tilted.
+An engine assumes antennas, and the thickness, conductivity and permittivity of materials if they are not calibrated.
+The gain of an antenna cancels in ratios of powers, but its polarization does not. An unpolarized antenna receives both
+components of a wave. Any other antenna is linearly polarized at a slant angle in the frame of its axis (3GPP TR 38.901,
+eq. 7.3-4/5), which may be tilted.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from calibray.paths import Paths
 from calibray.tracing.antennas import wave_basis
 
 HALF_SPACE: Final = 1e4
-"""Thickness that no wave crosses [m]: it decays within it unless the conductivity is below 1e-6 S/m."""
+"""Thickness of a half-space [m]: a wave decays within it unless the conductivity is below 1e-6 S/m."""
 
 DECAYED: Final = 4.0
 """Attenuation within a slab [Np] beyond which it acts as a half-space: the returning wave has e^-8 of its amplitude."""
@@ -54,18 +54,18 @@ TILT: Final = 0.3
 """Largest tangent of the tilt of an antenna's axis along x or y, 17 degrees: more than the tilt of base stations."""
 
 ANGLES: Final = 3
-"""Slant and two tilts of an end."""
+"""Number of angles of an end: the slant and two tilts."""
 
 BATCH: Final = 8
-"""Number of candidates that are evaluated at once; the program is compiled for it."""
+"""Number of candidates that are evaluated at once; the program is compiled for this number."""
 
 LEAST_DB: Final = -300.0
-"""Least power of a path [dB]."""
+"""Lower limit of the power of a path [dB]."""
 
 _COLUMNS: Final = tuple(FIELD_COLUMN[field] for field in (*RANGES, "relative_permittivity"))
 
 Ends = tuple[bool, bool]
-"""Whether the antenna is linearly polarized, at the transmitter and at the receiver."""
+"""Whether the antennas are linearly polarized, at the transmitter and at the receiver."""
 
 
 class Call(NamedTuple):
@@ -79,13 +79,13 @@ class Call(NamedTuple):
 class RayModel:
     """The powers of an export's paths as a function of the parameters and of the assumed values.
 
-    The values are the logarithms of the assumed constants [q], and then slant and two tilts [rad] of each end if the
-    antennas are unknown.
+    The values are the logarithms of the assumed constants [q], followed by the slant and two tilts [rad] of each end if
+    the antennas are unknown.
 
     Attributes:
         paths: The program, without correction.
         parameters: The study's parameters.
-        known: Whether its antennas are those of the engine; otherwise they have the ports V and H.
+        known: Whether the program's antennas are those of the engine; otherwise they have the ports V and H.
     """
 
     paths: Paths
@@ -99,7 +99,7 @@ class RayModel:
 
     @cached_property
     def assumed(self) -> tuple[tuple[str, str], ...]:
-        """Material and field of every assumed constant: those that are not calibrated and that a path meets."""
+        """Material and field of every assumed constant: those of materials on a path that are not calibrated."""
         calibrated = {(item.material, item.constant) for item in self.parameters}
         met = set(np.unique(self.paths.material).tolist())
         return tuple(
@@ -135,7 +135,7 @@ class RayModel:
     def levels_and_slopes(
         self, tables: NDArray[np.float64], values: NDArray[np.float64], linear: Ends
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Power of every path [n, P], [dB], and its derivatives by the values [n, P, k].
+        """Power of every path [n, P], [dB], and its derivatives with respect to the values [n, P, k].
 
         The n candidates are given by their constants [n, M, 8]. The assumed values [k] are the same for all of them.
         """
@@ -159,7 +159,7 @@ class RayModel:
                 loss, by_material, by_angle = path_losses_and_slopes_with_effects(
                     program, batch, effects, _COLUMNS, count=len(part)
                 )
-            # By the logarithms of the constants.
+            # Derivatives with respect to the logarithms of the constants.
             by_constant = by_material[:, :, rows, columns] * np.exp(values[:count])
             level, slope = -loss, -np.concatenate([by_constant, by_angle], axis=-1)
             levels.append(np.maximum(level, LEAST_DB))
@@ -167,7 +167,7 @@ class RayModel:
         return np.concatenate(levels), np.concatenate(slopes)
 
     def gains(self, candidate: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Gain of every path between the ports [P, R, T], with the constants of values [k]."""
+        """Gain of every path between the ports [P, R, T], with the assumed constants in the values [k]."""
         with jax_settings():
             table = self.paths.material_table(self.materials(candidate, values))
             real, imaginary = map(np.asarray, program_gains(self._layout.program, jnp.asarray(table)))
@@ -205,14 +205,14 @@ class RayModel:
                 yield f"{name}.{field}", value
 
     def half_spaces(self, candidate: NDArray[np.float64], values: NDArray[np.float64]) -> list[str]:
-        """Materials of assumed thickness from whose far face no wave returns, at a candidate [d] with values [k]."""
+        """Materials of assumed thickness whose far face reflects no wave back, at a candidate [d] with values [k]."""
         materials = self.materials(candidate, values)
         assumed = [name for name, field in self.assumed if field == "thickness"]
         return [name for name in assumed if _is_half_space(materials[name], self.paths.frequency)]
 
     @cached_property
     def bases(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Axes theta and phi of the fields at both ends [P, 2, 3]."""
+        """Unit vectors theta and phi of the fields at both ends [P, 2, 3]."""
         departure, arrival = (
             np.moveaxis(wave_basis(angles)[1:], -1, 0)
             for angles in (self.paths.departure, self.paths.arrival)
@@ -229,7 +229,7 @@ class RayModel:
 
     @cached_property
     def _by_path(self) -> tuple[GroupedProgram, Polarized]:
-        """The program with each path as a link of its own, and the polarization of its antennas."""
+        """The program with one link per path, and the polarization of its antennas."""
         count = self.paths.num_paths
         # Path loss of such a link is minus the power of its path, whatever the phase.
         nowhere = np.zeros((count, 3))
@@ -242,12 +242,12 @@ class RayModel:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Polarized:
-    """Polarization of antennas with the ports V and H; its parameters are slant and two tilts of each end [rad].
+    """Polarization of antennas with the ports V and H; its parameters are the slant and two tilts of each end [rad].
 
     Attributes:
-        tx: Axes of the fields at the transmitter [P, 2, 3].
-        rx: Those at the receiver.
-        linear: Whether the antenna is linearly polarized, at both ends [2]; otherwise it receives both components.
+        tx: Unit vectors theta and phi of the fields at the transmitter [P, 2, 3].
+        rx: The same at the receiver.
+        linear: Whether the antenna at each end is linearly polarized [2]; otherwise it receives both components.
     """
 
     tx: NDArray[np.float64]
@@ -289,9 +289,9 @@ def _is_half_space(material: Material, frequency: float) -> bool:
 
 
 def tilted_theta(basis: Any, axis: Any, xp: Any = np) -> Any:
-    """Axis theta of antennas with axes [..., 3], in the axes of the paths' fields [P, 2, 3]: [..., P, 2].
+    """Unit vector theta of antennas with axes [..., 3], as components [..., P, 2] along those of the fields [P, 2, 3].
 
-    It points away from the pole: -axis, without its part along the direction.
+    It points away from the pole: it is -axis without its component along the direction.
     """
     theta = -xp.einsum("pac,...c->...pa", basis, axis)
     return theta / xp.sqrt(xp.maximum(xp.sum(theta**2, axis=-1, keepdims=True), 1e-12))
@@ -301,8 +301,8 @@ def ports(basis: Any, angles: Any, xp: Any = np) -> Any:
     """Weights of the ports V and H in a linear polarization and in the orthogonal one [P, 2, 2].
 
     Args:
-        basis: Axes theta and phi of the fields [P, 2, 3].
-        angles: Slant and two tilts [3], [rad].
+        basis: Unit vectors theta and phi of the fields [P, 2, 3].
+        angles: The slant and two tilts [3], [rad].
         xp: The array namespace: NumPy, or JAX for derivatives.
     """
     theta = tilted_theta(basis, xp.stack([angles[1], angles[2], xp.ones(())]), xp)

@@ -1,13 +1,14 @@
-"""Scans for the starts of a fit to ratios of the powers of some paths: of one material's constants, and of antennas.
+"""Scans of one material's constants, and of antennas, for starting points of a fit to ratios of path powers.
 
-A slab resonates: the power of a ray has a minimum whenever the thickness grows by half a wavelength, so a local search
-ends in a wrong one. A scan evaluates a fine grid of thicknesses up to the depth where the wave has decayed, for some
+A slab resonates: the power of a ray oscillates with a period of half a wavelength of thickness, so a local search ends
+in a wrong minimum. A scan evaluates a fine grid of thicknesses up to the depth where the wave has decayed, for several
 conductivities, with several polarizations at both ends. It evaluates only reflections and transmissions.
 
-An antenna receives almost nothing from a direction orthogonal to its polarization. Every path near such a null gives
-the misfit a minimum, some 0.02 rad apart, so that a local search from upright antennas ends in a wrong one. With the
-materials fixed, the gain of a path is bilinear in the polarizations of both ends. A scan therefore evaluates a grid of
-one end's slant and tilts, for the other end as fitted and upright. Its best points start local searches of all angles.
+An antenna receives almost nothing from a direction orthogonal to its polarization. Every path near such a null adds a
+minimum of the misfit. These minima are about 0.02 rad apart, so that a local search from upright antennas ends in a
+wrong one. With the materials fixed, the gain of a path is bilinear in the polarizations of both ends. A scan therefore
+evaluates a grid of slants and tilts of one end, with the other end as fitted and upright. Local searches over all
+angles start from its best points.
 """
 
 from __future__ import annotations
@@ -31,26 +32,26 @@ from calibray.materials import Material
 from calibray.paths import Kind, Paths
 
 CONDUCTIVITIES: Final = 10.0 ** np.arange(-3.5, 1.1, 0.5)
-"""Conductivities of a scan [S/m]; a refinement bridges half a decade."""
+"""Conductivities of a scan [S/m]; a local search covers the half decade between them."""
 
 THINNEST: Final = 1e-3
-"""Least thickness of a scan [m]."""
+"""Smallest thickness of a scan [m]."""
 
 THICKEST: Final = 0.6
-"""Largest thickness of a scan [m], unless the study's is more than half of it."""
+"""Largest thickness of a scan [m], or twice the study's thickness if that is larger."""
 
 RESOLUTION: Final = 20.0
-"""Number of points of a scan per wavelength in the slab; a slab has two resonances per wavelength of thickness."""
+"""Number of scanned thicknesses per wavelength in the slab; a slab has two resonances per wavelength of thickness."""
 
 ROBUST_DB: Final = 1.5
-"""Error of a ratio beyond which it gets less weight [dB]: near a resonance, where a ray has almost no power, one step
-of a scan changes it by tens of dB."""
+"""Error of a ratio above which its weight decreases [dB]: near a resonance, where a ray has almost no power, one step
+of a scan changes the ratio by tens of dB."""
 
 SCANNED: Final = 48
-"""Paths of a scan."""
+"""Number of paths of a scan."""
 
 KEPT: Final = 3
-"""Local minima of each scan of a material, and of a search for antennas."""
+"""Number of local minima that are kept of each scan of a material, and of a search over antennas."""
 
 BATCH: Final = 512
 """Number of points that are evaluated at once."""
@@ -61,30 +62,30 @@ SLANTS: Final = (0.0, np.pi / 2, np.pi / 4, -np.pi / 4)
 """Slants of a linear polarization [rad]: vertical, horizontal, and both diagonals."""
 
 POLARIZATIONS: Final = [(tx, rx) for tx in (None, *SLANTS) for rx in (None, *SLANTS)]
-"""Slants at both ends; None for an antenna without polarization."""
+"""Slants at both ends; None for an unpolarized antenna."""
 
 STARTS: Final = 6
-"""Points of each scan from which a local search starts; of the best six, four reached the truth in development."""
+"""Number of points of each scan from which local searches start; of the best six, four found the true angles."""
 
 TILTS: Final = np.linspace(-TILT, TILT, 15)
-"""Tilts of a scan along x and along y: 0.04 rad apart, twice the distance of minima."""
+"""Tilts of a scan along x and along y: 0.04 rad apart, twice the distance between minima."""
 
 FINE_SLANTS: Final = np.pi * (np.arange(80) / 80 - 0.5)
 """Slants of a scan [rad]; a linear polarization has the period pi."""
 
 
 def robust(square: Any) -> Any:
-    """Geman-McClure loss [dB^2] of squared errors of ratios [...], [dB^2], a NumPy or JAX array."""
+    """Geman-McClure loss [dB^2] of squared errors of ratios [...], [dB^2], as a NumPy or JAX array."""
     return square / (1 + square / ROBUST_DB**2)
 
 
 class Observed(NamedTuple):
-    """Ratios of some paths [n] at a call to those at the last one.
+    """Power ratios of n paths between the last call and an earlier one.
 
     Attributes:
-        materials: The materials of the call, without those scanned.
+        materials: The materials of the earlier call; the scanned constants are replaced.
         weight: Weights of the paths [n].
-        change_db: Power at the last call over that at this one [n], [dB].
+        change_db: Power at the last call over that at the earlier one [n], [dB].
     """
 
     materials: dict[str, Material]
@@ -98,7 +99,7 @@ class Scan:
 
     Attributes:
         values: Logarithms of the scanned constants [H, K, c].
-        misfit: Mean loss of the ratios [H, K]; inf if there are fewer minima.
+        misfit: Mean loss of the ratios [H, K]; inf where a pair has fewer minima.
     """
 
     values: NDArray[np.float64]
@@ -115,9 +116,9 @@ def scan(
     """Scan the constants of one material.
 
     Args:
-        paths: The paths, of reflections and transmissions, with the ports V and H unless the antennas are known.
+        paths: Paths of only reflections and transmissions, with the ports V and H unless the antennas are known.
         name: The material.
-        fields: The constants that are scanned, of thickness and conductivity.
+        fields: The scanned constants: thickness, conductivity, or both.
         last: The materials of the last call.
         calls: The ratios to earlier calls.
         known: Whether the antennas are known; there is then only one pair of polarizations.
@@ -136,7 +137,7 @@ def scan(
 
 
 def chosen(paths: Paths, subset: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The paths that a scan evaluates: of those with only reflections and transmissions, the simplest and shortest."""
+    """The paths that a scan evaluates: the simplest and shortest with only reflections and transmissions."""
     other = ~np.isin(paths.kind, (Kind.SPECULAR, Kind.REFRACTION))
     path = np.repeat(np.arange(paths.num_paths), np.diff(paths.first))
     subset = np.setdiff1d(subset, path[other])
@@ -187,22 +188,22 @@ def _minima(
 
 
 class _Scanned(NamedTuple):
-    """The paths of a scan, P of at most D interactions, at the last call and at C earlier ones.
+    """The P paths of a scan with at most D interactions, at the last call and at C earlier ones.
 
-    P is `SCANNED`, so that few functions are compiled. Absent paths have weight 0.
+    P is always `SCANNED`, so that few functions are compiled. Missing paths have weight 0.
 
     Attributes:
-        exists: Whether a path has so many interactions [D, P].
+        exists: Whether a path has an interaction of this index [D, P].
         here: Whether an interaction is on the scanned material [D, P].
         cosine: Cosine of the angle of incidence [D, P].
-        through: Whether it is a transmission [D, P].
+        through: Whether the interaction is a transmission [D, P].
         rotation: Cosine and sine of the rotation into the frame of incidence [D, 2, P].
         constants: Permittivity, conductivity and thickness at every call, the last one first [C + 1, 3, D, P].
         tx: Fields at the transmitter [T, 2, P].
         rx: Conjugate fields at the receiver [R, 2, P].
         wavelength: [m].
-        weight: Weights of the ratios [C, P], of sum 1.
-        change_db: The ratios [C, P].
+        weight: Weights of the ratios [C, P]; their sum is 1.
+        change_db: The ratios [C, P], [dB].
     """
 
     exists: jax.Array
@@ -261,7 +262,7 @@ def _losses(program: _Scanned, points: jax.Array, columns: tuple[int, ...], know
 def _powers(
     program: _Scanned, constants: jax.Array, points: jax.Array, columns: tuple[int, ...], known: bool
 ) -> jax.Array:
-    """Powers [n, H, P] up to a factor of each path, with constants at one call [3, D, P]."""
+    """Powers [n, H, P], up to a factor per path, with constants at one call [3, D, P]."""
     values = list(jnp.broadcast_to(constants[:, None], (3, len(points), *constants.shape[1:])))
     for index, column in enumerate(columns):
         values[column] = jnp.where(program.here, points[:, index, None, None], values[column])
@@ -291,7 +292,7 @@ def _powers(
     square = _square(
         jnp.stack([cos * received[:, :, 0] + sin * received[:, :, 1] for cos, sin in ends], axis=1)
     )
-    # Without polarization, both components of the wave count.
+    # An unpolarized antenna receives both components of the wave.
     square = jnp.concatenate([square[:, :2].sum(axis=1, keepdims=True), square], axis=1)
     square = jnp.concatenate([square[:, :, :2].sum(axis=2, keepdims=True), square], axis=2)
     return materialize(square.reshape(len(points), -1, square.shape[-1]), program.wavelength)
@@ -302,12 +303,12 @@ def _square(gain: jax.Array) -> jax.Array:
 
 
 class Gains(NamedTuple):
-    """Ratios of some paths [n] at two calls, with the gains between the ports V and H.
+    """Power ratios of n paths between two calls, with the gains between the ports V and H.
 
     Attributes:
         last: Gains at the last call [n, R, T].
-        earlier: Gains at an earlier call.
-        bases: Axes of the fields at both ends [n, 2, 3].
+        earlier: Gains at an earlier call [n, R, T].
+        bases: Unit vectors theta and phi of the fields at both ends [n, 2, 3].
         weight: Weights of the paths [n].
         observed: Power at the last call over that at the earlier one [n], [dB].
     """
@@ -334,7 +335,7 @@ def antennas(parts: list[Gains], angles: NDArray[np.float64]) -> list[NDArray[np
     bound = np.tile([3 * np.pi, TILT, TILT], 2)
     found = []
     for start in starts:
-        # The soft loss counts paths near a null less, as in the search for all values.
+        # The soft loss reduces the weight of paths near a null, as in the search for all values.
         fit = least_squares(
             lambda angles: errors(parts, angles), np.clip(start, 1e-9 - bound, bound - 1e-9), bounds=(-bound, bound),
             loss="soft_l1", f_scale=ROBUST_DB, x_scale=0.05, max_nfev=30,
@@ -350,7 +351,7 @@ def antennas(parts: list[Gains], angles: NDArray[np.float64]) -> list[NDArray[np
 
 
 def errors(parts: list[Gains], angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Errors of the ratios [m], [dB], with weights of mean 1."""
+    """Errors of the ratios [m], [dB], times the roots of weights with mean 1."""
     errors, weights = [], np.concatenate([part.weight for part in parts])
     for part in parts:
         tx, rx = (
@@ -364,7 +365,7 @@ def errors(parts: list[Gains], angles: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def _scan_angles(parts: list[Gains], end: int, other: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """The angles [3] of one end with the least loss, for given angles of the other end."""
+    """The angles [3] of one end with the smallest loss, for given angles of the other end."""
     x, y = (each.ravel() for each in np.meshgrid(TILTS, TILTS))
     axis, loss = np.stack([x, y, np.ones_like(x)], axis=1), 0.0
     cos, sin = np.cos(FINE_SLANTS)[:, None], np.sin(FINE_SLANTS)[:, None]

@@ -1,4 +1,4 @@
-"""Choice of the calibration method, and its loop (paper Fig. 1): propose, run the engine, compare, repeat."""
+"""Choice of the calibration method, and the loop that runs it (paper Fig. 1): propose, run the engine, compare."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STARTS: Final = (16, 512)
 """Smallest and largest number of local searches of a multi-start method."""
 
 START_INTERACTIONS: Final = 4_000_000
-"""Target for local searches times interactions of the path program, which keeps the time of a search constant."""
+"""Target for the product of local searches and interactions of the path program, so that search times are similar."""
 
 
 def check_method(name: str) -> None:
@@ -85,7 +85,7 @@ def _make(
         )
     try:
         if "x0" in options:
-            with suppress(ValueError, TypeError), np.errstate(all="ignore"):  # the method refuses these
+            with suppress(ValueError, TypeError), np.errstate(all="ignore"):  # the method rejects these
                 options["x0"] = parameters.to_search(options["x0"])
         return optimizers.make(
             name,
@@ -109,7 +109,7 @@ Evaluate = Callable[[NDArray[np.float64], bool], Evaluation]
 """Evaluates points of the search space [n, d]; the flag requests derivatives."""
 
 SEARCHES: Final = 64
-"""Number of local searches for further minima if the method kept only its best, and on a corrected program."""
+"""Number of local searches for further minima if the method kept only its best one, and on a corrected program."""
 
 BASINS: Final = 24
 """Smallest number of minima from which posterior sampling starts."""
@@ -125,7 +125,7 @@ def rounds(optimizer: Optimizer, evaluate: Evaluate) -> Iterator[tuple[NDArray[n
         The candidates of every round, as points of the search space [n, d], and their evaluation.
     """
     derivatives = optimizer.needs_derivatives()
-    # The matrices of surrogates are small; BLAS threads cost more than they save.
+    # The matrices of surrogates are small, so BLAS threads would cost more time than they save.
     with single_blas_thread():
         while not optimizer.done:
             points = optimizer.ask()
@@ -247,9 +247,9 @@ def _hits(engine: Engine) -> int:
 
 
 def find_minima(problem: Problem, trail: Trail) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Collect the known minima of a problem; search for more if the method kept only its best.
+    """Collect the known minima of a problem; search for more if the method kept only its best one.
 
-    They are points of the search space, the calibrated one first [k, d], and their mean squares [k].
+    Returns points of the search space, the calibrated one first [k, d], and their mean squares [k].
     """
     points = np.concatenate([problem.parameters.to_search(trail.best)[None], trail.minima])
     # The calibrated point and the optimizer's best one are the same minimum.
@@ -263,7 +263,7 @@ def relevant_minima(
 ) -> NDArray[np.float64]:
     """Select the minima [k, d] that can contribute to an interval, the lowest first [j, d].
 
-    They have mean squares [k]; the freedom is the number of residuals minus unknowns.
+    Their mean squares are `square` [k]; `freedom` is the number of residuals minus that of unknowns.
     """
     order = np.argsort(square, kind="stable")
     # (square - lowest) / lowest x freedom is the excess in noise variances.
