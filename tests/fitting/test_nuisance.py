@@ -234,7 +234,7 @@ def test_dependent_columns_are_held_at_zero():
             "again": 0.5,
             "trees": 0,
         },
-        abs=1e-9,
+        abs=1e-8,
     )
     assert target.determined.tolist() == [False, True, True, True, True, False]
 
@@ -250,11 +250,11 @@ def test_a_dependent_column_moves_where_bounds_keep_the_others_from_the_minimum(
     elimination = Elimination.of(nuisance, links.weight, np.zeros(4))
     gap = np.array([11.0, 9.0, 10.0])[terms[1].group][None]
     found = elimination.coefficients(gap)
-    assert nuisance.design @ found[0] == pytest.approx(gap[0], abs=1e-5)
+    assert nuisance.design @ found[0] == pytest.approx(gap[0], abs=1e-4)
     # The change of a level changes the coefficients, and nothing of it is left.
     slope = (terms[1].group == 0)[None, :, None].astype(float)
     elimination.remove(slope, elimination.projection(slope, found))
-    assert slope == pytest.approx(0.0, abs=1e-5)
+    assert slope == pytest.approx(0.0, abs=1e-4)
 
 
 def test_terms_at_other_links_keep_centre_and_columns():
