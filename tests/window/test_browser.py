@@ -201,6 +201,7 @@ def test_what_an_editor_changed_in_the_study_is_shown_and_not_undone(walked):
         if lowest.input_value() == "1.25":
             break
         page.wait_for_timeout(100)
+    page.wait_for_timeout(600)  # until the buttons are shown again as well
     step(page, "Parameters").get_by_role("button", name="Save parameters").click()
     page.get_by_text("Saved").first.wait_for()
     study = tomllib.loads((folder / "study.toml").read_text())
