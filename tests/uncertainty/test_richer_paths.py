@@ -140,5 +140,5 @@ def test_the_remark_names_settings_errors_and_values_outside_of_their_intervals(
     text = remark_text(Remark(RemarkKind.RICHER_PATHS, values))
     assert "probability of 0.99. With refraction = true, diffraction = true, the RMSE would be 3.13" in text
     assert "instead of 4.90 dB" in text
-    assert f"outside of their intervals: {STONE}." in text
+    assert f"outside their intervals: {STONE}." in text
     assert "outside" not in remark_text(Remark(RemarkKind.RICHER_PATHS, values | {"outside": []}))

@@ -1,4 +1,4 @@
-"""Parameters: the quantities that a calibration may change, their search space, and the laws to which some belong."""
+"""Parameters: the quantities that a calibration may change, their search space, and their laws over frequency."""
 
 from calibray.parameters.parameter import SCATTERING_SPREAD as SCATTERING_SPREAD
 from calibray.parameters.parameter import Parameter as Parameter

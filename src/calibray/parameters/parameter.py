@@ -1,8 +1,8 @@
 """One parameter: its name, its bounds, its start value in a scene, and the law over frequency to which it may belong.
 
 Constants of a material follow eps_r = a f^b and sigma = c f^d [S/m], f in GHz (ITU-R P.2040). A material that ITU-R
-lists has the coefficients of Table 3. Any other material has the same constants at all frequencies: the same law with
-the exponents 0.
+lists has the coefficients of Table 3. Any other material has constants that do not depend on frequency: the same law
+with exponents of 0.
 """
 
 from __future__ import annotations
@@ -94,8 +94,8 @@ class Parameter:
         upper: Upper bound, in the field's unit.
         start: Value before calibration, within the bounds, in the field's unit.
         scale: "linear", or "log" for a constant that spans decades; then `lower` must be greater than 0.
-        at_lower: Length of the search space whose points all have the value `lower`: with a prior, exactly this value
-            has a probability.
+        at_lower: Length of an interval of the search space that maps to the value `lower`; with a prior, exactly this
+            value then has a finite probability.
 
     Raises:
         InputError: The field is unknown, or bounds or start are out of order or physically impossible.
@@ -163,15 +163,15 @@ class Parameter:
 
 
 SCATTERING_SPREAD: Final = 0.25
-"""Standard deviation of a scattering coefficient of which a scene says 0, unless it is exactly 0. Facades have 0.2 to
+"""Standard deviation of a scattering coefficient that is 0 in the scene, unless it is exactly 0. Facades have 0.2 to
 0.4 (V. Degli-Esposti et al., IEEE Trans. Antennas and Propagation 55, 2007)."""
 
 
 def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:
     """A parameter for a constant that a scene fixes, within four standard deviations of its logarithm.
 
-    A scattering coefficient of 0 is exactly 0 with a probability of one half, and otherwise has the positive half of a
-    Gaussian with the standard deviation `SCATTERING_SPREAD` as its prior. None if another constant is 0, if these
+    A scattering coefficient of 0 is exactly 0 with a probability of one half. Otherwise its prior is the positive half
+    of a Gaussian with the standard deviation `SCATTERING_SPREAD`. The result is None if another constant is 0, if these
     values are impossible, or if the spread is 0.
 
     Example:
@@ -182,7 +182,7 @@ def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:
     """
     constant = split_name(name)[1]
     if constant == "scattering_coefficient" and value == 0.0 and spread > 0.0:
-        # As long as the integral of the half Gaussian, whose density is 1 at 0.
+        # Equal to the integral of the half Gaussian, whose density is scaled to 1 at 0.
         return Parameter(name, 0.0, 3.0 * SCATTERING_SPREAD, 0.0, at_lower=SCATTERING_SPREAD * sqrt(pi / 2.0))
     bound, factor = PARAMETER_BOUNDS[constant], exp(4.0 * spread)
     # The range ends at a physical bound, such as 1 for a scattering coefficient.
@@ -193,7 +193,7 @@ def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:
 
 
 def is_effect(name: str) -> bool:
-    """Whether the name of a parameter is that of an effect.
+    """Whether a parameter name refers to an effect.
 
     Example:
         >>> is_effect("region:trees.specific_attenuation"), is_effect("walls.thickness")
@@ -205,7 +205,7 @@ def is_effect(name: str) -> bool:
 
 
 def _of_kind(name: str) -> bool:
-    """Whether a name begins with the kind of an effect."""
+    """Whether a name starts with a kind of effect."""
     kind, colon, _ = name.partition(":")
     return bool(colon) and kind in EFFECTS
 
@@ -279,7 +279,7 @@ def itu_start(name: str, start: str, frequency: float) -> float:
     """Look up the value of ITU-R P.2040, in the field's unit, for a start such as "itu:concrete@P.2040-1".
 
     Raises:
-        InputError: The text has another form, the field has no ITU-R law, or an error of `itu_material`.
+        InputError: The text has a different form, the field has no ITU-R law, or an error of `itu_material`.
     """
     field = split_name(name)[1]
     if is_effect(name):
@@ -306,10 +306,10 @@ def _coefficient(law: ItuLaw, field: str) -> float:
 
 
 def check_material(name: str, materials: Collection[str]) -> None:
-    """Refuse a parameter whose material is not in the scene.
+    """Reject a parameter whose material is not in the scene.
 
     Raises:
-        InputError: The material is not among them; the message suggests the nearest name.
+        InputError: The material is not in the scene; the message suggests the nearest name.
     """
     material = split_name(name)[0]
     if material not in materials:
@@ -347,10 +347,10 @@ def check_law(
     exponents: Iterable[float],
     frequencies: Iterable[float],
 ) -> None:
-    """Refuse bounds of a law s f^e that allow an impossible value of a constant at some carrier [Hz].
+    """Reject bounds of a law s f^e that allow an impossible value of a constant at any of the carriers [Hz].
 
     A power law is monotonic in both coefficients, so it is enough to check the corners of their bounds. A fixed
-    coefficient has one value.
+    coefficient has a single value.
 
     Raises:
         InputError: s f^e lies outside the constant's bound.

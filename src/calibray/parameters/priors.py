@@ -1,4 +1,4 @@
-"""Priors of parameters: log-normal around a value, Gaussian for antennas, or like another parameter."""
+"""Priors of parameters: log-normal around a value, Gaussian for antennas, or centred on another parameter."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from calibray.parameters.space import Parameters
 
 @dataclass(frozen=True)
 class LogNormal:
-    """Gaussian priors of the logarithms of k parameters, or of the values of some of them.
+    """Gaussian priors of the logarithms of k parameters, or, for those in `linear`, of their values.
 
     Attributes:
         index: Indices of the parameters that have a prior.
         centre: Medians, in the parameters' units; for those in `like`, relative to the value of the other parameter.
         spread: Standard deviations of the logarithms (0.3 is about 30 %), or of the values of those in `linear`.
         linear: Indices of the parameters whose prior is Gaussian in the value itself, which can be negative.
-        like: Index of a parameter with a prior, and of the parameter around which the prior is centred: members of a
+        like: Pairs of indices: a parameter with a prior, and the parameter on which the prior is centred. Members of a
             population scatter around their common value.
 
     Example:
@@ -42,9 +42,9 @@ class LogNormal:
         return len(self.index)
 
     def extended(self, index: Sequence[int], centre: Sequence[float], spread: float) -> LogNormal:
-        """These priors, and independent priors of further parameters with one spread of their logarithms.
+        """These priors, and independent priors of further parameters whose logarithms have the same spread.
 
-        Scattering coefficients around 0 have the standard deviation `SCATTERING_SPREAD`.
+        Scattering coefficients centred on 0 have the standard deviation `SCATTERING_SPREAD`.
         """
         return replace(
             self,
@@ -58,7 +58,7 @@ class LogNormal:
         )
 
     def residuals(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The priors as residuals of a least-squares problem: (log value - log centre) / spread [n, k].
+        """Least-squares residuals of the priors: (log value - log centre) / spread [n, k].
 
         Candidates [n, d] are in the fields' units, greater than 0 unless `linear`.
         """
@@ -83,15 +83,15 @@ class LogNormal:
     ) -> NDArray[np.float64]:
         """Logarithm of the integral of exp(-residual^2 / 2) over the bounds of the parameters in `like` [n].
 
-        The integral depends on the parameters around which these priors are centred. The density refers to the search
+        The integral depends on the parameters on which these priors are centred. The density refers to the search
         space.
         """
         total = np.zeros(len(candidates))
         for row, reference in self._pairs:
             middle, low, high, tilt = self._interval(row, candidates[:, reference], parameters)
-            # Integral over x of exp(-(log x - m)^2 / 2 s^2): exp(m + s^2 / 2) times a probability about m + s^2.
+            # Integral over x of exp(-(log x - m)^2 / 2 s^2): exp(m + s^2 / 2) times a probability of N(m + s^2, s^2).
             total += tilt * (middle - tilt * self.spread[row] ** 2 / 2)
-            # The normal distribution is symmetric; below its mean, differences of probabilities keep their digits.
+            # The normal distribution is symmetric; below its mean, differences of probabilities lose no precision.
             below, above = np.where(low > 0, [-high, -low], [low, high])
             total += log_ndtr(above) + np.log1p(-np.exp(log_ndtr(below) - log_ndtr(above)))
         return total
@@ -116,8 +116,8 @@ class LogNormal:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
         """Mean of the logarithm [n], and the distances of the bounds from it in standard deviations [n] each.
 
-        The last result is 1 if the search space is that of the value, where exp(-residual^2 / 2) has another mean than
-        in that of the logarithm, and otherwise 0.
+        The last result is 1 if the search coordinate is the value itself, for which the mean of the logarithm is
+        shifted, and 0 if it is the logarithm.
         """
         item, spread = parameters.items[self.index[row]], self.spread[row]
         tilt = 0.0 if item.scale == "log" else 1.0
@@ -127,7 +127,7 @@ class LogNormal:
 
     @property
     def _pairs(self) -> tuple[tuple[int, int], ...]:
-        """Index of the prior, and of the parameter around which it is centred."""
+        """Index of each prior in `like`, and of the parameter on which it is centred."""
         return tuple((self.index.index(parameter), reference) for parameter, reference in self.like)
 
     @property

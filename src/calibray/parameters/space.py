@@ -26,7 +26,7 @@ _DEFAULT_LAW: Final = frequency_independent_law(Material(1.0, 0.0, 1.0))
 _UNBOUNDED: Final = 1e300
 
 MAX_PARAMETERS: Final = 10_000
-"""Number of parameters above which a study is refused."""
+"""Largest number of parameters of a study."""
 
 
 class _Law(NamedTuple):
@@ -46,8 +46,8 @@ class Parameters:
 
     Attributes:
         items: The parameters, at least one.
-        frequency: Carrier [Hz] at which laws are evaluated unless another one is given.
-        laws: Laws of materials with a coefficient as parameter, by material; the other coefficients keep the values
+        frequency: Carrier [Hz] at which laws are evaluated by default.
+        laws: Laws by material, for materials with a coefficient as parameter; the other coefficients keep the values
             given here. By default, the constants of a law are the same at all frequencies.
 
     Raises:
@@ -145,10 +145,10 @@ class Parameters:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Constants that candidates set at one carrier, and their derivatives, each [..., parameters].
 
-        If None, the carrier is `frequency` of the parameters. Two coefficients of one law have the same constant.
+        If None, the carrier is `frequency` of the parameters. Both coefficients of a law have the same constant.
 
         Raises:
-            InputError: The candidates have another length.
+            InputError: The candidates have the wrong length.
         """
         given = self._components(candidates)
         constants, slopes = given.copy(), np.ones_like(given)
@@ -158,7 +158,7 @@ class Parameters:
                 np.asarray(law.fixed_exponent) if law.exponent is None else given[..., law.exponent],
                 self.frequency if frequency is None else frequency,
             )
-            # Both coefficients of a law stand for the constant that they set together.
+            # Both coefficients of a law have the constant that they set together.
             if law.scale is not None:
                 constants[..., law.scale], slopes[..., law.scale] = values.value, values.by_scale
             if law.exponent is not None:
@@ -168,8 +168,8 @@ class Parameters:
     def at_carrier(self, frequency: float) -> tuple[Parameters, NDArray[np.int64]]:
         """The constants that the parameters set at one carrier [Hz], as parameters themselves.
 
-        If they follow a law, they have only physical bounds. The second result is the index of the constant that each
-        of these parameters sets [parameters].
+        Constants that follow a law have only physical bounds. The second result is the index of the constant that each
+        of the original parameters sets [parameters].
         """
         if not self.has_laws:
             return self, np.arange(len(self))
@@ -178,7 +178,7 @@ class Parameters:
         for parameter, start in zip(self.items, starts.tolist(), strict=True):
             name = _constant_name(parameter)
             if name != parameter.name:
-                # Bounds of a coefficient say nothing about the constant.
+                # The bounds of a coefficient do not bound the constant.
                 parameter = Parameter(name, PARAMETER_BOUNDS[parameter.constant].lower, _UNBOUNDED, start)
             constants.setdefault(name, parameter)
         number = {name: index for index, name in enumerate(constants)}
@@ -186,10 +186,10 @@ class Parameters:
         return Parameters(tuple(constants.values()), frequency), np.array(indices, dtype=np.int64)
 
     def law_coefficients(self, candidate: ArrayLike) -> dict[str, dict[str, float]]:
-        """For each material, both coefficients of each constant that has a coefficient among the parameters.
+        """For each material, both coefficients of every law that has a coefficient among the parameters.
 
         Raises:
-            InputError: The candidate has another length.
+            InputError: The candidate has the wrong length.
         """
         values = self._components(candidate)
         coefficients: dict[str, dict[str, float]] = {}
@@ -203,7 +203,7 @@ class Parameters:
         return coefficients
 
     def check_carriers(self, frequencies: Sequence[float]) -> None:
-        """Refuse bounds of laws that allow an impossible value of a constant at some carrier [Hz].
+        """Reject bounds of laws that allow an impossible value of a constant at any of the carriers [Hz].
 
         Raises:
             InputError: A law exceeds the bound of its constant; the message names the carrier.
@@ -244,7 +244,7 @@ class Parameters:
         If None, the carrier is `frequency` of the parameters.
 
         Raises:
-            InputError: The candidate has another length, a value is physically impossible, or a material is unknown.
+            InputError: The candidate has the wrong length, a value is physically impossible, or a material is unknown.
         """
         values = np.asarray(candidate, dtype=np.float64)
         if values.shape != (len(self),):
@@ -267,7 +267,7 @@ class Parameters:
         laws have no cell; use the parameters of `at_carrier` for them.
 
         Raises:
-            InputError: A parameter's material is not among them, or a parameter is a coefficient of a law.
+            InputError: A parameter's material is not in `materials`, or a parameter is a coefficient of a law.
         """
         if self.has_laws:
             raise InputError(
@@ -291,7 +291,7 @@ class Parameters:
         parameters.
 
         Raises:
-            InputError: The candidates have another length, or a parameter's material is unknown.
+            InputError: The candidates have the wrong length, or a parameter's material is unknown.
         """
         carrier = self.frequency if frequency is None else frequency
         values, _ = self.constants_and_slopes(candidates, carrier)
@@ -304,8 +304,8 @@ class Parameters:
         batch[..., rows[cell], columns[cell]] = values[..., self.of_materials]
         return batch
 
-    # The search space: logarithms of the parameters that span decades, the others in their physical unit as in the
-    # paper; in unit coordinates the bounds become 0 and 1.
+    # Search coordinates are logarithms for parameters that span decades, and otherwise values in the physical unit, as
+    # in the paper. In unit coordinates, the bounds become 0 and 1.
 
     @property
     def search_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -322,7 +322,7 @@ class Parameters:
         """Convert points of the search space [..., parameters] to candidates within the bounds."""
         values = self._components(points)
         values = np.where(self.logarithmic, np.exp(np.where(self.logarithmic, values, 0.0)), values)
-        # Rounding of exp and log would otherwise leave the bounds by an ulp.
+        # Rounding of exp and log could otherwise exceed the bounds by an ulp.
         return np.clip(values, self.lower, self.upper)
 
     def search_slope(self, candidates: ArrayLike) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""The files of a result: written completely, and read back into the same sections by a closed model."""
+"""Writes the files of a result, each complete or not at all, and reads and validates them."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class LinkCounts(Section):
 class Stored(Section):
     """The content of `result.json`: the sections of a `Record`.
 
-    `study_from_here` is the path of the study file from the result's folder: both may have moved together.
+    `study_from_here` is the path of the study file relative to the result's folder, as both may have moved together.
     """
 
     version: Literal[1]
@@ -112,9 +112,9 @@ SECTIONS: Final = ("fit", "accuracy", "uncertainty", "nuisance", "prediction", "
 def content(
     record: Record, sentences: tuple[str, ...] = (), files: dict[str, str] | None = None
 ) -> dict[str, Any]:
-    """A result as the content of `result.json`, without its tables, with its remarks as sentences.
+    """The content of `result.json` for a result: everything but its tables, and its remarks as sentences.
 
-    `files` has the SHA-256 of every other file of the result, by name, once they are written.
+    `files` is the SHA-256 of each other file of the result, by name, once they are written.
     """
     parts = {name: getattr(record, name) for name in SECTIONS}
     values = {name: TypeAdapter(type(part)).dump_python(part, mode="json") for name, part in parts.items()}
@@ -140,8 +140,8 @@ def write(
     """Write `result.json`, its tables, the calibrated scene and, if there is one, the validation.
 
     Each file is written under a temporary name and then renamed, so every file is complete or absent. `result.json` is
-    written last and contains the digests of the others: if the run is killed before that, `read` refuses the mixture of
-    two runs. Sentences and the figures of the validation are for readers of the files.
+    written last and contains the digests of the other files: if the run is killed before that, `read` rejects the
+    mixture of two runs. Sentences and the figures of the validation are for readers of the files.
 
     Raises:
         InputError: The folder cannot be written, or a file there must not be replaced.
@@ -158,7 +158,8 @@ def write(
         write_text(target / HISTORY_FILE, csv_text(record.history, "%.9g"))
         if record.held_out is None and (target / VALIDATION_FILE).exists():
             _LOG.warning(
-                "%s: removed, because it was of an earlier result; validate again", target / VALIDATION_FILE
+                "%s: removed, because it belonged to an earlier result; validate again",
+                target / VALIDATION_FILE,
             )
         (target / VALIDATION_FILE).unlink(missing_ok=True)
         if record.held_out is not None:
@@ -179,7 +180,7 @@ def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str,
     With `allow_changed_inputs`, files may have been changed after they were written.
 
     Raises:
-        InputError: The folder contains no result, one of another version, one that was damaged or edited, or files of
+        InputError: The folder contains no result, a result of a different version, a damaged or edited one, or files of
             several runs.
     """
     source = as_path(folder, "result") / RESULT_FILE
@@ -196,7 +197,7 @@ def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str,
 
 
 def _check_one_run(folder: Path, digests: dict[str, str], allow_edits: bool) -> None:
-    """Refuse files of several runs, and edited files unless edits are allowed."""
+    """Reject files of several runs, and edited files unless edits are allowed."""
     for name in SIGNED_FILES:
         file = folder / name
         if name not in digests:
@@ -245,7 +246,7 @@ def _read_stored(source: Path) -> tuple[Stored, Study]:
 
 
 def _check_consistent(stored: Stored, study: Study, source: Path) -> None:
-    """Refuse sections that contradict each other or the study."""
+    """Reject sections that contradict each other or the study."""
     names, fit = list(study.parameters), stored.fit
     for key, values in (("parameters", fit.parameters), ("initial_parameters", fit.initial_parameters)):
         if sorted(values) != sorted(names):
@@ -293,10 +294,10 @@ def _check_consistent(stored: Stored, study: Study, source: Path) -> None:
 
 
 def check_same_study(study: Study, folder: Path) -> None:
-    """Refuse a folder whose result cannot be read or is of another study; one without a result suits every study.
+    """Reject a folder whose result cannot be read or belongs to another study; accept one without a result.
 
     Raises:
-        InputError: It is such a folder.
+        InputError: The result cannot be read or belongs to another study.
     """
     if (folder / RESULT_FILE).is_file():
         _, calibrated = _read_stored(folder / RESULT_FILE)
@@ -310,14 +311,14 @@ def write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figure
     """Write held-out errors of a study into a folder; the figures are for readers of the file.
 
     Raises:
-        InputError: The folder contains a result of another study or of other links, or one that cannot be read.
+        InputError: The folder contains a result of another study or of different links, or one that cannot be read.
     """
     check_same_study(study, folder)
     if (folder / RESULT_FILE).is_file():
         measured_db = read_rows(folder, LINKS_FILE, LINKS)["measured_db"].to_numpy()
         if not _same(held_out.measured_db, measured_db):
             raise InputError(
-                f"{folder}: its result is of other links ({len(measured_db)}, but the validation has "
+                f"{folder}: its result has different links ({len(measured_db)}, but the validation has "
                 f"{len(held_out.measured_db)}); give another folder, or run the study again, with [holdout] by if --by "
                 "separates rows of one link"
             )
@@ -347,7 +348,7 @@ def _rounded(values: NDArray[np.float64]) -> list[float | None]:
 
 
 def _problem_digest(study: Study) -> str:
-    """SHA-256 of what determines a study's validation: `run` may use another method, seed or engine."""
+    """SHA-256 of what determines a study's validation: not the method, seed or engine, which `run` may change."""
     content = {
         key: value for key, value in study.content().items() if key not in ("method", "engine", "holdout")
     }
@@ -365,10 +366,10 @@ def _same(first_db: NDArray[np.float64], second_db: NDArray[np.float64]) -> bool
 
 
 def read_validation(folder: Path, study: Study, measured_db: NDArray[np.float64]) -> HeldOutErrors | None:
-    """Read the held-out errors of a result with measured path loss [links], [dB]; None without validation.
+    """Read the held-out errors of a result with measured path loss [links], [dB]; None if it was not validated.
 
     Raises:
-        InputError: The file was damaged or edited, or belongs to another study or other links.
+        InputError: The file was damaged or edited, or belongs to another study or to different links.
     """
     file = folder / VALIDATION_FILE
     if not file.is_file():
@@ -423,7 +424,7 @@ def _checked_validation(file: Path, values: dict[str, Any], links: int) -> HeldO
 
 
 def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
-    """Read a table of a result's folder with the required columns of kinds "i", "f" or "b"; others stay unchanged.
+    """Read a table from a result's folder; check the required columns, each of kind "i", "f" or "b".
 
     Raises:
         InputError: The file does not exist, lacks a column, or has invalid values in one.
@@ -442,7 +443,7 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
         if column not in table:
             raise InputError(f"{file}: has no column {column!r}; run the study again")
         actual = table[column].dtype.kind
-        # Whole numbers are valid floats. A table without rows has no kinds.
+        # Integers are valid floats. Columns of a table without rows have no kind.
         if len(table) and actual != kind and not (kind == "f" and actual == "i"):
             raise InputError(f"{file}: column {column!r} has values of the wrong type; run the study again")
         if kind == "f":

@@ -37,22 +37,22 @@ BASELINES: Final = (Model.INITIAL, *WITHOUT_MATERIALS, Model.KRIGING)
 """Models that calibrate no material."""
 
 FITTED: Final = (Model.CALIBRATED, Model.PRIOR, Model.OFFSETS)
-"""Models that calibrate materials and can make predictions anywhere."""
+"""Models that calibrate materials and can predict any link."""
 
 AVERAGES: Final[dict[str, tuple[Model, Model]]] = {
     Model.AVERAGE_INITIAL: (Model.PRIOR, Model.INITIAL),
     Model.AVERAGE_CALIBRATED: (Model.CALIBRATED, Model.PRIOR),
     Model.AVERAGE_OFFSETS: (Model.CALIBRATED, Model.OFFSETS),
 }
-"""The two models that each average takes path loss from. If it is chosen, an exported scene has the materials of the
-first one."""
+"""The two models whose path loss each average combines. If an average is chosen, an exported scene has the materials of
+the first one."""
 
 AVERAGE_OF: Final[dict[str, Model]] = {
     Model.INITIAL: Model.AVERAGE_INITIAL,
     Model.CALIBRATED: Model.AVERAGE_CALIBRATED,
     Model.OFFSETS: Model.AVERAGE_OFFSETS,
 }
-"""The average that predicts if blocks choose a model."""
+"""The average that makes the predictions if blocks choose a model."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class ObservableErrors:
         unit: The unit.
         links: Number of held-out links with a value.
         rmse: RMSE of the calibrated model.
-        mean_rmse: RMSE of the mean of the other links.
-        distance_rmse: RMSE of a law of distance fitted to the other links.
+        mean_rmse: RMSE of predicting the mean of the other links.
+        distance_rmse: RMSE of a distance law fitted to the other links.
     """
 
     unit: str
@@ -80,9 +80,9 @@ class HeldOutErrors:
 
     Attributes:
         labels: Names of the blocks.
-        block: Block of every link [links]; -1 if it is not judged.
-        errors: Modelled minus measured path loss by name of the model [links], [dB]; NaN if it is not judged.
-        position: Positions of the end that moved [links, 3], [m], from `moving_end`.
+        block: Block of every link [links]; -1 if the link is not judged.
+        errors: Modelled minus measured path loss by model name [links], [dB]; NaN if the link is not judged.
+        position: Positions of the end that moves [links, 3], [m]; see `moving_end`.
         measured_db: Measured path loss [links], [dB].
         level: Nominal coverage of the intervals.
         observables: Errors of the further observables by name; empty in a loaded result, whose accuracy contains them.
@@ -124,7 +124,7 @@ class Judgement:
 
     @property
     def helped(self) -> bool:
-        """Whether the gain exceeds its standard error significantly (Student's t, one degree less than clusters)."""
+        """Whether the gain exceeds its standard error significantly (Student's t, clusters - 1 degrees of freedom)."""
         if self.error_db is None:
             return False
         # The standard error comes from resampling the clusters.
@@ -143,9 +143,9 @@ class FittedTerm:
     """A nuisance term with its coefficients.
 
     Attributes:
-        name: Its name.
-        by: Its column: "constant", "log_distance", or a column of the links' table.
-        per: Its groups: "offset" for those of the study's offset, "transmitter", a column, or "" for none.
+        name: Name of the term.
+        by: Column of the term: "constant", "log_distance", or a column of the links' table.
+        per: Groups of the term: "offset" for those of the study's offset, "transmitter", a column, or "" for none.
         coefficients: Coefficient by group, [dB] per unit of the column; groups without data have the others' mean.
         centre: Value that is subtracted from the column.
         spread_db: Standard deviation between groups of a random effect, [dB] per unit of the column; None for the
@@ -162,15 +162,14 @@ class FittedTerm:
 
 @dataclass(frozen=True)
 class BlockErrors:
-    """Errors on new links in two levels: within blocks of neighbouring links, and common to a block.
+    """Errors on new links at two levels: within blocks of neighbouring links, and common to a block.
 
     Attributes:
-        within_db: Standard deviation of a link's own error [dB].
-        between_db: Standard deviation of the error that a new block's links have in common [dB].
+        within_db: Standard deviation of the error of an individual link [dB].
+        between_db: Standard deviation of the error that the links of a new block have in common [dB].
         blocks: Number of blocks.
-        reach_m: Distance to the nearest calibration link that nine of ten held-out links did not exceed [m].
-        groups_db: Root mean square of the contribution of random effects of groups without other links to these errors
-            [dB].
+        reach_m: Distance from a held-out link to the nearest calibration link, 90 % quantile [m].
+        groups_db: RMS contribution to these errors of random effects whose group has no links outside the block [dB].
         out_of_sight: Errors of links out of sight relative to those of all links; at least 1.
     """
 
@@ -187,15 +186,15 @@ class PredictionModel:
     """A model fitted to the calibration links, and its errors on new links.
 
     Attributes:
-        name: Its name; see `held_out.Model`.
+        name: Name of the model; see `held_out.Model`.
         parameters: Values of the parameters in the fields' units; None if the model uses no scene.
-        terms: Its nuisance terms.
-        residual_db: Root mean square of its residuals on new links [dB]; None if there are too few links.
+        terms: Nuisance terms of the model.
+        residual_db: RMS of its residuals on new links [dB]; None if there are too few links.
         basis: Description of the links on which these residuals were computed.
         links: Number of these links, or degrees of freedom if they are calibration links.
         sizes_db: Absolute held-out residuals, ascending, or 400 quantiles of them if there are more [dB].
-        blocks: These residuals in two levels; None if no links, or too few, were held out.
-        averaged: Further values of the parameters, if path loss is the average over both; otherwise None.
+        blocks: Standard deviations of these residuals at two levels; None if no links, or too few, were held out.
+        averaged: Second set of parameter values, if path loss is the average over both sets; otherwise None.
     """
 
     name: str

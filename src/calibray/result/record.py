@@ -25,7 +25,7 @@ from calibray.scenes import Scene
 from calibray.study import Study
 from calibray.tracing.protocol import EnclosedAntennas
 
-# `files` validates the sections with Pydantic when it reads them; these are the bounds of their numbers.
+# `files` validates the sections with Pydantic when it reads them, including these bounds of numbers.
 NonNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=0)]
 Offset = Annotated[float, Field(ge=-500, le=500)]
@@ -43,7 +43,7 @@ class ObservableFit:
         links: Number of calibration links with a value.
         rmse: RMSE of the calibrated model.
         initial_rmse: RMSE with the initial materials.
-        mean_rmse: RMSE of the mean value, as a baseline.
+        mean_rmse: RMSE of predicting the mean value, as a baseline.
         error: Standard deviation of a value's error, stated or estimated.
         biases: Bias by group; the group "" means all links.
         bias_errors: Standard error of each bias, including that of the parameters.
@@ -101,7 +101,7 @@ class Accuracy:
         holdout_rmse_db: RMSE of the calibrated model [dB].
         initial_holdout_rmse_db: RMSE with the initial materials and no nuisance [dB].
         nuisance_only_holdout_rmse_db: RMSE with the initial materials and fitted nuisances [dB].
-        log_distance_holdout_rmse_db: RMSE of the log-distance model [dB].
+        log_distance_holdout_rmse_db: RMSE of the log-distance model fitted to the calibration links [dB].
         judgement: The calibrated model compared with its best baseline.
         observables: Errors of the further observables by name.
     """
@@ -121,11 +121,11 @@ class Uncertainty:
     Attributes:
         intervals: 95 % interval and verdict by parameter.
         draws: Draws from the posterior by parameter, constant and nuisance coefficient; empty if none could be made.
-        constants_db: Constants that the scene fixes and that vary in the draws, with the change of path loss by one
-            standard deviation of each [dB].
+        constants_db: Constants that the scene fixes and that vary in the draws, each with the change of path loss per
+            standard deviation [dB].
         noise: Posterior weights of the noise models and of an undeclared offset.
         undeclared_offset_db: The best-fitting offset if the study declares none [dB]; None if it was not estimated.
-        undeclared_offset_error_db: Its standard error [dB].
+        undeclared_offset_error_db: Standard error of this offset [dB].
         remarks: Warnings and advice.
     """
 
@@ -178,17 +178,17 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Cost:
-    """RT calls, replays and time.
+    """Number of RT calls and replays, and the time taken.
 
     Attributes:
         rt_calls: RT calls of the method, including those answered by the ledger.
         ledger_hits: RT calls that the ledger answered.
-        seconds: Time of the method, without tracing [s].
-        trace_seconds: Time of tracing and loading before the search [s].
-        uncertainty_replays: Replays for intervals and draws.
-        uncertainty_seconds: Their time [s].
+        seconds: Time taken by the method, without tracing [s].
+        trace_seconds: Time taken by tracing and loading before the search [s].
+        uncertainty_replays: Number of replays for intervals and draws.
+        uncertainty_seconds: Time taken by these replays [s].
         cheap_replays: Number of replays of the cheap model; none of them is an RT call.
-        cheap_seconds: Their time [s].
+        cheap_seconds: Time taken by the replays of the cheap model [s].
     """
 
     rt_calls: Count
@@ -222,18 +222,18 @@ class Record:
 
     Attributes:
         study: The study, with the method, seed and engine that ran.
-        fit: The candidate of least RMSE.
+        fit: The candidate with the lowest RMSE.
         accuracy: Accuracy on held-out links.
         uncertainty: Intervals, draws, warnings.
         nuisance: Coefficients of the nuisances.
         prediction: The model that predictions use.
         cost: RT calls, replays and time.
         provenance: The inputs of the calibration.
-        links: One row per link: row in the source file, path loss measured, before, after, of the log-distance model,
-            of the prediction model (predicted; of its fallback without a path) and of its scene alone [dB],
-            has_path, held_out, change on tracing again [dB]; positions tx_x to rx_z [m]; where they apply: group,
-            frequency [Hz], path loss with the nuisances alone [dB], the values in the
-            measured quantity, leverage, depth, and whether the link is censored or expected near the noise floor.
+        links: One row per link: row in the source file; path loss [dB] measured, before and after calibration, of the
+            log-distance model, of the prediction model (of its fallback for links without a path), and of its scene
+            alone; has_path; held_out; change of path loss when traced again [dB]; positions tx_x to rx_z [m]. Where
+            they apply: group, frequency [Hz], path loss with the nuisances alone [dB], values in the measured
+            quantity, leverage, depth, and whether the link is censored or expected near the noise floor.
         history: One row per RT call: number, iteration, RMSE, best so far, seconds since the start.
         held_out: Held-out errors of every model, if blocks were held out in turn; None otherwise.
         scene: The scene as it was read; None in a loaded result.
@@ -282,7 +282,7 @@ class Record:
     @property
     def scene_laws(self) -> dict[str, dict[str, float]]:
         """Coefficients of ITU-R P.2040 by material, as in `Fit.laws`, that give the constants of `scene_materials`."""
-        # The prediction model may have other values than the calibrated ones.
+        # The values of the prediction model may differ from the calibrated ones.
         values = self.prediction.model.parameters or {}
         return {
             material: {name: values.get(f"{material}.{name}", value) for name, value in law.items()}

@@ -21,9 +21,11 @@ class Verdict(StrEnum):
 
 
 class ReasonKind(StrEnum):
-    """Reasons for a verdict; the comments name the values of each."""
+    """Reasons for a verdict; the comments list the values of each kind."""
 
-    WIDTH = "width"  # share of the range, or of a customary one; ranges outside the judged set: lower, upper, weight
+    WIDTH = (
+        "width"  # share of the range or a customary one; further ranges of the interval: lower, upper, weight
+    )
     SEEN_BUILDINGS = "seen buildings"  # share of the range for the buildings that were measured
     SEPARATE_RANGES = "separate ranges"  # ranges: most probable value, weight
     AT_BOUND = "at bound"  # side and the other end of the interval
@@ -31,7 +33,7 @@ class ReasonKind(StrEnum):
     TRADE_OFF = "trade-off"  # the other parameter and the rank correlation
     CONFOUNDED = "confounded"  # change_db over the range, compensated by other unknowns
     NOISE = "noise"  # change_db over the range, noise_db
-    OUTSIDE_INTERVAL = "outside interval"  # value of least RMSE
+    OUTSIDE_INTERVAL = "outside interval"  # value with the lowest RMSE
     TOO_FEW_LINKS = "too few links"  # links
     TOO_FEW_CALLS = "too few calls"  # calls
     NO_NOISE = "no noise"
@@ -39,7 +41,7 @@ class ReasonKind(StrEnum):
 
 
 class Cause(StrEnum):
-    """Possible causes of a wide interval, besides the noise itself."""
+    """Possible causes of a wide interval, in addition to noise."""
 
     BUILDINGS = "buildings that differ"
     CORRELATION = "correlated errors"
@@ -55,7 +57,7 @@ class Reason:
 
     Attributes:
         kind: The kind of reason.
-        values: Its numbers and names; see `ReasonKind`.
+        values: Numbers and names for the sentence; see `ReasonKind`.
         ranges: Ranges or modes that the reason names, each with its weight last.
     """
 
@@ -69,7 +71,7 @@ class Interval:
     """How well the links determine one parameter.
 
     Attributes:
-        standard_error: From the curvature of the sum of squares at the optimum, in the parameter's unit.
+        standard_error: Standard error from the curvature of the sum of squares at the optimum, in the parameter's unit.
         lower: Lower end of the 95 % interval, within the bounds; if there are several pieces, of the lowest.
         upper: Upper end of the interval; if there are several pieces, of the highest.
         verdict: The verdict on the parameter.
@@ -78,7 +80,7 @@ class Interval:
         approximate: Whether an emulator replaced an engine that gives no derivatives.
         seen: Pieces of the 95 % interval for the buildings that the links meet, which predictions use; empty if they
             equal those for the mean over all buildings of this kind.
-        without: Share of the width that remains if a cause is ruled out, for the causes that matter.
+        without: Share of the width that remains if a cause is ruled out, by cause, for the causes that matter.
     """
 
     standard_error: float
@@ -103,7 +105,7 @@ class Interval:
 
 
 class RemarkKind(StrEnum):
-    """Kinds of remarks; the comments name the values of each."""
+    """Kinds of remarks; the comments list the values of each kind."""
 
     CORRELATED_NOISE = "correlated noise"  # weight, gaussian_weight
     HEAVY_TAILS = "heavy tails"  # weight, gaussian_weight
@@ -126,12 +128,12 @@ class RemarkKind(StrEnum):
     # (links), half_space (all surfaces), half_spaces (materials); names and values of constants
     RAY_MAPPING = "ray mapping"
     NO_CHEAP_MODEL = "no cheap model"  # cause
-    # when traced again: links that change by more than tolerance_db, of (all), largest_db; lost, those that have a path
-    # in one trace only
+    # when traced again: links that change by more than tolerance_db, of (all), largest_db; lost, the number of links
+    # with a path in one trace only
     RETRACED = "retraced"
     NOT_JUDGED = "not judged"
     MISSING_REGION = "missing region"  # west, south, east, north, height, attenuation, links, share, chance
-    # transmitters; azimuth_deg and downtilt_deg, what to add to their stated angles, and azimuth_error_deg,
+    # transmitters; azimuth_deg and downtilt_deg, the corrections of their stated angles, and azimuth_error_deg,
     # downtilt_error_deg
     ANTENNA_DIRECTIONS = "antenna directions"
     # column, labels, differences_db, errors_db, others (columns that also explain residuals), per, chance

@@ -1,4 +1,4 @@
-"""The sentences of a result, for terminal, page and JSON. Statistics return data; this module converts it to text."""
+"""The sentences of a result, for terminal, page and JSON: this module converts the data of the statistics to text."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def interval_text(interval: Interval) -> str:
 
 
 def reason_text(reason: Reason | None) -> str:
-    """The reason of a verdict as a clause without a full stop; empty without a reason."""
+    """The reason for a verdict as a clause without a full stop; empty without a reason."""
     return "" if reason is None else _REASONS[reason.kind](reason.values, reason.ranges)
 
 
 def explanation_text(interval: Interval) -> str:
-    """The reason of a verdict, and what would narrow the interval: clauses without a full stop, or nothing."""
+    """The reason for a verdict, and what would narrow the interval: clauses without a full stop; empty without any."""
     clauses = [reason_text(interval.reason)]
     if interval.seen:
         ends = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in interval.seen[:SHOWN_PIECES])
@@ -140,7 +140,7 @@ def _noise_remark(finding: str) -> Callable[[dict[str, Any]], str]:
 
 def _errors_out_of_sight(values: dict[str, Any]) -> str:
     text = _noise_remark(
-        "Errors of weak links out of sight are larger than those of the others, as if the scene lacked paths to them"
+        "Errors of weak links out of sight are larger than those of other links, as if the scene lacked paths to them"
     )(values)
     # Results of earlier versions do not say what their study lacks.
     lacking = values.get("lacking")
@@ -152,16 +152,16 @@ def _richer_paths(values: dict[str, Any]) -> str:
     text = (
         f"The measurements favour paths that the study's settings leave out, with a probability of "
         f"{values['probability']:.2f}. With {settings}, the RMSE would be {values['rmse_db']:.2f} instead of "
-        f"{values['rmse_without_db']:.2f} dB. The intervals, verdicts and remarks on noise are those with these paths; "
-        "calibrated values and predictions are not."
+        f"{values['rmse_without_db']:.2f} dB. The intervals, verdicts and remarks on noise include these paths; "
+        "calibrated values and predictions do not."
     )
     if outside:
-        text += f" Calibrated values outside of their intervals: {', '.join(outside)}."
+        text += f" Calibrated values outside their intervals: {', '.join(outside)}."
     return f"{text} Set these keys in [trace], and calibrate again."
 
 
 _CAUSES: Final = {
-    "correlated": "neighbouring links share part of their errors, so that many links count as few",
+    "correlated": "neighbouring links share part of their errors, so that they count less than independent links",
     "out_of_sight": "weak links out of sight count less if the scene lacks paths to them",
     "student-t": "outliers count less if noise has heavy tails",
     "heterogeneous": "links that depend on single buildings count less if buildings differ",
@@ -207,8 +207,8 @@ def _approximate_intervals(values: dict[str, Any]) -> str:
     replay = ", with the corrected replay of its scene" if values["replay"] else ""
     return (
         f"The intervals are approximate: the engine {values['engine']!r} gives no derivatives, so an emulator was "
-        f"fitted to {values['calls']} of its calls{replay}. In cross-validation, it predicts calls whose RMSE is below "
-        f"the median to {values['error_db']:.2g} dB."
+        f"fitted to {values['calls']} of its calls{replay}. In cross-validation, its RMS error is "
+        f"{values['error_db']:.2g} dB at calls whose RMSE is below the median."
     )
 
 
@@ -391,7 +391,7 @@ def judgement_text(judgement: Judgement) -> str:
 
 
 def choice_text(chosen: str, best: str, partner: str | None = None) -> str:
-    """Which model held-out blocks choose, and why; `best` has the lowest RMSE there among those that predict anywhere.
+    """Which model held-out blocks choose, and why; `best` is their best model of those that can predict any link.
 
     `partner` is the model with which the chosen one is averaged.
     """
