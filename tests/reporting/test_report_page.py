@@ -289,7 +289,7 @@ def test_inputs_that_cannot_be_read_any_more_are_listed(written, result, tmp_pat
     assert "residual-over-distance.png" not in left
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert set(page.ids) >= SECTIONS
-    assert "absent.csv cannot be read any more" in page.words
+    assert "absent.csv can no longer be read" in page.words
     assert page.data is None
 
 

@@ -1,4 +1,4 @@
-"""Diagnostics of a finished calibration: residuals, leverage, power, trade-offs, neighbours and changes, as tables."""
+"""Diagnostics of a finished calibration as tables: residuals, leverage, power, trade-offs, neighbours and changes."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from calibray.uncertainty.residual_correlation import variogram
 from calibray.validation.held_out_statistics import spatial_blocks
 
 CLASSES: Final = 6
-"""Largest number of classes of distance, with about the same number of links each."""
+"""Largest number of distance classes, with about the same number of links each."""
 
 MOST_UNKNOWNS: Final = 300
 """Largest number of unknowns whose draws are compared pair by pair."""
 
 
 STREETS: Final = 12
-"""Most groups of neighbouring receivers."""
+"""Largest number of groups of neighbouring receivers."""
 
 
 def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
@@ -38,11 +38,11 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
         Tables by name, without those that cannot be computed. "distance", "depth" and "group": number of links, mean
         and standard deviation of the residuals [dB] on the calibration links; residuals are predicted minus measured in
         the measured quantity. "obstruction" and "streets": the same by the length of the straight line below roofs, and
-        by neighbouring receivers. "missing_region": the rectangle whose extra loss would explain most of the residuals.
-        "leverage": leverage and residual of every calibration link. "power": share of the
-        links' power by material and type of interaction. "trade_offs": correlation of the draws of every two unknowns.
-        "neighbours": semivariance of the residuals by distance between links, both ends counted. "moved": value
-        of every parameter before and after, the change and the 95 % interval as shares of its range.
+        by neighbouring receivers. "missing_region": the rectangle whose extra loss would explain the largest part of
+        the residuals. "leverage": leverage and residual of every calibration link. "power": share of the links' power
+        by material and type of interaction. "trade_offs": correlation of the draws of each pair of unknowns.
+        "neighbours": semivariance of the residuals by distance between links, both ends counted. "moved": value of
+        every parameter before and after, with the change and the 95 % interval as shares of its range.
     """
     tables = {
         "distance": _by_distance(result),
@@ -79,7 +79,7 @@ def _by_distance(result: Record) -> pd.DataFrame:
     distance = link_distance(links)
     if distance is None or len(residuals) < FEW:
         return pd.DataFrame()
-    # Each class has four links or more.
+    # Each class has at least four links.
     classes = np.array_split(np.argsort(distance, kind="stable"), min(CLASSES, len(residuals) // 4))
     return pd.DataFrame(
         [
@@ -109,7 +109,7 @@ def _by_obstruction(result: Record) -> pd.DataFrame:
         return pd.DataFrame()
     blocked, length = links[OUT_OF_SIGHT].to_numpy(float) > 0, links["obstruction_m"].to_numpy(float)
     order = np.flatnonzero(blocked)[np.argsort(length[blocked], kind="stable")]
-    # Indoors nothing lies below a roof, so there is only one class.
+    # Indoors, no part of a line is below a roof, so there is only one class.
     count = min(CLASSES, len(order) // FEW) if length[blocked].max(initial=0.0) >= 1.0 else 1
     classes = [np.flatnonzero(~blocked), *np.array_split(order, max(count, 1))]
     return pd.DataFrame(
@@ -158,7 +158,7 @@ def _missing_region(result: Record) -> pd.DataFrame:
     if ends is None:
         return pd.DataFrame()
     known = links[OUT_OF_SIGHT].to_numpy(float) if OUT_OF_SIGHT in links else np.zeros(len(links))
-    # Positive where links lose more than the prediction model says.
+    # Positive where the measured path loss exceeds the predicted one.
     excess_db = links["measured_db"].to_numpy(float) - links["predicted_db"].to_numpy(float)
     region = _searched(np.column_stack([ends, excess_db, known]).tobytes())
     return pd.DataFrame() if region is None else pd.DataFrame([region.row()])
@@ -166,7 +166,7 @@ def _missing_region(result: Record) -> pd.DataFrame:
 
 @lru_cache(maxsize=4)
 def _searched(rows: bytes) -> MissingRegion | None:
-    """The search over links: both ends, excess loss and whether out of sight. A page and its figures use it twice."""
+    """The region found from rows of both ends, excess loss and out of sight; cached, as a report needs it twice."""
     links = np.frombuffer(rows).reshape(-1, 8)
     return missing_region(links[:, :3], links[:, 3:6], links[:, 6], [links[:, 7]])
 
@@ -212,7 +212,7 @@ def _trade_offs(result: Record) -> pd.DataFrame:
 
 
 def _scaled_draws(result: Record, name: str) -> NDArray[np.float64]:
-    """Draws of an unknown, logarithmic if the parameter is searched on a logarithmic scale."""
+    """Draws of an unknown; their logarithms if the parameter is searched on a logarithmic scale."""
     values = np.array(result.uncertainty.draws[name])
     section = result.study.parameters.get(name)
     return np.log(values) if section is not None and section.scale == "log" else values

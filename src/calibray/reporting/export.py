@@ -33,7 +33,7 @@ VERIFIED_LINKS: Final = 3
 """Number of links whose path loss is compared before an export is finished."""
 
 SOLVER: Final = {"line_of_sight": "los", "samples": "samples_per_src"}
-"""Settings that have another name in Sionna RT's path solver."""
+"""Settings that have a different name in Sionna RT's path solver."""
 
 MATLAB: Final = """function T = materials
 %MATERIALS Calibrated materials as a table, or as a structure in Octave.
@@ -104,7 +104,7 @@ def export(
 
 
 def _verify(scene: Scene, result: Record, target: Path, links: Survey) -> None:
-    """Load the written scene in the same way as the user, and compare it with the calibrated one."""
+    """Load the written scene as a user would, and compare it with the calibrated one."""
     # Sionna RT takes seconds to import.
     from calibray.tracing.sionna import Tracer
     from calibray.tracing.sionna.live_scene import verify_export
@@ -149,7 +149,7 @@ def _rows(result: Record) -> Iterator[dict[str, Any]]:
         for parameter in result.parameters:
             owner, _, constant = parameter.rpartition(".")
             if owner not in names:
-                continue  # that of an antenna or a region, which no material has
+                continue  # the parameter belongs to an antenna or a region, not a material
             interval = result.intervals.get(parameter) if owner == name else None
             # All rows have the columns of all calibrated constants.
             row.setdefault(f"{constant}_lower", math.nan)
@@ -217,6 +217,6 @@ def _json(content: dict[str, Any]) -> str:
 
 
 def _quoted(text: str) -> str:
-    """A text as a literal of MATLAB and Octave, with unprintable characters escaped."""
+    """Text as a string literal of MATLAB and Octave, with unprintable characters escaped."""
     doubled = printable(text).replace("'", "''")
     return f"'{doubled}'"

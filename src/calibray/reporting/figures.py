@@ -1,4 +1,4 @@
-"""Figures of calibrations: those of the paper, and residuals."""
+"""Figures of calibrations: the figures of the paper, and residuals."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def cumulative_cost(results: Mapping[str, Record]) -> Figure:
             label = f"{method_text(result, method)}: {value.iloc[-1]:.4g}"
             axes.plot(value.index, value, "o-", ms=4, color=style.COLORS.get(method), label=label)
             if method == "sgwo-im":
-                # The first iterations evaluate all wolves, the others only those that the surrogate selects.
+                # The first iterations evaluate all wolves, later ones only those that the surrogate selects.
                 calls = result.history.groupby("iteration").size()
                 for first in calls[calls < calls.iloc[0]].index[:1]:
                     axes.axvline(
@@ -64,8 +64,8 @@ def cumulative_cost(results: Mapping[str, Record]) -> Figure:
 
 @style.styled()
 def convergence(results: Mapping[str, Record], optimum_db: float | None = None) -> Figure:
-    """Draw the best RMSE so far versus RT calls, and if known the RMSE of the global optimum [dB]."""
-    figure, axes = style.plain_figure("RT calls", "RMSE of the best so far [dB]")
+    """Draw the best RMSE so far versus RT calls, and, if known, the RMSE of the global optimum [dB]."""
+    figure, axes = style.plain_figure("RT calls", "Best RMSE so far [dB]")
     for method, result in results.items():
         history = result.history
         axes.step(
@@ -111,7 +111,7 @@ def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
     draw(first, "before", "s--", ".", color=style.FAINT, ms=4 if few else 2, lw=1, label="before calibration")
     for index, (method, result) in enumerate(results.items()):
         color, size = style.COLORS.get(method, style.BLUE), 2 if many else 4
-        # Upper lines are thinner, so that lines below them remain visible.
+        # Lines on top are thinner, so that the lines below them remain visible.
         width = 1.3 + 1.4 * (len(results) - 1 - index)
         draw(result, "after", "-", ".", color=color, label=method_text(result, method), ms=size, lw=width)
     axes.set_xlim(0, len(links) + 1)
@@ -165,7 +165,7 @@ def residual_by_group(survey: Survey) -> Figure:
 
 
 def result_figures(result: Record, links: Survey | None) -> dict[str, Figure]:
-    """All figures of a calibration by name; some need the links with positions."""
+    """All figures of a calibration by name; figures that need positions are absent without `links`."""
     method = {result.study.method.name: result}
     figures = {
         "convergence": convergence(method),
@@ -184,7 +184,7 @@ def result_figures(result: Record, links: Survey | None) -> dict[str, Figure]:
 
 
 def _unequal(results: Mapping[str, Record]) -> bool:
-    """Whether numbers of RT calls differ so much that only a logarithmic axis shows all methods."""
+    """Whether the numbers of RT calls differ so much that only a logarithmic axis shows all methods."""
     calls = [result.history["call"].max() for result in results.values()]
     return bool(max(calls) > 4 * min(calls))
 
@@ -197,7 +197,7 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 @style.styled()
 def measured_over_modelled(result: Record) -> Figure | None:
-    """Draw measured versus modelled values of the first observables, without biases of devices; None without any."""
+    """Draw measured versus modelled values of the first observables, minus device biases; None without observables."""
     fits = dict(list(result.fit.observables.items())[:PANELS])
     if not fits:
         return None

@@ -22,7 +22,7 @@ from calibray.support.messages import counted
 from calibray.support.output_files import check_file, replacing
 
 WIDTH: Final = 1000
-"""Width of the map, and its largest height, in its own units."""
+"""Width of the map, and its largest height, in map units."""
 
 LEAST_ASPECT: Final = 0.45
 """Smallest ratio of height to width, so that links along a street do not make a thin strip."""
@@ -31,17 +31,17 @@ MARGIN: Final = 0.12
 """Margin around the links, as a share of their extent."""
 
 LEAST_EXTENT: Final = 5.0
-"""Least extent of the map [m]."""
+"""Smallest extent of the map [m]."""
 
 MOST_WALLS: Final = 20_000
 """Largest number of lines that are drawn for vertical faces, the longest first."""
 
 RAMP: Final = ("#1f5fa8", "#5b94cf", "#a9b4bd", "#e0953f", "#b34a00")
-"""Colours from negative to positive residuals; colour-blind people can distinguish the ends."""
+"""Colours from negative to positive residuals; the ends are distinguishable with colour blindness."""
 
 
 OUTLINED: Final = 400
-"""Largest number of links that the map draws with an outline each."""
+"""Largest number of links whose symbols have an outline."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ class Plan:
         height: Height in units of the map; the width is `WIDTH`.
         west: Coordinate of the left edge [m].
         north: Coordinate of the upper edge [m].
-        scale: Units of the map per metre [1/m].
+        scale: Map units per metre [1/m].
         buildings: Outlines of buildings, as data of an SVG path.
-        walls: Vertical faces seen from above, in the same form.
+        walls: Vertical faces seen from above, also as data of an SVG path.
         bar: Length of the scale bar [m].
     """
 
@@ -67,7 +67,7 @@ class Plan:
     walls: str = ""
 
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert positions [n, 2 or 3], [m], to units of the map from its upper left corner [n, 2]."""
+        """Convert positions [n, 2 or 3], [m], to map units measured from the upper left corner [n, 2]."""
         return np.stack(
             [(points[:, 0] - self.west) * self.scale, (self.north - points[:, 1]) * self.scale], axis=1
         )
@@ -98,7 +98,7 @@ def lay_out(ends: NDArray[np.float64], triangles: Triangles | None) -> Plan:
 
 
 def marks(links: Survey, layout: Plan) -> dict[str, Any]:
-    """The symbols of links on the map: discs at the ends with more positions, triangles at the others."""
+    """The symbols of links on the map: discs at the ends with more positions, triangles at the opposite ends."""
     residuals = links.residual_db
     limit = ramp_limit(residuals)
     by_rx = len(np.unique(links.rx, axis=0)) >= len(np.unique(links.tx, axis=0))
@@ -158,7 +158,7 @@ def _round(value: float, up: bool = False) -> float:
 
 
 def _buildings(triangles: Triangles, layout: Plan) -> str:
-    """Outlines of all objects within the map except the ground; equal outlines are drawn once."""
+    """Outlines of all objects within the map except the ground; identical outlines are drawn once."""
     south = layout.north - layout.height / layout.scale
     loops = footprints(triangles, layout.west, south, layout.west + WIDTH / layout.scale, layout.north)
     outlines: dict[frozenset[tuple[float, ...]], list[list[float]]] = {}
@@ -169,7 +169,7 @@ def _buildings(triangles: Triangles, layout: Plan) -> str:
 
 
 def _walls(triangles: Triangles, layout: Plan) -> str:
-    """The vertical faces within the map, each as the line between its ends in plan; equal lines are drawn once."""
+    """The vertical faces within the map, each as the line between its ends in plan; identical lines are drawn once."""
     normal = triangles.normal
     area = np.linalg.norm(normal, axis=1)
     steep = (np.abs(normal[:, 2]) < STEEP * area) & (area > 0)
@@ -180,7 +180,7 @@ def _walls(triangles: Triangles, layout: Plan) -> str:
     lines = sides[np.arange(len(sides)), longest]
     inside = (lines.max(axis=1) > 0).all(axis=1) & (lines.min(axis=1) < [WIDTH, layout.height]).all(axis=1)
     lines = lines[inside]
-    # Every line starts at the end with less x, then less y, so that lines of both faces of a wall are equal.
+    # Every line starts at the end with the smaller x, then y, so that the lines of both faces of a wall are identical.
     backwards = (lines[:, 0] > lines[:, 1]) @ [2, 1] > (lines[:, 0] < lines[:, 1]) @ [2, 1]
     lines[backwards] = lines[backwards][:, ::-1]
     lines = np.unique(lines.reshape(-1, 4), axis=0)
@@ -211,7 +211,7 @@ def save_positions(
         overwrite: Replace a file that Calibray did not write.
 
     Raises:
-        InputError: The file has another suffix or must not be replaced, or the scene cannot be read.
+        InputError: The file has an unknown suffix or must not be replaced, or the scene cannot be read.
     """
     if file.suffix.lower() not in SUFFIXES:
         raise InputError(f"{file}: the suffix {file.suffix!r} is unknown; use {', '.join(SUFFIXES)}")

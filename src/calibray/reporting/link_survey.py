@@ -22,7 +22,7 @@ class Survey:
         tx: Transmitters [L, 3], [m].
         rx: Receivers [L, 3], [m].
         group: Names of the groups [L]; None without groups.
-        sign: 1 if path loss was measured, -1 if power or gain was.
+        sign: 1 if path loss was measured, -1 if power or gain was measured.
     """
 
     table: pd.DataFrame
@@ -38,7 +38,7 @@ class Survey:
 
     @property
     def residual_db(self) -> NDArray[np.float64]:
-        """Predicted minus measured, in the measured quantity [L], [dB]; NaN as `residual` states."""
+        """Predicted minus measured, in the measured quantity [L], [dB]; NaN as described in `residual`."""
         return residual(self.table, self.sign)
 
     @property
@@ -56,9 +56,9 @@ class Quantity(NamedTuple):
     """The quantity that a study measured.
 
     Attributes:
-        name: Its name.
-        unit: Its unit.
-        sign: 1 if it rises with path loss, otherwise -1.
+        name: Name of the quantity.
+        unit: Unit of the quantity.
+        sign: 1 if the quantity increases with path loss, otherwise -1.
     """
 
     name: str
@@ -83,13 +83,13 @@ def measured_quantity(result: Record) -> Quantity:
 def in_measured_quantity(result: Record, name: str) -> NDArray[np.float64]:
     """Values of the links in the measured quantity [L], in its unit.
 
-    `name` states which: "measured", "before", "after" or "predicted".
+    `name` selects them: "measured", "before", "after" or "predicted".
     """
     path_loss_db, column = result.links[f"{name}_db"].to_numpy(float), _column(result)
     if column not in result.links:
         return path_loss_db
-    # Received power plus path loss is the transmitted power, and path gain plus path loss is 0: known from the measured
-    # values, this sum of a link converts its modelled path loss as well.
+    # Received power plus path loss is the transmitted power, and path gain plus path loss is 0. This sum is known from
+    # a link's measured values, and also converts its modelled path loss.
     reference = result.links[column].to_numpy(float) + result.links["measured_db"].to_numpy(float)
     return reference - path_loss_db
 
@@ -102,9 +102,9 @@ def _column(result: Record) -> str:
 def residual(table: pd.DataFrame, sign: int) -> NDArray[np.float64]:
     """Predicted minus measured value of a result's links, in the measured quantity [L], [dB].
 
-    The sign is 1 if the quantity rises with path loss, otherwise -1. For links without a path, the fallback predicts;
-    NaN without a prediction, and for links near or below the noise floor: those that were received have favourable
-    errors, and the others only a bound.
+    The sign is 1 if the quantity increases with path loss, otherwise -1. For links without a path, the fallback
+    predicts. NaN without a prediction, and for links near or below the noise floor: received ones have favourable
+    errors, and the others give only a bound.
     """
     difference = table["predicted_db"].to_numpy(float) - table["measured_db"].to_numpy(float)
     return sign * np.where(np.isfinite(difference) & ~_faint(table), difference, np.nan)
@@ -115,7 +115,7 @@ def _faint(table: pd.DataFrame) -> NDArray[np.bool_]:
 
 
 def survey(result: Record) -> Survey | None:
-    """A calibration's links with their positions, from the result or otherwise the study's measurements.
+    """A calibration's links with their positions, from the result if it has them, otherwise from the measurements.
 
     None if the measurements cannot be read or have changed.
     """

@@ -1,4 +1,4 @@
-"""The report of a calibration: one HTML file that opens from disk and loads nothing else.
+"""The report of a calibration: a single HTML file that opens from disk and loads no other files.
 
 Names come from files and are not trusted: the template engine escapes text, `<`, `>` and `&` are escaped in embedded
 JSON, and a content security policy allows only the script whose checksum it names.
@@ -51,7 +51,7 @@ CAPTIONS: Final = {
     "convergence": "RMSE of the best candidate so far versus RT calls (runs of the ray tracer over all links). It can "
     "rise if the objective is not the RMSE alone.",
     "cumulative-cost": "RT calls and time versus iterations of the method.",
-    "path-loss": "Every link: measured, before and after calibration.",
+    "path-loss": "Path loss of every link: measured, before and after calibration.",
     "residual-over-distance": "Residual (predicted minus measured) versus distance between the antennas.",
     "possible-values": "Posterior of every parameter over its bounds. Wide line: 95 % interval. Dashed: value before "
     "calibration. Solid: calibrated value.",
@@ -84,9 +84,9 @@ class PageData:
     Attributes:
         links: The links with positions; None if these are unknown.
         scene: The scene; None if it can no longer be read.
-        triangles: Its meshes.
+        triangles: Meshes of the scene.
         rays: Paths of the links; None without paths.
-        missing: What is not shown, with the reason.
+        missing: Items that are not shown, with the reasons.
     """
 
     links: Survey | None
@@ -108,9 +108,9 @@ def report(
 
     Args:
         result: The calibration; paths that it does not contain come from the cache or are traced.
-        file: File to write; replaced only once the new one is complete.
-        figures: Folder for the figures as SVG and PNG; created if needed. Those of an earlier report are removed. None
-            writes no separate figures.
+        file: File to write; an old one is replaced only once the new one is complete.
+        figures: Folder for the figures as SVG and PNG, created if needed; figures of an earlier report are removed. If
+            None, no separate figures are written.
         overwrite: Replace files that Calibray did not write.
         progress: Called with the stage "tracing" after every launch.
 
@@ -130,7 +130,7 @@ def report(
             for name, figure in result_figures(result, data.links).items():
                 for suffix in ("svg", "png"):
                     style.write(figure, folder / f"{name}.{suffix}")
-            # Figures that an earlier result had and this one lacks.
+            # Remove figures that an earlier result had and this one lacks.
             for picture in PICTURES:
                 if Path(picture).stem not in drawn:
                     (folder / picture).unlink(missing_ok=True)
@@ -147,7 +147,7 @@ def collect(result: Record, progress: Progress | None = None) -> PageData:
         shown = {label: group_text(result, str(label)) for label in set(links.group)}
         links = replace(links, group=np.array([shown[label] for label in links.group], dtype=object))
     if links is None:
-        missing.append(f"Positions of the links: {study.links.file} cannot be read any more, or has changed.")
+        missing.append(f"Positions of the links: {study.links.file} can no longer be read, or has changed.")
     scene = result.scene
     if scene is None:
         try:
@@ -222,12 +222,12 @@ def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
 
 
 def _title(study: Path) -> str:
-    """A study's name: if the file has the usual name, that of its folder."""
+    """Name of a study: that of its folder if the file has the usual name."""
     return (study.resolve().parent.name if study.stem == "study" else "") or study.stem
 
 
 def _breakable(name: str) -> Markup:
-    """A parameter's name, which may only break after the material."""
+    """A parameter's name, in which lines break only after the material."""
     material, dot, constant = name.rpartition(".")
     return escape(material) + dot + Markup("<wbr>") + escape(constant)
 
@@ -271,7 +271,7 @@ def _tiles(result: Record) -> list[tuple[str, str, tuple[str, ...]]]:
 def _held_out_errors(result: Record) -> tuple[float | None, float | None, float | None]:
     """Held-out RMSE of the prediction model, of the initial materials with nuisances, and of the log-distance model."""
     model, accuracy = result.prediction.model, result.accuracy
-    # The residual of a model that held-out links have chosen is its RMSE on them.
+    # If held-out links chose the model, its residual is its RMSE on these links.
     own_db = accuracy.holdout_rmse_db if model.name == Model.CALIBRATED else model.residual_db
     return own_db, accuracy.nuisance_only_holdout_rmse_db, accuracy.log_distance_holdout_rmse_db
 
@@ -343,7 +343,7 @@ def _script_data(result: Record, data: PageData, layout: Plan | None) -> dict[st
     links = data.links
     if links is None or layout is None:
         return None
-    # Links have the number of their group, which takes less space than its name.
+    # Links store the number of their group, which takes less space than its name.
     names = [] if links.group is None else sorted(set(links.group.tolist()))
     index = {name: number for number, name in enumerate(names)}
     materials = [] if data.scene is None else list(data.scene.materials)
@@ -370,5 +370,5 @@ def _script_data(result: Record, data: PageData, layout: Plan | None) -> dict[st
 
 
 def _rounded(values: np.ndarray) -> list[float | None]:
-    """Values to 0.01 dB; None for infinity and NaN, which JSON does not have."""
+    """Values rounded to 0.01 dB; None for infinity and NaN, which JSON cannot express."""
     return [round(value, 2) if math.isfinite(value) else None for value in values.tolist()]

@@ -1,4 +1,4 @@
-"""A calibration as tables, and its calibrated values for the report."""
+"""Tables of a calibration, and its calibrated values for the report."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def links(result: Record) -> Table:
 
 
 def _held_out(result: Record) -> tuple[str, str]:
-    """Number of held-out links, and in how many blocks if they were held out in turn."""
+    """Number of held-out links, and of blocks if they were held out in turn."""
     if result.held_out is None:
         return str(result.counts["held_out"]), ""
     return str((result.held_out.block >= 0).sum()), f"in turn, in {len(result.held_out.labels)} blocks"
@@ -81,7 +81,7 @@ def suspicious_rows(
 ) -> Iterator[tuple[str, str, str]]:
     """Lines about links to check: what is counted, the number, and the rows with a remedy.
 
-    The rows without a path are followed by their treatment; without `enclosed`, antennas were not checked.
+    The rows without a path are followed by their treatment. If `enclosed` is None, antennas were not checked.
     """
     text = rows_text(without_path)
     yield "without a path", str(len(without_path)), text + treatment if text else ""
@@ -114,7 +114,7 @@ def parameters(result: Record) -> Table:
 
 
 def reasons(result: Record) -> Table:
-    """The reason of every verdict that has one."""
+    """The reason for every verdict that has one."""
     rows = [
         (name, explanation_text(interval)) for name, interval in result.intervals.items() if interval.reason
     ]
@@ -122,7 +122,7 @@ def reasons(result: Record) -> Table:
 
 
 def observables(result: Record) -> Table:
-    """The fit of further observables, each in its unit; without rows if the study has none."""
+    """The fit of further observables, each in its unit; no rows if the study has none."""
     rows = []
     for name, fit in result.fit.observables.items():
         biases = ", ".join(
@@ -148,7 +148,7 @@ def remarks(result: Record) -> Table:
 
 
 def nuisances(result: Record) -> Table:
-    """Offsets and the coefficients of further nuisances, by group; without rows if the study declares none."""
+    """Offsets and the coefficients of further nuisances, by group; no rows if the study declares none."""
     nuisance = result.nuisance
     others = _nuisances_besides_offset(result)
     offsets = {group: f"{value:+z.2f}" for group, value in nuisance.offsets_db.items()}
@@ -156,13 +156,13 @@ def nuisances(result: Record) -> Table:
     rows = [(group_text(result, group) if group else "all links", text) for group, text in offsets.items()]
     for name, values in others.items():
         rows += [(f"{name}, {group}" if group else name, f"{value:+.3g}") for group, value in values.items()]
-    # The column of an offset is 1; that of another nuisance can be a length or a number of walls.
+    # The column of an offset is 1; that of a further nuisance can be a length or a number of walls.
     title, unit = ("Nuisances", "dB per unit") if others else ("Offsets", "dB")
     return Table(title, (Column(), numbers(unit=unit)), tuple(rows))
 
 
 def accuracy(result: Record) -> Table:
-    """RMSE before and after calibration, and that of the baselines."""
+    """RMSE before and after calibration, and of the baselines."""
     fit, held_out = result.fit, result.accuracy
     rows = (
         ("before", fit.initial_rmse_db, held_out.initial_holdout_rmse_db),
@@ -177,7 +177,7 @@ def accuracy(result: Record) -> Table:
 
 
 def costs(result: Record) -> Table:
-    """RT calls, replays and time."""
+    """Number of RT calls and replays, and the time taken."""
     cost = result.cost
     rows = [("RT calls", f"{cost.rt_calls:,}")]
     if cost.ledger_hits:
@@ -201,17 +201,17 @@ class Value:
     """A parameter in the form of the report: text, and positions on a bar over its bounds.
 
     Attributes:
-        name: Its name.
-        unit: Its unit; empty without one.
-        before: Its value before calibration.
-        after: Its calibrated value.
-        interval: Its 95 % interval; empty if unknown.
+        name: Name of the parameter.
+        unit: Unit; empty without one.
+        before: Value before calibration.
+        after: Calibrated value.
+        interval: 95 % interval; empty if unknown.
         verdict: The verdict on the parameter.
-        bounds: Its bounds, lower and upper.
+        bounds: Lower and upper bound.
         scale: "linear" or "log".
         positions: Positions of the values "before" and "after" on the bar, 0 to 1.
         pieces: Ends of every piece of the interval on the bar, 0 to 1.
-        reason: The reason of the verdict; empty if unknown.
+        reason: The reason for the verdict; empty if unknown.
         approximate: Whether the interval comes from an emulator of the engine.
         predicted: The value that predictions use; empty if it is the calibrated one, or if predictions use no scene.
     """
@@ -232,7 +232,7 @@ class Value:
 
     @property
     def mark(self) -> str:
-        """A symbol of the verdict."""
+        """A symbol for the verdict."""
         return MARKS.get(self.verdict, "")
 
 

@@ -48,7 +48,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def findings(check: SceneCheck) -> list[Table]:
-    """The size of a scene with the verdict, and if there are any, its defects."""
+    """The size of a scene with the verdict, and its defects if there are any."""
     west, south, bottom, east, north, top = check.bounds
     errors = sum(finding.severity == "error" for finding in check.findings)
     warnings = sum(finding.severity == "warning" for finding in check.findings)
@@ -76,7 +76,7 @@ def findings(check: SceneCheck) -> list[Table]:
 
 
 def objects(check: SceneCheck) -> Table:
-    """The objects of a scene, with the numbers of their faces and of defects."""
+    """The objects of a scene, with their numbers of faces and defects."""
     columns = (
         Column("object"), Column("material"), numbers("faces"), numbers("open edges"), numbers("unwelded edges"),
         numbers("flipped faces"), numbers("empty faces"), numbers("repeated faces"),
@@ -98,7 +98,7 @@ def assumptions(draft: Draft) -> Table:
 
 
 def warning_lines(findings: Sequence[Finding]) -> str:
-    """Findings about links as warnings, a line each."""
+    """Findings about links as warnings, one per line."""
     return "\n".join(
         f"Warning: {finding.subject}: {finding.problem}; {finding.remedy}" for finding in findings
     )
@@ -107,7 +107,7 @@ def warning_lines(findings: Sequence[Finding]) -> str:
 def overview(paths: Paths, row: NDArray[np.int64], enclosed: EnclosedAntennas | None) -> Table:
     """Numbers of links, paths and interactions, and the links to check by their rows in the source file [L].
 
-    Without `enclosed`, antennas were not checked.
+    If `enclosed` is None, antennas were not checked.
     """
     reached = np.bincount(paths.link, minlength=paths.num_links) > 0
     rows = [
@@ -120,7 +120,7 @@ def overview(paths: Paths, row: NDArray[np.int64], enclosed: EnclosedAntennas | 
 
 
 def convergence(change: Convergence, row: NDArray[np.int64], tolerance_db: float) -> tuple[Table | str, ...]:
-    """How path loss changed when traced again with more samples: a summary, links that changed most, and a verdict.
+    """How path loss changed in a trace with more samples: a summary, the links that changed most, and a verdict.
 
     Links are named by their rows in the source file [L]; `tolerance_db` is the largest acceptable change [dB].
     """
@@ -130,9 +130,10 @@ def convergence(change: Convergence, row: NDArray[np.int64], tolerance_db: float
 
 
 def last_round(settings: Mapping[str, object], tolerance_db: float) -> str:
-    """The verdict on the last round of a trace whose rays are added in rounds.
+    """The verdict on the last round of a trace that adds rays in rounds.
 
-    `settings` are those of the paths; `tolerance_db` is the largest acceptable change of a link's path loss [dB].
+    `settings` are the trace settings of the paths; `tolerance_db` is the largest acceptable change of a link's path
+    loss [dB].
     """
     rays, change = int(str(settings["rays"])), float(str(settings["last_round_db"]))
     if not rays:
@@ -167,7 +168,7 @@ def _most_changed(change: Convergence, row: NDArray[np.int64]) -> Table:
             f"{change.paths_after[link]:,}",
         )
         for link in change.largest[:LISTED]
-        # Smaller changes are 0 when rounded to 0.01 dB.
+        # Smaller changes round to 0.00 dB.
         if abs(change.change_db[link]) >= 0.005
     )
     return Table("", columns, rows)

@@ -25,15 +25,15 @@ from calibray.validation.validation import Validation
 Kind = Literal["plain", "good", "caution"]
 
 RARE: Final = 0.05
-"""Share of the links below which more links that interact with a material are advised."""
+"""Share of links with paths that interact with a material, below which the advice is to measure more of them."""
 
 LISTED_VALUES: Final = 6
-"""Number of identified values up to which they are listed one by one."""
+"""Largest number of identified values that are listed."""
 
 MEANINGS: Final = {
     Verdict.WEAKLY_IDENTIFIED: "weakly identified: each interval covers much of its range",
     Verdict.AMBIGUOUS: "ambiguous: several separate ranges fit the links, or the best fit is outside the interval",
-    Verdict.AT_BOUND: "at a bound: the best value may lie beyond it, or the model lacks something",
+    Verdict.AT_BOUND: "at a bound: the best value may lie outside the bounds, or the model is incomplete",
     Verdict.NOT_IDENTIFIABLE: "not identifiable: all values within the interval fit the links about equally well",
 }
 
@@ -43,7 +43,7 @@ class Sentence:
     """One statement of the summary.
 
     Attributes:
-        heading: The question that it answers; empty if it continues the previous answer.
+        heading: The question that the sentence answers; empty if it continues the previous answer.
         text: The answer.
         kind: Whether it is neutral, good news, or a caution.
     """
@@ -54,7 +54,7 @@ class Sentence:
 
 
 def summary(result: Record, links_by_material: Mapping[str, int] | None = None) -> tuple[Sentence, ...]:
-    """Summarize a calibration in a few sentences: what predictions use, fit, help, certainty, advice and warnings.
+    """Summarize a calibration in a few sentences: model for predictions, fit, benefit, certainty, advice and warnings.
 
     `links_by_material` is the number of links with a path that interacts with the material; None without paths.
     """
@@ -160,7 +160,7 @@ def _advice(result: Record, links_by_material: Mapping[str, int] | None) -> Iter
     heading = "What to measure next?"
     unidentified = _by_verdict(result, Verdict.NOT_IDENTIFIABLE)
     owners = dict.fromkeys(name.rpartition(".")[0] for name in unidentified)
-    # No path interacts with the owners of other parameters, such as antennas.
+    # Paths do not interact with the owners of other parameters, such as antennas.
     materials = [name for name in owners if name in result.materials]
     sentences = []
     if result.uncertainty.draws and (unidentified or _by_verdict(result, Verdict.AMBIGUOUS)):
@@ -233,12 +233,12 @@ def _number(value: float) -> str:
 
 
 def _list(names: Sequence[str]) -> str:
-    """Names with "and" before the last; only the first eight if there are more."""
+    """Names with "and" before the last one; only the first eight if there are more."""
     if len(names) > 8:
         return named(names, 8)
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def _seconds(value: float) -> str:
-    # Two digits of 99.5 and more would be written as 1e+02.
+    # With two digits, values of at least 99.5 would be written as 1e+02.
     return f"{value:.2g} s" if value < 99.5 else f"{value / 60:.0f} min"

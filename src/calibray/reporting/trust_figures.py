@@ -1,4 +1,4 @@
-"""Figures that show how far to trust a calibration: posterior, validation and diagnostics."""
+"""Figures that show how reliable a calibration is: posterior, validation and diagnostics."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ROWS: Final = 14
 """Largest number of rows of the figure of power."""
 
 PANELS: Final = 6
-"""Largest number of panels of a figure: transmitters with the most links, or observables."""
+"""Largest number of panels of a figure, one for each observable or each of the transmitters with the most links."""
 
 DEEPEST_DB: Final = -30.0
 """Level of the pattern at the centre of a figure [dB]; sector antennas radiate backwards at about this level."""
@@ -109,7 +109,7 @@ def held_out_errors(validation: Validation) -> Figure:
     for name, color in _colors(validation):
         error = np.sort(np.abs(validation.errors[name][judged]))
         share = np.arange(1, len(error) + 1) / len(error)
-        # A few gross errors would compress the rest of the curves.
+        # Without this limit, a few gross errors would compress the rest of the curves.
         reach = max(reach, float(np.quantile(error, 0.97)))
         wide = 2.2 if name == validation.best else 1.2
         axes.step(error, share, where="post", color=color, lw=wide, label=f"{name}: {_rmse(error):.2f} dB")
@@ -187,7 +187,7 @@ def leverage(table: pd.DataFrame) -> Figure:
 def by_depth(table: pd.DataFrame) -> Figure:
     """Draw the mean residual by the number of interactions of the strongest path, with two standard errors."""
     figure, axes = style.residual_figure("Interactions of the strongest path")
-    # One link has no standard error, and no bar.
+    # A single link has no standard error and therefore no bar.
     error = table["standard_deviation_db"] / np.sqrt((table["links"] - 1).replace(0, np.nan))
     axes.errorbar(table["depth"], table["mean_db"], 2 * error, fmt="o", color=style.BLUE, capsize=3)
     labels = [f"{row.depth:.0f}\n({row.links:,})" for row in table.itertuples()]
@@ -197,7 +197,7 @@ def by_depth(table: pd.DataFrame) -> Figure:
 
 
 def residuals_by_direction(result: Record) -> Figure | None:
-    """Draw the residuals of links over the direction from their transmitter, and its pattern on the horizon.
+    """Draw the residuals of links versus the direction from their transmitter, with its pattern on the horizon.
 
     None if the study does not state the mounting of transmitters, or its links cannot be read.
     """
@@ -211,7 +211,7 @@ def residuals_by_direction(result: Record) -> Figure | None:
         return None
     if links.row.tolist() != result.links["row"].tolist():
         return None
-    # Predicted minus measured path loss, so that an outer point received more than was predicted.
+    # Predicted minus measured path loss: outer points received more power than predicted.
     residuals = residual(result.links, sign=1)
     shown = np.isfinite(residuals) & result.links["has_path"].to_numpy(bool)
     has_names = study.links.transmitter in links.table.frame
@@ -260,7 +260,7 @@ def _polar_figures(
 
 
 def _pattern_db(mounting: Mounting, link: int, bearing: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gain on the horizon of the antenna of one link, relative to its largest there [n], [dB]."""
+    """Gain on the horizon of the antenna of one link, relative to its maximum on the horizon [n], [dB]."""
     on_link = mounting.of_paths(np.full(len(bearing), link))
     pose = Pose(*on_link.pose)
     # On the horizon; azimuths are measured anticlockwise from the east, bearings clockwise from the north.

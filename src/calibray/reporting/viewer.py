@@ -1,6 +1,6 @@
 """Data of the report's 3-D viewer: the scene and the strongest paths of every link, packed as text.
 
-Positions are whole steps of a grid over the scene, with 65,536 steps in each direction: 3 cm in a scene of 2 km.
+Positions are rounded to a grid over the scene with 65,536 points in each direction: 3 cm apart in a scene of 2 km.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ class Rays:
 
     Attributes:
         paths: The strongest paths of every link, strongest first.
-        vertex: Their points of interaction [I, 3], [m].
-        gain_db: Their power gain with the materials that exports write, without nuisances [P], [dB].
-        per_link: Most paths per link.
+        vertex: Interaction points of the paths [I, 3], [m].
+        gain_db: Power gain of the paths with the materials that exports write, without nuisances [P], [dB].
+        per_link: Largest number of paths per link.
         traced: Number of traced paths.
         links_by_material: Number of links with at least one traced path that interacts with the material, by material.
     """
@@ -74,9 +74,9 @@ def strongest(paths: Paths, result: Record) -> Rays:
     gain_db = 10 * np.log10(np.maximum(power, 1e-40))
     order = np.lexsort((-gain_db, paths.link))
     link = paths.link[order]
-    # The place of every path among those of its link, 0 for the strongest.
+    # Rank of every path within its link, 0 for the strongest.
     rank = np.arange(len(link)) - np.searchsorted(link, link)
-    # Interactions in all if every link keeps its 1, 2, ... strongest paths.
+    # Total number of interactions if every link keeps its 1, 2, ... strongest paths.
     interactions = np.cumsum(
         np.bincount(rank[rank < PER_LINK], np.diff(paths.first)[order][rank < PER_LINK], PER_LINK)
     )
@@ -118,9 +118,9 @@ class Grid:
 def packed(
     survey: Survey, triangles: Triangles | None, rays: Rays | None, materials: list[str]
 ) -> dict[str, Any]:
-    """What the viewer draws; arrays are base64 of little-endian whole numbers.
+    """Data that the viewer draws; arrays are little-endian integers in base64.
 
-    `materials` are those of the scene, in its order; triangles or rays are None if there are none.
+    `materials` are those of the scene, in its order; triangles and rays are None if not available.
     """
     points = [survey.tx, survey.rx]
     if triangles is not None and len(triangles.face):
@@ -167,7 +167,7 @@ def _paths(rays: Rays, grid: Grid) -> dict[str, Any]:
     return {
         "count": _text(counts.astype(np.uint8)),
         "depth": _text(np.diff(paths.first).astype(np.uint8)),
-        # In hundredths of a decibel below 0 dB.
+        # Loss in hundredths of a decibel.
         "loss": _text(np.clip(np.rint(-100 * rays.gain_db), 0, STEPS).astype(np.uint16)),
         "kind": _text(paths.kind.astype(np.uint8)),
         "material": _text(paths.material.astype(np.uint16)),

@@ -24,7 +24,7 @@ from calibray.uncertainty.verdicts import TRADE_OFF
 
 
 def prediction_text(record: Record) -> str:
-    """What predictions use."""
+    """The model that predictions use, as one or two sentences."""
     model = record.prediction.model
     if model.parameters is None:
         source = _unused(record)
@@ -54,19 +54,19 @@ _AVERAGED: Final = {
 
 
 def _unused(record: Record) -> str:
-    """What a prediction model without materials does not use; the one with obstruction uses walls and roofs."""
+    """What a prediction model without materials ignores; the one with obstruction uses walls and roofs."""
     return "no materials" if record.prediction.model.name == Model.OBSTRUCTION else "no scene"
 
 
 def carriers_text(record: Record) -> str:
-    """The carriers of the links: that of the scene, unless links have their own."""
+    """The carriers of the links: the carrier of the scene, unless links have their own."""
     if "frequency" not in record.links:
         return hertz(record.study.scene.frequency)
     return named(map(hertz, np.unique(record.links["frequency"].to_numpy(float)).tolist()))
 
 
 def group_text(record: Record, label: str) -> str:
-    """The label of a group of the offset; in GHz or MHz if the groups are the carriers of the links."""
+    """The label of an offset's group; in GHz or MHz if the groups are the carriers of the links."""
     column = record.study.links.frequency
     if column is None or record.study.offset_groups != (column,):
         return label
@@ -79,7 +79,7 @@ def group_text(record: Record, label: str) -> str:
 def scene_alone_text(record: Record) -> str:
     """How far the exported scene alone is from the predictions.
 
-    One or two sentences; empty if the scene alone gives the predictions.
+    One or two sentences; empty if the scene alone reproduces the predictions.
     """
     links, model = record.links, record.prediction.model
     scene_db, predicted_db = (links[name].to_numpy(float) for name in ("scene_db", "predicted_db"))
@@ -138,7 +138,7 @@ def method_text(record: Record, name: str) -> str:
 
 
 def sampling_text(record: Record) -> str:
-    """The reason why the exported scene can give a path loss that differs from the reported one; empty if it cannot."""
+    """Reasons why the exported scene can give a path loss that differs from the reported one; empty without any."""
     trace, model = record.study.trace, record.prediction.model
     calibrated = model.parameters is None or model.parameters == record.parameters
     causes = []
@@ -179,7 +179,7 @@ CLEAR: Final = 2.0
 
 
 def diagnostics_table(result: Record) -> Table:
-    """Summarize the diagnostics in a line each."""
+    """Summarize each diagnostic in one line."""
     tables = diagnostics(result)
 
     def text(name: str, described: Callable[[pd.DataFrame], str]) -> str:
@@ -231,7 +231,7 @@ def _class_text(tables: dict[str, pd.DataFrame], column: str, described: Callabl
     """The class of links with the largest mean residual."""
     if column not in tables or len(tables[column]) < 2:
         return ""
-    # The mean of one or two links is hardly more than their noise.
+    # The mean of one or two links is mostly noise.
     table = tables[column][tables[column]["links"] >= 3]
     if not len(table):
         return ""
@@ -246,7 +246,7 @@ def _class_text(tables: dict[str, pd.DataFrame], column: str, described: Callabl
 
 
 def _obstruction_text(table: pd.DataFrame) -> str:
-    """Mean residual of links in sight, and of those out of sight by the length of the line below roofs."""
+    """Mean residual of links in sight, and of links out of sight by the length of the line below roofs."""
     parts = []
     for row in table.to_dict("records"):
         digits = 0 if row["to_m"] - row["from_m"] >= 1.0 else 1
@@ -257,7 +257,7 @@ def _obstruction_text(table: pd.DataFrame) -> str:
 
 
 def _missing_region_text(table: pd.DataFrame) -> str:
-    """Where a region of extra loss would explain residuals, if it explains more than chance."""
+    """The region whose extra loss would explain residuals, if it explains more than chance."""
     row = table.iloc[0]
     if not row["significant"]:
         return "no region of extra loss, such as trees, would explain more of the residuals than chance"
@@ -271,8 +271,8 @@ def _missing_region_text(table: pd.DataFrame) -> str:
 def _neighbours_text(table: pd.DataFrame) -> str:
     if len(table) < 3:
         return ""
-    # Distant links share no errors, so half their mean squared difference is the whole variance (the sill). Neighbours
-    # differ by less, as far as their errors are the same.
+    # Distant links share no errors, so half their mean squared difference is the full variance (the sill). Neighbours
+    # differ by less, to the extent that they share errors.
     nearest, sill = table.iloc[0], float(table["semivariance_db2"].iloc[len(table) // 2 :].mean())
     share = 1.0 - nearest["semivariance_db2"] / sill if sill > 0 else 0.0
     # The relative standard error of a semivariance of n independent pairs is sqrt(2 / n).

@@ -19,12 +19,12 @@ import sionna.rt as rt
 from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 from sionna.rt.radio_materials import scattering_pattern_registry
 
-# The solver tells repeated paths by hashes, and loses paths whose hashes collide in its table of a million.
+# The solver detects repeated paths by hashes, and loses paths whose hashes collide in its table of a million entries.
 SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = 67_108_859
 
 FOLDER = Path(__file__).resolve().parent
-LANES = 20_000_000  # rays x interactions x receivers of one call, which take some 800 MB
-CLOSE_DB = 0.02  # links that differ by more are computed again alone
+LANES = 20_000_000  # rays x interactions x receivers of one call, which take about 800 MB
+CLOSE_DB = 0.02  # links that differ by more are computed again one at a time
 MOST_RECEIVERS = 16  # per call, since they share the solver's buffer of a million paths
 CALIBRATION = json.loads((FOLDER / "calibration.json").read_text(encoding="utf-8"))
 
@@ -84,7 +84,7 @@ def received(gain: np.ndarray, delay: np.ndarray) -> float:
 
 
 def batches(links: list[dict[str, str]]) -> list[list[dict[str, str]]]:
-    """Links of one transmitter each, as many as one call of the solver traces together."""
+    """Batches of links with the same transmitter, each for one call of the solver."""
     solver = CALIBRATION["solver"]
     lanes = solver["samples_per_src"] * max(solver["max_depth"], 1)
     # Diffuse paths of one receiver can fill the solver's buffer.
@@ -125,8 +125,8 @@ def main() -> None:
             nuisance, reported = float(link["nuisance_db"]), float(link["reported_db"])
             computed = scene_db + nuisance
             if len(part) > 1 and np.isfinite(reported) and not abs(computed - reported) < CLOSE_DB:
-                # The solver tells repeated paths by hashes. Which paths collide and are lost depends on the receivers
-                # of the call.
+                # The solver detects repeated paths by hashes. The receivers of a call determine which paths collide and
+                # are lost.
                 computed = path_losses(scene, tx, [rx])[0] + nuisance
             print(f"{link['row']},{reported:.4f},{computed:.4f}")
             if np.isfinite(reported):

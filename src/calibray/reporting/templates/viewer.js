@@ -230,7 +230,7 @@
     const mesh = data.solid.mesh;
     const land = mesh && { vertex: buffer(gl.ARRAY_BUFFER, decode(mesh.vertex, Uint16Array)), face: buffer(gl.ELEMENT_ARRAY_BUFFER, decode(mesh.face, Uint32Array)) };
 
-    // All positions, the camera's included, are in steps of the grid.
+    // All positions, including the camera's, are in steps of the grid.
     const span = (ends) => [0, 1, 2].map((k) => {
       let low = Infinity, high = -Infinity;
       for (let i = k; i < 3 * count; i += 3) { low = Math.min(low, ends[i]); high = Math.max(high, ends[i]); }
@@ -291,7 +291,7 @@
     };
     const stream = gl.createBuffer();
     const upload = (values) => { gl.bindBuffer(gl.ARRAY_BUFFER, stream); gl.bufferData(gl.ARRAY_BUFFER, values, gl.DYNAMIC_DRAW); };
-    // The points of the links change with the theme only.
+    // The points of the links change only with the theme.
     let points = null;
     const makePoints = () => {
       const far = count > 2000 ? 3 : 8, values = [], seen = new Set();
@@ -388,7 +388,7 @@
       }
       gl.depthMask(false);
       const lines = segments(), number = lines.length / 10;
-      // First, faintly, also what buildings hide; then the visible parts.
+      // First draw all parts faintly, including those that buildings hide, then the visible parts.
       gl.disable(gl.DEPTH_TEST);
       drawDots(m, points.values, points.count, ratio, 0.22);
       if (number) { upload(lines); drawTubes(m, number, ratio, 0.4); }
