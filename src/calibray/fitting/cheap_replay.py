@@ -100,8 +100,8 @@ class ReplayedModel:
         engine: The replay, over the study's parameters followed by the constants.
         count: Number of the study's parameters.
         rows: Converts path loss to residuals.
-        calls: Candidates evaluated so far.
-        seconds: Time spent on them [s].
+        calls: Number of candidates evaluated so far.
+        seconds: Time taken by their evaluation [s].
     """
 
     engine: StoredPaths

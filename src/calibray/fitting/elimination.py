@@ -8,7 +8,7 @@ Otherwise the normal equations have an arrowhead matrix: diagonal blocks bordere
 groups share no link, so they form separate blocks. Columns over all links overlap with every block and form the border.
 Block elimination solves the system in about the time needed to read the matrix, for any number of groups.
 
-Block principal pivoting keeps the bounds (L. F. Portugal, J. J. Judice and L. N. Vicente, A comparison of block
+Block principal pivoting enforces the bounds (L. F. Portugal, J. J. Judice and L. N. Vicente, A comparison of block
 pivoting and interior-point algorithms for linear least squares problems with nonnegative variables, Mathematics of
 Computation 63, 1994), in all problems of a batch at once. Each iteration fixes the components that leave their bounds,
 releases the fixed components whose gradient points inwards, and solves again. If the number of infeasible components
@@ -151,7 +151,7 @@ class Elimination:
         self, side: NDArray[np.float64], coefficients: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """`projection` [n, q, d] from sums over the links, Z' W times the derivatives [n, q, d]."""
-        # A coefficient at its bound does not follow the parameters.
+        # A coefficient at its bound does not depend on the parameters.
         free = ((coefficients > self.lower) & (coefficients < self.upper))[:, self.order]
         projection = np.empty_like(side)
         projection[:, self.order] = self.normal.solve(free, side[:, self.order])
@@ -326,7 +326,7 @@ def _to_exchange(
     patience: NDArray[np.int64],
     pending: NDArray[np.intp],
 ) -> NDArray[np.bool_]:
-    """Components to exchange [r, q]: all infeasible ones while their number decreases, else the last of each part.
+    """Components to exchange [r, q]: all infeasible ones while their number decreases, else only the last of each part.
 
     Infeasible components [r, q] belong to the unsolved problems `pending` [r]. For each independent part [m, i], the
     smallest number so far and the remaining full exchanges without progress are updated in place.

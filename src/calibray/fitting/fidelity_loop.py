@@ -20,7 +20,7 @@ from calibray.support.progress import Progress, with_stage
 
 AROUND: Final = (0.0625, 0.125, 0.25, 0.5, 1.0)
 """Traced displacements on each side of calibrated positions, as shares of the largest one: 0.5 to 8 m of 8 m. The inner
-ones are equidistant, so that they show the error of interpolation."""
+ones are equidistant, so that the error of interpolation can be estimated."""
 
 
 def retrace(

@@ -75,7 +75,7 @@ class Term:
         return tuple(f"{self.name}[{label}]" if label else self.name for label in self.labels)
 
     def at(self, links: Measurements, labels: ArrayLike | None = None) -> Term:
-        """The same term, with the same columns, at other links, for prediction.
+        """The term with the same columns at other links, for prediction.
 
         A link whose group label [n] is unknown belongs to no group. A term without groups takes no labels.
 
@@ -193,7 +193,7 @@ class Nuisance:
 
     Attributes:
         num_links: Number of links L.
-        terms: Its terms; may be empty.
+        terms: Terms of the design; may be empty.
 
     Raises:
         InputError: A term has a different number of links, or two terms have the same name.
@@ -283,7 +283,7 @@ class Nuisance:
         return filled
 
     def new_group_spread(self, block: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Standard deviation of the random effects of each link that no other block determines [L], [dB].
+        """Standard deviation of those random effects of each link that no other block determines [L], [dB].
 
         `block` is the block of each link, and -1 for a link that is not used [L].
         """

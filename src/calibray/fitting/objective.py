@@ -128,7 +128,7 @@ class Objective:
         return self._fitted(self.measured - self.capped(path_loss))
 
     def completed(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The `coefficients` with which other links are predicted [n, q], for path loss [n, L], [dB].
+        """The `coefficients` for the prediction of other links [n, q], for path loss [n, L], [dB].
 
         One that is not `determined` is the mean of the determined ones of its term, which are then fitted again.
         """

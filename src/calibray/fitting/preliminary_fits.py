@@ -118,7 +118,7 @@ def _far_from(
 
 
 def _determines_as_much(problem: Problem, selected: Objective) -> bool:
-    """Whether the selected links determine the same coefficients as those of the problem."""
+    """Whether the selected links determine the same coefficients as the links of the problem."""
     if not (selected.weight > 0).any():
         return False
     has_freedom = replace(problem, objective=selected).freedom >= 1

@@ -28,7 +28,7 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths, take
 
 KEPT: Final = 3
-"""Number of explanations that are passed from one material to the next."""
+"""Number of explanations that are kept from one material to the next."""
 
 EXACT_DB: Final = 0.005
 """Misfit at which a search ends [dB]."""
@@ -210,7 +210,7 @@ def _best(fits: list[Understanding]) -> list[Understanding]:
 
 
 def _meetings(model: RayModel) -> tuple[NDArray[np.bool_], list[int]]:
-    """The materials that every path meets [P, M], and those with a parameter, most often met alone first."""
+    """The materials on each path [P, M], and those with a parameter, most often the only one on a path first."""
     paths, names = model.paths, list(model.paths.materials)
     meets = np.zeros((paths.num_paths, len(names)), dtype=bool)
     meets[np.repeat(np.arange(paths.num_paths), np.diff(paths.first)), paths.material] = True
@@ -290,7 +290,7 @@ def _polarized(fit: Understanding, slants: tuple[float | None, float | None]) ->
 
 
 def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: int) -> Understanding:
-    """Least squares on all ratios, starting from an explanation; values that change no ratio keep their value."""
+    """Least squares on all ratios, starting from an explanation; values that change no ratio stay fixed."""
     lower, upper = fit.model.bounds
     start, tables = np.clip(fit.values, lower, upper), _tables(fit.model, ratios, last)
     size = np.linalg.norm(_errors(replace(fit, values=start), ratios, tables)[1], axis=0)
@@ -315,7 +315,7 @@ def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: in
     slopes = cast(Any, lambda values: evaluate(values)[1])
     weights = np.concatenate([ratio.weight for ratio in ratios])
     scale = ray_scan.ROBUST_DB * float(np.sqrt(weights.mean()))
-    for loss in ("soft_l1", "linear"):  # paths near a resonance count less at first
+    for loss in ("soft_l1", "linear"):  # the first loss gives less weight to paths near a resonance
         values = least_squares(
             lambda values: evaluate(values)[0], values, slopes, bounds=(lower, upper), x_scale="jac",
             loss=loss, f_scale=scale, max_nfev=evaluations, xtol=1e-10, ftol=1e-8,

@@ -7,7 +7,7 @@ slabs or half-spaces, and the polarization of its antennas. We fit these to all 
 this corrected program, and checks it.
 
 The first call is at the start values. The second call is where the ratios are most informative about the assumed
-constants: at the one of `PROBES` points with the largest mean log determinant of the information.
+constants: of `PROBES` random points, the one with the largest mean log determinant of the information.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ GAP_DB: Final = 0.2
 0.016 dB in six runs with gaps of 0.06 to 0.17 dB, and 0.020 to 0.15 dB in eight runs with gaps above 0.36 dB."""
 
 MISFIT_DB: Final = 0.2
-"""Largest misfit of the ratios if an engine counts as understood [dB]. Wrong minima had at least 0.8 dB. With 0.07 to
-0.19 dB, the optimum was reached within 0.006 dB (docs/measurements/expensive-engines.md)."""
+"""Largest misfit of the ratios if an engine counts as understood [dB]. Wrong minima had misfits of at least 0.8 dB.
+With 0.07 to 0.19 dB, the optimum was reached within 0.006 dB (docs/measurements/expensive-engines.md)."""
 
 CHANGED_DB: Final = 0.5
 """Largest change of a link's path loss without the paths that another call lacks, if an engine counts as understood
@@ -87,7 +87,7 @@ class RayMap:
         understanding: The assumptions that explain the engine.
         gap_db: RMS over the links of the difference between the engine's and the predicted path loss at the last call
             [dB].
-        changed: Largest number of paths that the best call lacks from another one, or the other one from it.
+        changed: Largest number of paths that occur in the best call but not in another call, or vice versa.
         changed_db: Largest change of a link's path loss without these paths, over links that keep a path [dB].
         lost: Number of links that keep no path, or have none in the replay at the best call.
         minima: Minima of the replay that replaces the engine, the lowest first, as points of the search space [k, d].
@@ -136,7 +136,7 @@ def search_rays(
 ) -> tuple[Problem, Trail, Remark]:
     """Search by ray mapping, on an engine that returns its rays.
 
-    The results are the problem on the replay that replaces the engine, the search, and how well the engine's
+    Returns the problem on the replay that replaces the engine, the search, and a remark on how well the engine's
     assumptions are identified. The stage of `progress` is "calibrating".
 
     Raises:
@@ -171,8 +171,8 @@ def map_rays(
     """Call an engine until the path loss at the minimum is predicted within the tolerance, or `most_calls` are made.
 
     The result is the replay that replaces the engine, and its accuracy. If the minimum is not at the best call, calls
-    continue: after a short step, the last call does not show how well the model predicts. The function calls the engine
-    only by `ask`, not that of the problem.
+    continue: after a short step, the last call does not show how well the model predicts. Calls go
+    through `ask`, not through the engine of the problem.
     """
     parameters, known = problem.parameters, problem.setup.known_antennas is not None
     understanding: Understanding | None = None
@@ -280,7 +280,7 @@ def _most_informative(problem: Problem, call: Call, random: np.random.Generator)
 
 
 def _changes(calls: list[Call]) -> tuple[int, float, int]:
-    """Largest number of paths that the last call lacks from another one, or vice versa, and their effect on links.
+    """Largest number of paths that occur in the last call but not in another one, or vice versa, and their effect.
 
     The second result is the largest change of path loss without these paths [dB], the third the number of links that
     lose all paths.

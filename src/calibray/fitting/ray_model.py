@@ -42,7 +42,7 @@ HALF_SPACE: Final = 1e4
 """Thickness of a half-space [m]: a wave decays within it unless the conductivity is below 1e-6 S/m."""
 
 DECAYED: Final = 4.0
-"""Attenuation within a slab [Np] beyond which it acts as a half-space: the returning wave has e^-8 of its amplitude."""
+"""Attenuation within a slab [Np] above which it acts as a half-space: the returning wave has e^-8 of its amplitude."""
 
 RANGES: Final = {"thickness": (5e-4, HALF_SPACE), "conductivity": (1e-7, 1e3)}
 """Ranges of the assumed constants, in the fields' units."""
@@ -99,7 +99,7 @@ class RayModel:
 
     @cached_property
     def assumed(self) -> tuple[tuple[str, str], ...]:
-        """Material and field of every assumed constant: those of materials on a path that are not calibrated."""
+        """Material and field of every assumed constant: not calibrated, of a material that a path meets."""
         calibrated = {(item.material, item.constant) for item in self.parameters}
         met = set(np.unique(self.paths.material).tolist())
         return tuple(
@@ -149,7 +149,7 @@ class RayModel:
         levels, slopes = [], []
         for start in range(0, len(tables), BATCH):
             part = tables[start : start + BATCH]
-            # Padded to the compiled number of candidates.
+            # Pad to the number of candidates for which the program is compiled.
             batch = np.concatenate([part, np.repeat(part[:1], BATCH - len(part), axis=0)])
             if self.known:
                 loss, by_material, _ = path_losses_and_slopes(program, batch, _COLUMNS, count=len(part))

@@ -155,14 +155,14 @@ class Trail:
         iteration: Round of each call.
         seconds: Time of each call since the start [s].
         best: The best candidate [d].
-        best_modelled: The engine's values for it [L].
-        best_rmse_db: Its RMSE [dB].
-        best_value: Its objective, including priors [dB].
+        best_modelled: The engine's values for the best candidate [L].
+        best_rmse_db: RMSE of the best candidate [dB].
+        best_value: Objective of the best candidate, including priors [dB].
         minima: Minima of the optimizer's searches, the best first, as points of the search space [k, d].
         rt_calls: RT calls of the search, including calls of an earlier run that the ledger answered.
         ledger_hits: Number of calls that the ledger answered.
         modelled: The engine's values for each candidate [L], only for an engine without derivatives.
-        observed: Further observables for each candidate [K, L], only for such an engine.
+        observed: Further observables for each candidate [K, L], only for an engine without derivatives.
     """
 
     candidates: list[NDArray[np.float64]] = field(default_factory=list)

@@ -29,7 +29,7 @@ RASTERIZED: Final = 2000
 """Largest number of points that are drawn as vectors; more points are rasterized."""
 
 LONG: Final = 1000
-"""Number of RT calls above which their axis is logarithmic, because the first calls improve the RMSE most."""
+"""Number of RT calls above which the axis is logarithmic, because the first calls reduce the RMSE most."""
 
 GROUPS: Final = 24
 """Largest number of groups that are shown: those with the most links."""
@@ -83,7 +83,7 @@ def convergence(results: Mapping[str, Record], optimum_db: float | None = None) 
 
 @style.styled()
 def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
-    """Draw the path loss of every link: measured, before and after calibration; all results are of the same links."""
+    """Draw the path loss of every link: measured, before and after calibration; all results have the same links."""
     first = next(iter(results.values()))
     links = first.links
     few, many = len(links) <= SYMBOLS, len(links) > FILE_ORDER

@@ -240,5 +240,5 @@ def _list(names: Sequence[str]) -> str:
 
 
 def _seconds(value: float) -> str:
-    # With two digits, values of at least 99.5 would be written as 1e+02.
+    # With two digits, values of at least 99.5 would become 1e+02.
     return f"{value:.2g} s" if value < 99.5 else f"{value / 60:.0f} min"

@@ -75,7 +75,7 @@ FINITE: Final = ("measured_db", "log_distance_db", "best_db", "seconds")
 
 
 class LinkCounts(Section):
-    """Numbers of links, for readers of the file; see `Record.counts`. They are not read back."""
+    """Numbers of links, for readers of the file; see `Record.counts`. `read` ignores them."""
 
     calibrated_on: Count
     held_out: Count

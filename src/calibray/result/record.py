@@ -39,14 +39,14 @@ class ObservableFit:
 
     Attributes:
         kind: What was measured.
-        unit: The unit of the other values.
+        unit: Unit of the observable.
         links: Number of calibration links with a value.
         rmse: RMSE of the calibrated model.
         initial_rmse: RMSE with the initial materials.
         mean_rmse: RMSE of predicting the mean value, as a baseline.
         error: Standard deviation of a value's error, stated or estimated.
         biases: Bias by group; the group "" means all links.
-        bias_errors: Standard error of each bias, including that of the parameters.
+        bias_errors: Standard error of each bias, including the uncertainty of the parameters.
     """
 
     kind: str
@@ -116,7 +116,7 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """How far the calibrated values can be trusted.
+    """How reliable the calibrated values are.
 
     Attributes:
         intervals: 95 % interval and verdict by parameter.

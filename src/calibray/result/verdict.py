@@ -79,7 +79,7 @@ class Interval:
         reason: The reason for the verdict.
         approximate: Whether an emulator replaced an engine that gives no derivatives.
         seen: Pieces of the 95 % interval for the buildings that the links meet, which predictions use; empty if they
-            equal those for the mean over all buildings of this kind.
+            equal the pieces for the mean over all buildings of this kind.
         without: Share of the width that remains if a cause is ruled out, by cause, for the causes that matter.
     """
 

@@ -142,7 +142,7 @@ def _errors_out_of_sight(values: dict[str, Any]) -> str:
     text = _noise_remark(
         "Errors of weak links out of sight are larger than those of other links, as if the scene lacked paths to them"
     )(values)
-    # Results of earlier versions do not say what their study lacks.
+    # Results of earlier versions do not list the missing settings.
     lacking = values.get("lacking")
     return f"{text} To find more paths, set in [trace]: {', '.join(lacking)}." if lacking else text
 
@@ -373,7 +373,7 @@ _BASELINES: Final[dict[str, str]] = {
     Model.LOG_DISTANCE: "a log-distance model",
     Model.OBSTRUCTION: "a log-distance model with obstruction",
 }
-"""Names of baselines within a sentence, if they differ from those of the models; an offset is a nuisance."""
+"""Names of baselines within a sentence, if they differ from the models' names; an offset is a nuisance."""
 
 
 def judgement_text(judgement: Judgement) -> str:
@@ -431,7 +431,7 @@ def remarks(record: Record, choice: str = "") -> tuple[str, ...]:
     sentences = [
         remark_text(remark)
         for remark in record.uncertainty.remarks
-        # A finished result can be validated.
+        # A finished result can have been validated since.
         if remark.kind != RemarkKind.NOT_JUDGED or record.held_out is None
     ]
     if record.accuracy.judgement is not None:
