@@ -163,7 +163,7 @@ def deviations_of(name: str) -> str:
 
 
 def transmitters(links: Measurements) -> NDArray[np.str_]:
-    """Label each link's transmitter by its position to the centimetre [L]."""
+    """Label each link's transmitter by its position, rounded to the centimetre [L]."""
     return np.array([",".join(f"{value:z.2f}" for value in tx) for tx in links.tx], dtype=np.str_)
 
 

@@ -1,6 +1,6 @@
 """Fits before the calibration: which links to leave out near the noise floor, and the noise level for priors.
 
-Among links with equal expected power, those near the noise floor are reported only if their error makes them strong.
+Among links with equal expected power, those near the noise floor are received only if their error is favourable.
 A selection by measured values keeps these links and biases the fit. A selection by predicted values does not, because
 the prediction is independent of the link's error (selection on the explanatory variables: J. M. Wooldridge, Econometric
 Analysis of Cross Section and Panel Data, 2nd ed., MIT Press 2010, chapter 19). We fit the model to all links above the

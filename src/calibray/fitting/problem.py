@@ -289,7 +289,7 @@ class Problem:
         slope: NDArray[np.float64],
         observed_slope: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
-        """Derivatives of `residuals` [n, m, k] with respect to k variables: the d search coordinates, then any more.
+        """Derivatives of `residuals` [n, m, k] with respect to k variables: the d search coordinates, then others.
 
         They follow from the derivatives of the modelled values [n, L, k] and of further observables [n, K, L, k].
         """

@@ -129,7 +129,7 @@ class RayModel:
         return np.minimum(lower, self.start), np.maximum(upper, self.start)
 
     def tables(self, candidates: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Constants of the materials with the parameters of n candidates [d]: [n, M, 8]."""
+        """Constants of the materials [n, M, 8], with the parameters of n candidates [d]."""
         return np.stack([self.paths.material_table(self.materials(each)) for each in candidates])
 
     def levels_and_slopes(

@@ -250,7 +250,7 @@ def start_value(
 
     Raises:
         InputError: The scene has no such material, the field has no effect with the material's scattering pattern, the
-            start is not finite, or an error of `itu_material`.
+            start is not finite, or `itu_material` raises it.
 
     Example:
         >>> walls = {"walls": Material(5.0, 0.1, 0.3)}
@@ -279,7 +279,7 @@ def itu_start(name: str, start: str, frequency: float) -> float:
     """Look up the value of ITU-R P.2040, in the field's unit, for a start such as "itu:concrete@P.2040-1".
 
     Raises:
-        InputError: The text has a different form, the field has no ITU-R law, or an error of `itu_material`.
+        InputError: The text has a different form, the field has no ITU-R law, or `itu_material` raises it.
     """
     field = split_name(name)[1]
     if is_effect(name):

@@ -25,7 +25,7 @@ WIDTH: Final = 1000
 """Width of the map, and its largest height, in map units."""
 
 LEAST_ASPECT: Final = 0.45
-"""Smallest ratio of height to width, so that links along a street do not make a thin strip."""
+"""Smallest ratio of height to width, so that the map of links along a street is not a thin strip."""
 
 MARGIN: Final = 0.12
 """Margin around the links, as a share of their extent."""
@@ -49,7 +49,7 @@ class Plan:
     """Layout of the map, which the template draws.
 
     Attributes:
-        height: Height in units of the map; the width is `WIDTH`.
+        height: Height in map units; the width is `WIDTH`.
         west: Coordinate of the left edge [m].
         north: Coordinate of the upper edge [m].
         scale: Map units per metre [1/m].

@@ -218,7 +218,7 @@ def _distance_text(result: Record) -> str:
     distance = link_distance(links)
     if distance is None or len(residuals) < FEW or np.ptp(distance) == 0:
         return ""
-    # A least-squares line over the logarithm of distance; its two coefficients cost two degrees of freedom.
+    # A least-squares line over the logarithm of distance; its two coefficients use two degrees of freedom.
     decades = np.log10(distance) - np.log10(distance).mean()
     slope = float(decades @ residuals / (decades @ decades))
     rest = residuals - residuals.mean() - slope * decades

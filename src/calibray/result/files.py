@@ -49,7 +49,7 @@ VERSION: Final = 1
 """The version of `result.json` that is written and read."""
 
 FILES: Final = ("result.json", "result-links.csv", "result-history.csv", "result-scene.xml")
-"""Files of a result. The prefix keeps them apart from users' own links.csv and scene.xml."""
+"""Files of a result. The prefix distinguishes them from users' own links.csv and scene.xml."""
 
 RESULT_FILE, LINKS_FILE, HISTORY_FILE, SCENE_FILE = FILES
 SIGNED_FILES: Final = (LINKS_FILE, HISTORY_FILE, SCENE_FILE)

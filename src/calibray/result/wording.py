@@ -15,7 +15,7 @@ MOST_ODDS: Final = 1000.0
 
 CLEAR_ODDS: Final = 2.0
 """Odds below which two candidates count as about equally probable: log densities of draws of one Gaussian
-parameter scatter by sqrt(1/2), nearly ln 2."""
+parameter have a standard deviation of sqrt(1/2), nearly ln 2."""
 
 SHOWN_PIECES: Final = 3
 """Largest number of pieces of an interval that are listed one by one."""
@@ -170,7 +170,7 @@ _CAUSES: Final = {
 
 
 def _ranges(ends: list[float]) -> str:
-    # Lower and upper ends in turn.
+    # Lower and upper ends alternate.
     return ", ".join(f"{low:.4g} to {high:.4g}" for low, high in zip(ends[::2], ends[1::2], strict=True))
 
 
