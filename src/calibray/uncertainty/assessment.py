@@ -60,21 +60,21 @@ MAX_COLUMNS: Final = 100
 """Number of columns of the nuisance up to which the draws include its coefficients."""
 
 SHOWN_DIFFERENCE: Final = 0.1
-"""Smallest difference between the sets for the measured and for all buildings that is reported, as a share of their
-range."""
+"""Smallest reported difference between the credible sets for the measured buildings and for all buildings, as a share
+of their range."""
 
 CUSTOMARY: Final = {("relative_permittivity", "linear"): 10.0, ("conductivity", "log"): float(np.log(1000.0))}
-"""Usual widths of ranges: permittivities of building materials are between 2 and 12, and conductivities within three
+"""Usual widths of ranges: building materials have permittivities between 2 and 12, and conductivities that span three
 decades. Wider bounds therefore do not improve a verdict."""
 
 EXACT_DB: Final = 1e-6
-"""RMSE below which the data contain no noise, so that linear theory is exact [dB]."""
+"""RMSE below which the data count as free of noise, so that linear theory is exact [dB]."""
 
 FEWEST_DRAWS: Final = 30
-"""Number of effective draws below which a standard deviation, then uncertain by 13 %, is not compared."""
+"""Smallest number of effective draws whose standard deviation is compared; it is then uncertain by 13 %."""
 
 NOTABLE_SHARE: Final = 0.85
-"""Largest share that is reported: the uncertainty of a standard deviation from `FEWEST_DRAWS` draws."""
+"""Largest share that is reported; larger ones may be chance, because few draws leave a standard deviation uncertain."""
 
 
 @dataclass(frozen=True)
@@ -82,10 +82,10 @@ class Certainty:
     """Uncertainty of a calibration.
 
     Attributes:
-        record: What a result states.
+        record: The uncertainty that a result states.
         posterior: All draws; None if none were made.
-        calls: Replays that the draws took.
-        seconds: Time of the assessment [s].
+        calls: Number of replays that the assessment took.
+        seconds: Time taken by the assessment [s].
     """
 
     record: Uncertainty
@@ -99,7 +99,7 @@ def certainty(
 ) -> Certainty:
     """Assess the uncertainty of a calibration from its finished search.
 
-    `model` is the replay of the study's scene, if the search had one as a cheap model. The stage of `progress` is
+    `model` is the replay of the study's scene, if the search used one as a cheap model. The stage of `progress` is
     "drawing".
     """
     started = time.perf_counter()
@@ -165,11 +165,11 @@ def _approximate(intervals: dict[str, Interval]) -> dict[str, Interval]:
 def _assess(
     problem: Problem, engines: Sequence[Problem], trail: Trail, progress: Progress | None
 ) -> Certainty:
-    """Uncertainty of a problem; draws come from problems with equally likely engines."""
+    """Uncertainty of a problem; the draws come from copies of it with equally likely engines."""
     optimum = problem.squares(problem.parameters.to_search(trail.best)[None], derivatives=True)
     freedom = optimum.num_rows - problem.unknowns
     if freedom < 1:
-        # Residuals that as many unknowns explain say nothing about errors.
+        # If there are as many unknowns as residuals, the residuals say nothing about the errors.
         reason = Reason(ReasonKind.TOO_FEW_LINKS, {"links": optimum.num_rows})
         return Certainty(Uncertainty(_full_ranges(problem.parameters, reason)))
     local = local_intervals(problem, trail, optimum)
@@ -293,7 +293,7 @@ def _differ(verdict: JudgedSet) -> bool:
 
 
 def _named_draws(problem: Problem, model: JointModel, posterior: Posterior) -> dict[str, list[float]]:
-    """Draws of equal weight by name: parameters, constants that the scene fixes, coefficients of the nuisance."""
+    """Equally weighted draws by name: parameters, constants that the scene fixes, and coefficients of the nuisance."""
     parameters, nuisance, draws = model.parameters, problem.objective.nuisance, posterior.seen
     random = np.random.default_rng(problem.setup.study.method.seed)
     kept = systematic_resampling(draws.weight, KEPT_DRAWS, random)
@@ -301,7 +301,7 @@ def _named_draws(problem: Problem, model: JointModel, posterior: Posterior) -> d
     values[:, : len(model.study)] = model.study.from_search(draws.point[kept])
     by_name = dict(zip(parameters.names, values.T.tolist(), strict=True))
     if 0 < len(nuisance.columns) <= MAX_COLUMNS:
-        # Given the parameters, coefficients scatter about their best values; undetermined ones keep theirs.
+        # Given the parameters, coefficients scatter about their best values; undetermined ones stay there.
         objective = replace(problem.objective, noise_db=model.marginal.noise_db)
         normal = random.standard_normal((len(values), len(nuisance.columns)))
         scatter = np.where(objective.determined, normal @ objective.coefficient_root().T, 0.0)
@@ -312,12 +312,12 @@ def _named_draws(problem: Problem, model: JointModel, posterior: Posterior) -> d
 
 
 def remaining_widths(model: JointModel, posterior: Posterior) -> list[dict[Cause, float]]:
-    """By parameter of the study, the shares of its interval's width that remain without each cause.
+    """For each parameter of the study, the share of its interval's width that remains without each cause.
 
     Draws without a cause, for example those with equal buildings, follow the posterior of a study that rules it out.
     Constants that the scene fixes are ruled out by a linear regression of the parameter on them; their share is an
-    upper bound, because the parameter may not depend linearly on them. Only causes that make an interval noticeably
-    wide are listed, with the smallest share first.
+    upper bound, because the parameter may not depend linearly on them. Only causes that noticeably widen an
+    interval are listed, in ascending order of their shares.
     """
     draws, width = posterior.means, len(model.study)
     models = [model.marginal.models[index] for index in posterior.model]
@@ -334,7 +334,7 @@ def remaining_widths(model: JointModel, posterior: Posterior) -> list[dict[Cause
         without = np.where(mask, 0.0, draws.weight)
         if mask.any() and _effective(without) >= FEWEST_DRAWS:
             _note(shares, cause, _deviation(draws.point, without) / full)
-    # Points of an interval that stands for one value become one point.
+    # Coordinates that all represent one value become one coordinate.
     parameters = model.parameters
     constants = parameters.to_unit(parameters.from_unit(posterior.joint))[:, width:]
     if constants.shape[1] and _effective(draws.weight) >= FEWEST_DRAWS + constants.shape[1]:
@@ -362,22 +362,22 @@ def _effective(weight: NDArray[np.float64]) -> float:
 
 
 REPEAT_M: Final = 0.01
-"""Distance of the ends up to which rows repeat a link [m]; antennas are larger."""
+"""Largest distance between the ends of rows that repeat a link [m]; antennas are larger."""
 
 REPEAT_DB: Final = 0.1
-"""Difference of modelled path loss up to which they do [dB]; another antenna or carrier changes it by more."""
+"""Largest difference in their modelled path loss [dB]; a different antenna or carrier changes it by more."""
 
 
 def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
-    """The problem whose rows of one link are replaced by their mean; the problem itself if no row repeats a link.
+    """Replace the rows that repeat a link by their mean; the problem is unchanged if no row repeats a link.
 
     Rows at one position share the error of the link. If they counted as independent, intervals would be too narrow by
     the square root of their number. Their scatter says nothing about that error either: a noise model with one
     variance for both underestimates it if the rows agree closely.
 
     Rows repeat a link if their ends are at the same positions, they have the same nuisances and biases, and the model
-    gives them the same path loss, with the initial values and with the best ones. The first row gets the mean path
-    loss, the mean weight and the means of further observables, the others the weight 0.
+    gives them the same path loss, for the initial and for the best values. The first row gets the mean path loss, the
+    mean weight and the means of further observables; the other rows get the weight 0.
 
     Args:
         problem: The problem.
@@ -404,7 +404,7 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     first = np.full(len(counted), -1)
     for row in range(len(counted)):
         if first[row] < 0:
-            # A first row takes all later rows that agree with it.
+            # All later rows that agree with a first row repeat its link.
             near = np.array(tree.query_ball_point(position[row], REPEAT_M))
             equal = (np.abs(columns[:, near] - columns[:, [row]]) <= 1.0).all(axis=0) & (first[near] < 0)
             first[near[equal]] = row
@@ -425,9 +425,9 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
 def _means(
     values: NDArray[np.float64], counted: NDArray[np.int64], first: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Values [L] with the mean of the known ones of each link in its first row; NaN if none is known.
+    """Values [L] in which the first row of each link has the mean of the link's known values; NaN if none is known.
 
-    `first` is the number of the first row of each counted link's repeats [m].
+    `first` is, for each counted row, the number of the first row of its link [m].
     """
     known = np.isfinite(values[counted])
     number = np.bincount(first[known], minlength=len(counted))

@@ -1,4 +1,4 @@
-"""Replay with constants that the study does not vary: those of single buildings, and those that the scene fixes.
+"""Replay with constants that the study does not vary: constants of single buildings, and constants fixed by the scene.
 
 The building of every interaction follows from its position and the scene's meshes (`scenes/buildings.py`). Each pair of
 building and material becomes a separate material.
@@ -37,9 +37,9 @@ MANY: Final = 10_000
 """Number of interactions above which weak paths are left out."""
 
 WEAK: Final = 0.1
-"""Share of a link's power that the omitted paths have together, summed over 16 candidates. On an office floor in
-Auckland, 71 % of the interactions are left out, and path loss of posterior draws changes by 0.05 dB (RMS), with errors
-of 5.3 dB. With 0.03, 61 % are left out, and it changes by 0.02 dB."""
+"""Largest share of a link's power that all omitted paths carry together, summed over 16 candidates. On an office floor
+in Auckland, 71 % of the interactions are left out, which changes the path loss of posterior draws by 0.05 dB (RMS); the
+errors are 5.3 dB. With a share of 0.03, 61 % are left out, and the change is 0.02 dB."""
 
 EXPONENTS: Final = {exponent for _, exponent in LAWS.values()}
 """Fields of parameters that are exponents of laws."""
@@ -60,7 +60,7 @@ class _Part:
     constants: NDArray[np.intp]
 
     def respond(self, constants: NDArray[np.float64], wanted: tuple[Statistic, ...]) -> Responses:
-        """Path loss and further observables for all constants [n, c], which are kept within their physical bounds."""
+        """Path loss and further observables for all constants [n, c], which are clipped to their physical bounds."""
         parameters = self.engine.parameters
         candidates = np.tile(parameters.start, (len(constants), 1))
         if len(self.constants):
@@ -78,7 +78,7 @@ class Split(ABC):
 
     Attributes:
         parameter_of: Index of the parameter to which each of c constants belongs, ascending [c].
-        building_of: Building of each constant, from 0; -1 for objects that are not buildings, such as the ground [c].
+        building_of: Building of each constant, numbered from 0; -1 for other objects, such as the ground [c].
         met: Numbers of the buildings that the paths meet.
         interactions: Number of interactions that are evaluated for a candidate.
     """
@@ -90,12 +90,12 @@ class Split(ABC):
 
     @property
     def keys(self) -> NDArray[np.int64]:
-        """A number for the parameter and building of every constant, ascending [c]."""
+        """A number that encodes the parameter and the building of each constant, ascending [c]."""
         # Building -1 comes just before building 0 of the same parameter.
         return (self.parameter_of << 32) + self.building_of
 
     def path_loss(self, values: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss [n, L], [dB] with values of the parameters [n, d] and a factor for every constant [n, c]."""
+        """Path loss [n, L], [dB], for values of the parameters [n, d] and a factor for every constant [n, c]."""
         return self.respond(values, factors, ()).path_loss
 
     @abstractmethod
@@ -108,7 +108,7 @@ class Split(ABC):
 @final
 @dataclass(frozen=True, eq=False)
 class SplitReplay(Split):
-    """The same in this process.
+    """A split replay in this process.
 
     Attributes:
         parameters: The parameters, which may be coefficients of laws.
@@ -132,7 +132,7 @@ class SplitReplay(Split):
 @final
 @dataclass(frozen=True, eq=False)
 class SplitChunks(Split):
-    """The same for links in chunks. Every worker splits the replays of its chunks and keeps them.
+    """A split replay of links in chunks. Every worker splits the replays of its chunks and keeps them.
 
     Attributes:
         engine: The chunks.
@@ -152,7 +152,7 @@ class SplitChunks(Split):
 
 @dataclass(frozen=True)
 class _Splitting:
-    """How replays are split; picklable. Equal ones split equally.
+    """How replays are split; picklable. Equal objects split a replay in the same way.
 
     Attributes:
         parameters: The study's parameters and further constants.
@@ -180,7 +180,7 @@ class _Splitting:
                 building = _interaction_buildings(paths, study.scene)
             met |= set(building[building >= 0].tolist())
             splits.append((*_split_paths(study.radio, replay, paths, building, self.parameters), links))
-        # By the index of its parameter and its building.
+        # Sorted by the index of the parameter, then by building.
         constants = sorted({key for _, keys, _ in splits for key in keys})
         number = {key: index for index, key in enumerate(constants)}
         parts = tuple(
@@ -231,7 +231,7 @@ def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool)
     equal at all carriers. If the paths meet fewer than two buildings, no constant belongs to a building.
     """
     engine = cast(Replay | ReplayCarriers | Chunked, problem.engine)
-    # Weak paths are late ones, which delay spreads depend on.
+    # Weak paths often arrive late, and delay spreads depend on late paths.
     may_drop = problem.setup.study.objective.combining == "power" and not problem.observed
     splitting = _Splitting(parameters, may_drop and engine.interactions > MANY, by_building)
     split = (
@@ -247,9 +247,9 @@ def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool)
 def _split_paths(
     radio: RadioSettings, replay: Replay, paths: Paths, building: NDArray[np.int64], parameters: Parameters
 ) -> tuple[Replay, list[tuple[int, int]]]:
-    """The replay of one carrier on some of its paths; for each of its constants its parameter, and building or -1.
+    """The replay of one carrier with the given paths; and the parameter and the building, or -1, of each constant.
 
-    It is the given replay without constants if its paths depend on none.
+    If its paths depend on no constants, the replay is unchanged, and the list is empty.
     """
     names = list(paths.materials)
     # One material per pair of building and material, numbered by the sorted pairs.
@@ -308,7 +308,7 @@ def _chunk_respond(
     factors: NDArray[np.float64],
     wanted: tuple[Statistic, ...],
 ) -> Responses:
-    """A chunk's answer; the factors are those of the constants with the given keys."""
+    """A chunk's answer; the factors belong to the constants with the given keys."""
     split = chunk.derived(splitting)
     return split.respond(values, factors[:, np.searchsorted(keys, split.keys)], wanted)
 

@@ -16,7 +16,7 @@ class Draws:
     Attributes:
         point: The points [n, d].
         density: Log posterior at the points, up to a constant [n].
-        weight: Their weights, with sum one [n].
+        weight: Their weights, which sum to one [n].
         agree: Whether independent populations of the sampler agree on them.
     """
 
@@ -27,7 +27,7 @@ class Draws:
 
 
 def pooled(draws: Sequence[Draws]) -> Draws:
-    """Draws from the mean of several posteriors, with equal weight of each."""
+    """Draws from the mean of several posteriors, each with the same weight."""
     return Draws(
         np.concatenate([each.point for each in draws]),
         np.concatenate([each.density for each in draws]),
@@ -37,7 +37,7 @@ def pooled(draws: Sequence[Draws]) -> Draws:
 
 
 def evenly_spaced(count: int, most: int) -> NDArray[np.int64]:
-    """Indices of evenly spaced items among a number of them, all if there are no more than `most`."""
+    """Indices of `most` evenly spaced items out of `count`; all indices if `count` is not larger."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
 
 

@@ -4,7 +4,7 @@ Intervals need thousands of evaluations, and calls are expensive. A Gaussian pro
 interpolates the calls (`multifidelity/discrepancy.py`). Its mean is the corrected replay of the study's scene, if there
 is one that is not misleading; otherwise a constant. The uncertainty of the process must widen the intervals. We
 therefore draw functions from it, use each as an engine, and pool their posteriors. Every call is also predicted from
-all others; if these leave-one-out errors exceed the expected ones, the spread of the drawn functions is increased by
+all others. If these leave-one-out errors exceed the expected ones, the spread of the drawn functions is increased by
 the same factor.
 """
 
@@ -140,7 +140,7 @@ class ResponseRows:
         return [each.used(self.problem.objective.weight) for each in self.problem.observed]
 
     def unit(self, index: int) -> float:
-        """Rows of an observable per its unit."""
+        """Factor that converts scaled values of an observable to rows."""
         return self.problem.objective.noise_db / self.problem.observed[index].std
 
 
@@ -168,9 +168,9 @@ class EmulatedEngine:
         interactions: Cost of a candidate, as an equivalent number of interactions.
         mean: The mean function.
         function: The function added to the mean.
-        rows: What the m emulated rows are.
+        rows: The definition of the m emulated rows.
         initial_loss: Initial path loss of all links, kept for links that are not emulated [L], [dB].
-        calls: Candidates evaluated so far.
+        calls: Number of candidates evaluated so far.
     """
 
     parameters: Parameters
@@ -206,7 +206,7 @@ class EmulatedEngine:
             return Responses(*self._for_all_links(base + self.function.values(inputs), wanted))
         base, slope, inputs, change = self.mean.base_and_slope(unit)
         box, scale = self._box, self.parameters.search_slope(candidates)
-        # From derivatives by the unit cube's coordinates to those by the fields' values.
+        # Derivatives with respect to the fields' values instead of the unit cube's coordinates.
         slope = (slope + self.function.slopes(inputs, change)) / (box.width * scale[:, None, :])
         links, last = self.rows.links, len(self.rows.links)
         loss_slope = np.zeros((count, len(self.initial_loss), box.dimension))
@@ -250,7 +250,7 @@ class Ensemble:
     Attributes:
         mean: The posterior mean of the process.
         drawn: Functions drawn from the process.
-        apart_db: Root mean square difference of these from the mean, over the whole range of the parameters [dB].
+        apart_db: Root mean square difference between these and the mean, over the parameters' whole range [dB].
         error_db: Root mean square leave-one-out error of the better half of the calls [dB].
         calls: Number of calls that the process interpolates.
         replayed: The corrected replay in the mean function; None if there is none, or if it is misleading.
@@ -265,7 +265,7 @@ class Ensemble:
 
 
 def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) -> Ensemble | None:
-    """Emulate an engine from its calls, with the replay of the study's scene if available; None if they are too few."""
+    """Emulate an engine from its calls, with the replay of the study's scene if available; None if too few calls."""
     objective, parameters, method = problem.objective, problem.parameters, problem.setup.study.method
     box, rows = Box(*parameters.search_bounds), ResponseRows(problem, np.flatnonzero(objective.weight > 0))
     calls = _calls(problem, trail, box, rows)
@@ -290,7 +290,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
     else:
         return None
     better = np.argsort(calls.value, kind="stable")[: max(2, len(calls.value) // 2)]
-    # If leave-one-out errors exceed what the process expects, the drawn functions vary by as much more.
+    # If leave-one-out errors exceed those that the process expects, the drawn functions spread by the same factor.
     stretch = max(
         1.0, standardized_error(process, better), standardized_error(process, np.arange(len(calls.value)))
     )
@@ -316,7 +316,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
 
 
 def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Calls:
-    """The calls with a path loss for every link with weight; if there are too many, the most informative ones."""
+    """The calls with a path loss for every link with weight; a selection that favours the best ones if too many."""
     parameters = problem.parameters
     candidates, modelled = np.array(trail.candidates), np.array(trail.modelled)
     observed = np.array(trail.observed)

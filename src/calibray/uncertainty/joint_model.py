@@ -2,7 +2,7 @@
 
 - The study's parameters have flat priors over their bounds, or the priors that the study declares.
 - Constants of the same materials that the scene fixes, such as thickness, have a log-normal prior around the scene's
-  value, because nobody knows them exactly. A scattering coefficient of 0 is exact with a probability of one half.
+  value, because they are never known exactly. A scattering coefficient of 0 is exact with a probability of one half.
 - The walls of building b have the constants x exp(s z_b), where x is the material's mean and z_b is standard normal.
   The between-building spread s is zero with probability `ALIKE`, otherwise exponential.
 - Errors follow one of several noise models (`noise_models.py`), whose level, nuisances and undeclared offset are
@@ -70,7 +70,7 @@ class QuadraticForms:
         return cls(marginal, np.array(group), tuple(square))
 
     def densities(self, gap: NDArray[np.float64], model: NDArray[np.int64]) -> NDArray[np.float64]:
-        """As `Marginal.densities`, under the model with the given index for each gap [n]."""
+        """Like `Marginal.densities`, but for each gap only under the model with the given index [n]."""
         models, log_density = self.marginal.models, np.full(len(gap), -np.inf)
         if not self.square:
             for index in np.unique(model).tolist():
@@ -96,7 +96,7 @@ FIXED_FIELDS: Final = ("thickness", "conductivity", "scattering_coefficient")
 
 NO_EFFECT: Final = 0.02
 """Change of path loss by one standard deviation of a fixed constant, relative to the noise, below which it stays
-fixed: its variance then is below 0.04 % of that of the noise."""
+fixed: its variance is then below 0.04 % of the noise variance."""
 
 ALIKE: Final = 0.5
 """Prior probability that buildings do not differ."""
@@ -108,7 +108,7 @@ SPREAD_BOUNDS: Final = (0.004, 0.8)
 """Range of the spread of buildings that differ."""
 
 GRID: Final = 2001
-"""Points over the range of a parameter at which its prior is tabulated."""
+"""Number of points over the range of a parameter at which its prior is tabulated."""
 
 
 Gaps = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
@@ -128,11 +128,11 @@ class JointModel:
         loss: Path loss of all links for values of the parameters [n, d + k] and equal buildings [n, L], [dB].
         marginal: The density of the gaps under every noise model.
         parameter_of: Index of the parameter to which each of the c constants of single buildings belongs [c].
-        building_of: Building of each of these constants, from 0 [c].
+        building_of: Building of each of these constants, numbered from 0 [c].
         only_buildings: Indices of the parameters whose constants all belong to buildings, so that these determine the
             mean.
         spread: The between-building spread if the study declares it; otherwise None.
-        interactions: Interactions that one evaluation takes.
+        interactions: Number of interactions per evaluation.
         effects_db: Change of path loss by one standard deviation of each fixed constant [dB].
         observed: Number of rows of each further observable, which follow the m gaps of path loss; its degrees of
             freedom; and whether the rows are in units of the stated error.
@@ -184,7 +184,7 @@ class JointModel:
     def at_scene_constants(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log posterior [n] at points of the study's search space [n, d], up to a constant.
 
-        Buildings are equal, and constants are those of the scene. It is averaged over the noise models.
+        Buildings are equal, and the constants are the scene's. The posterior is averaged over the noise models.
         """
         constants = [item.start for item in self.parameters.items[len(self.study) :]]
         values = np.hstack([self.study.from_search(points), np.tile(constants, (len(points), 1))])
@@ -229,15 +229,15 @@ class JointModel:
 
 
 def joint_model(problem: Problem, best: NDArray[np.float64], square: float, freedom: int) -> JointModel:
-    """Set up the unknowns that a study does not fix, from the optimum in the search space [d].
+    """Set up the joint model of all that a study does not fix, from the optimum in the search space [d].
 
-    `square` is the mean square of its residuals [dB^2], and `freedom` their number minus that of unknowns.
+    `square` is the mean square of the residuals there [dB^2], and `freedom` their number minus the number of unknowns.
     """
     objective, links, section = problem.objective, problem.setup.links, problem.setup.study.noise
     weight, censored = _weights_and_censoring(problem)
     counted = np.flatnonzero(weight > 0)
     weight, censored = weight[counted], censored[counted]
-    # Of mean square one, as in the objective: the noise level is that of a link of mean weight.
+    # The mean square is one, as in the objective: the noise level refers to a link of mean weight.
     scale = np.sqrt(weight * len(weight) / weight.sum())
     noise_db = float(np.sqrt(square * (freedom + problem.unknowns) / freedom))
     nuisance, position = objective.nuisance, np.hstack([links.rx, links.tx])[counted]
@@ -246,7 +246,7 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
     at_bound = (coefficients <= nuisance.lower) | (coefficients >= nuisance.upper)
     design = nuisance.design[counted].toarray() if nuisance.terms else np.zeros((len(counted), 0))
     used = objective.determined & ~at_bound
-    # Few links distinguish neither noise models nor buildings; what the study states they need not distinguish.
+    # Few links cannot distinguish noise models or buildings, so only those that the study states are used.
     few = len(counted) < FEW
     # With correlated errors, the probability of censoring is an integral over all censored links.
     uncorrelated = bool(censored.any()) or (few and section.range_m == "auto")
@@ -312,12 +312,12 @@ def _with_constants(
     replay, effects = split_replay(problem, every, by_building=model.spread != 0), {}
 
     def loss_at(values: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
-        # The same compiled program as for the gaps.
+        # Uses the same compiled program as the gaps.
         return replay.respond(values, factors, problem.statistics).path_loss
 
     if fixed:
         values = np.append(study.from_search(best), [item.start for item in fixed])
-        # One row per fixed constant, in which it is larger by one standard deviation.
+        # In the row of each fixed constant, this constant is larger by one standard deviation.
         one = np.eye(len(values))[len(study) :]
         larger = values * np.exp(known_to * one) + SCATTERING_SPREAD * one * (values == 0)
         alike = np.ones((len(values) - len(study) + 1, len(replay.parameter_of)))
@@ -331,7 +331,7 @@ def _with_constants(
     index = [every.names.index(name) for name in parameters.names]
 
     def full(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values with the constants that have no effect."""
+        """Values, extended by the constants that have no effect."""
         all_values = np.tile([item.start for item in every.items], (len(values), 1))
         all_values[:, index] = values
         return all_values
@@ -385,7 +385,7 @@ def has_offset(problem: Problem) -> bool:
 def _fixed_constants(problem: Problem) -> list[Parameter]:
     """Constants that the scene fixes, equal at all carriers, of the materials that have a parameter.
 
-    A scattering coefficient of 0 that the study states is exact, also that of facades that are part of the material.
+    A scattering coefficient of 0 that the study states is exact, also for facades of the material.
     """
     study = problem.setup.study
     materials, spread = problem.engine.materials, study.noise.constants_spread
@@ -415,12 +415,12 @@ def _fixed_constants(problem: Problem) -> list[Parameter]:
 def _weights_and_censoring(problem: Problem) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Weights of the links in the likelihood [L], and mask of the censored ones [L].
 
-    With censored links in the likelihood, links measured near the noise floor are used as well: together they are not
-    selected by measured values.
+    With censored links in the likelihood, links measured near the noise floor are used as well: the links are then not
+    selected by their measured values.
     """
     objective, links = problem.objective, problem.setup.links
     if links.censored is None or problem.faint is None:
         return objective.weight, np.zeros(len(links), dtype=bool)
-    # A censored link without a path agrees with the model whatever the parameters.
+    # A censored link without a path agrees with the model for any parameters.
     informative = problem.faint & ~problem.setup.held_out & np.isfinite(problem.before)
     return np.where(informative, links.weight, objective.weight), links.censored

@@ -1,7 +1,7 @@
 """Densities of errors whose integrals over nuisance and scale have no closed form: Laplace's approximation.
 
 Heavy tails: the tails of Student's t decrease gradually. If most errors are ordinary and a few are gross, for example
-because a link was measured at a wrong position, the ordinary errors are Gaussian, and a share of the errors has a
+because a link's position was recorded wrongly, the ordinary errors are Gaussian, and a share of the errors has a
 larger standard deviation (J. W. Tukey, in: Contributions to Probability and Statistics, 1960). We fit both by
 iteratively reweighted least squares (K. L. Lange, R. J. A. Little, J. M. G. Taylor, J. Am. Stat. Assoc. 84 (1989) 881)
 and integrate at the mode, with the Fisher information.
@@ -29,7 +29,7 @@ CENSORED_TOLERANCE: Final = 1e-9
 """Predicted gain of the log density at which the iteration ends."""
 
 LARGEST: Final = 1e4
-"""Limit for errors, in median errors; applies to a censored link without a path, whose error is infinite."""
+"""Limit for errors, in units of their median; applies to a censored link without a path, whose error is infinite."""
 
 
 class _Terms(NamedTuple):
@@ -41,7 +41,7 @@ class _Terms(NamedTuple):
 
 
 def log_survival(error: NDArray[np.float64], freedom: float) -> NDArray[np.float64]:
-    """Log probability of larger errors than given, in units of their scale; Gaussian with infinite degrees of freedom.
+    """Log probability of exceeding an error, in units of its scale; Gaussian if the degrees of freedom are infinite.
 
     Example:
         >>> log_survival(np.array([0.0, 40.0]), np.inf).round(2).tolist()
@@ -81,7 +81,7 @@ def log_evidence(
             break
         trial = np.asarray(point + np.clip(step, -_longest(point), _longest(point)), dtype=np.float64)
         trial_value, trial_slope, trial_curvature = joint(trial, gap, censored, design, ridge, freedom)
-        # Damping as in Levenberg's method: less after a step that raises the density, more after others.
+        # Damping as in Levenberg's method: less after a step that raises the density, more otherwise.
         better = trial_value > value
         point = np.where(better[:, None], trial, point)
         value = np.where(better, trial_value, value)
@@ -130,7 +130,7 @@ def joint(
     measured = int((~censored).sum())
     penalty = 0.5 * np.sum((ridge * coefficients) ** 2, axis=1)
     value = terms.value.sum(axis=1) - measured * point[:, -1] - penalty
-    # Derivatives of the errors by coefficients and log scale.
+    # Derivatives of the errors with respect to coefficients and log scale.
     rows = np.concatenate([-design / scale[:, None, None], -error[..., None]], axis=2)
     slope = np.einsum("nm,nmi->ni", terms.first, rows)
     slope[:, :-1] -= ridge**2 * coefficients
@@ -165,7 +165,7 @@ def _terms(error: NDArray[np.float64], censored: NDArray[np.bool_], freedom: flo
 
 
 def _damped(curvature: NDArray[np.float64], damping: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Minus the Hessian, made positive definite and damped, relative to its diagonal."""
+    """The negative Hessian, made positive definite and damped relative to its diagonal."""
     size = np.sqrt(np.maximum(np.abs(np.diagonal(curvature, axis1=1, axis2=2)), 1e-12))
     values, vectors = np.linalg.eigh(curvature / (size[:, :, None] * size[:, None, :]))
     values = np.maximum(np.abs(values), 1e-6) + damping[:, None]
@@ -206,7 +206,7 @@ class Tail(NamedTuple):
         size: Fisher information of an error about the logarithm of its scale, a number or [n].
         by_weights: Whether to update the scale with the sum of the weights instead of the number of links, which
             converges faster.
-        select: The distributions of the gaps with given indices.
+        select: Returns the distributions of the gaps with given indices.
     """
 
     log_density: OfSquare
@@ -241,7 +241,7 @@ def _student(freedom: NDArray[np.float64], constant: NDArray[np.float64]) -> Tai
 
 @cache
 def gross() -> Tail:
-    """Gaussian errors with a share of gross errors, whose standard deviation is larger by a factor."""
+    """Gaussian errors, a share `GROSS_SHARE` of which has a standard deviation `GROSS_RATIO` times as large."""
     share, times = GROSS_SHARE, GROSS_RATIO
     ratio, fall = share / (1.0 - share) / times, 0.5 * (1.0 - 1.0 / times**2)
     constant = float(np.log1p(-share) - 0.5 * np.log(2 * np.pi))
@@ -309,11 +309,11 @@ def _mode(
     size: NDArray[np.float64],
     tail: Tail,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Errors [n, m], coefficients [n, q] and scale [n] at the mode, from a first scale and the priors' precisions."""
+    """Errors [n, m], coefficients [n, q] and scale [n] at the mode, from an initial scale and the prior precisions."""
     links, columns = design.shape
     outer = (design[:, :, None] * design[:, None, :]).reshape(links, -1)
     errors, coefficients, change = gap, np.zeros((len(gap), columns)), np.float64(0.0)
-    # Gaps leave the iteration when they have converged; `rows` are those that remain.
+    # Gaps leave the iteration once they have converged; `rows` are those that remain.
     mode, rows = (gap.copy(), coefficients.copy(), size.copy()), np.arange(len(gap))
     for step in range(MAX_STEPS):
         variance = size**2
@@ -342,7 +342,7 @@ def _mode(
 
 
 def regular(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Normal equations [..., q, q] with slightly increased diagonal, for linearly dependent columns."""
+    """Normal equations [..., q, q] with a slightly increased diagonal, to allow for linearly dependent columns."""
     size = matrix.shape[-1]
     trace = np.trace(matrix, axis1=-2, axis2=-1)[..., None, None]
     return matrix + (1e-10 * trace / size + 1e-300) * np.eye(size)

@@ -1,7 +1,7 @@
-"""A missing region, such as trees without a map, would explain most of the residuals by its extra loss.
+"""Search for a missing region, such as unmapped trees, whose extra loss explains the residuals best.
 
-All rectangles of a grid are tried, at several heights: the residuals are regressed on the length of the straight lines
-inside each. The same search over residuals in random order shows the effect of chance (a scan statistic; M. Kulldorff,
+All rectangles of a grid are tried, at several heights: the residuals are regressed on the length of each straight line
+inside. The same search over residuals in random order shows the effect of chance (a scan statistic; M. Kulldorff,
 Communications in Statistics 26, 1997).
 """
 
@@ -26,22 +26,22 @@ HEIGHTS: Final = (5.0, 10.0, 20.0)
 """Heights above the lowest antenna up to which the rectangles reach [m]: hedges, street trees, tall trees."""
 
 FEWEST_LINKS: Final = 30
-"""Fewest links that are searched."""
+"""Smallest number of links that are searched."""
 
 MOST: Final = 20_000
-"""Largest number of links that are searched; of more, every second, third, ... one is taken."""
+"""Largest number of links that are searched; of more links, every second, third, ... is used."""
 
 SHUFFLES: Final = 99
-"""Number of random orders of the residuals; a rectangle is reported if none of them has a better one."""
+"""Number of random orders of the residuals; a rectangle is significant only if none of them gives a better one."""
 
 
 class Explained(NamedTuple):
-    """The best rectangle of a width.
+    """The best rectangle of one width.
 
     Attributes:
         explained: Sum of squares that it explains.
         attenuation: Its attenuation [dB/m].
-        cells: Its corners, counted in cells [2, 2].
+        cells: Its corners, in cells [2, 2].
         chance: Sum of squares that the best rectangle of this width explains for residuals in random order [k - 1].
     """
 
@@ -57,12 +57,12 @@ class MissingRegion:
 
     Attributes:
         box: West, south, east and north in the scene's frame [m].
-        height: Height at which it ends [m].
+        height: Height up to which it reaches [m].
         attenuation: Loss per length inside [dB/m].
         links: Number of links whose straight line crosses it; an estimate if not all links are searched.
         share: Share of the mean square of the residuals that it explains.
         chance: Median share that the best rectangle explains if residuals are in random order.
-        significant: Whether it explains more than in any random order.
+        significant: Whether at least `FEW` links cross it, and no random order has a rectangle that explains as much.
     """
 
     box: tuple[float, float, float, float]
@@ -85,11 +85,11 @@ def missing_region(
     excess_db: NDArray[np.float64],
     known: Sequence[NDArray[np.float64]] = (),
 ) -> MissingRegion | None:
-    """Search the rectangle whose extra loss explains most of the residuals.
+    """Search for the rectangle whose extra loss explains most of the residuals.
 
     Args:
-        tx: Transmitters [n, 3], [m].
-        rx: Receivers [n, 3], [m].
+        tx: Positions of the transmitters [n, 3], [m].
+        rx: Positions of the receivers [n, 3], [m].
         excess_db: Measured minus predicted path loss [n], [dB].
         known: Columns that explain residuals in another way, such as whether a link is out of sight [n].
 
@@ -110,7 +110,7 @@ def missing_region(
         return None
     random = np.random.default_rng(0)
     orders = np.stack([residual, *(random.permutation(residual) for _ in range(SHUFFLES))])
-    # In another order, residuals are no longer orthogonal to the fitted columns.
+    # Shuffled residuals are no longer orthogonal to the fitted columns.
     orders -= (orders @ basis) @ basis.T
     corner, cell = _grid(tx, rx)
     lowest = float(min(tx[:, 2].min(), rx[:, 2].min()))
@@ -120,7 +120,7 @@ def missing_region(
         # The part of the lengths that the fitted columns do not explain already.
         inside = length - basis @ (basis.T @ length)
         rectangles = list(_rectangles(inside.T @ orders.T, inside.T @ inside))
-        # Residuals in random order have the same choice of heights and rectangles.
+        # The same heights and rectangles are searched for residuals in random order.
         chance = np.maximum(chance, np.max([rectangle.chance for rectangle in rectangles], axis=0))
         top = max(rectangles, key=lambda rectangle: rectangle.explained)
         if top.explained / square > (0.0 if best is None else best.share):
@@ -145,7 +145,7 @@ def missing_region(
 
 
 def _grid(tx: NDArray[np.float64], rx: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """South-western corner [2] and width of the cells of a square grid over all links [m]."""
+    """South-west corner [2] and width of the cells of a square grid over all links [m]."""
     ends = np.concatenate([tx, rx])[:, :2]
     low, high = ends.min(axis=0), ends.max(axis=0)
     cell = max(float((high - low).max()) / GRID, 1e-3)
@@ -160,16 +160,16 @@ def _lengths(
     point = tx[:, None] + share[:, None] * (rx - tx)[:, None]
     index = np.clip(((point[..., :2] - corner) / cell).astype(np.int64), 0, GRID - 1)
     number = np.arange(len(tx))[:, None] * GRID**2 + index[..., 0] * GRID + index[..., 1]
-    # Each point stands for a piece of its line; pieces above the top have no length inside.
+    # Each point represents a piece of its line; pieces above the top do not count.
     piece = np.linalg.norm(rx - tx, axis=1)[:, None] / SAMPLES * (point[..., 2] < top)
     counts = np.bincount(number.reshape(-1), piece.reshape(-1), len(tx) * GRID**2)
     return counts.reshape(len(tx), GRID**2).astype(np.float64)
 
 
 def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> Iterator[Explained]:
-    """The best rectangle of the grid, width by width.
+    """The best rectangle of the grid for each width.
 
-    The arguments are products of residuals and the columns of the cells, with the residuals in order first [cells, k],
+    The arguments are products of residuals and the columns of the cells, with unshuffled residuals first [cells, k],
     and products of the columns of the cells [cells, cells].
     """
     moment = _summed(moments.reshape(GRID, GRID, -1), (0, 1))
@@ -185,7 +185,7 @@ def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> 
             strip[:, north, north] - strip[:, north, south] - strip[:, south, north] + strip[:, south, south]
         )
         band = moment[columns:] - moment[:-columns]
-        # Below this, rounding dominates.
+        # Below this limit, rounding errors dominate.
         used = square > 1e-6 * largest
         root = np.where(used, 1.0 / np.sqrt(np.where(used, square, 1.0)), 0.0)
         # Signed root of the sum of squares that a rectangle explains: only extra loss counts.

@@ -5,10 +5,10 @@ offset may be undeclared. Larger errors out of sight are a discrepancy of the tw
 Royal Statistical Society B 63, 2001): paths that it lacks change the path loss of its weak links (`excess_db`).
 The right model is unknown, and choosing the best-fitting one ignores others that fit nearly as well. Every model
 therefore gets a prior weight, and results are averages over all models (Bayesian model averaging). A discrepancy that
-the data do not need thus has almost no weight, and does not take over what the parameters explain.
+the data do not need thus has almost no weight, and leaves to the parameters what they explain.
 
 The noise level has the prior 1/level, and nuisances have their own priors, flat unless declared. For Gaussian noise
-with covariance C times an unknown variance, both integrals are closed (D. A. Harville, Biometrika 61, 1974): with
+with covariance C times an unknown variance, both have closed forms (D. A. Harville, Biometrika 61, 1974): with
 whitened errors y and design Z, ridge R, A = Z'Z + R'R and S = y'y - y'Z A^-1 Z'y,
 
     p = (2 pi)^(-f/2) Gamma(f/2) / 2 (S/2)^(-f/2) |C|^(-1/2) |A|^(-1/2) |R|,
@@ -17,7 +17,7 @@ where f is the number of links minus the number of columns with a flat prior. Fo
 Laplace's approximation (`laplace.py`).
 
 Paths that the twin lacks, such as paths through buildings, add power. They hardly change links in sight, but raise the
-power of links out of sight by as much as the twin makes these too weak.
+power of links out of sight by as much as the twin underestimates it.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ from calibray.uncertainty.residual_correlation import (
 )
 
 CANDIDATES: Final = 16
-"""Candidates between the bounds whose median is the loss that the twin expects of a link."""
+"""Number of candidates between the bounds whose median path loss is the twin's expectation for a link."""
 
 STRONGEST: Final = 0.05
-"""Quantile of the excess of the strongest links, which is that of the line of sight if some links have it."""
+"""Quantile of the excess loss that represents the strongest links: those in line of sight, if there are any."""
 
 
 def excess_db(problem: Problem) -> NDArray[np.float64]:
     """Path loss of links out of sight in excess of free space and of the strongest links [L], [dB].
 
-    It is the median over candidates between the bounds; minus infinity in sight, where the twin has the strongest path.
+    It is the median over candidates between the bounds; minus infinity in sight, where the twin has the line of sight.
     """
     from scipy.stats import qmc  # takes 0.4 s
 
@@ -66,7 +66,7 @@ def excess_db(problem: Problem) -> NDArray[np.float64]:
 
 
 def missing_db(excess: NDArray[np.float64], level: float) -> NDArray[np.float64]:
-    """Change of path loss by missing power at a level below the line of sight, for links of this excess [dB]."""
+    """Change of path loss due to missing power, at a level below the line of sight, for links with this excess [dB]."""
     # 10 log10(1 + 10^((excess - level) / 10)), without overflow.
     return 10.0 * np.logaddexp(0.0, (excess - level) * (0.1 * np.log(10.0))) / np.log(10.0)
 
@@ -81,26 +81,26 @@ SHARES: Final = (0.4, 0.7, 0.95)
 """Correlated shares of the variance that are tried."""
 
 RANGES: Final = 4
-"""Number of correlation ranges tried, from the distance of neighbours to a third of the campaign."""
+"""Number of correlation ranges tried, from the distance between neighbours to a third of the campaign's extent."""
 
 SAME_PLACE: Final = 0.01
-"""Range, relative to the distance of neighbours, of errors that only links at one position share."""
+"""Correlation range of errors that only links at one position share, relative to the distance between neighbours."""
 
 FREEDOMS: Final = (2.0, 4.0)
 """Degrees of freedom of Student's t that are tried."""
 
 DEPARTURE: Final = 2.0
 """Prior weight of an offset, of correlated and of heavy-tailed errors, relative to independent Gaussian ones: measured
-errors rarely are. Larger errors out of sight have weight one: where the twin lacks refraction, their posterior weight
+errors are rarely so. Larger errors out of sight have weight one: if the twin lacks refraction, their posterior weight
 exceeds 0.9 in five of nine development runs."""
 
 IMPROBABLE: Final = 50.0
-"""Log odds at the optimum above which a model is left out for many links. The optimum of that model can be better by
-some units for each parameter, which is far less than this."""
+"""Log odds at the optimum above which a model is left out for many links. At its own optimum, that model can gain a few
+units per parameter, which is far less than this."""
 
 LEVELS: Final = (5.0, 15.0, 25.0)
-"""Power that the twin lacks out of sight, below that of the links in sight, that is tried [dB]. In three development
-districts whose twins lack refraction, it is 2 to 35 dB below."""
+"""Levels tried for the power that the twin lacks out of sight: how far it is below the power in sight [dB]. In three
+development districts whose twins lack refraction, it is 2 to 35 dB below."""
 
 COMMON: Final = 0.5
 """Share of these errors' variance that all links have in common: missing paths can only add power."""
@@ -109,7 +109,7 @@ COMMON: Final = 0.5
 GAUSSIAN, CORRELATED, OUT_OF_SIGHT, HEAVY = "gaussian", "correlated", "out_of_sight", "student-t"
 
 DIFFERING: Final = "heterogeneous"
-"""Buildings that differ, which have a weight like the kinds of noise."""
+"""Name of the hypothesis that buildings differ, which has a posterior weight as the kinds of noise do."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class NoiseModel:
         range: Correlation range, if "correlated" [m]; level of the power that the twin lacks, if "out_of_sight" [dB].
         share: Correlated share of the variance, if "correlated".
         freedom: Degrees of freedom, if "student-t".
-        gross: Whether the errors are Gaussian with some gross errors instead of Student's t, if "student-t".
+        gross: Whether the errors are Gaussian with a few gross errors instead of Student's t, if "student-t".
     """
 
     kind: str
@@ -151,14 +151,14 @@ def noise_models(
         kind: "gaussian" or "student-t" if declared; both are tried if None.
         range_m: Correlation range, 0 for none [m]; several are tried if None.
         offset: Whether to try an undeclared offset.
-        censored: Whether some links are censored; gross errors are then left out, because their probability of
+        censored: Whether any links are censored; gross errors are then left out, because their probability of
             censoring is not implemented.
         out_of_sight: Whether to try larger errors of links out of sight.
 
     Returns:
         The models; their weights sum to one.
     """
-    # A declared range rules out independent errors, and a range of 0 correlated ones.
+    # A declared range rules out independent errors, and a range of 0 rules out correlated ones.
     kinds = [[NoiseModel(GAUSSIAN, 1.0)]] if kind != HEAVY and not range_m else []
     ranges = _ranges(position) if range_m is None else (range_m,) * (range_m > 0)
     if kind != HEAVY and ranges:
@@ -305,7 +305,7 @@ class Marginal:
             white, shift = filter_.apply(white), 0.5 * filter_.log_determinant
         square, freedom = white.T @ white, len(design) - int((ridge == 0).sum())
         if len(ridge):
-            # The form is S of the module; the shift contains |C| and |A|.
+            # The form is S in the module's docstring; the shift contains |C| and |A|.
             columns = white @ design
             matrix, side = regular(columns.T @ columns + np.diag(ridge**2)), columns.T @ white
             square -= side.T @ np.linalg.solve(matrix, side)
@@ -321,7 +321,7 @@ class Marginal:
         design, ridge = self._with_offset(bool(offset.any()))
         by_gap = np.tile(ridge / self.noise_db, (len(gap), 1))
         if offset.any():
-            # So large a ridge fixes the offset at 0. Its normalisation cancels its integral.
+            # A ridge this large fixes the offset at 0. The normalisation of this prior cancels its integral.
             by_gap[~offset, -1] = NO_OFFSET
         freedom = np.array([model.freedom for model in models])
         return evidence(gap, design, by_gap, gross() if models[0].gross else student(freedom))
@@ -342,7 +342,7 @@ def _constant(freedom: int, ridge: NDArray[np.float64]) -> float:
 def _plain(
     gap: NDArray[np.float64], design: NDArray[np.float64], ridge: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Log density p of whitened Gaussian errors, see the module [n]; the caller adds |C|."""
+    """Log density p of whitened Gaussian errors (see the module's docstring) [n]; the caller adds the term of |C|."""
     freedom = gap.shape[1] - int((ridge == 0).sum())
     square, log_root = np.sum(gap**2, axis=1), 0.0
     if design.shape[1]:

@@ -2,8 +2,8 @@
 
 - One or more parameters move along the difference of two other members (C. J. F. ter Braak, Statistics and Computing
   16, 2006).
-- One parameter is redrawn from the population's values of it, smoothed. Reflections inside walls give a permittivity
-  several narrow ranges, and members of one range reach the others in one move.
+- One parameter is redrawn from the smoothed density of its values in the population. Reflections inside walls give a
+  permittivity several narrow ranges, and a member can reach any of them in one move.
 - One, two or all buildings are redrawn around their values (S. L. Cotter, G. O. Roberts, A. M. Stuart and D. White,
   Statistical Science 28, 2013).
 - The between-building spread is redrawn from its prior, together with all buildings: buildings become equal or
@@ -31,13 +31,13 @@ ACCEPTANCE: Final = 0.25
 Gelman and W. R. Gilks, Annals of Applied Probability 7, 1997)."""
 
 JITTER: Final = 1e-4
-"""Random addition to moves along differences, so that every point can be reached."""
+"""Standard deviation of the random addition to moves along differences, so that every point can be reached."""
 
 NEIGHBOURHOOD: Final = 32
-"""Width of a kernel, as the share of the population on either side of its centre."""
+"""Inverse of the share of the population, on either side of a kernel's centre, that sets the width of the kernel."""
 
 TINY: Final = 1e-30
-"""Replaces a constant of 0 under the logarithm; its factors have no effect."""
+"""Replaces a constant of 0 in logarithms; its factors have no effect."""
 
 NEVER: Final = -1e300
 """Finite replacement for a log density of minus infinity."""
@@ -66,11 +66,11 @@ class Population:
     log_prior: NDArray[np.float64]
 
     def selected(self, index: NDArray[np.intp]) -> Population:
-        """The members of these indices."""
+        """The members with these indices."""
         return Population(*(part[index] for part in self.parts()))
 
     def updated(self, accepted: NDArray[np.bool_], proposal: Population) -> Population:
-        """The members of the proposal if accepted [n], otherwise the present ones."""
+        """The members of the proposal where accepted [n], otherwise the current ones."""
         return Population(
             *(
                 np.where(accepted.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
@@ -150,7 +150,7 @@ class Moves:
         # 2.38 / sqrt(2 k) is the optimal length for k moving coordinates of a normal density (ter Braak).
         length = lengths.points * 2.38 / np.sqrt(2.0 * moving.sum(axis=1, keepdims=True))
         length = length * np.exp(0.4 * random.standard_normal((count, 1)))
-        # The full difference of two modes carries a member from one to the other.
+        # The full difference between two modes moves a member from one to the other.
         full = random.random((count, 1)) < 1 / 3
         step = np.where(full, 1.0, length) * (population.point[first] - population.point[second])
         point = population.point + moving * (step + JITTER * random.standard_normal((count, width)))
@@ -159,7 +159,7 @@ class Moves:
         return moved, replace(lengths, points=points)
 
     def _redraw_coordinate(self, population: Population) -> Population:
-        """Redraw one parameter from the population's values of it: Gaussian kernels as wide as their neighbourhood."""
+        """Redraw one parameter from its values in the population, smoothed by Gaussian kernels of local width."""
         random, (count, width) = self.random, population.point.shape
         chosen, point, log_ratio = random.integers(0, width, count), population.point.copy(), np.zeros(count)
         near = max(2, count // NEIGHBOURHOOD)
@@ -170,7 +170,7 @@ class Moves:
             size = (centre[np.minimum(high, count - 1)] - centre[np.maximum(low, 0)]) / 2 + JITTER
             kernel = random.integers(0, count, len(rows))
             value = centre[kernel] + size[kernel] * random.standard_normal(len(rows))
-            # The rule needs the proposal's density at the present value and at the new one.
+            # The acceptance rule needs the proposal density at the current value and at the new one.
             both = np.concatenate([population.point[rows, index], value])
             density = np.mean(np.exp(-0.5 * ((both[:, None] - centre) / size) ** 2) / size, axis=1)
             with np.errstate(divide="ignore"):
@@ -181,7 +181,7 @@ class Moves:
     def _at_points(
         self, population: Population, point: NDArray[np.float64], log_ratio: float | NDArray[np.float64] = 0.0
     ) -> tuple[Population, NDArray[np.bool_]]:
-        """The population at proposed points [n, d + k] if accepted [n]; a point beyond the bounds needs no replay."""
+        """The population at proposed points [n, d + k] if accepted [n]; a point outside the bounds needs no replay."""
         inside = np.asarray(((point >= 0.0) & (point <= 1.0)).all(axis=1))
         proposal = self._evaluated_where(inside, population, replace(population, point=point))
         accepted = inside & self._accepts(population, proposal, log_ratio)
@@ -201,7 +201,7 @@ class Moves:
         normal = random.standard_normal((count, width))
         deviation = np.sqrt(1.0 - length**2) * population.deviation + length * normal
         moved = replace(population, deviation=deviation)
-        # Without a spread, deviations have no effect: no replay is needed, and every move is accepted.
+        # If the spread is 0, deviations have no effect: no replay is needed, and every move is accepted.
         proposal = self._evaluated_where(population.spread > 0, population, moved)
         accepted = self._accepts(population, proposal)
         buildings = _adapted(lengths.buildings, accepted[all_buildings & (population.spread > 0)], 1.0)
@@ -234,7 +234,7 @@ class Moves:
         values, spread = parameters.from_unit(population.point), population.spread
         differing = spread > 0
         before = np.log(np.maximum(values[:, index], TINY))
-        # Logarithms of the buildings' constants, which stay.
+        # Logarithms of the buildings' constants, which do not change.
         constants = before[:, None] + spread[:, None] * population.deviation[:, columns]
         normal = self.random.standard_normal(len(spread))
         after = constants.mean(axis=1) + spread / np.sqrt(columns.sum()) * normal
@@ -260,7 +260,7 @@ class Moves:
         """Redraw the noise model of every member from its conditional probabilities."""
         by_model = self.model.densities_by_model(population.gap)
         by_model = np.where(np.isfinite(by_model), by_model, NEVER)
-        # The largest of log weights plus Gumbel numbers is a draw by these weights.
+        # The index of the largest log weight plus Gumbel noise is a draw with these weights.
         model = np.argmax(self.power * by_model + self.random.gumbel(size=by_model.shape), axis=1)
         return replace(population, model=model, log_likelihood=by_model[np.arange(len(model)), model])
 

@@ -1,9 +1,9 @@
 """Checks of a finished calibration that lead to remarks: noise, missed optimum, intervals, undeclared offset, conflict.
 
-Path loss and further observables may contradict each other beyond their errors, and want different parameters. The
-parameters are fitted to path loss alone, to the further observables alone, and to both. The increase of both sums of
+Path loss and further observables may contradict each other beyond their errors, and require different parameters. The
+parameters are fitted to path loss alone, to the further observables alone, and to both. The increase in both sums of
 squares at the common fit, in units of the errors' variances, follows Fisher's F if one set of parameters explains
-everything. Another possibility is that no parameters explain an observable, as if it was measured in another scene.
+everything. It is also possible that no parameters explain an observable, as if it were measured in a different scene.
 Measured values are regressed on modelled ones: the slope is 1 if the model is right, and near 0 if the two are
 unrelated.
 """
@@ -35,14 +35,14 @@ SIGNIFICANT: Final = 0.005
 links share make small probabilities somewhat more frequent."""
 
 UNRELATED: Final = 0.02
-"""Probability of a slope, if the model is right, below which an observable does not belong to the scene; shared among
-the observables."""
+"""Probability of so small a slope under the model, below which an observable does not fit the scene; it is divided by
+the number of observables."""
 
 FEWEST: Final = 5
 """Degrees of freedom below which no slope is judged."""
 
 CONFLICT_STARTS: Final = 32
-"""Number of local searches of the fits to one kind of data."""
+"""Number of local searches per fit."""
 
 DOMINANT: Final = 1e3
 """Factor by which the further observables count more than path loss in a fit that is meant to use only them, and less
@@ -111,7 +111,7 @@ class Slope(NamedTuple):
 
 
 def _slopes(problem: Problem, point: NDArray[np.float64]) -> list[Slope]:
-    """Slopes of the observables at a point of the search space, with a constant or the biases of devices."""
+    """Slopes of the observables at a point of the search space, fitted with a constant or the biases of devices."""
     modelled = problem.respond(problem.parameters.from_search(point[None])).observed[0]
     slopes = []
     for each, values in zip(problem.observed, modelled, strict=True):
@@ -151,7 +151,7 @@ NOTABLE: Final = 0.25
 """Smallest posterior weight of a kind of noise that is reported; several kinds can share the weight."""
 
 SLACK: Final = 0.02
-"""Distance of a value from its interval, as a share of the range, above which it is reported."""
+"""Distance between a value and its interval, as a share of the range, above which it is reported."""
 
 MISSED_DB: Final = 0.01
 """Improvement of the objective by a draw above which the method is reported to have missed the optimum [dB]."""
@@ -175,7 +175,7 @@ CAUSES: Final = (CORRELATED, OUT_OF_SIGHT, HEAVY, DIFFERING, GAUSSIAN)
 def departures(noise: Mapping[str, float], study: StudyModel) -> tuple[Remark, ...]:
     """A remark for each noise model that the data favour over independent Gaussian noise, from their weights.
 
-    What the study states has no rival. The study also shows which paths the model may lack.
+    Noise that the study states is not reported. The study also shows which paths the model may lack.
     """
     gaussian, remarks = float(noise.get(GAUSSIAN, 0.0)), []
     stated = {
@@ -274,7 +274,7 @@ def fit_undeclared_offset(
     Args:
         problem: The problem.
         minima: Its minima, the lowest first [k, d].
-        square: Mean square of the residuals at the lowest [dB^2].
+        square: Mean square of the residuals at the lowest minimum [dB^2].
         freedom: Number of residuals minus unknowns.
 
     Returns:
@@ -290,7 +290,7 @@ def fit_undeclared_offset(
     lowest = int(np.argmin(value))
     loss, remaining = trial.modelled(best[lowest : lowest + 1]), float(value[lowest] ** 2)
     offset = float(trial.objective.coefficients(loss)[0, -1])
-    # F statistic of one further column: the square of the offset over its standard error.
+    # F statistic of one further column: (offset / standard error)^2.
     ratio = (square - remaining) / remaining * (freedom - 1) if remaining > 0 else np.inf
     if not ratio > 0 or not np.isfinite(ratio):
         return UndeclaredOffset()

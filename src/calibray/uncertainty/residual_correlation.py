@@ -3,11 +3,11 @@
 A link's error has a correlated and an uncorrelated part. Nearby receivers share the correlated part, for example
 because clutter that the scene lacks shadows all of them. Its covariance falls off exponentially with distance. Range
 and size maximise the restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971), so that fitted
-parameters do not bias the noise low. The fit is exact with one Cholesky factor per trial, for up to some thousand
-links.
+parameters do not bias the noise low. The fit is exact, with one Cholesky factorisation per trial, for up to a few
+thousand links.
 
-Whitening makes errors independent. For up to some hundred links, it factors their covariance. For more links, each
-error is its conditional mean given its nearest neighbours among the earlier links, plus an independent rest (A. V.
+Whitening makes errors independent. For up to a few hundred links, it factors their covariance. For more links, each
+error is its conditional mean given its nearest neighbours among the earlier links, plus an independent remainder (A. V.
 Vecchia, J. R. Stat. Soc. B 50, 1988). The time is then proportional to the number of links.
 """
 
@@ -34,7 +34,7 @@ FEWEST_LINKS: Final = 10
 """Number of links below which no correlation is reported; fewer links cannot show one."""
 
 MOST_LINKS: Final = 500
-"""Number of links used for correlation and variogram; if there are more, an evenly spaced subset."""
+"""Largest number of links used for correlation and variogram; if there are more, an evenly spaced subset is used."""
 
 SIGNIFICANT: Final = 3.0
 """Gain in log likelihood above which correlation is reported: about the 95 % quantile for two further parameters."""
@@ -49,7 +49,7 @@ CHUNK: Final = 500
 """Number of links whose neighbourhoods are solved together."""
 
 Neighbours = tuple[NDArray[np.int64], NDArray[np.int64]]
-"""An order of links [m], and the positions of each one's nearest earlier links in it, -1 for none [m, NEAREST]."""
+"""An order of the links [m], and the places in it of each link's nearest earlier links, -1 for none [m, NEAREST]."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def fit_correlation(
     the same links, of full rank [m, q]: nuisances, and derivatives with respect to the parameters.
 
     Raises:
-        InputError: The number of links exceeds that of columns by fewer than three, or all receivers have one position.
+        InputError: The number of links exceeds that of columns by less than three, or all receivers share one position.
         EngineError: The errors are all zero.
     """
     count = len(errors)
@@ -100,7 +100,7 @@ def fit_correlation(
         raise InputError("noise: all receivers have the same position; set range_m = 0")
     if not errors.any():
         raise EngineError("noise: all errors are zero, which no noise explains; check the measured values")
-    # Beyond these ranges errors are independent, or common to all links.
+    # Below these ranges, errors are independent; above them, they are common to all links.
     log_ranges = np.log([pairs[pairs > 0].min() / 3, 3 * pairs.max()])
 
     def trial(share: float, log_range: float) -> tuple[float, float]:
@@ -133,7 +133,7 @@ def fit_correlation(
 def _restricted(
     matrix: NDArray[np.float64], errors: NDArray[np.float64], columns: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """Restricted log likelihood of errors with covariance matrix x variance, and the best variance."""
+    """Restricted log likelihood of errors whose covariance is `matrix` times a variance, and the best variance."""
     factor = cho_factor(matrix, lower=True)
     freedom = len(errors) - columns.shape[1]
     solved = cho_solve(factor, np.column_stack([errors, columns]))
@@ -147,13 +147,13 @@ def _restricted(
 
 
 def shared_errors(errors: NDArray[np.float64], position: NDArray[np.float64]) -> Correlation | None:
-    """The correlation of errors at the best fit [m], [dB], at positions [m, k], [m]; None if it is not significant."""
+    """The correlation of the best fit's errors [m], [dB], at positions [m, k], [m]; None if it is not significant."""
     if len(errors) < FEWEST_LINKS:
         return None
     chosen = evenly_spaced(len(errors), MOST_LINKS)
     try:
         correlation = fit_correlation(errors[chosen], position[chosen])
-    except (InputError, EngineError):  # all links at one position, or no errors
+    except (InputError, EngineError):  # all links at one position, or all errors zero
         return None
     significant = correlation.log_likelihood - correlation.independent > SIGNIFICANT
     return correlation if significant else None
@@ -166,11 +166,11 @@ def variogram(
 
     A rising variogram indicates correlated errors [m], [dB], and a flat one indicates independent errors. Positions
     [m, k], [m], are those of the receivers or of both ends. The result is the mean distance [8], [m], the semivariance
-    [8], [dB^2], and the number of pairs [8] of classes with about equal numbers of pairs; fewer if pairs are few.
+    [8], [dB^2], and the number of pairs [8] of 8 classes with about as many pairs each; of fewer if pairs are few.
     """
     chosen = evenly_spaced(len(errors), MOST_LINKS)
     distance, half = pdist(position[chosen]), 0.5 * pdist(errors[chosen, None], "sqeuclidean")
-    if len(distance):  # pairs beyond half the extent are few, and all at its ends
+    if len(distance):  # pairs farther apart than half the extent are few, and all lie at its ends
         near = distance <= max(np.median(distance), distance.max() / 2)
         distance, half = distance[near], half[near]
     order = np.argsort(distance, kind="stable")
@@ -200,7 +200,7 @@ class Whitener:
 
 
 def pairwise(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances between positions [n, k] of links; beyond `EXACT` links those of an evenly spaced subset [m, m]."""
+    """Distances between positions [n, k] of links; for 2 `EXACT` links or more, those of a subset [m, m]."""
     subset = position[:: max(1, len(position) // EXACT)]
     return np.asarray(cdist(subset, subset), dtype=np.float64)
 
@@ -215,9 +215,9 @@ def whitener(
 ) -> Whitener:
     """Make the whitener of errors of links whose ends have positions [m, k], [m].
 
-    The errors were multiplied by `scale` so that the uncorrelated part has unit size [m]. The correlated part, a share
-    of the variance from 0 to below 1, has fallen to 1/e at the distance `range_m` [m]. Up to `exact` links, the
-    covariance is factored exactly. Nearest earlier neighbours may be given if they are known.
+    The errors were multiplied by `scale` [m], which makes the uncorrelated part equal for all links. The covariance of
+    the correlated part, a share of the variance from 0 to below 1, falls to 1/e at the distance `range_m` [m]. Up to
+    `exact` links, the covariance is factored exactly. `neighbours` are computed if None.
     """
     count = len(position)
     if count <= exact:
@@ -227,9 +227,9 @@ def whitener(
 
 
 def shared(error: NDArray[np.float64], share: float) -> Whitener:
-    """The whitener of errors of unit variance plus further ones with these standard deviations [m].
+    """The whitener of errors of unit variance plus further errors with these standard deviations [m].
 
-    All links have a share of the further variance in common; beyond `EXACT` links, all errors are independent.
+    All links have a share of the further variance in common; above `EXACT` links, all errors are independent.
     """
     if len(error) > EXACT:
         variance = 1.0 + error**2
@@ -244,7 +244,7 @@ def _exact(covariance: NDArray[np.float64]) -> Whitener:
 
 
 def nearest_earlier(position: NDArray[np.float64]) -> Neighbours:
-    """A random order of links at positions [m, k], with earlier ones both near and far; and the nearest ones."""
+    """A random order of links at positions [m, k], so that earlier ones are near and far; and the nearest of these."""
     order = np.random.default_rng(0).permutation(len(position))
     shuffled, near = position[order], np.full((len(order), NEAREST), -1)
     for index in range(1, len(order)):
@@ -270,7 +270,7 @@ def _vecchia(
         chosen = order[members[rows]]
         place, factor = position[chosen], np.where(members[rows] < 0, 0.0, scale[chosen])
         distance = np.sqrt(np.sum((place[:, :, None] - place[:, None]) ** 2, axis=-1))
-        # A neighbour that does not exist has no covariance with others.
+        # A missing neighbour has no covariance with others.
         common = np.exp(-distance / range_m) * factor[:, :, None] * factor[:, None]
         matrix = share * common + (1 - share) * diagonal
         # Conditional mean and variance of the last member given its neighbours.

@@ -1,8 +1,8 @@
 """Uncertainty if the measurements favour paths that the study's trace leaves out.
 
-Intervals of a twin that lacks paths, such as paths through buildings, are around wrong values: the constants make up
-for the missing power. The links are therefore traced once more with refraction and diffraction.
-The evidence of both twins, from their draws, decides between them.
+If a twin lacks paths, such as paths through buildings, its intervals lie around wrong values: the constants compensate
+for the missing power. The links are therefore traced once more with refraction and diffraction. The evidence of both
+twins, from their draws, decides between them.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ OF_THE_FIT: Final = (RemarkKind.MISSED_OPTIMUM, RemarkKind.OUTSIDE_INTERVAL)
 def assess_richer_paths(
     problem: Problem, trail: Trail, assessed: Certainty, progress: Progress | None = None
 ) -> Certainty:
-    """The uncertainty on richer paths, with a remark, if the measurements favour these; otherwise the given one.
+    """The uncertainty with richer paths, with a remark, if the measurements favour these; otherwise the given one.
 
-    Nothing is traced if the study states the noise, if its `fidelity.rounds` are 0, or if no link is out of sight. The
+    Nothing is traced if the study states the noise, if its `fidelity.rounds` is 0, or if no link is out of sight. The
     stages of `progress` are "tracing more paths" and "drawing with more paths".
 
     Args:
@@ -72,7 +72,7 @@ def assess_richer_paths(
         return assessed
     method = LeastSquares(*problem.parameters.search_bounds, starts=STARTS[0], x0=trail.minima[:BASINS])
     fitted = search(richer, method)
-    # The likelihood ratio of Gaussian errors of unknown level; draws take much longer.
+    # Screen by the likelihood ratio of Gaussian errors of unknown level, because draws take much longer.
     if (
         counted.sum() * (np.log(trail.best_value) - np.log(max(fitted.best_value, EXACT_DB)))
         < LIKELY_LOG_ODDS
@@ -104,7 +104,7 @@ def assess_richer_paths(
 
 
 def lacking(problem: Problem) -> dict[str, bool]:
-    """Settings of the tracer that find more paths than the study's; none if these are not to be tried."""
+    """Settings of the tracer that find more paths than the study's; empty if none are to be tried."""
     study, counted = problem.setup.study, problem.objective.weight > 0
     traced = isinstance(problem.engine, Replay | ReplayCarriers) and study.rays_path is None
     displaced = any(displaces(name) for name in problem.parameters.names)

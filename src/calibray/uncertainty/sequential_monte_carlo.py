@@ -1,11 +1,11 @@
 """Draws from the joint posterior by tempered sequential Monte Carlo.
 
-A population drawn from the prior follows the prior times a power of the likelihood, while the power grows to 1 (P. Del
+A population drawn from the prior follows the prior times a power of the likelihood, as the power grows to 1 (P. Del
 Moral, A. Doucet and A. Jasra, J. Royal Statistical Society B 68, 2006). Each step raises the power until half of the
 population is effective, resamples the population, and moves its members (`population_moves.py`).
 
-Two populations are independent. While the halves of all populations disagree, their number is doubled, as far as the
-budget allows. All populations are weighted by their estimates of the evidence, which are unbiased.
+We start with two independent populations, and double their number while their two halves disagree and the budget allows
+it. Populations that agree are weighted by their estimates of the evidence, which are unbiased.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ SIZE: Final = (64, 256)
 """Smallest and largest number of members of a population."""
 
 BUDGET: Final = 1_100_000_000
-"""Interactions that all populations may evaluate together. A tenth less is worth 392 to 422 independent draws in
-Auckland (`benchmarks/certainty_cost.py --seeds 3`)."""
+"""Number of interactions that all populations may evaluate together. With a tenth less, draws are worth 392 to 422
+independent ones in Auckland (`benchmarks/certainty_cost.py --seeds 3`)."""
 
 EVALUATIONS: Final = 100
 """Approximate number of evaluations per member: steps times moves."""
 
 POPULATIONS: Final = (2, 4, 8)
-"""Number of independent populations; more as long as the halves of them disagree. If the slabs' fringes fit, means of
-one population of 256 scatter by 0.2 posterior standard deviations; in three development districts, the draws of two or
-four populations agreed for half of the truths."""
+"""Numbers of independent populations, increased while their two halves disagree. If several fringes of slabs fit, means
+of one population of 256 scatter by 0.2 posterior standard deviations; in three development districts, the draws of two
+or four populations agree for half of the true scenes."""
 
 SWEEPS: Final = 4
 """Number of sweeps per step; a sweep moves every member in each way. The share of one of two distant ranges in five
@@ -54,7 +54,7 @@ EFFECTIVE: Final = 0.5
 """Effective share of the population after each step."""
 
 MAX_STEPS: Final = 60
-"""Number of steps after which the population is used as it is; most posteriors need 8 to 20."""
+"""Largest number of steps, the last of which raises the power to 1; most posteriors need 8 to 20."""
 
 APART: Final = 0.2
 """Largest distance between the distribution functions of a parameter in independent populations that agree. Two sets of
@@ -75,8 +75,8 @@ class Posterior:
         joint: Points of the unit cube of all parameters [n, d + k].
         spread: Between-building spread of every draw [n].
         model: Index of the noise model of every draw [n].
-        replays: Evaluations of path loss that the draws took.
-        shape: Numbers of populations, of states that each member kept as draws, and of members of a population.
+        replays: Number of evaluations of path loss that the draws took.
+        shape: Number of populations, number of states of each member kept as draws, and members per population.
         log_evidence: Logarithm of the probability density of the measurements, averaged over the prior.
     """
 
@@ -173,7 +173,7 @@ def draw_posterior(
         distance = _distance(model, [_together(populations[:half]), _together(populations[half:])])
         agree = distance < max(APART, APART_BY_CHANCE * float(np.sqrt(2.0 / (size * half))))
     members = len(populations[0].spread)
-    # Populations that disagree count alike: the estimates of their evidence are then unreliable.
+    # Populations that disagree are weighted equally: the estimates of their evidence are then unreliable.
     share = _weights(np.array(evidences)) if agree else np.full(len(populations), 1.0 / len(populations))
     posterior = _posterior(model, _together(populations), np.repeat(share, members) / members, agree)
     # Noise models were drawn uniformly, but the likelihood contains their weights.
@@ -222,14 +222,14 @@ def _posterior(model: JointModel, members: Population, weight: NDArray[np.float6
 def _anneal(
     model: JointModel, size: int, last: int, random: np.random.Generator, stepped: Callable[[float], None]
 ) -> tuple[Population, float]:
-    """Members of a population that followed the likelihood's power from 0 to 1, and its log evidence.
+    """Members of a population after the likelihood's power has grown from 0 to 1, and its log evidence.
 
     They are kept during the `last` sweeps. `stepped` is called with the share of the work done: half of it is done when
     the power is 1.
     """
     point = model.draw_prior(size, random)
     deviation = random.standard_normal((size, len(model.parameter_of)))
-    # Uniform, because the likelihood contains the weights of the models and is raised to a power with them.
+    # Uniform, because the likelihood contains the weights of the models, which are raised to the power with it.
     models = random.integers(0, len(model.marginal.models), size)
     empty = np.zeros(size)
     population = Population(
@@ -250,7 +250,7 @@ def _anneal(
         rise = (power - before) * population.log_likelihood
         # Logarithm of the mean of likelihood^rise: the ratio of successive normalising constants.
         evidence += float(np.logaddexp.reduce(rise)) - np.log(size)
-        # Moves take differences to members at a fixed distance, so copies must not be neighbours.
+        # Moves use differences between members at fixed index distances, so copies must not be neighbours.
         population = population.selected(
             random.permutation(systematic_resampling(_weights(rise), size, random))
         )

@@ -25,7 +25,7 @@ from calibray.uncertainty.draws import Draws, systematic_resampling
 
 
 def local_intervals(problem: Problem, trail: Trail, optimum: Evaluation) -> dict[str, Interval]:
-    """Intervals by linear theory, by name, in the search space, where a parameter over decades is logarithmic.
+    """Intervals by linear theory, by name, in the search space, where a parameter that spans decades is logarithmic.
 
     `optimum` is the evaluation of the optimum, with derivatives.
     """
@@ -53,7 +53,7 @@ def local_intervals(problem: Problem, trail: Trail, optimum: Evaluation) -> dict
 def with_reason(local: dict[str, Interval], reason: Reason) -> dict[str, Interval]:
     """Add to intervals by linear theory the reason why the posterior was not sampled.
 
-    Curvature alone does not show other minima and correlated errors, so no parameter is more than weakly identified,
+    Curvature alone does not show other minima or correlated errors, so no parameter is more than weakly identified,
     unless the data contain no noise.
     """
     exact, identified = reason.kind == ReasonKind.NO_NOISE, Verdict.IDENTIFIED
@@ -74,9 +74,9 @@ def linear_intervals(
 ) -> list[Interval]:
     """95 % confidence intervals from the curvature of the sum of squares at the optimum [d], one per parameter.
 
-    A parameter is not identifiable if its interval is wider than half of its bounds [d]. Other minima and correlated
-    errors can make the true interval wider. Residuals [m], [dB], and their derivatives [m, d] have the nuisance
-    eliminated; the freedom is the number of full residuals minus unknowns.
+    A parameter is not identifiable if its interval is wider than half of its range between bounds [d]. Other minima and
+    correlated errors can make the true interval wider. The nuisance is eliminated from the residuals [m], [dB], and
+    their derivatives [m, d]; `freedom` is the number of full residuals minus unknowns.
     """
     freedom = max(freedom, 1)
     quantile = float(stdtrit(freedom, (1 + CONFIDENCE) / 2))  # of Student's t
@@ -108,10 +108,10 @@ IDENTIFIED: Final = 0.25
 """Largest width of the credible set of an identified parameter, as a share of the range."""
 
 WEAKLY: Final = 0.5
-"""Largest width for a weakly identified parameter; a wider one is not identifiable."""
+"""Largest width for a weakly identified parameter; with a wider set, it is not identifiable."""
 
 NO_EFFECT_DB: Final = 1.0
-"""Change of path loss over the range below which no link depends on the parameter [dB]."""
+"""Change of path loss over a parameter's range below which no link counts as dependent on it [dB]."""
 
 END: Final = 0.1
 """Largest distance of an interval's end from the bound, as a share of the range, that counts as chance if no link
@@ -121,7 +121,7 @@ TRADE_OFF: Final = 0.5
 """Rank correlation above which another parameter compensates."""
 
 LARGE_EFFECT: Final = 3.0
-"""Change of path loss, in standard deviations of the errors, above which single links would determine the parameter."""
+"""Change of path loss, in standard deviations of the errors, above which one link would determine the parameter."""
 
 RANKED: Final = 400
 """Number of draws of equal weight from which rank correlations are computed."""
@@ -148,14 +148,14 @@ reference have 1.1. If all draws count, they contain 0.87 to 0.90, and those of 
 (`benchmarks/simulation_based.py --reference`)."""
 
 LEAST_SHARE: Final = 0.005
-"""Smallest share of the posterior in a piece; smaller shares are chance."""
+"""Smallest share of the posterior in a piece; smaller shares count as chance."""
 
 REACH: Final = 8.5
 """Kernel widths beyond which a Gaussian is zero in double precision."""
 
 LEAST_GAP: Final = 0.03
-"""A gap between pieces is chance if it is narrower than this share of the range and than the wider piece. Pieces that
-all lie within this share are one value for a user."""
+"""A gap between pieces counts as chance if it is narrower than this share of the range and than the wider piece. Pieces
+that all lie within this share of the range are one value for a user."""
 
 
 Modelled = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -223,7 +223,7 @@ def verdicts(
     level: float = 0.95,
     seen: Draws | None = None,
 ) -> list[JudgedSet]:
-    """Judge every parameter by its posterior, of the means over all buildings if these differ.
+    """Judge every parameter by its posterior; if buildings differ, by that of the mean over all buildings.
 
     The links' errors have the standard deviation `noise_db` [dB]. Intervals cover the share `level` of the posterior.
     `seen` is the posterior for the measured buildings; the same as `draws` if None.
@@ -243,7 +243,7 @@ def verdicts(
         share, seen_share = _width(pieces) / extent, _width(seen_pieces) / extent
         range_ = {"customary": True} if extent < upper - lower else {}
         seen_ends = _bounds_reached(seen_pieces, lower, upper)
-        # A flat posterior of all buildings reaches both bounds, and its pieces are chance.
+        # If the posterior of all buildings is flat, its set reaches both bounds, and its pieces are due to chance.
         judged = pieces if share <= WEAKLY else seen_pieces
         ends = _bounds_reached(judged, lower, upper) or seen_ends
         if share > WEAKLY >= seen_share and len(seen_pieces) == 1 and not seen_ends:
@@ -290,7 +290,7 @@ def _bounds_reached(pieces: tuple[tuple[float, float], ...], lower: float, upper
 def _without_chance(
     pieces: tuple[tuple[float, float], ...], lower: float, upper: float
 ) -> tuple[float, float]:
-    """One range for a parameter without effect: gaps between pieces and short distances to a bound are chance."""
+    """One range for a parameter without effect: gaps between pieces and short distances to a bound count as chance."""
     low, high, slack = pieces[0][0], pieces[-1][1], END * (upper - lower)
     return lower if low - lower < slack else low, upper if upper - high < slack else high
 
@@ -312,7 +312,7 @@ def _outlying_pieces(
     draws: Draws,
     axes: Axes,
 ) -> tuple[tuple[float, float, float], ...]:
-    """Pieces of the reported interval outside the judged set, with their weights; mostly none."""
+    """Pieces of the reported interval outside the judged set, with their weights; usually none."""
     others, value = [], draws.point[:, index]
     for low, high in reported:
         if not any(start <= high and low <= end for start, end in pieces):
@@ -322,7 +322,7 @@ def _outlying_pieces(
 
 
 def _effect(index: int, modelled: Modelled, best: NDArray[np.float64], axes: Axes) -> float:
-    """Largest change of a link's path loss over the range of a parameter, the others fixed [dB]."""
+    """Largest change of a link's path loss over the range of a parameter, with the others fixed [dB]."""
     line = np.tile(best, (LINE, 1))
     line[:, index] = np.linspace(axes.lower[index], axes.upper[index], LINE)
     loss = modelled(line)
@@ -376,7 +376,7 @@ def credible_sets(
     """
     width = upper - lower
     edges, mass = _masses((value - lower) / width, weight)
-    # Intervals by falling density, until the level is reached.
+    # Intervals in order of decreasing density, until the level is reached.
     order = np.argsort(-mass / np.diff(edges), kind="stable")
     covered, sets = np.cumsum(mass[order]), []
     for level in levels:
@@ -396,7 +396,7 @@ def _masses(
     total = np.cumsum(weight[order]) / weight.sum()
     index = np.searchsorted(total, (np.arange(QUANTILES) + 0.5) / QUANTILES)
     quantile = unit[order][np.minimum(index, len(unit) - 1)]
-    # A kernel is as wide as a share of the draws on its nearer side.
+    # A kernel is as wide as the range of a share of the draws, on the side where they are denser.
     near = round(QUANTILES * KERNEL_SHARE * min(1.0, (200.0 / independent) ** 0.2))
     above, below = np.full(QUANTILES, np.inf), np.full(QUANTILES, np.inf)
     above[:-near] = below[near:] = quantile[near:] - quantile[:-near]
@@ -404,7 +404,7 @@ def _masses(
     ends = (quantile[0] - size[0] * STEPS, quantile[-1] + size[-1] * STEPS)
     edges = np.unique(np.clip(np.concatenate([np.linspace(0, 1, GRID), quantile, *ends]), 0.0, 1.0))
     edges = np.unique(np.concatenate([edges, 0.5 * (edges[1:] + edges[:-1])]))
-    # Mirror only the kernels that reach over a bound.
+    # Mirror only the kernels that extend beyond a bound.
     low, high = quantile < REACH * size, 1.0 - quantile < REACH * size
     centre = np.concatenate([quantile, -quantile[low], 2.0 - quantile[high]])
     cumulative = ndtr((edges[:, None] - centre) / np.concatenate([size, size[low], size[high]]))
@@ -414,7 +414,7 @@ def _masses(
 def _pieces(
     edges: NDArray[np.float64], mass: NDArray[np.float64], inside: NDArray[np.bool_]
 ) -> list[tuple[float, float]]:
-    """Merge adjacent intervals to pieces; drop pieces and close gaps that are chance."""
+    """Merge adjacent intervals into pieces; drop pieces and close gaps that count as chance."""
     first = np.flatnonzero(inside & ~np.concatenate([[False], inside[:-1]]))
     last = np.flatnonzero(inside & ~np.concatenate([inside[1:], [False]]))
     kept: list[tuple[float, float]] = []
