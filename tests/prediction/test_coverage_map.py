@@ -192,7 +192,7 @@ def test_a_power_in_addition_to_that_in_the_offset_of_rsrp_is_announced(result, 
     shown = cb.coverage_map(rsrp, **arguments)
     assert "RSRP" not in caplog.text
     raised = cb.coverage_map(rsrp, power_dbm=17.0, **arguments)
-    assert "so the map is +17 dB from RSRP; leave the power out" in caplog.text
+    assert "so the map differs from RSRP by +17 dB; leave the power out" in caplog.text
     higher = raised.layers["received_power_dbm"] - shown.layers["received_power_dbm"]
     assert higher[np.isfinite(higher)] == pytest.approx(17.0)
 
@@ -249,7 +249,7 @@ def test_a_group_without_measurements_is_announced(result, caplog):
         assert not caplog.messages
         cb.coverage_map(result, columns={"half": "wset"}, **arguments)
     assert caplog.messages == [
-        "half = wset: no link of this group was measured, so the map has the mean offset"
+        "half = wset: no link of this group was measured, so the map uses the mean offset"
     ]
 
 

@@ -33,10 +33,10 @@ BATCH: Final = 10_000
 """Number of links that are traced and evaluated together."""
 
 DIFFUSE_BATCH: Final = 50
-"""The same with diffuse reflection, which produces tens of thousands of paths per link."""
+"""Number of such links with diffuse reflection, which produces tens of thousands of paths per link."""
 
 CHUNKS_PER_BATCH: Final = 100
-"""Number of chunks that the workers receive together."""
+"""Number of chunks that are sent to the workers together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ def predict_links(
     The stage of `progress` is "tracing".
 
     Raises:
-        InputError: What `interval` refuses.
+        InputError: `interval` refuses the input.
         EngineError: The paths do not fit into memory, or workers fail repeatedly.
     """
     links = setup.links
@@ -79,11 +79,11 @@ def predict_links(
         workers = InProcess(at_most=0)
     if workers is None:
         return _predict_chunk(_Task(result, setup, level, with_remarks), links, progress)
-    # Predictions need neither the history nor the paths, so that these are not sent to the workers.
+    # Predictions need neither the history nor the paths, so these are not sent to the workers.
     light = replace(result, history=result.history.iloc[:0], paths=None, scene=None)
     task = _Task(light, setup.at(select_links(links, np.array([0]))), level, with_remarks)
     chunks = for_each_chunk(workers, _predict_chunk, task, links, _chunk_size(setup), progress)
-    # Back to the order of the links.
+    # Restore the order of the links.
     order = np.argsort(np.concatenate([link_indices for link_indices, _ in chunks]))
     table = pd.concat([predictions for _, predictions in chunks], ignore_index=True)
     return table.iloc[order].reset_index(drop=True)
@@ -120,7 +120,7 @@ def predict_batches(
             refuse_far_links(result, links, triangles)
             near = True
         except InputError as error:
-            far = error  # refused if it applies to all batches
+            far = error  # raised only if all batches are far
         setup.parameters.check_carriers([frequency for frequency, _ in links.carriers])
         if level is None:
             check_groups(result, links)
@@ -155,11 +155,11 @@ def _predict_chunk(task: _Task, links: Measurements, progress: Progress | None =
 
 
 LOG: Final = logging.getLogger(__name__)
-"""Costs are logged before the work; the command line prints them."""
+"""Logs the expected cost before the work starts; the command line prints it."""
 
 
 def announce(result: Record, links: int, what: str = "links") -> None:
-    """Log how many links are traced, and about how long this takes."""
+    """Log how many links are traced, and roughly how long this takes."""
     counted = f"{links:,} {what.removesuffix('s') if links == 1 else what}"
     if result.prediction.model.parameters is None:
         LOG.info("%s, predicted without a trace: the log-distance model uses no scene", counted)
@@ -167,7 +167,7 @@ def announce(result: Record, links: int, what: str = "links") -> None:
     if (engine := result.study.engine).external:
         once = engine.exports_rays or result.prediction.model.averaged is None
         LOG.info(
-            "%s: the program is called %s for each batch of them; the result's RT calls do not include these calls",
+            "%s: the program is called %s per batch; the result's RT calls do not include these calls",
             counted, "once" if once else "twice",
         )  # fmt: skip
         return

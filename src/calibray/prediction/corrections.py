@@ -1,4 +1,4 @@
-"""What is added to the modelled path loss of new links: nuisance and residual field, and the fallback without a path.
+"""Corrections of the modelled path loss of new links: nuisance, residual field, and the fallback for a missing path.
 
 The nuisance is uncertain for groups without measurements. A link without a path gets the log-distance model with its
 own interval, and its prediction is marked.
@@ -33,14 +33,14 @@ from calibray.validation.held_out_statistics import interval_half_width
 from calibray.validation.models import TX_OFFSET, without_scene
 
 MOST_EXACT: Final = 1000
-"""Number of measured links up to which all of them are used at every new link; with more, only the nearest ones are
-used."""
+"""Number of measured links up to which all of them are used at every new link; if there are more, only the nearest
+ones are used."""
 
 NEAREST: Final = 50
 """Number of nearest measured links used at each new link."""
 
 TOGETHER: Final = 500
-"""Number of new links whose neighbours are solved for together; each needs about 150 kB."""
+"""Number of new links whose kriging equations are solved together; each needs about 150 kB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class Shift(NamedTuple):
     """The contribution of the nuisance to path loss.
 
     Attributes:
-        value_db: With the best coefficients, then with each draw [1 + draws, links], [dB].
+        value_db: Its value for the best coefficients, then for each draw [1 + draws, links], [dB].
         spread_db: Standard deviation at links of groups without a coefficient, otherwise 0 [links], [dB].
     """
 
@@ -84,7 +84,7 @@ def model_terms(model: PredictionModel, links: Measurements) -> Iterator[TermAtL
         InputError: The links lack a column.
     """
     for term in model.terms:
-        # By the name of the term: a column of the study may be called "transmitter" or "offset".
+        # The name of the term decides, because a column of the study may be called "transmitter" or "offset".
         if not term.per:
             labels = None
         elif term.name == TX_OFFSET:
@@ -105,8 +105,8 @@ def nuisance_shift(
     """The contribution of nuisance terms to the path loss of new links, with draws from the posterior by coefficient.
 
     A group without a coefficient gets the mean of the other coefficients. Its spread is their standard deviation s,
-    enlarged by the uncertainty of a mean of n values: s sqrt(1 + 1 / n). With `new_groups`, such groups are allowed
-    also in terms whose spread is not estimated; new transmitters, which no column names, always are.
+    enlarged by the uncertainty of a mean of n values: s sqrt(1 + 1 / n). With `new_groups`, such groups are also
+    allowed in terms whose spread is not estimated; new transmitters, which no column names, are always allowed.
 
     Raises:
         InputError: A group has no coefficient, and `new_groups` is False.
@@ -152,10 +152,10 @@ def fill_missing(
     level: float | None = None,
     least_db: NDArray[np.float64] | float = 0.0,
 ) -> pd.DataFrame:
-    """Use the fallback to predict the links without a path, in a table of the predictions of all links.
+    """Predict the links without a path by the fallback, in a table of the predictions of all links.
 
     The columns are path_loss_db, infinite without a path, basis and, with a level, lower_db and upper_db. The interval
-    is at least twice `least_db` [links], [dB], wide: that of the prediction model.
+    is at least as wide as that of the prediction model, which is twice `least_db` [links], [dB].
     """
     missing = ~np.isfinite(table["path_loss_db"].to_numpy(float))
     if not missing.any():

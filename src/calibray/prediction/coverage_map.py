@@ -61,7 +61,7 @@ def coverage_map(
 
     Args:
         result: The calibration.
-        tx: Position of the transmitter [3], [m]; if None, that of the calibration, if it had only one.
+        tx: Position of the transmitter [3], [m]; if None, that of the calibration, which must have only one.
         height: Height of the receivers above the ground or, where there is no ground, above the scene's lowest point
             [m].
         cell: Width of the cells [m]; the receivers are at their centres.
@@ -75,10 +75,10 @@ def coverage_map(
             of an offset comes from the links measured at this transmitter, if they share one.
         progress: Called with the stage "tracing" after every launch.
         workers: Workers that trace and predict chunks of cells (`engines.open_workers`); this process if None.
-        allow_changed_inputs: Predict although a file of the scene or an antenna has changed since the calibration.
+        allow_changed_inputs: Predict even if a file of the scene or an antenna has changed since the calibration.
 
     Raises:
-        InputError: An argument is impossible, a column is missing, there would be more than a million cells, or
+        InputError: An argument is invalid, a column is missing, there would be more than a million cells, or
             `Result.predict_interval` refuses the links.
         EngineError: The paths do not fit into memory.
     """
@@ -97,8 +97,8 @@ def coverage_map(
         _check_number("power_dbm", power_dbm, -np.inf)
     if power_dbm and study.links.quantity == "rsrp":
         _LOG.warning(
-            "power %g dBm: after a calibration on RSRP the offset contains the transmitted power, so the map is %+g dB "
-            "from RSRP; leave the power out for RSRP", power_dbm, power_dbm,
+            "power %g dBm: after a calibration on RSRP the offset contains the transmitted power, so the map differs "
+            "from RSRP by %+g dB; leave the power out for RSRP", power_dbm, power_dbm,
         )  # fmt: skip
     frame = known_frame(study)
     # The study is opened with one link, 1 m above the transmitter, before the grid is known.
@@ -137,8 +137,8 @@ def coverage_map(
         no_path[batch] = predictions["basis"].str.startswith(NO_PATH)
         if not start and predictions["basis"].str.contains(NEW_GROUP).any():
             stated = ", ".join(f"{name} = {value}" for name, value in constants.items())
-            _LOG.warning("%s: no link of this group was measured, so the map has the mean offset", stated)
-    # Outdoors, the log-distance model does not apply inside buildings.
+            _LOG.warning("%s: no link of this group was measured, so the map uses the mean offset", stated)
+    # In an outdoor study, the log-distance model does not apply inside buildings.
     without_scene = no_path | (result.prediction.model.parameters is None)
     if without_scene.any() and not is_indoors(result, triangles):
         inside = np.zeros(len(rx), dtype=bool)
@@ -152,7 +152,7 @@ def coverage_map(
 
 
 def _transmitter(result: Record, tx: Sequence[float] | None) -> NDArray[np.float64]:
-    """The given position of the transmitter, or that of the calibration's only one [3], [m]."""
+    """The given position of the transmitter, or that of the calibration's only transmitter [3], [m]."""
     if tx is not None:
         position = _numbers(tx)
         if position.shape != (3,) or not np.isfinite(position).all():
@@ -175,7 +175,7 @@ def _column_values(
 ) -> dict[str, object]:
     """Values of the study's columns, the same at every link from this transmitter."""
     if not isinstance(columns, Mapping):
-        raise InputError(f"columns = {columns!r}: must be a dictionary of a value for each column")
+        raise InputError(f"columns = {columns!r}: must be a dictionary with a value for each column")
     study, values = result.study, dict(columns)
     groups = study.offset_groups
     if len(groups) == 1 and groups[0] not in values and {"group", "tx_x"} <= set(result.links):
@@ -248,7 +248,7 @@ def _grid(
     if count.prod() > MOST_CELLS:
         raise InputError(
             f"cell = {cell:g} m: gives {count.prod():.0f} cells of {np.ptp(ends[::2]):.0f} m x "
-            f"{np.ptp(ends[1::2]):.0f} m, must be at most {MOST_CELLS}; use a wider cell, or less area by --bounds"
+            f"{np.ptp(ends[1::2]):.0f} m, must be at most {MOST_CELLS}; use wider cells, or a smaller area (--bounds)"
         )
     eastings, northings = (
         start + cell * (np.arange(int(cells)) + 0.5) for start, cells in zip(ends[:2], count, strict=True)
@@ -257,7 +257,7 @@ def _grid(
 
 
 def _numbers(values: Sequence[float]) -> NDArray[np.float64]:
-    """The values as numbers [n]; NaN if they are none."""
+    """The values as numbers [n]; one NaN if they are not numbers."""
     try:
         return np.array(values, dtype=float).reshape(-1)
     except (TypeError, ValueError):

@@ -4,23 +4,23 @@ The posterior draws represent the possible values. In turn, each draw is taken a
 weighted by their agreement with the measurement that this truth would give. A candidate is ranked by the mean logarithm
 of the remaining standard deviations over draws and parameters (an A-optimal design in relative units, averaged over the
 posterior; K. Chaloner and I. Verdinelli, Bayesian experimental design: a review, Statistical Science 10, 1995). The
-standard deviations are computed in two ways, and the logarithms added:
+standard deviations are computed in two ways, and their logarithms are added:
 
 - by scatter, from the weighted draws: this distinguishes separate minima, but resolves a parameter only relative to its
   whole range;
 - by curvature at each draw: this shows how much a single minimum narrows.
 
 Scatter shows little if a range of a parameter contains few draws. If separate ranges of a parameter fit, the
-probability of ruling out all but one is therefore added to the rank. Values that explain the links so far lie in each
-range, each with its excess sum of squares over the best. At a candidate, the squared difference from the truth is added
-to this excess. The smallest sum in a range is the value that a fit would reach there with all other parameters free. A
-range is ruled out if its smallest sum exceeds that of the true range by the quantile of an interval. Between two models
+probability of ruling out all but one is therefore added to the rank. Each range has values that explain the links so
+far, each with the excess of its sum of squares. At a candidate, the squared difference from the truth is added to this
+excess. The smallest sum in a range is the value that a fit would reach there with all other parameters free. A
+range is ruled out if its smallest sum exceeds that of the true range by the quantile of an interval. For two models,
 this is the T-optimal design of A. C. Atkinson and V. V. Fedorov, The design of experiments for discriminating between
 two rival models, Biometrika 62, 1975, with the expectation over the truth of G. E. P. Box and W. J. Hill,
 Discrimination among mechanistic models, Technometrics 9, 1967.
 
-Candidates are chosen one after another. Candidates share part of their errors, from an unknown offset or common
-clutter. Conditioning after each choice removes this part, so that a second measurement at the same point gains less.
+Candidates are chosen one at a time. They share part of their errors, caused by an unknown offset or by common clutter.
+Conditioning after each choice removes this part, so that a second measurement at the same point gains less.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ UNIFORM_INFORMATION: Final = 12.0
 """Inverse variance of the uniform distribution over the unit interval: the information before any link."""
 
 LEAST_VARIANCE: Final = 1e-5
-"""Variance in the unit cube that the scatter of about a hundred draws cannot resolve."""
+"""Variance in the unit cube below the resolution of the scatter of about a hundred draws."""
 
 SEPARATION_WEIGHT: Final = 8.0
 """Weight of ruling out all ranges of a parameter but one, compared with narrowing it by a factor e."""
@@ -93,7 +93,7 @@ class Outlook:
         index: The candidate.
         narrowed: Standard deviation of every parameter relative to its value before any candidate [d]; at most 1.
         range_probability: Probability of knowing in which of its separate ranges a parameter lies [d]; 1 for one range.
-        information: Information matrix of all links that are then measured, at every draw [n, d, d].
+        information: Information matrix of all links measured by then, at every draw [n, d, d].
     """
 
     index: int
@@ -111,7 +111,7 @@ class Beliefs:
         information: Information matrix of the links measured so far, at every draw [n, d, d].
         piece: Index of the separate range that each parameter lies in [m, d]: first for the draws, then for further
             values that explain the links so far, in ranges with few draws.
-        excess: Sum of squares of each of these values above the least, in noise variances [m].
+        excess: Sum of squares of each of these values minus the smallest one, in noise variances [m].
     """
 
     point: NDArray[np.float64]
@@ -123,10 +123,10 @@ class Beliefs:
 def choose_candidates(
     beliefs: Beliefs, predicted: NDArray[np.float64], slope: NDArray[np.float64], errors: Errors, count: int
 ) -> list[Outlook]:
-    """Choose candidates one after another.
+    """Choose candidates one at a time.
 
     Args:
-        beliefs: What the calibration says.
+        beliefs: The state of the calibration.
         predicted: Path loss of the candidates for every draw and further value [m, candidates], [dB].
         slope: Its derivatives with respect to the coordinates of the unit cube, for the draws [n, candidates, d], [dB].
         errors: Expected errors of the measurements.
@@ -145,7 +145,7 @@ def choose_candidates(
     taken = np.zeros(len(variance), dtype=bool)
     conditioned, outlooks = np.zeros((0, len(variance))), []
     before = np.maximum(np.std(beliefs.point, axis=0), np.sqrt(LEAST_VARIANCE))
-    # Draws that scatter less than the curvature allows have a prior that the information lacks.
+    # Draws that scatter less than the curvature implies follow a prior that the information does not contain.
     scale = np.minimum(before / _by_curvature(beliefs.information), 1.0)
     narrowed = np.ones(len(before))
     for _ in range(min(count, len(variance))):
@@ -169,11 +169,11 @@ def choose_candidates(
         slope -= best_slope[:, None, :] * share[:, None]
         variance = np.maximum(variance - share**2, 1e-6 * errors.own_db**2)
         conditioned = np.vstack([conditioned, share])
-        # Where only the true draw keeps its weight, scatter is too small, and curvature says what is left.
+        # Where only the true draw keeps its weight, scatter is too small, and curvature gives what is left.
         left = np.maximum(
             _scatter(beliefs.point, squares[:, :draws]), scale * _by_curvature(beliefs.information)
         )
-        # A measurement takes nothing away; the scatter of a hundred draws can grow nevertheless.
+        # A measurement removes no information, but the scatter of a hundred draws can still grow.
         narrowed = np.minimum(left / before, narrowed)
         probability = _range_probability(beliefs.piece[:draws], squares[:, :draws])
         outlooks.append(Outlook(best, narrowed, probability, beliefs.information))
@@ -196,10 +196,11 @@ def separation_probability(
 ) -> NDArray[np.float64]:
     """Probability of ruling out all ranges of a parameter but one, after a candidate is measured [candidates].
 
-    It is averaged over draws and parameters; a parameter with one range adds nothing. The excess is the sum of squares
-    of every value above the least, in noise variances [m]; the first n values are the draws. Every parameter lies in a
-    range [m, d]. Squared differences between draws and values at the candidates chosen before are [n, m]; the path loss
-    of the candidates for every value is in standard deviations of their errors [m, candidates].
+    It is averaged over draws and parameters; a parameter with one range adds nothing. `excess` is every value's sum of
+    squares minus the smallest one, in noise variances [m]; the first n values are the draws. `piece` is the range of
+    each parameter [m, d]. `squares` are squared differences between draws and values at the candidates chosen so far
+    [n, m]. `predicted` is the candidates' path loss for every value, in standard deviations of their errors
+    [m, candidates].
     """
     draws, candidates = len(squares), predicted.shape[1]
     ambiguous = [column for column in piece.T if np.ptp(column)]
@@ -234,7 +235,7 @@ def _rank_by_scatter(
     for start in range(0, candidates, size):
         batch = predicted[:, start : start + size].T
         weight = _weights(squares + (batch[:, :, None] - batch[:, None, :]) ** 2)
-        # Moments of the draws if the draw of a row is the truth.
+        # Moments of the draws if the draw of each row is the truth.
         mean = weight @ point
         variance = np.maximum(weight @ point**2 - mean**2, 0.0)
         rank[start : start + size] = 0.5 * np.log(variance + LEAST_VARIANCE).mean(axis=(1, 2))

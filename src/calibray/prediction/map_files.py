@@ -35,7 +35,7 @@ WIDTH_COLORS: Final = "cividis"
 """Matplotlib's colour scales that keep their order for colour-blind readers and in grey; strong signals are bright."""
 
 QUANTILES: Final = (0.02, 0.98)
-"""Quantiles of the cells' values at which the colour scale ends, so that few extreme values do not compress it."""
+"""Quantiles of the cells' values at which the colour scale ends, so that a few extreme values do not compress it."""
 
 
 @final
@@ -45,7 +45,7 @@ class CoverageMap:
 
     Attributes:
         tx: Position of the transmitter [3], [m].
-        height: Height of the receivers over the ground [m].
+        height: Height of the receivers above the ground [m].
         cell: Width of the cells [m].
         x: Eastings of the cells' centres, ascending [nx], [m].
         y: Northings of the cells' centres, ascending [ny], [m].
@@ -55,9 +55,9 @@ class CoverageMap:
         lower_db: Lower end of the interval [ny, nx], [dB]; NaN without a prediction or without a level.
         upper_db: Upper end of the interval [ny, nx], [dB].
         no_path: Cells predicted by the log-distance model, because they have no path [ny, nx].
-        level: Probability that the interval contains a measurement; None for a map without interval.
+        level: Probability that the interval contains a measurement; None for a map without intervals.
         power_dbm: Transmitted power of a map of received power [dBm]; None for a map of path loss.
-        frame: Position of the scene on the globe; None if unknown.
+        frame: Geographic frame of the scene; None if unknown.
         triangles: The scene, for drawing.
         observables: Further observables of the study by name and unit, such as spread_ns [ny, nx].
     """
@@ -160,7 +160,7 @@ def geotiff(coverage: CoverageMap, path: Path) -> None:
     rows, columns = coverage.z.shape
     layout = {"width": columns, "height": rows, "count": len(bands), "dtype": "float32", "nodata": np.nan}
     compressed = {"driver": "GTiff", "compress": "deflate", "predictor": 3}
-    # GDAL only accepts file names in UTF-8, so that the file is made in memory.
+    # GDAL only accepts file names in UTF-8, so the file is made in memory.
     with rasterio.MemoryFile() as memory:
         with memory.open(**compressed, **layout, **georeference) as file:
             for number, (name, values) in enumerate(bands.items(), start=1):

@@ -1,4 +1,4 @@
-"""Further observables at new links, and the interval of a measurement there."""
+"""Further observables at new links, and the interval for a measurement there."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ deviation from them is 9 %."""
 
 
 class Replayed(NamedTuple):
-    """An engine over new links, the values of the prediction model, then of every draw [1 + draws, d].
+    """An engine for new links, and parameter values: of the prediction model, then of every draw [1 + draws, d].
 
-    If path loss is averaged over two sets of values, both precede the draws, and `averaged` is 2. `answers` are the
-    path loss that an external program answers for the values before the draws [averaged, links], [dB].
+    If path loss is averaged over two sets of values, both precede the draws, and `averaged` is 2. `answers` is the
+    path loss that an external program returns for the values before the draws [averaged, links], [dB].
     """
 
     engine: Engine
@@ -57,8 +57,8 @@ def further_observables(
 ) -> dict[str, NDArray[np.float64]]:
     """Further observables at opened links [links] by column name; without the biases of devices.
 
-    The interval has two parts: the errors of single values, from held-out links if there are any, and the draws. There
-    are no columns without further observables, or without a scene in the prediction model.
+    The interval has two parts: the errors of single values, from held-out links if there are any, and the scatter of
+    the draws. The result is empty without further observables, or if the prediction model uses no scene.
     """
     sections = result.study.observables
     if not sections or replayed is None or not isinstance(replayed.engine, Observing):
@@ -113,10 +113,10 @@ def worth_measuring(
     index: NDArray[np.int64],
     information: NDArray[np.float64],
 ) -> list[Worth]:
-    """The best observable of every suggested link [suggestions], the best link first.
+    """The best observable at every suggested link [suggestions], the best link first.
 
     Draws of the parameters, and their derivatives with respect to the coordinates of the unit cube, are [n, d].
-    Information matrices are those with path loss of each suggestion and those above it [suggestions, n, d, d].
+    Information matrices include the path loss of each suggestion and of those above it [suggestions, n, d, d].
     """
     own = {section.kind: (name, section) for name, section in result.study.observables.items()}
     statistics = tuple(own[kind][1].statistic if kind in own else Statistic(kind) for kind in CHOICES)
@@ -153,9 +153,9 @@ def _deviation(information: NDArray[np.float64]) -> NDArray[np.float64]:
 def as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
     """Predictions of path_loss_db and its interval in the measured quantity of the study's links, by column name.
 
-    It is path gain [dB], received power or RSRP [dBm], as `received_power_dbm`, `received_power_lower_dbm` and
-    `received_power_upper_dbm` [links]. Empty if path loss was measured, or the transmitted power of these links is
-    unknown.
+    The quantity is path gain [dB], received power or RSRP [dBm]. The columns are, for example, `received_power_dbm`,
+    `received_power_lower_dbm` and `received_power_upper_dbm` [links]. The result is empty if path loss was measured, or
+    if the transmitted power of these links is unknown.
     """
     quantity = study.links.quantity
     reference = _reference_level(study, links)

@@ -49,11 +49,11 @@ NEIGHBOURS: Final = (0.125, 0.5)
 """Distances of the displaced antennas that are traced, as shares of the largest displacement: 1 and 4 m of 8 m."""
 
 NEAR_SHARE: Final = 0.1
-"""Share of the residual field's variance explained by measured links above which a link is near measured links."""
+"""Share of the residual field's variance explained by measured links above which a link counts as near them."""
 
 WEAKER_DB: Final = 10.0
-"""Path loss above the largest measured one beyond which a prediction has a remark [dB]. In a planted town with wrong
-heights of buildings, such predictions were wrong by up to 46 dB."""
+"""Excess over the largest measured path loss above which a prediction gets a remark [dB]. In a synthetic town with
+wrong heights of buildings, such predictions were wrong by up to 46 dB."""
 
 
 def predict(
@@ -101,7 +101,7 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
     """New links, with the groups and carriers of the study's columns, from a table or from rows of a file.
 
     Raises:
-        InputError: The links are no table, a column is missing, or a position is not finite.
+        InputError: The links are not a table, a column is missing, or a position is not finite.
     """
     if isinstance(links, Measurements):
         return links
@@ -119,7 +119,7 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
 
 
 def _with_measured_spellings(model: PredictionModel, links: Measurements) -> Measurements:
-    """The links with the measured spelling of labels such as 007, which a column without texts reads as 7."""
+    """The links with the measured spelling of labels such as 007, which a purely numeric column reads as 7."""
     for term in model.terms:
         spelling: dict[str, set[str]] = {}
         for label in term.coefficients:
@@ -140,7 +140,7 @@ def _spelled(
 
 
 def _as_number(label: str) -> str:
-    """A label, possibly of several columns, as it reads if its columns contain numbers only."""
+    """A label, possibly of several columns, as it is read if these columns contain only numbers."""
     parts = []
     for part in label.split(" "):
         try:
@@ -155,7 +155,7 @@ def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs:
     """Open the study of a calibration for new links.
 
     Raises:
-        InputError: The scene or the parameters cannot be used, or one of these files has changed.
+        InputError: The scene or the parameters cannot be used, or a file of the scene or an antenna has changed.
     """
     warn_of_carriers(result, links)
     setup = Setup.open(result.study, links=links).placed_at(result.parameters, NEIGHBOURS)
@@ -178,14 +178,14 @@ def warn_of_carriers(result: Record, links: Measurements) -> None:
             where = f"other than {hertz(low)}" if low == high else f"outside {hertz(low)} to {hertz(high)}"
             _LOG.warning(
                 "%s: %d of %d links have carriers %s, where links were measured; materials are extrapolated, which "
-                "the intervals do not include", links.source, beyond.sum(), len(links), where,
+                "the intervals do not account for", links.source, beyond.sum(), len(links), where,
             )  # fmt: skip
 
 
 def refuse_far_links(result: Record, links: Measurements, triangles: Triangles) -> None:
     """Refuse links whose receivers are all far from a scene, given its triangles.
 
-    A scene whose triangles are not all known has no known size.
+    Nothing is refused if some triangles are unknown, because the size of the scene is then unknown.
 
     Raises:
         InputError: All receivers are far.
@@ -199,10 +199,10 @@ def refuse_far_links(result: Record, links: Measurements, triangles: Triangles) 
 
 
 def traced_materials(result: Record, materials: dict[str, Material] | None) -> dict[str, Material] | None:
-    """The materials with which paths are evaluated if these depend on them; otherwise None: one trace serves all.
+    """The materials to trace with if the paths depend on them; otherwise None, because one trace serves all materials.
 
-    The tracer samples only refraction and diffuse reflection by the materials. The powers of a program's rays depend on
-    the materials.
+    The tracer's sampling depends on the materials only with refraction or diffuse reflection. The powers of a program's
+    rays always depend on them.
     """
     trace, rays = result.study.trace, result.study.engine.exports_rays
     return materials if trace.refraction or trace.diffuse_reflection or rays else None
@@ -266,7 +266,7 @@ def interval(
     replayed = _replay(result, setup, draws, progress)
     modelled = _modelled(result, links, replayed) + shift.value_db
     best, reached = modelled[0], np.isfinite(modelled).all(axis=0)
-    # About the best value instead of the draws' mean, so that their difference counts as an error.
+    # Deviations are from the best value instead of the draws' mean, so that their difference counts as an error.
     deviation = np.where(reached, modelled[1:] - np.where(reached, best, 0.0), 0.0)
     factor, between = _quantiles(model, level)
     # `factor` multiplies everything below; the spread of groups needs the quantile of blocks instead.
@@ -309,7 +309,7 @@ def _quantiles(model: PredictionModel, level: float) -> tuple[float, float]:
 
 
 def _residual_db(result: Record, links: Measurements, ratio: float) -> NDArray[np.float64]:
-    """Standard deviation of the prediction model's errors at new links [links], [dB]; between blocks times a ratio.
+    """Standard deviation of the prediction model's errors at new links [links], [dB]; `ratio` scales that of blocks.
 
     Beyond the distance that held-out links had from the others, the variance between blocks is raised by a factor of
     up to two: a place that far away differs from the blocks as these differ from each other. The contribution of random
@@ -332,8 +332,8 @@ def with_constants(result: Record, setup: Setup) -> Setup:
     """The study with the constants of its scene that vary in the draws as further parameters.
 
     Returns:
-        The study with these parameters, after its own; without them for a program that answers with rays, whose own
-        constants vary in the draws. A constant that another carrier of the links changes keeps its law.
+        The study with these parameters after its own; unchanged for a program that returns rays, because only the
+        constants of that program vary in the draws. A constant that differs between the links' carriers keeps its law.
     """
     if result.study.engine.exports_rays:
         return setup
@@ -353,8 +353,8 @@ def _replay(
 ) -> Replayed | None:
     """The paths of opened links, with the values of the prediction model and of every draw; None without a scene.
 
-    A program that answers with path loss is called for the values of the prediction model, which the replay of another
-    ray tracer would miss by its antennas and its physics. The replay gives the change of path loss from draw to draw.
+    A program that returns path loss is called for the values of the prediction model, because the replay of another ray
+    tracer has different antennas and physics. The replay gives the change of path loss from draw to draw.
     """
     prediction, names = result.prediction, setup.parameters.names
     if prediction.model.parameters is None:
@@ -380,7 +380,7 @@ def _replay(
 
 
 def _answers(program: Engine, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Path loss that a program answers to values of its parameters [n, d], [n, links], [dB].
+    """Path loss that a program returns for values of its parameters [n, d], [n, links], [dB].
 
     Raises:
         EngineError: A call failed.
@@ -396,7 +396,7 @@ def _modelled(result: Record, links: Measurements, replayed: Replayed | None) ->
     if replayed is None:
         return without_scene(result.study, links)[None]
     path_loss_db = _path_loss(replayed)
-    # The model ends at the ceiling, as in the fit and on held-out links.
+    # Path loss is limited to the ceiling, as in the fit and on held-out links.
     ceiling_db = result.study.objective.ceiling_db
     path_loss_db = path_loss_db if ceiling_db is None else np.minimum(path_loss_db, ceiling_db)
     mean_db = path_loss_db[: replayed.averaged].mean(axis=0, keepdims=True)
@@ -404,7 +404,7 @@ def _modelled(result: Record, links: Measurements, replayed: Replayed | None) ->
 
 
 def _path_loss(replayed: Replayed) -> NDArray[np.float64]:
-    """Path loss for all values [n, links], [dB]; for a program, its answers and the changes of the replay."""
+    """Path loss for all values [n, links], [dB]; for a program, its answers plus the changes of the replay."""
     if (answers := replayed.answers) is None:
         return replayed.engine.path_loss(replayed.values)
     if len(replayed.values) == len(answers):
@@ -446,9 +446,9 @@ def check_inputs(result: Record, setup: Setup, allow_changed: bool) -> None:
 
 
 def add_remarks(result: Record, setup: Setup, predictions: pd.DataFrame) -> pd.DataFrame:
-    """Predictions with a column of remarks on the ends of a link or otherwise on its path loss, empty without any.
+    """Predictions with a column of remarks on the ends of a link, or else on its path loss; empty without a remark.
 
-    Indoors, if most calibrated receivers are inside a building, the remark on this is omitted.
+    If most calibrated receivers are inside a building, remarks on ends inside a building are omitted.
     """
     links, triangles, by_end = setup.links, read_triangles(setup.scene), []
     if len(triangles.face):
@@ -459,7 +459,7 @@ def add_remarks(result: Record, setup: Setup, predictions: pd.DataFrame) -> pd.D
                 [f"{end} {at}" if at and not (indoors and at == INSIDE) else "" for at in locations]
             )
     weak = _weak(result, predictions["path_loss_db"].to_numpy(float))
-    # Positions explain weak links.
+    # A remark on a position takes precedence, because the position explains a weak link.
     remarks = [", ".join(filter(None, ends)) or other for *ends, other in zip(*by_end, weak, strict=True)]
     return predictions.assign(remark=np.array(remarks, dtype=np.str_))
 

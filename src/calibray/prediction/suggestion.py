@@ -1,4 +1,4 @@
-"""Suggestions where to measure next: candidates ranked by the parameter uncertainty expected after measuring them."""
+"""Suggestions of where to measure next: candidates ranked by the expected uncertainty after measuring them."""
 
 from __future__ import annotations
 
@@ -68,8 +68,8 @@ def suggest(
     """Suggest where to measure next, by the expected narrowing of the parameters' intervals.
 
     Each candidate is traced and replayed for draws from the posterior. If the draws predict the same path loss, a
-    measurement adds nothing; if they differ by more than the error of a link, it rules some of them out. Candidates are
-    chosen one after another, each as the best addition to the earlier ones. Candidates whose mean predicted power is
+    measurement adds nothing; if they differ by more than the error of a link, it rules out some of them. Candidates are
+    chosen one at a time, each as the best addition to the earlier ones. Candidates whose mean predicted power is
     not above the study's noise floor are left out; a warning in the log counts them.
 
     Args:
@@ -77,16 +77,16 @@ def suggest(
         candidates: Possible measurements: links, or a table, as for `Result.predict`.
         count: Number of suggestions.
         progress: Called with the stage "tracing" after every launch.
-        allow_changed_inputs: Continue although a file of the scene or an antenna has changed since the calibration.
-        observables: Also report which further observable is worth measuring there.
+        allow_changed_inputs: Continue even if a file of the scene or an antenna has changed since the calibration.
+        observables: Also report which further observable is worth measuring at each suggestion.
 
     Returns:
         One row per suggestion, the best first: the candidate's row, its positions [m] and group; path_loss_db and
         spread_db, mean and standard deviation of the draws' predictions [dB]; NAME_width for every parameter, the
         expected width of its 95 % interval once this candidate and those above are measured; NAME_sure, where several
-        ranges fit, the expected probability of knowing the right one; and gain, a summary as text. With `observables`
-        also observable, which narrows the intervals most if it is measured in addition to path loss at this candidate
-        and those above, and observable_gain, a summary as text.
+        ranges fit, the expected probability of knowing the right one; and gain, a summary as text. With `observables`,
+        also observable, the quantity that narrows the intervals most if it is measured in addition to path loss at this
+        candidate and those above, and observable_gain, a summary as text.
 
     Raises:
         InputError: `Result.predict` would refuse the input, except for unknown groups; the calibration has no draws; or
@@ -147,7 +147,7 @@ def _received(
     All remain if the study has no noise floor, or the transmitted power of the candidates is unknown.
 
     Raises:
-        InputError: None is above it.
+        InputError: No candidate is above it.
     """
     floor = result.study.links.noise_floor_dbm
     powers = as_measured(result.study, links, pd.DataFrame({"path_loss_db": path_loss_db}))
@@ -183,7 +183,7 @@ class _ReplayedDraws:
         self.engine = self._engine(setup)
         problem = _as_calibrated(result, Problem.of(setup, self.engine))
         parameters, objective = problem.parameters, problem.objective
-        # Constants of the scene have tight priors, and take no degree of freedom from the residuals.
+        # Constants of the scene have tight priors, and take no degrees of freedom from the residuals.
         freedom = problem.freedom + len(parameters) - len(result.study.parameters)
         if freedom < 1:
             raise InputError(
@@ -260,7 +260,7 @@ class _ReplayedDraws:
         return np.einsum("nmi,nmj->nij", slopes, slopes)
 
     def _further_values(self, draws: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values around the draws in every separate range, distributed as the curvature there allows [k, d]."""
+        """Values around the draws in every separate range, with the scatter that the curvature implies [k, d]."""
         parameters, piece = self.problem.parameters, self._pieces(draws)
         members = [
             np.flatnonzero(piece[:, k] == number)
@@ -326,9 +326,9 @@ class _ReplayedDraws:
         return share * at_links.value[:, None], unknown
 
     def _errors(self, candidates: Measurements, common: NDArray[np.float64]) -> Errors:
-        """Expected errors of candidates, which have no weight: calibration links count equally.
+        """Expected errors of candidates. These have no weights, so calibration links count equally.
 
-        `common` is as for `Errors`. Residuals of neighbouring links may be correlated, unless the study rules it out.
+        `common` is as for `Errors`. Residuals of neighbouring links may be correlated, unless the study rules this out.
         """
         problem, objective, links = self.problem, self.problem.objective, self.problem.setup.links
         counted, point = objective.weight > 0, _calibrated_point(self.result, problem)
@@ -346,7 +346,7 @@ class _ReplayedDraws:
 def _as_calibrated(result: Record, problem: Problem) -> Problem:
     """The problem of the calibration: its links, its spreads and errors, and priors of the drawn constants.
 
-    Links near the noise floor are not among its links.
+    Links near the noise floor are excluded.
     """
     first = len(result.study.parameters)
     constants, priors = problem.parameters.items[first:], problem.priors
@@ -397,7 +397,7 @@ def _table(
             for gain, probability in zip(gains, probabilities, strict=True):
                 if probability > before + LEAST_GAIN:
                     gain.append(
-                        f"right range of {name} known with {percent(probability)} (now {percent(before)})"
+                        f"right range of {name} known with probability {percent(probability)} (now {percent(before)})"
                     )
     table["gain"] = [", ".join(gain) or "no interval narrower by more than 2 %" for gain in gains]
     return pd.DataFrame(table)
@@ -416,7 +416,7 @@ def _gain(result: Record, narrowed: NDArray[np.float64]) -> str:
 def _width(result: Record, name: str, narrowed: float) -> float:
     """Width of a parameter's interval after the draws are narrowed by a factor, on the scale of the search.
 
-    The draws refer to the buildings that the links meet. The measurement does not show how much other buildings differ,
+    The draws refer to the buildings that the links meet. A measurement does not show how much other buildings differ,
     so this part of the width remains.
     """
     section, interval = result.study.parameters[name], result.intervals.get(name)
@@ -427,7 +427,7 @@ def _width(result: Record, name: str, narrowed: float) -> float:
         (np.log(ends) if log else ends).mean(),
         *(np.ptp(np.log(bounds) if log else bounds) / 2 for bounds in (ends, seen)),
     )
-    # Squares add: what other buildings differ by, and the rest, which the measurement narrows.
+    # Squares add: the differences of other buildings, and the rest, which the measurement narrows.
     half = min(float(np.hypot(np.sqrt(max(half**2 - seen_half**2, 0.0)), narrowed * seen_half)), half)
     after = np.array([middle - half, middle + half])
     return float(np.ptp(np.exp(after) if log else after))

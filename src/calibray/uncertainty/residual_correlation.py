@@ -99,7 +99,7 @@ def fit_correlation(
     if not pairs.any():
         raise InputError("noise: all receivers have the same position; set range_m = 0")
     if not errors.any():
-        raise EngineError("noise: all errors are zero, which no noise explains; check the measured values")
+        raise EngineError("noise: all errors are zero, so no noise can be fitted; check the measured values")
     # Below these ranges, errors are independent; above them, they are common to all links.
     log_ranges = np.log([pairs[pairs > 0].min() / 3, 3 * pairs.max()])
 
