@@ -16,7 +16,7 @@ __all__ = ["main"]
 def main() -> None:
     """Run the command line of this process and exit."""
     if not sys.warnoptions:
-        warnings.simplefilter("ignore")  # warnings of libraries, for programmers; the tests make them errors
+        warnings.simplefilter("ignore")  # library warnings are for programmers; the tests raise them
     try:
         from calibray.cli.app import app
 

@@ -24,18 +24,18 @@ from calibray.support.interruption import INTERRUPTED, ensure_interruption
 from calibray.support.memory import check_address_space
 
 LONGEST: Final = 4096
-"""Largest number of characters of an argument; paths on Linux are not longer."""
+"""Maximum number of characters in an argument, which is also the limit of a path on Linux."""
 
 
 class Commands(TyperGroup):
-    """Commands that report expected failures by a message and an exit status, without a traceback."""
+    """A group of commands that report expected failures with a message and an exit status, without a traceback."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Refuse overlong and empty arguments, then parse."""
         for argument in args:
             if len(argument) > LONGEST:
-                ctx.fail(f"an argument has {len(argument)} characters, but the most is {LONGEST}")
-            # An empty name of a folder would be the current one.
+                ctx.fail(f"an argument has {len(argument)} characters; the maximum is {LONGEST}")
+            # An empty folder name would mean the current folder.
             if not argument.strip():
                 ctx.fail("an argument is empty; give a value, or omit the option")
         return super().parse_args(ctx, args)
@@ -58,7 +58,7 @@ class Commands(TyperGroup):
             echo(f"Error: {error}", err=True)
             raise typer.Exit(1) from error
         except MemoryError as error:
-            echo("Error: not enough memory; end other programs, or use fewer links at once", err=True)
+            echo("Error: not enough memory; close other programs, or use fewer links at once", err=True)
             raise typer.Exit(1) from error
         except BrokenPipeError:
             raise
@@ -70,7 +70,7 @@ class Commands(TyperGroup):
             )
             raise typer.Exit(1) from error
         except KeyboardInterrupt as error:
-            # The command itself reports what was kept. Report here an error that occurred during the interruption.
+            # The command itself reports what was kept. An error during the interruption is reported here.
             if isinstance(error.__cause__, (InputError, EngineError)):
                 echo(f"Error: {error.__cause__}", err=True)
             echo("Interrupted", err=True)
@@ -83,15 +83,15 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    # Plain help: Rich would double the time of --help.
+    # Plain help: Rich would double the time that --help takes.
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-"""All commands; a new one is a module with a function and is listed below."""
+"""All commands. To add one, write a function in a module of its own, and list it below."""
 
 
 def _print_version(requested: bool) -> None:
-    """Print the version and exit, if it was requested."""
+    """Print the version and exit, if requested."""
     if requested:
         from importlib import metadata
 
@@ -113,7 +113,7 @@ for command in (  # in the order of `--help`
     doctor, demo, open, init, schema, run, report, compare, validate, trace, predict, map, suggest, export, ledger,
     cache,
 ):  # fmt: skip
-    # Without a short help, Typer shortens the summary. Errors are for callers from Python.
+    # Without a short help, Typer truncates the summary. The errors matter only to Python callers.
     text = (command.__doc__ or "").partition("\n    Raises:")[0]
     app.command(help=text, short_help=text.partition("\n\n")[0])(command)
 app.add_typer(scene)

@@ -40,7 +40,7 @@ def log() -> Console:
 
 
 def echo(text: str, err: bool = False, nl: bool = True) -> None:
-    """Print text with control characters escaped: names in it come from files and must not control the terminal."""
+    """Print text with control characters escaped, because names from files must not control the terminal."""
     from calibray.support.messages import printable
 
     typer.echo(printable(text, keep="\n\t"), err=err, nl=nl)
@@ -63,7 +63,7 @@ def print_costs() -> None:
 
 
 def option(placeholder: str, meaning: str, *names: str, **limits: Any) -> Any:
-    """An option with a value; its names are given if they are not that of the argument."""
+    """An option with a value; `names` are needed only if they differ from the argument's name."""
     return typer.Option(*names, metavar=placeholder, help=meaning, **limits)
 
 
@@ -83,7 +83,7 @@ Overwrite = Annotated[
 
 @dataclass(frozen=True)
 class Pool:
-    """Options that state the workers; their fields are the arguments of `calibray.engines.open_workers`."""
+    """Options for the workers; the fields are the arguments of `calibray.engines.open_workers`."""
 
     workers: Annotated[
         int | None, option("N", "Number of local processes among which chunks of links are distributed.")
@@ -95,13 +95,13 @@ class Pool:
 
 @dataclass(frozen=True)
 class Permissions:
-    """Options that permit what is refused otherwise."""
+    """Options that permit what is otherwise refused."""
 
     allow_changed_inputs: Annotated[
         bool,
         typer.Option(
             "--allow-changed-inputs",
-            help="Continue although a file of the result, the scene or an antenna has changed.",
+            help="Continue even if a file of the result, the scene or an antenna has changed.",
         ),
     ] = False
     overwrite: Overwrite = False
@@ -123,7 +123,7 @@ def read_origin(text: str) -> tuple[float, float]:
 
 
 def with_groups(command: Callable[..., None]) -> Callable[..., None]:
-    """A command in which each argument that is a dataclass becomes one option for each of its fields."""
+    """Convert a command: every field of an argument that is a dataclass becomes an option."""
     arguments: dict[str, Any] = get_type_hints(command, include_extras=True)
     groups: dict[str, Any] = {name: kind for name, kind in arguments.items() if is_dataclass(kind)}
     options: list[Parameter] = []
@@ -161,7 +161,7 @@ def warn(study: Study, links: Measurements) -> None:
 
 
 LINE_INTERVAL: Final = 4.0
-"""Time between two lines without a terminal [s]; shorter work prints no line."""
+"""Interval between progress lines without a terminal [s]; shorter work prints no line."""
 
 STARTING: Final = "starting"
 """The stage shown before the first stage with a count: reading, importing, compiling."""
@@ -243,7 +243,7 @@ class _State:
 
 @contextmanager
 def _lines(console: Console, every: float) -> Iterator[Progress]:
-    """Prints lines from a separate thread, so that they also appear while the work reports nothing."""
+    """Print lines from a separate thread, so that they also appear while the work reports nothing."""
     state, finished = _State(), Event()
 
     def print_lines() -> None:
@@ -260,7 +260,7 @@ def _lines(console: Console, every: float) -> Iterator[Progress]:
 
 
 def line(stage: str, done: int, total: int | None, seconds: float) -> str:
-    """Stage, share, rate, time and remaining time as one line, as far as they are known.
+    """Stage, share, rate, elapsed time and remaining time as one line; unknown values are left out.
 
     Example:
         >>> line("tracing", 30, 120, 15.0)

@@ -1,4 +1,4 @@
-"""`calibray doctor`, `cache` and `ledger`: check this machine or a scene, and look after what is kept between runs."""
+"""`calibray doctor`, `cache` and `ledger`: check this machine or a scene, and manage files kept between runs."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def ledger(
 
 
 def calls_table(frame: pd.DataFrame) -> Table:
-    """The RT calls of a ledger, one row per call; the last column is the first line of its message."""
+    """The RT calls of a ledger, one row per call; the last column is the first line of the call's message."""
     from pandas.api.types import is_numeric_dtype
 
     from calibray.tables import Column, Table, numbers

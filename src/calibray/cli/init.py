@@ -15,11 +15,11 @@ from calibray.support.messages import command, counted
 
 @dataclass(frozen=True)
 class Known:
-    """Options that state what the table of links lacks."""
+    """Options for values that the table of links lacks."""
 
     transmitters: Annotated[Path | None, option("FILE", "Table of transmitter positions.")] = None
     track: Annotated[
-        Path | None, option("FILE", "GPX track that gives each row the position at its time.")
+        Path | None, option("FILE", "GPX track that gives the position of each row at its time.")
     ] = None
     antennas: Annotated[Path | None, option("DIR", "Folder of MSI files named after the antennas.")] = None
     tx: Annotated[str | None, option("X,Y,Z", "Transmitter position in the scene frame [m].")] = None

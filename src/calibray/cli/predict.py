@@ -50,7 +50,7 @@ def predict(
         typer.Argument(
             metavar="LINKS",
             help="CSV or Parquet file with the position columns of the study, or tx_x, tx_y, tx_z, rx_x, rx_y, rx_z "
-            "[m]; with its group column if its offset has one, and its frequency column if it has one.",
+            "[m]; it also needs the group column of the study's offset and the study's frequency column, if any.",
             show_default=False,
         ),
     ],
@@ -110,7 +110,7 @@ def predict(
                 columns = {name: predictions[name].to_numpy() for name in (*names, *texts)}
                 measured = as_measured(study, links, predictions)
                 measured |= {name: predictions[name].to_numpy() for name in further if name in predictions}
-                # In the order: predictions, basis, the measured quantity, remark.
+                # Column order: predictions, basis, the measured quantity, remark.
                 remark = {} if level is None else {"remark": columns.pop("remark")}
                 append(links.frame.rename(columns=renamed).assign(**columns, **measured, **remark))
                 _collect_warnings(warnings, links.row, predictions)
@@ -120,7 +120,7 @@ def predict(
     if UNREACHED in warnings and result.prediction.fallback is not None:
         received = study.links.noise_floor_dbm is not None
         reason = (
-            "; it is fitted to powers above the noise floor, so theirs may be much lower" if received else ""
+            "; as it is fitted above the noise floor, the true powers may be much lower" if received else ""
         )
         echo(
             f"The log-distance model predicts the links without a path; see the column basis{reason}",
@@ -172,7 +172,7 @@ def _warn(warning: str, rows: Sequence[int], count: int) -> None:
 
 
 def _renamed_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -> dict[str, str]:
-    """New names for columns of the table that have the name of a prediction, such as measured path loss."""
+    """New names for columns of the table that share a name with a prediction, such as measured path loss."""
     renamed = {name: f"input_{name}" for name in columns if name in frame}
     for name, new in renamed.items():
         if new in frame:
@@ -183,7 +183,7 @@ def _renamed_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) 
 
 @dataclass(frozen=True)
 class SuggestOptions:
-    """Options that state what is suggested, and in which form."""
+    """Options for the suggestions and their output."""
 
     count: Annotated[int, option("N", "Number of links to suggest.", min=1)] = 5
     out: Annotated[
@@ -240,7 +240,7 @@ def suggest(
 
 
 def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
-    """Positions of suggestions, and the gain expected from each together with those above it, as tables."""
+    """Tables of the suggested positions, and of the gain expected from each together with those above it."""
     from calibray.measurements.placement import POSITION_COLUMNS
 
     grouped = ["group"] if "group" in suggestions else []
@@ -277,13 +277,13 @@ def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
 
 @dataclass(frozen=True)
 class Area:
-    """Options that state the transmitter and the receivers of a map."""
+    """Options for the transmitter and the receivers of a map."""
 
     tx: Annotated[
         tuple[float, float, float] | None,
         option(
             "X Y Z",
-            "Transmitter position [m]; by default that of the links, if they have only one transmitter.",
+            "Transmitter position [m]; by default the transmitter of the links, if there is only one.",
         ),
     ] = None
     height: Annotated[float, option("M", "Height of the receivers above the ground [m].")] = 1.5
@@ -296,7 +296,7 @@ class Area:
 
 @dataclass(frozen=True)
 class Values:
-    """Options that state what is predicted, and how."""
+    """Options for the predicted values."""
 
     level: Annotated[
         float, option("P", "Probability that a measurement lies in the interval; 0 for no interval.")
@@ -308,7 +308,7 @@ class Values:
         str | None,
         option(
             "N|auto",
-            "Number of rays instead of the study's. The time grows with this number; too few rays miss paths.",
+            "Number of rays instead of the study's. More rays take more time; too few rays miss paths.",
         ),
     ] = None
     column: Annotated[
@@ -332,7 +332,7 @@ def map(
 ) -> None:
     """Predict path loss over an area and write map.tif (GeoTIFF), map.png and map.csv.
 
-    For cells without a path, the log-distance model predicts; the map hatches these cells.
+    The log-distance model predicts cells without a path; the map hatches these cells.
     """
     target = out or folder
     with progress_bars(log()) as progress:
@@ -347,7 +347,7 @@ def map(
         print_costs()
         result = Result.load(folder, allow_changed_inputs=permissions.allow_changed_inputs)
         inputs = result.study.files()
-        # Checked before the tracing, which takes long.
+        # Checked before tracing, which takes a long time.
         check_outputs(target, FILES, inputs, permissions.overwrite)
         with open_workers(pool.workers, pool.scheduler) as workers:
             coverage = coverage_map(

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Changes:
-    """Options that replace the study's own."""
+    """Options that override those of the study."""
 
     method: Annotated[
         str | None, option("NAME", "Method instead of the study's: auto, sgwo-im, gwo, ...")
@@ -50,14 +50,14 @@ class Changes:
 
 @dataclass(frozen=True)
 class RunPool:
-    """Options that state the workers, which may also run an external program."""
+    """Options for the workers, which may also run an external program."""
 
     workers: Annotated[
         int | None,
         option(
             "N",
-            "Number of local processes among which chunks of links are distributed, or of simultaneous programs "
-            "of the engine 'command'.",
+            "Number of local processes among which chunks of links are distributed, or of programs that the engine "
+            "'command' runs in parallel.",
         ),
     ] = None
     scheduler: Annotated[
@@ -70,7 +70,7 @@ class RunPool:
 
 @dataclass(frozen=True)
 class Output:
-    """Options that state what is printed and written."""
+    """Options for what is printed and written."""
 
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON instead of tables.")] = (
         False
@@ -247,7 +247,7 @@ def trace(
 
 
 def _traces(study: StudyModel) -> bool:
-    """Whether the ray tracer finds the paths of a study, and no table or program."""
+    """Whether the ray tracer finds the paths of a study, rather than a table or a program."""
     return study.rays_path is None and not study.engine.exports_rays
 
 
@@ -264,7 +264,7 @@ def _trace(
     study, links = setup.study, setup.links
     if _traces(study) and (announcement := setup.tracer.plan(links).announcement(len(links))):
         echo(announcement, err=True)
-    # With the antennas and facades of the study, as a calibration traces.
+    # With the antennas and facades of the study, as in a calibration.
     paths = setup.trace(progress=progress)
     if out is not None:
         paths.save(out, overwrite)

@@ -29,7 +29,7 @@ Out = Annotated[Path, option("DIR", "Folder for scene.xml and the meshes.", "--o
 
 @dataclass(frozen=True)
 class MapOptions:
-    """Options of scenes of buildings and ground."""
+    """Options for scenes with buildings and ground."""
 
     terrain: Annotated[
         Path | None, option("FILE", "GeoTIFF height model of the ground; by default the ground is level.")
@@ -78,7 +78,7 @@ class MapOptions:
 
     @property
     def inputs(self) -> list[Path]:
-        """The files that the options name."""
+        """The files named by the options."""
         return [] if self.terrain is None else [self.terrain]
 
     @property
@@ -125,7 +125,7 @@ def osm(
     out: Out,
     options: MapOptions,
 ) -> None:
-    """Make a scene from the buildings of an OpenStreetMap extract, with a file of its trees."""
+    """Make a scene from the buildings of an OpenStreetMap extract, and a file with its trees."""
     from calibray.scenes.authoring import SCENE_FILES, TREES_FILE, read_openstreetmap, read_trees
     from calibray.support.output_files import check_outputs
 
@@ -162,12 +162,12 @@ def footprints(
 
 @dataclass(frozen=True)
 class PlanOptions:
-    """Options of scenes of floor plans."""
+    """Options for scenes from floor plans."""
 
     height: Annotated[float, option("M", "Height of walls for which the plan states none [m].")] = 3.0
     unit: Annotated[
         float | None,
-        option("M", "Unit of length of the plan [m]; 0.001 for mm. Without it, that of a DXF, or metres."),
+        option("M", "Unit of length of the plan [m]; 0.001 for mm. By default the DXF unit, or metres."),
     ] = None
     floor: Annotated[bool, typer.Option(help="Make a floor.")] = True
     ceiling: Annotated[bool, typer.Option(help="Make a ceiling.")] = True
@@ -260,7 +260,7 @@ def _check_origin(origin: str | None, buildings: Footprints) -> None:
 
 
 def _types(entries: list[str]) -> dict[str, SurfaceMaterial]:
-    """Materials by type of wall, from entries such as `drywall=plasterboard:0.1`."""
+    """Materials by wall type, from entries such as `drywall=plasterboard:0.1`."""
     from calibray.scenes.authoring import WALL_THICKNESS, material_name
 
     types: dict[str, SurfaceMaterial] = {}

@@ -15,7 +15,7 @@ from calibray.support.messages import command
 
 @dataclass(frozen=True)
 class Division:
-    """Options that state which links are held out in turn."""
+    """Options for the links that are held out in turn."""
 
     blocks: Annotated[
         int | None,
@@ -79,7 +79,7 @@ def validate(
 
 @dataclass(frozen=True)
 class Runs:
-    """Options that state the runs to compare."""
+    """Options for the runs to compare."""
 
     methods: Annotated[
         str, option("NAMES", "Methods, separated by commas; METHOD@CALLS sets the budget of one method.")
@@ -102,7 +102,7 @@ def compare(
     """Compare methods on a study: many seeds, equal budgets of RT calls, replayed paths."""
     import os
 
-    # The matrices are small, so threads of BLAS cost more than they gain; runs are distributed over processes instead.
+    # The matrices are small, so BLAS threads cost more than they save; runs are distributed over processes instead.
     # NumPy reads these variables when it is imported, here and in the workers.
     for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
@@ -120,7 +120,7 @@ def compare(
     check_outputs(out, FILES, Study.load(study_file).files(), overwrite)
     parsed = parse_methods(names, runs.budget)
     calls = runs.seeds * sum(method.budget for method in parsed if not method.stops_by_itself)
-    free = "".join(f", without those of {method.name}" for method in parsed if method.stops_by_itself)
+    free = "".join(f", not counting {method.name}" for method in parsed if method.stops_by_itself)
     echo(
         f"{runs.seeds * len(parsed):,} runs with {calls:,} RT calls in total{free}; "
         f"runs that are kept in {out} are not repeated",

@@ -1,8 +1,8 @@
-"""Comparison of methods at equal budgets: every method from many seeds on one problem.
+"""Comparison of methods at equal budgets: every method runs with many seeds on one problem.
 
-The result is the excess of every method versus RT calls, as numbers, tables, files and a figure: the best objective so
-far minus the global optimum of the same data. The optimum comes from least squares with many starts, or from a run that
-reached a lower value.
+The result is the excess of every method versus RT calls, as numbers, tables, files and a figure. The excess is the best
+objective so far minus the global optimum of the same data. The optimum comes from least squares with many starts, or
+from a run that reached a lower value.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from calibray.support.progress import Progress
 from calibray.tables import Column, Table, numbers, short_html, short_text
 
 CALLS: Final = (30, 60, 225)
-"""Numbers of RT calls for which the excess is tabulated, in addition to the end."""
+"""Numbers of RT calls at which the excess is tabulated, in addition to the end of the run."""
 
 COLUMNS: Final = (
     Column("method"), Column("uses"), numbers("RT calls"),
@@ -88,11 +88,11 @@ class Comparison:
         return np.array([run.first(self.optimum + excess_db) for run in self.runs[name]])
 
     def table(self) -> pd.DataFrame:
-        """One row per method: excesses after some RT calls, and RT calls to some excesses.
+        """One row per method: the excess after given numbers of RT calls, and the RT calls needed for given excesses.
 
-        Median, quartiles and worst excess after 30, 60 and 225 RT calls and at the end; the median RT calls to an
-        excess over all runs (empty if at least half of them did not reach it) and how many runs reached it; failed
-        runs; median seconds per run.
+        Columns: median, quartiles and worst excess after 30, 60 and 225 RT calls and at the end; the median number of
+        RT calls to reach an excess (empty if at least half of the runs did not reach it), and the number of runs that
+        reached it; the number of failed runs; the median seconds per run.
         """
         return pd.DataFrame([self._row(method) for method in self.methods])
 
@@ -103,7 +103,7 @@ class Comparison:
         ]
 
     def history(self) -> pd.DataFrame:
-        """Every improvement of every run, and its last RT call: columns method, seed, call, best_db, failure."""
+        """Every improvement of every run, and the run's last RT call: columns method, seed, call, best_db, failure."""
         parts = [
             pd.DataFrame(
                 {
@@ -137,7 +137,7 @@ class Comparison:
         }
         for calls in (*CALLS, None):
             column = "end" if calls is None else str(calls)
-            # A smaller budget says nothing about this number of calls. No run has 2^62 calls, which stand for the end.
+            # A smaller budget says nothing about this number of calls. No run has 2^62 calls, which mean the end.
             reached = calls is None or method.stops_by_itself or calls <= method.budget
             excess = self.excess(method.name, 2**62 if calls is None else calls)
             for statistic, share in (("median", 0.5), ("q25", 0.25), ("q75", 0.75), ("worst", 1.0)):
@@ -162,7 +162,7 @@ def quantile(values: NDArray[np.float64], share: float) -> float:
     """
     ordered = np.sort(values)
     position = share * (len(ordered) - 1)
-    # Between two infinite values, their difference would not be a number.
+    # The difference of two infinite values would be NaN.
     low, high = ordered[int(np.floor(position))], ordered[int(np.ceil(position))]
     return float(low) if low == high else float(low + (position % 1.0) * (high - low))
 
@@ -175,7 +175,7 @@ def table(comparison: Comparison) -> Table:
 
 
 def optimum_text(comparison: Comparison) -> str:
-    """The optimum to which excesses refer, as a line of text."""
+    """The optimum from which excesses are measured, as a line of text."""
     return f"Optimum {comparison.optimum:.6g} dB, found by {comparison.found_by}"
 
 
@@ -248,7 +248,7 @@ def figure(comparison: Comparison) -> Figure:
 
 
 ROUNDING_DB: Final = 1e-7
-"""Difference below which two objectives are equal."""
+"""Difference below which two objectives count as equal."""
 
 OPTIMUM: Final[RunKey] = ("optimum", 0, 0)
 """Key of the reference search among the runs."""
@@ -257,7 +257,7 @@ REFERENCE: Final = "least-squares"
 """Method of the reference search."""
 
 OPTIMUM_STARTS: Final = {False: 2048, True: 64}
-"""Number of its local searches on small and on large path programs."""
+"""Number of local searches of the reference search on small (False) and large (True) path programs."""
 
 OpenProblem = Callable[[], ComparisonProblem]
 
@@ -271,13 +271,13 @@ def compare(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> Comparison:
-    """Run methods from seeds 0, 1, ... on one problem at equal budgets of RT calls.
+    """Run methods with seeds 0, 1, ... on one problem at equal budgets of RT calls.
 
     Every finished run is appended to `runs.jsonl` in `out` at once. If the file contains a run of the same problem,
-    optimizer code, method, budget and seed, it is not repeated.
+    optimizer code, method, budget and seed, that run is not repeated.
 
     Args:
-        open_problem: Makes the problem; picklable for several workers, which call it once each.
+        open_problem: Makes the problem. With several workers, it must be picklable, and each worker calls it once.
         methods: Methods with their budgets (`parse_methods`).
         seeds: Number of runs of each method.
         out: Folder that keeps the runs.
@@ -314,7 +314,7 @@ def compare(
 
 
 def parse_methods(names: Sequence[str], budget: int) -> tuple[BudgetedMethod, ...]:
-    """Parse methods, as in "gwo@600", or with the common budget; duplicates are left out.
+    """Parse method names, such as "gwo@600"; `budget` applies to names without one, and duplicates are left out.
 
     Raises:
         InputError: The list is empty, a method is unknown, or a budget is invalid.
@@ -362,7 +362,7 @@ def _finished(
     tasks: list[tuple[BudgetedMethod, int]],
     workers: int,
 ) -> Iterator[MethodRun]:
-    """The runs, as they finish."""
+    """Yield the runs as they finish."""
     if workers == 1 or len(tasks) < 2:
         yield from (method.run(problem, seed) for method, seed in tasks)
         return

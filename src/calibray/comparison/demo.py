@@ -35,7 +35,7 @@ MAPPING_CALLS: Final = 8
 
 
 def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = None) -> Demo:
-    """Run the experiment on "replay" (trace once) or "retrace" (trace for every RT call, as in the paper).
+    """Run the experiment with the engine "replay" (trace once) or "retrace" (trace for every RT call, as in the paper).
 
     `progress` is called for every stage, whose name begins with the method.
 
@@ -167,7 +167,7 @@ class Demo:
 
 
 def cost(demo: Demo) -> Table:
-    """RT calls and time of every method, and those that the paper reports."""
+    """RT calls and time of every method, and the paper's values."""
     columns = (
         Column("method"), numbers("RT calls"), numbers("time", "s"),
         numbers("paper: calls"), numbers("paper: time", "s"),
@@ -185,7 +185,7 @@ def cost(demo: Demo) -> Table:
 
 
 def permittivity(demo: Demo) -> Table:
-    """Permittivities of every method, the planted values, and those of the paper at its own site."""
+    """Permittivities from every method, the planted values, and the paper's values at its own site."""
     columns = (
         Column("material"),
         Column("before"),

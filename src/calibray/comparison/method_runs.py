@@ -60,7 +60,7 @@ class ComparisonProblem:
 
 
 def study_problem(path: str | Path) -> ComparisonProblem:
-    """Make a problem of a study file on its stored paths, which are traced if the cache does not contain them.
+    """Make a problem from a study file and its stored paths, which are traced if the cache does not contain them.
 
     Raises:
         InputError: The study cannot be used, or its engine is an external program.
@@ -77,7 +77,7 @@ def study_problem(path: str | Path) -> ComparisonProblem:
     problem = with_preliminary_fits(Problem.of(setup, engine))
     objective, parameters = problem.objective, problem.parameters
     lower, upper = parameters.search_bounds
-    # Everything that changes an evaluation: the study but its method, its files, and the data that follow from them.
+    # Everything that changes an evaluation: the study except its method, its files, and the data derived from them.
     content = {key: section for key, section in problem.setup.study.content().items() if key != "method"}
     record = (
         fingerprint(setup),
@@ -106,7 +106,7 @@ def study_problem(path: str | Path) -> ComparisonProblem:
 
 
 LIMITS: Final = {"seeds": 10_000, "workers": 1_000, "budget": 1_000_000}
-"""Largest accepted numbers; a comparison with larger ones would not end in useful time."""
+"""Largest accepted numbers; a comparison with larger ones would take impractically long."""
 
 RunKey = tuple[str, int, int]
 """Method, budget and seed, which identify a run on a problem."""
@@ -133,10 +133,10 @@ class BudgetedMethod:
 
     @staticmethod
     def parse(name: str, budget: int) -> BudgetedMethod:
-        """Parse a method, as in "gwo@600", or with the common budget [RT calls].
+        """Parse a method name, such as "gwo@600"; `budget` applies if the name states none [RT calls].
 
         Raises:
-            InputError: The method is unknown, the budget is not a whole number or too small, or the method has none.
+            InputError: The method is unknown or takes no budget, or the budget is not a whole number or is too small.
 
         Example:
             >>> BudgetedMethod.parse("gwo@600", 225)
@@ -150,7 +150,7 @@ class BudgetedMethod:
             with suppress(ValueError):
                 budget = int(calls)
         least = 1 if schedule is None else schedule.least
-        # Python also reads 6_00, +600 and " 600" as numbers; the name of a run must state its budget in one way.
+        # Python also reads 6_00, +600 and " 600" as numbers; a run's name must state its budget in only one way.
         if (at and calls != str(budget)) or not least <= budget <= LIMITS["budget"]:
             raise InputError(
                 f"method {name!r}: the budget {calls if at else budget} must be a whole number of RT calls from "
@@ -159,14 +159,14 @@ class BudgetedMethod:
         return BudgetedMethod(name, method, budget)
 
     def key(self, seed: int) -> RunKey:
-        """The key of a run from a seed, with the budget 0 if the method stops by itself."""
+        """The key of the run with a seed; its budget is 0 if the method stops by itself."""
         return self.method, 0 if self.stops_by_itself else self.budget, seed
 
     def optimizer(self, problem: ComparisonProblem, seed: int) -> Optimizer:
         """Make the optimizer of a run, which respects the budget or stops by itself.
 
         Raises:
-            InputError: The method does not fit the problem, or its library is not installed.
+            InputError: The method does not suit the problem, or its library is not installed.
         """
         return optimizers.make(
             self.method,
@@ -194,7 +194,7 @@ class MethodRun:
         seed: Its seed.
         evaluations: RT calls that it used.
         calls: Numbers of the RT calls that improved on all earlier ones.
-        best: Objectives there, [dB].
+        best: Objectives of these calls [dB].
         seconds: Duration [s].
         failure: The error that ended it; empty if it finished.
     """
@@ -241,20 +241,20 @@ def run_optimizer(problem: ComparisonProblem, key: RunKey, make: Callable[[], Op
 
 
 class RunFile:
-    """Finished runs of one problem, in a file of JSON lines that can also contain runs of other problems.
+    """Finished runs of one problem, in a JSON Lines file that can also contain runs of other problems.
 
     Runs are appended one by one, so an interrupted comparison continues where it stopped. The file is created when the
     first run is added; `problem` is a digest of everything that determines a run apart from method, budget and seed.
 
     Raises:
-        InputError: The file contains something else.
+        InputError: The file contains something other than runs.
     """
 
     def __init__(self, path: Path, problem: str) -> None:
         self._path, self._problem = path, problem
         self._runs: dict[RunKey, MethodRun] = {}
         text = path.read_text(encoding="utf-8") if exists(path) else ""
-        # A killed process may have left a last line without its end.
+        # A killed process may have left an incomplete last line.
         self._torn = bool(text) and not text.endswith("\n")
         for line in text.splitlines():
             try:
