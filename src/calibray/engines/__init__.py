@@ -1,14 +1,14 @@
 """Engines compute the path loss of candidates.
 
 - `Replay` evaluates stored paths, with derivatives, in microseconds per candidate.
-- `ReplayCarriers` does so at several carriers.
+- `ReplayCarriers` does the same at several carriers.
 - `ChunkedReplay` replays chunks of links in this process or on workers, which return only sums.
 - `Retrace` runs the ray tracer again for every candidate, as the paper does.
 - `Command` calls an external program.
 - `Recorded` adds a `Ledger` to the last two, so that no RT call is repeated.
 
-One RT call is a run of one candidate over all links. Calls are counted here, where the engine runs. `engines.kinds`
-defines the engine sections of a study file and is imported with the study; what needs JAX is loaded when used.
+One RT call is a run of one candidate over all links. Every engine counts its own calls. `engines.kinds` defines the
+engine sections of a study file and is imported with the study; modules that need JAX are loaded on first use.
 """
 
 from typing import TYPE_CHECKING

@@ -1,13 +1,13 @@
-"""Compression replaces tens of thousands of paths by few weighted ones, within a stated error of path loss.
+"""Compression replaces tens of thousands of paths with a few weighted paths, within a stated error of path loss.
 
 The power of a link is a sum over its paths, P(x) = sum_p p_p(x), of functions of the candidate x. Within the bounds of
-a few parameters these functions span a space of few dimensions, so few of them with weights w >= 0 suffice:
+a few parameters these functions span a low-dimensional space, so a few of them with weights w >= 0 suffice:
 sum_p w_p p_p(x) is fitted to P(x) at training candidates by non-negative least squares. Paths are added greedily until
 the fit is good enough (C. Farhat, T. Chapman, P. Avery, Int. J. Numer. Methods Eng. 102 (2015) 1077).
 
 Weights are non-negative and the paths are physical, so a compressed link behaves as a link between the training
 candidates as well. The error is nevertheless measured at new candidates, many of them on faces of the bounds. If a
-link's error there exceeds half the tolerance, it is fitted again to more candidates, or keeps all its paths.
+link's error there exceeds half the tolerance, the link is fitted again to more candidates, or keeps all its paths.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths, take
 
 TOLERANCE_DB: Final = 0.01
-"""Default of the largest error of a link's path loss [dB]."""
+"""Default tolerance: largest error of a link's path loss [dB]."""
 
 MIN_PATHS: Final = 64
 """A link with fewer paths is not compressed, because the gain would be small."""
@@ -39,29 +39,29 @@ CHECK_SHARE: Final = 0.5
 """Largest error at new candidates as a share of the tolerance; the rest allows for candidates that are not checked."""
 
 TRAINING: Final = 16
-"""Number of random training candidates per parameter in the first fit, plus the same number once; corners of the bounds
-are added."""
+"""With d parameters, the first fit uses TRAINING * (d + 1) random training candidates, in addition to corners of the
+bounds."""
 
 CORNER_PARAMETERS: Final = 5
-"""Number of parameters whose corners are all fitted; further parameters have their middle value there."""
+"""Number of parameters whose bounds define the fitted corners; further parameters have their middle value there."""
 
 CHECKED: Final = 48
-"""New candidates of every check."""
+"""Number of new candidates in every check."""
 
 ROUNDS: Final = 6
 """Number of fits of a link before it keeps all its paths."""
 
 RANKING: Final = 16
-"""Candidates that rank the paths by power."""
+"""Number of candidates used to rank the paths by power."""
 
 POOL: Final = 2000
-"""Number of strongest paths of a link that may be kept, and of random other paths."""
+"""Number of a link's strongest paths that may be kept, and also of randomly chosen weaker paths."""
 
 BATCH_POWERS: Final = 400_000_000
 """Largest number of powers, paths times candidates, in memory at once."""
 
 FIRST_INTERVALS: Final = 512
-"""First number of intervals of a table of coefficients."""
+"""Initial number of intervals in a table of coefficients."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Compressed:
     Attributes:
         paths: The program over the same links. The weights are part of the spreading factors of its paths, so it is
             valid only for the sum of powers, not for delays or sums of fields.
-        error_db: Largest difference of path loss from the full program at the checked candidates [L], [dB].
+        error_db: Largest difference in path loss from the full program at the checked candidates [L], [dB].
         candidates: Number of candidates, not used in the fit, at which every compressed link was checked.
     """
 
@@ -81,9 +81,9 @@ class Compressed:
 
 
 def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERANCE_DB) -> Compressed:
-    """Compress a program for given parameters within their bounds, for path loss by the sum of powers.
+    """Compress a program for given parameters within their bounds, for path loss from the sum of powers.
 
-    The largest error of a link's path loss is `tolerance_db` [dB]. Returns the compressed program and its error.
+    `tolerance_db` is the largest error of a link's path loss [dB]. Returns the compressed program and its error.
 
     Raises:
         InputError: The tolerance is not a positive number, or a parameter's material is not in the paths.
@@ -114,7 +114,7 @@ def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERAN
     compressed = take(paths, kept)
     compressed = replace(
         compressed,
-        # Weights are factors of powers, spreading is one of amplitudes.
+        # Weights multiply powers; spreading factors multiply amplitudes.
         spreading=compressed.spreading * np.sqrt(weight[kept]),
         settings={**compressed.settings, "compressed_db": tolerance_db},
     )
@@ -122,18 +122,18 @@ def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERAN
 
 
 def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
-    """A program without the paths that together carry at most a share of a link's power, for sums of powers.
+    """A program without the weakest paths, which together carry at most `share` of a link's power; for sums of powers.
 
-    The power is the sum over candidates that are spread over the parameters' bounds, so the share of the omitted paths
-    at a single candidate is smaller. Raises InputError if a parameter's material is not in the paths.
+    The shares are summed over candidates spread over the parameters' bounds, so the omitted paths carry even less at a
+    single candidate. Raises InputError if a parameter's material is not in the paths.
     """
-    from scipy.stats import qmc  # takes 0.4 s
+    from scipy.stats import qmc  # the import takes 0.4 s
 
     candidates = parameters.from_unit(qmc.Sobol(len(parameters), rng=0).random(RANKING))
     _, strength, _ = _evaluate_all(paths, parameters, [candidates], FIRST_INTERVALS)
     order = np.lexsort((strength, paths.link))
     total = np.concatenate([[0.0], np.cumsum(strength[order])])
-    # Share of a path together with all weaker ones of its link.
+    # Combined share of a path and all weaker paths of its link.
     weaker = total[1:] - total[np.searchsorted(paths.link, paths.link[order])]
     return take(paths, np.sort(order[weaker > share]))
 
@@ -143,7 +143,7 @@ def _candidate_sets(parameters: Parameters) -> list[NDArray[np.float64]]:
 
     A fit fails first where it extrapolates, so half of the candidates of a check are on faces of the bounds.
     """
-    from scipy.stats import qmc  # takes 0.4 s
+    from scipy.stats import qmc  # the import takes 0.4 s
 
     d, random = len(parameters), np.random.default_rng(0)
     corners = np.full((2 ** min(d, CORNER_PARAMETERS), d), 0.5)
@@ -162,8 +162,8 @@ def _evaluate_all(
 ) -> tuple[list[NDArray[np.float64]], NDArray[np.float64], float]:
     """Evaluate the whole program.
 
-    Power of every link at each set of candidates [n, L]; share of every path in its link's power, summed over the
-    ranking candidates [P]; largest error of a tabulated coefficient.
+    Returns power of every link at each set of candidates [n, L], the share of every path in its link's power, summed
+    over the ranking candidates [P], and the largest error of a tabulated coefficient.
     """
     plan = layout(paths, np.float32, intervals, phases=False)
     totals, errors = [], []
@@ -181,7 +181,7 @@ def _evaluate_all(
 
 
 def _pool(paths: Paths, strength: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Paths that may be kept, ascending: of every link with many paths the strongest and as many random others."""
+    """Indices of paths that may be kept, ascending: for links with many paths, the strongest and as many at random."""
     random, pool = np.random.default_rng(0), []
     for of_link in np.split(np.arange(paths.num_paths), np.flatnonzero(np.diff(paths.link)) + 1):
         if len(of_link) > MIN_PATHS:
@@ -193,7 +193,7 @@ def _pool(paths: Paths, strength: NDArray[np.float64]) -> NDArray[np.int64]:
 def _batches(
     links: NDArray[np.integer], size: NDArray[np.int64], candidates: int
 ) -> list[NDArray[np.integer]]:
-    """Links whose candidate paths' powers fit into memory together."""
+    """Batches of links; the powers of all candidate paths of a batch fit into memory."""
     batch = np.cumsum(size[links]) * candidates // BATCH_POWERS
     return [part for part in np.split(links, np.flatnonzero(np.diff(batch)) + 1) if len(part)]
 
@@ -210,7 +210,7 @@ class _Powers:
         self._powers: dict[int, NDArray[np.float64]] = {}
 
     def at(self, set_index: int, paths: slice) -> NDArray[np.float64]:
-        """Powers of some paths at one set of candidates [n, paths]."""
+        """Powers of a slice of the paths at one set of candidates [n, paths]."""
         if set_index not in self._powers:
             tables = self._tables[set_index].astype(np.float32)
             powers = [np.asarray(path_powers(self._program, table)) for table in tables]
@@ -225,14 +225,14 @@ def _fit_link(
 
     Candidates without power, for instance without scattering, are left out, because no weight changes a zero.
     """
-    # Largest relative error of a power, from one in decibels.
+    # Largest relative error of a power, converted from decibels.
     bound = FIT_SHARE * tolerance_db * np.log(10) / 10
     shares, first = [], None
     for index, total in enumerate(totals):
         positive = total > 0
         share = powers.at(index, paths)[positive] / total[positive, None]
         if index:
-            # The first set only trains; each further one checks the fit to all before it.
+            # The first set is only for training; each further set checks the fit to all earlier sets.
             weight = sparse_weights(np.vstack(shares), bound, first)
             first = np.flatnonzero(weight)
             error = float(np.abs(10 * np.log10(share @ weight)).max(initial=0.0))

@@ -43,15 +43,15 @@ def make(
         progress: Called after every launch of a trace ("tracing"), or every RT call of a batch ("running").
         ledger: SQLite file that stores RT calls. Replay does not use it, because computing an answer is faster than
             reading one.
-        workers: Run the calls of a batch on "command", or keep chunks of links on "replay" (`open_workers`).
+        workers: Run the calls of a batch for "command", or keep chunks of links for "replay" (`open_workers`).
         paths: Paths of the study's links for "replay"; if None, they are traced or read from the cache.
 
     Returns:
         The engine, over all links of the study, including held-out links.
 
     Raises:
-        InputError: The engine is unknown, does not suit the study, or takes no workers; the ledger cannot be used; or
-            the study's scene, links or parameters cannot be used.
+        InputError: The engine is unknown, does not suit the study, or does not support workers; the ledger cannot be
+            used; or the study's scene, links or parameters cannot be used.
     """
     opened = study.opened()
     name = opened.engine.name if name is None else name
@@ -66,14 +66,14 @@ def make(
     engine = opened.engine.open(opened, paths, progress, workers)
     if ledger is None or not opened.engine.expensive:
         return engine
-    # Every expensive kind gives its answers one by one.
+    # Every expensive kind returns its answers one by one.
     return Recorded(cast(Answering, engine), Ledger(ledger), fingerprint(opened), name, progress)
 
 
 def fingerprint(study: OpenedStudy) -> str:
     """Fingerprint (SHA-256, in hexadecimal) of the problem that an engine solves for each candidate.
 
-    Method, seed, measured values, bounds and start values do not enter: studies that differ only in these share their
+    Method, seed, measured values, bounds and start values are left out: studies that differ only in these share their
     calls. For re-tracing, the fingerprint includes the tracer's versions. An external program's version is unknown, so
     its command line is included instead.
     """
@@ -128,7 +128,7 @@ def _fixed_constants(materials: Mapping[str, Material], free: set[str]) -> dict[
 
 
 def _geometry(scene: Scene) -> bytes:
-    """The scene's XML without material constants, some of which are calibrated and must not enter the fingerprint."""
+    """The scene's XML without material constants, because the fingerprint must not include calibrated constants."""
     root = ElementTree.fromstring(scene.xml)
     for constants in root.findall("bsdf"):
         root.remove(constants)

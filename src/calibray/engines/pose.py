@@ -1,4 +1,4 @@
-"""Errors of the stated directions and gains of transmit antennas, as an effect on stored paths."""
+"""Errors in the stated directions and gains of transmit antennas, as an effect on stored paths."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ class PoseError:
     Attributes:
         basis: Directions of departure with their basis vectors [3, 3, P], see `wave_basis`.
         axis: Theta vector of every path in the frame of its first interaction [P, 2].
-        pose: Stated directions that paths share [M].
-        mounted: Number of the pose of every path [P].
-        of_antenna: Paths of each of the antennas.
+        pose: Stated directions, each shared by several paths [M].
+        mounted: Index of every path's pose [P].
+        of_antenna: Paths of each antenna.
         transmitter: Transmitter of every pose [M].
         weights: The changes of yaw [rad], downtilt [rad] and gain [dB] of a transmitter, per unit of each effect
             parameter [3, T, e].
-        antennas: The different antennas.
-        gains: The same by content: a changed file of gains needs another compiled program, whatever its name.
+        antennas: The distinct antennas.
+        gains: Content of the antennas: if a gain file changes but keeps its name, the program is compiled again.
     """
 
     basis: Any
@@ -74,7 +74,7 @@ class PoseError:
 
     def ordered(self, order: NDArray[np.int64]) -> PoseError:
         """See `Effect.ordered`."""
-        # Place of every path in the new order.
+        # Position of every path in the new order.
         place = np.argsort(order)
         return replace(
             self,
@@ -127,7 +127,7 @@ def pose_error(
     """
     names, transmitter = np.unique(labels, return_inverse=True)
     degree = np.pi / 180
-    # Compass bearings grow clockwise, yaw counter-clockwise.
+    # Compass bearings increase clockwise, yaw counter-clockwise.
     unit = {"azimuth": -degree if from_north else degree, "downtilt": degree, "gain": 1.0}
     weights = np.zeros((len(FIELDS), len(names), len(effect_parameters)))
     for number, parameter in enumerate(effect_parameters):

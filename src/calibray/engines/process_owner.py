@@ -12,8 +12,8 @@ from typing import Final
 import psutil
 
 CLOCK_TOLERANCE: Final = 2.0
-"""Largest difference of two readings of one process's start time [s]: if it is counted from 1970, the system's clock
-may be corrected between them.
+"""Largest difference between two readings of a process's start time [s]: if it is measured from 1970, the system clock
+may be corrected between the readings.
 
 The system does not reuse a process number within this time, because it first uses all others.
 """
@@ -25,12 +25,11 @@ class ProcessOwner:
 
     Attributes:
         host: The machine.
-        namespace: The process namespace, in which a container counts its own processes; empty if unknown.
+        namespace: The process namespace, in which a container numbers its own processes; empty if unknown.
         pid: The process number.
-        started: Start time of the process [s since the machine's start, or since 1970 if that is unknown]; process
-            numbers are reused.
-        boot: Identifier of the machine's start, after which the same numbers refer to other processes; empty if
-            unknown.
+        started: Start time of the process [s since boot, or since 1970 if the boot time is unknown]; process numbers
+            are reused.
+        boot: Boot identifier; after another boot, the same numbers refer to other processes. Empty if unknown.
     """
 
     host: str
@@ -88,7 +87,7 @@ class ProcessOwner:
 
 
 def _start_time(pid: int) -> float:
-    """Start time of a process [s]. On Linux it counts from the machine's start, so setting the clock does no harm.
+    """Start time of a process [s]. On Linux it is measured from boot, so it does not depend on the system clock.
 
     Raises:
         FileNotFoundError: The process does not exist; the same applies to `ProcessLookupError` and
@@ -105,7 +104,7 @@ def _start_time(pid: int) -> float:
 
 @cache
 def _boot() -> str:
-    """Identifier of the machine's start; empty if the system has none."""
+    """Boot identifier; empty if the system has none."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError):

@@ -41,14 +41,14 @@ class Engine(Protocol):
         """Path loss [n, L], [dB], for candidates [n, d] in the fields' units; +inf for a link without a path.
 
         Raises:
-            InputError: The candidates have another width, or a value is not finite or unphysical.
+            InputError: The candidates have the wrong width, or a value is not finite or unphysical.
         """
         ...
 
 
 @runtime_checkable
 class Differentiable(Engine, Protocol):
-    """An engine that gives derivatives."""
+    """An engine that computes derivatives."""
 
     @property
     def large(self) -> bool:
@@ -66,7 +66,7 @@ class Differentiable(Engine, Protocol):
         """Path loss [n, L], [dB], and its derivatives with respect to the parameters [n, L, d], [dB] per unit.
 
         Raises:
-            InputError: The candidates have another width, or a value is not finite or unphysical.
+            InputError: The candidates have the wrong width, or a value is not finite or unphysical.
         """
         ...
 
@@ -95,13 +95,13 @@ class Responses:
 
 
 def joined(parts: Sequence[Responses]) -> Responses:
-    """The responses of successive batches of candidates as one."""
+    """Combine the responses of successive batches of candidates."""
     columns = zip(*(part.arrays() for part in parts), strict=True)
     return Responses(*(np.concatenate(column) for column in columns))
 
 
 def of_links(parts: Sequence[Responses], links: Sequence[NDArray[np.intp]]) -> Responses:
-    """Combines the responses of parts of the links [l]; each part gives the indices of its links among all links."""
+    """Combine the responses of subsets of the links; `links` are the indices of every subset among all links [l]."""
     count, arrays = sum(map(len, links)), []
     # Axis of the links in path loss, in observables, and in the derivatives of both.
     for column, axis in zip(zip(*(part.arrays() for part in parts), strict=True), (1, 2, 1, 2), strict=False):
@@ -124,7 +124,7 @@ class Observing(Engine, Protocol):
         """Path loss and the statistics `wanted` of every link for candidates [n, d], one RT call each.
 
         Raises:
-            InputError: The candidates have another width, or a value is not finite or unphysical.
+            InputError: The candidates have the wrong width, or a value is not finite or unphysical.
         """
         ...
 
@@ -133,7 +133,7 @@ Reduction = Callable[[NDArray[np.float64], NDArray[np.float64] | None], Any]
 """Reduces the path loss of a chunk's links [n, l], [dB], and its derivatives [n, l, d] or None, to a few sums."""
 
 Reduced = Callable[[NDArray[np.float64], bool], list[Any]]
-"""From candidates [n, d] and whether derivatives are requested to the result of the reduction for every chunk."""
+"""Maps candidates [n, d], and whether derivatives are requested, to the result of every chunk's reduction."""
 
 
 @runtime_checkable
@@ -177,8 +177,8 @@ class ReplaysScene(Protocol):
     ) -> NDArray[np.float64]:
         """Path loss [n, L], [dB], of the scene alone for candidates [n, d], in the fields' units.
 
-        It is without effects on paths, such as the loss in regions. `walls` are the materials of the scene by the name
-        of the facades that are parts of them.
+        Effects on paths, such as the loss in regions, are left out. `walls` maps the name of every facade to the scene
+        material of its wall.
         """
         ...
 
@@ -190,7 +190,7 @@ class Answer:
     Attributes:
         index: Index of the candidate in the batch.
         path_loss_db: Path loss [L], [dB]; +inf for a link without a path, and for all links of a failed call.
-        seconds: Time of the call [s].
+        seconds: Duration of the call [s].
         failure: Error message with engine and candidate; empty if the call succeeded.
         rays: The response with the rays, as the program wrote it, or further observables [K, L] in SI units as
             little-endian doubles; empty from an engine with neither.
@@ -252,7 +252,7 @@ def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> ND
 def gather_responses(
     answers: Iterable[Answer], shape: tuple[int, int], num_observables: int, first: bool
 ) -> Responses:
-    """Collect path loss and further observables of a batch of answers; NaN for all links of a failed candidate.
+    """Collect path loss and further observables of a batch of answers; the latter are NaN for a failed candidate.
 
     Raises:
         EngineError: Every candidate of the first batch failed.
@@ -269,7 +269,7 @@ def check_candidates(candidates: NDArray[np.float64], width: int) -> NDArray[np.
     """Convert candidates [n, d] to an array, and refuse candidates that cannot be evaluated.
 
     Raises:
-        InputError: The shape differs, or a value is not finite.
+        InputError: The shape is wrong, or a value is not finite.
     """
     values = np.asarray(candidates, dtype=float)
     if values.ndim != 2 or values.shape[1] != width or not len(values):
@@ -286,10 +286,10 @@ class Observable:
     Attributes:
         name: Its name in messages.
         unit: Its unit.
-        measured: Its measured values [L] of given links.
+        measured: Its measured values for given links [L].
         modelled: An engine's values for candidates [n, d]: [n, L], +inf for a link without a path.
-        derivatives: The same with derivatives with respect to the parameters, [n, L] and [n, L, d]; None if there are
-            none.
+        derivatives: An engine's values and their derivatives with respect to the parameters, [n, L] and [n, L, d]; None
+            if there are none.
     """
 
     name: str
@@ -309,4 +309,4 @@ PATH_LOSS: Final = Observable(
     modelled=lambda engine, candidates: engine.path_loss(candidates),
     derivatives=lambda engine, candidates: engine.path_loss_and_jacobian(candidates),
 )
-"""Path loss [dB], on which the paper calibrates."""
+"""Path loss [dB], to which the paper calibrates."""

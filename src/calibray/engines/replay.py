@@ -31,13 +31,13 @@ TABLE_TOLERANCE: Final = 1e-4
 """Largest error of a tabulated coefficient."""
 
 TABLE_CANDIDATES: Final = 32
-"""Candidates spread over the bounds; together with the start values they determine how fine tables must be."""
+"""Number of candidates spread over the bounds; along with the start values they determine how fine tables must be."""
 
 BATCH: Final = 32
 """Largest number of candidates in one call."""
 
 OBSERVED_SIZE: Final = 64
-"""Largest number of candidates in one call of a function of further observables, which is compiled for this number."""
+"""Largest number of candidates in one call for further observables; the function is compiled for this number."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Replay:
 
     @property
     def parts(self) -> tuple[tuple[Replay, NDArray[np.intp]], ...]:
-        """The replay of every carrier with the indices of its links: this one with all links."""
+        """The replay of every carrier with the indices of its links; here, this replay with all links."""
         return ((self, np.arange(self.paths.num_links)),)
 
     @property
@@ -190,7 +190,7 @@ class Replay:
     def _by_parameter(
         self, by_material: NDArray[np.floating], by_effect: NDArray[np.floating]
     ) -> NDArray[np.floating]:
-        """Derivatives by the parameters [..., d] from those by material constants and by effects."""
+        """Derivatives with respect to parameters [..., d] from those with respect to material constants and effects."""
         jacobian = np.empty((*by_effect.shape[:-1], len(self.parameters)), by_effect.dtype)
         jacobian[..., self.parameters.of_materials] = by_material[..., self._rows, self._used_column]
         jacobian[..., self.parameters.of_effects] = by_effect
@@ -217,7 +217,7 @@ class Replay:
         loss, slope, error = fields.path_losses_and_slopes(
             self._program, tables, self._used_columns, self._combining, count
         )
-        # Parameters of effects that none of these links has change nothing.
+        # No effect applies to these links, so derivatives with respect to parameters of effects are 0.
         by_effect = np.zeros((*loss.shape, len(self.parameters.of_effects)), slope.dtype)
         return loss, self._by_parameter(slope, by_effect), error
 
@@ -230,7 +230,7 @@ class Replay:
             *answers, table_error = function(*self._arguments(self._base, batch, size), len(batch))
             too_coarse = table_error > TABLE_TOLERANCE
             refused = np.flatnonzero(too_coarse.any(axis=(1, 2)))
-            # Candidates before the first refused one are accurate; it is evaluated again with finer tables.
+            # Candidates before the first refused one are accurate; evaluation continues from it with finer tables.
             done = refused[0] if len(refused) else len(batch)
             batches.append([np.asarray(answer[:done], dtype=float) for answer in answers])
             start += done
@@ -256,7 +256,7 @@ class Replay:
         """Intervals of the tables by material and mode; None if evaluating every coefficient is faster."""
         if not force and self.interactions <= MAY_TABULATE:
             return None
-        from scipy.stats import qmc  # takes 0.4 s
+        from scipy.stats import qmc  # the import takes 0.4 s
 
         unit = qmc.Sobol(len(self.parameters), rng=0).random(TABLE_CANDIDATES)
         candidates = np.concatenate([self.parameters.start[None], self.parameters.from_unit(unit)])
@@ -265,7 +265,7 @@ class Replay:
         return intervals if force or intervals.sum() <= MOST_NODES * self.interactions else None
 
     def _refine_tables(self, too_coarse: NDArray[np.bool_]) -> None:
-        """Make tables [M, 3] finer for these and all following candidates, or stop using them at the finest."""
+        """Refine the tables in the mask [M, 3] for this and all later candidates; beyond the finest, use no tables."""
         if self._intervals is not None:
             finer = np.where(too_coarse, 2 * self._intervals, self._intervals)
             self._intervals = finer if finer.max() <= fields.FINEST else None
@@ -288,7 +288,7 @@ class CarrierPaths:
     """The paths at one carrier.
 
     Attributes:
-        paths: The path program of the links measured at the carrier, with the constants there.
+        paths: The path program of the links measured at the carrier, with the material constants at this carrier.
         links: Indices of these links among all links [l].
         effects: Effects on the paths.
     """
@@ -300,7 +300,7 @@ class CarrierPaths:
 
 @final
 class ReplayCarriers:
-    """Stored paths, evaluated at several carriers; parameters may be coefficients of laws over frequency.
+    """Stored paths, evaluated at several carriers; parameters may be coefficients of frequency laws.
 
     Args:
         carriers: The carriers; together they contain every link once.
@@ -349,7 +349,7 @@ class ReplayCarriers:
 
     @property
     def large(self) -> bool:
-        """Whether some carrier has so many interactions that a candidate takes milliseconds."""
+        """Whether any carrier has so many interactions that a candidate takes milliseconds."""
         return any(replay.large for replay, _, _ in self._carriers)
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -37,7 +37,7 @@ class RadioSettings:
         bandwidth: Bandwidth [Hz], or None.
         combining: How a link's paths combine: "power", "coherent" or "band".
         antennas: Transmit and receive antenna.
-        observables: Further observables besides path loss.
+        observables: Observables other than path loss.
     """
 
     frequency: float
@@ -116,11 +116,11 @@ class OpenedStudy(Protocol):
         ...
 
     def with_trace(self, settings: TraceSettings) -> Self:
-        """The same with other settings of the ray tracer, whose scene is not loaded again."""
+        """The same study with other settings of the ray tracer; the scene is not loaded again."""
         ...
 
     def effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
-        """Effects, other than materials, on the paths of links; of all links if None."""
+        """Effects other than materials on the paths of the given links, or of all links if None."""
         ...
 
     def at(self, links: Measurements) -> Self:
@@ -143,9 +143,9 @@ class Openable(Protocol):
 class EngineSection(Section, ABC):
     """``[engine]``: computes the path loss of candidates, chosen by its name.
 
-    To add a kind of engine, write one final subclass in a separate module in `engines.kinds`, where it is found. Its
-    fields are its keys in the study file, and its name is a literal. Put heavy imports into `open`, because every study
-    file that is read imports all kinds.
+    To add a kind of engine, write one final subclass in a separate module in `engines.kinds`, where it is discovered.
+    Its fields are its keys in the study file, and its name is a literal. Put heavy imports into `open`, because reading
+    any study file imports all kinds.
 
     Attributes:
         name: The kind's name in study files.
@@ -172,7 +172,7 @@ class EngineSection(Section, ABC):
     def open(
         self, study: OpenedStudy, paths: Paths | None, progress: Progress | None, workers: Workers | None
     ) -> Engine:
-        """The engine over all links of a study, on `paths` if they are already traced.
+        """The engine over all links of a study, on `paths` if they have already been traced.
 
         Workers run the calls of a batch if the kind is `external`, and keep chunks of links if it is `chunked`.
 

@@ -43,4 +43,4 @@ if TYPE_CHECKING:
     AnyEngine = EngineSection
 else:
     AnyEngine = Annotated[reduce(or_, KINDS.values()), Field(discriminator="name")]
-"""The section of any kind of engine; its name decides which."""
+"""The section of any kind of engine; its name determines the kind."""

@@ -1,4 +1,4 @@
-"""Command: an external program computes path loss for every candidate, one after the other or in parallel."""
+"""Command: an external program computes path loss for every candidate, sequentially or in parallel."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class CommandSection(EngineSection):
     Attributes:
         name: "command".
         command: The program to call, and its arguments.
-        timeout: Time limit of one attempt of the program [s].
+        timeout: Time limit for one attempt [s].
         retries: Number of further attempts after a failure.
         format: Format of the files exchanged with the program: "json" or "hdf5".
         give_up_after: Number of successive failed calls after which the run ends.
@@ -93,7 +93,7 @@ class Command:
         program: How the program is called.
         study: The opened study.
         give_up_after: Number of successive failed calls after which the run ends.
-        executor: Executor for the calls of a batch; if None, one call runs after the other.
+        executor: Executor for the calls of a batch; if None, calls run sequentially.
         progress: Called with "running" after every candidate of a batch.
     """
 
@@ -115,7 +115,7 @@ class Command:
         self._successive_failures, self._give_up_after = 0, give_up_after
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates, as the program answers; see `Answering`."""
+        """Path loss of every link for candidates, from the program's answers; see `Answering`."""
         first = not self.calls
         values = check_candidates(candidates, len(self.parameters))
         return gather(self.answers(values), (len(values), self.num_links), first)
@@ -123,7 +123,7 @@ class Command:
     def respond(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
     ) -> Responses:
-        """Path loss and further observables of every link, as the program answers; see `Observing.respond`.
+        """Path loss and further observables of every link, from the program's answers; see `Observing.respond`.
 
         Raises:
             InputError: The program does not compute these observables, or derivatives are requested.
@@ -139,7 +139,7 @@ class Command:
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
         """Answer candidates, each as soon as its call ends; see `Answering.answers`."""
         if not self.calls:
-            # A study comes from somebody: whoever starts it sees what runs on this machine.
+            # A study may come from someone else, so the user must see what it runs on this machine.
             _LOG.warning(
                 "%s runs a program in %s: %s", printable(str(self._source)), printable(str(self._program.folder)),
                 printable(shlex.join(self._program.words)),
@@ -157,7 +157,7 @@ class Command:
                 self._progress("running", done, len(requests))
             failure = self._describe(requests[index], outcome.failure) if outcome.failure else ""
             yield Answer(index, outcome.path_loss_db, outcome.seconds, failure, outcome.rays)
-            # Counted after the answer was given: whoever takes it may store it before the run ends.
+            # Counted after the answer was yielded, so that the caller can store it before the run ends.
             self._successive_failures = self._successive_failures + 1 if failure else 0
             if self._successive_failures >= self._give_up_after:
                 raise EngineError(
@@ -184,7 +184,7 @@ class Command:
     def _parallel(
         self, requests: list[Request], stop: Event, executor: Executor
     ) -> Iterator[tuple[int, Outcome]]:
-        # An event reaches threads only; programs on other machines run until they end or exceed their time limit.
+        # An event reaches only threads; programs on other machines run until they end or exceed their time limit.
         threads = executor if isinstance(executor, ThreadPoolExecutor) else None
         local_stop = None if threads is None else stop
         waiting, interruption = iter(enumerate(requests)), None
@@ -200,18 +200,18 @@ class Command:
                 for future in wait(pending, POLL, FIRST_COMPLETED).done:
                     outcome = self._outcome(future)
                     yield pending.pop(future), outcome
-                    # A run that is killed repeats calls whose answers are not stored: no more than there are threads.
+                    # A killed run repeats the calls whose answers were not stored: at most one per thread.
                     if not stop.is_set():
                         start(1)
         except (Exception, KeyboardInterrupt) as error:
             interruption = error
         finally:
-            # After the last answer the caller may go on, and waits for the answers of another run.
+            # If all calls have ended, `stop` stays unset, so the caller can still wait for answers of another run.
             if pending:
                 stop.set()
             for future in pending:
                 future.cancel()
-        # Answers of calls that have ended by now are given before the run ends, so that they are not lost.
+        # Answers of calls that have already ended are yielded before the run ends, so that they are not lost.
         for future in wait(pending, None if local_stop else 0).done:
             if not future.cancelled() and not future.exception():
                 yield pending[future], future.result()

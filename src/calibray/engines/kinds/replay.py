@@ -35,11 +35,11 @@ class ReplaySection(EngineSection):
 
     Attributes:
         name: "replay".
-        compress_db: Replay few weighted paths instead of all, with this largest error of path loss [dB]; all paths if
-            None.
-        chunk_links: Largest number of links that are traced and replayed together. If None, all links together, or with
-            workers `chunks.CHUNK_LINKS` links in at most `chunks.MOST_CHUNKS` chunks.
-        rays: Ray table with the paths of another engine, in place of a trace.
+        compress_db: Largest error of path loss when a few weighted paths replace all paths [dB]; if None, all paths are
+            replayed.
+        chunk_links: Largest number of links that are traced and replayed together. If None, all links; with workers,
+            `chunks.CHUNK_LINKS` or as many as give at most `chunks.MOST_CHUNKS` chunks.
+        rays: Ray table with the paths of another engine, instead of a trace.
     """
 
     expensive: ClassVar[bool] = False
@@ -53,7 +53,7 @@ class ReplaySection(EngineSection):
     rays: Text | None = None
 
     def answers_by(self, study: OpenedStudy) -> None:
-        """Nothing: replay keeps no answers."""
+        """None, because replay stores no answers."""
         return
 
     def open(
@@ -80,8 +80,8 @@ class ReplaySection(EngineSection):
         displaced = [item.name for item in study.parameters if item.is_effect and item.field in DISPLACED]
         if displaced:
             raise InputError(
-                f"{study.source}: parameters: {displaced[0]!r}: path loss between traced positions is checked in one "
-                "process; calibrate without --workers and --scheduler (workers=None)"
+                f"{study.source}: parameters: {displaced[0]!r}: path loss between traced positions can only be checked "
+                "in one process; calibrate without --workers and --scheduler (workers=None)"
             )
         chunks = cut(study.links, chunk_size(self.chunk_links, len(study.links)))
         if workers is None and (seconds := seconds_to_trace(study, chunks)) > LONG_TRACE_SECONDS:
@@ -112,7 +112,7 @@ def trace_and_replay(
 def replay(study: OpenedStudy, paths: Paths, compress_db: float | None = None) -> Replay | ReplayCarriers:
     """The replay of an opened study on stored paths, with one program per carrier.
 
-    If few weighted paths approximate all, `compress_db` is the largest error of path loss [dB].
+    `compress_db` is the largest error of path loss if a few weighted paths replace all paths [dB]; None keeps all.
     """
     from calibray.engines.compression import compress
     from calibray.engines.replay import CarrierPaths, Replay, ReplayCarriers

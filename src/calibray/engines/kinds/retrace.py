@@ -59,8 +59,8 @@ class CarrierTracer:
     """The ray tracer at one carrier.
 
     Attributes:
-        tracer: The scene in the ray tracer, with the constants at that carrier before calibration.
-        links: The links measured there.
+        tracer: The scene in the ray tracer, with the constants at this carrier before calibration.
+        links: The links measured at this carrier.
         index: Indices of these links among all links [l].
     """
 
