@@ -163,7 +163,7 @@ def test_comparisons_without_end_are_refused(arguments, tmp_path):
 
 
 def test_blocks_without_number_are_refused(found):
-    with pytest.raises(InputError, match=r"blocks = 1000000000; must be 2 to 100"):
+    with pytest.raises(InputError, match=r"blocks = 1000000000; must be a whole number from 2 to 100"):
         validate(Study.load(found.base / "study.toml"), blocks=10**9)
 
 

@@ -100,7 +100,7 @@ def test_what_is_no_study_no_links_and_no_material(study: cb.Study, paths: cb.Pa
         refused("study: is a .*, must be a Study; read a file", lambda value=value: cb.validate(value))
     for blocks in (2.5, "3", True):
         refused(
-            "blocks = .*; must be 2 to 100, a whole number", lambda b=blocks: cb.validate(study, blocks=b)
+            "blocks = .*; must be a whole number from 2 to 100", lambda b=blocks: cb.validate(study, blocks=b)
         )
     refused("study.toml: is a list, must be a dictionary", lambda: cb.Study.from_content([1]))
     refused(

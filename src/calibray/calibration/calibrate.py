@@ -67,8 +67,8 @@ def calibrate(
 
     Args:
         study: The study, opened or not.
-        method: Method instead of the study's: "auto", "sgwo-im", "gwo", ...
-        seed: Seed instead of the study's.
+        method: Method to use instead of the study's: "auto", "sgwo-im", "gwo", ...
+        seed: Seed to use instead of the study's.
         out: Folder to save the result in. It is checked before any computation. The ledger of RT calls is written
             there, so that an interrupted run repeats no call when it is started again.
         engine: Engine over all links of the study; if None, it is made from the study, with a ledger.
@@ -81,7 +81,7 @@ def calibrate(
             if None, the study itself.
 
     Raises:
-        InputError: Something in the study, the method or the folder cannot be used.
+        InputError: The study, the method or the folder cannot be used.
         EngineError: The engine failed.
 
     Example:
@@ -133,7 +133,7 @@ def calibrate(
     enclosed = setup.enclosed if can_trace else None
     traced = time.perf_counter()
     problem = with_preliminary_fits(problem, progress)
-    # Making the cheap model does not count as time of the search.
+    # The time to make the cheap model does not count as search time.
     paused = time.perf_counter()
     cheap, of_rays = CheapReplay(), ()
     if exporting is None:
@@ -164,6 +164,6 @@ def calibrate(
     run = Run(problem, trail, gap_db, cheap, enclosed, (*of_rays, *on_links), timing)
     result = make_result(run, assessment, validation)
     if out is not None:
-        # The folder was checked before the search; a file that appeared since then must not cost the result.
+        # The folder was checked before the search; a file that appeared since then must not prevent saving.
         result.save(out, overwrite=True)
     return result

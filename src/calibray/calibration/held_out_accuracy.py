@@ -1,8 +1,8 @@
-"""Accuracy on held-out links, chosen by a filter or in blocks, and the prediction model that they choose.
+"""Accuracy on links held out by a filter or in blocks, the prediction model that they choose, and its fallback.
 
-It has the study's nuisances and is fitted to the calibration links, like the baseline in the validation. Links without
-a path are behind obstacles, so their path loss exceeds the prediction of this fit. If the study has enough of these
-links, otherwise of links out of sight, their mean residual is added, and their errors are the errors of the fallback.
+The fallback has the study's nuisances and is fitted to the calibration links, like the baseline in validation. Links
+without a path are behind obstacles, so their path loss exceeds the prediction of this fit. If the study has enough of
+these links, or else of links out of sight, their mean residual is added, and their scatter gives the fallback's errors.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def on_held_out_links(
         errors = {name: (model - objective.measured)[judged] for name, model in modelled.items()}
         baselines = {name: errors[name] for name in BASELINES if name in errors}
         judgement = compare(errors[Model.CALIBRATED], baselines, moving_end(links)[judged])
-        # No link has a residual in all models.
+        # None if no link has a residual in every model.
         judgement = judgement if judgement.links else None
     name, residuals = _choice(problem, trail, modelled, judged)
     accuracy = Accuracy(
@@ -114,7 +114,7 @@ def _choice(
 ) -> tuple[str, HeldOutResiduals]:
     """The model that held-out links choose, and its residuals there; with too few links, the calibrated model.
 
-    `modelled` is the path loss of the models that were compared; may be empty if no link is judged.
+    `modelled` is the path loss of the models that were compared; it is empty if no link is judged.
     """
     objective, setup = problem.objective, problem.setup
     # Kriging is never chosen.
@@ -146,7 +146,7 @@ def _choice(
         return name, HeldOutResiduals(rms_db, basis, count, errors[name], levels)
     rms_db, errors_db = None, objective.model(trail.best_modelled[None])[0] - objective.measured
     if problem.freedom >= 1:
-        # A new link has no weight, so these count equally, as held-out ones do.
+        # A new link has no weight, so these links count equally, as held-out ones do.
         rms_db = float(np.sqrt(np.sum(errors_db[objective.weight > 0] ** 2) / problem.freedom))
     basis = f"errors of {objective.num_counted} calibration links"
     return Model.CALIBRATED, HeldOutResiduals(rms_db, basis, max(round(problem.freedom), 1), np.zeros(0))
@@ -155,7 +155,7 @@ def _choice(
 def log_distance_errors(
     problem: Problem, models: Models, validation: Validation | None
 ) -> tuple[NDArray[np.float64], str]:
-    """Residuals of the log-distance model on held-out links with a path [n], [dB], and what these links are."""
+    """Residuals of the log-distance model on held-out links with a path [n], [dB], and a description of these."""
     if validation is not None:
         basis = f"errors on {len(validation.labels)} blocks held out in turn"
         return validation.errors[Model.LOG_DISTANCE][validation.judged], basis
@@ -196,12 +196,12 @@ def on_blocks(
 
 
 def _groups_db(problem: Problem, block: NDArray[np.int64], links: NDArray[np.int64]) -> float:
-    """Root mean square of the random effects of groups that are in one block only [L], at some links [n], [dB]."""
+    """Root mean square of the random effects of groups that are in one block only [L], at given links [n], [dB]."""
     return float(np.sqrt(np.mean(problem.objective.nuisance.new_group_spread(block)[links] ** 2)))
 
 
 def _out_of_sight(problem: Problem, errors: NDArray[np.float64], links: NDArray[np.int64]) -> float:
-    """Factor by which errors of links out of sight are larger; 1 if the study states this difference."""
+    """Factor by which errors of links out of sight exceed those of all links; 1 if the study states this difference."""
     terms = problem.objective.nuisance.terms
     table = problem.setup.with_obstruction().links.table
     if any(term.around and term.by == OUT_OF_SIGHT for term in terms) or OUT_OF_SIGHT not in table.frame:
@@ -218,8 +218,8 @@ def fit_fallback(
 ) -> PredictionModel:
     """Fit the fallback, the log-distance model, to the calibration links.
 
-    Its errors come from links without a path; if these are too few, from links out of sight, of which some are near the
-    noise floor, as links without a path are; if these are too few as well, from its residuals on held-out links [n],
+    Its errors come from links without a path; if these are too few, from links out of sight, some of which are near the
+    noise floor, like links without a path; if these are too few as well, from its residuals on held-out links [n],
     [dB], which `basis` describes; and otherwise from the calibration links.
     """
     setup, links = problem.setup, problem.setup.links
@@ -229,14 +229,14 @@ def fit_fallback(
     measured = ~setup.held_out if links.censored is None else ~setup.held_out & ~links.censored
     usable, name = without_path & measured, WITHOUT_PATH
     usable = usable if problem.faint is None else usable & ~problem.faint
-    # Lines of sight take time, so only if they are needed.
+    # Lines of sight take time, so they are only computed if needed.
     if usable.sum() < FEW and OUT_OF_SIGHT in (table := setup.with_obstruction().links.table).frame:
         usable, name = (table.numbers(OUT_OF_SIGHT) > 0) & measured, OUT_OF_SIGHT.replace("_", " ")
     count = int(usable.sum())
     if count >= FEW:
         mean_db = float(residuals[usable].mean())
         terms += (FittedTerm(name, CONSTANT, "", {"": mean_db}),)
-        # The error of each link if the mean is that of the others.
+        # The error of each link relative to the mean of the others.
         errors = (residuals[usable] - mean_db) * count / (count - 1)
         basis = f"errors of {count} links {name}"
     elif len(held_out_db) >= FEW:
@@ -244,7 +244,7 @@ def fit_fallback(
     else:
         counted = objective.weight > 0
         count, unknowns = int(counted.sum()), int(objective.determined.sum())
-        # In-sample errors are too small by the unknowns that were fitted to them.
+        # In-sample errors are too small, because unknowns were fitted to them.
         inflation = np.sqrt(count / (count - unknowns)) if count > unknowns else np.nan
         errors = residuals[counted] * inflation
         errors, basis = errors[np.isfinite(errors)], f"errors of {count} calibration links"

@@ -1,7 +1,7 @@
 """Diagnostics of the links of a finished calibration.
 
-They are leverage, depth, and power by material and interaction; which settings of the tracer reach links without a
-path; and what would explain the residuals: a missing region, groups of links, other directions of antennas.
+They are leverage, depth, and power by material and interaction; the tracer settings that reach links without a path;
+and possible explanations of the residuals: a missing region, groups of links, or other antenna directions.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class LinkDiagnostics:
         columns: Columns for the table of links: `leverage`, NaN for a link without weight; `depth`, the number of
             interactions of the strongest path, NaN for a link without a path.
         power_shares: Mean share over the links of the power carried by paths with an interaction, by material and kind
-            of interaction. A path counts in full for each of its interactions, so the sum of the shares exceeds 1.
+            of interaction. A path counts in full for each of its interactions, so the sum of the shares can exceed 1.
     """
 
     columns: dict[str, NDArray[np.float64]] = field(default_factory=dict)
@@ -107,7 +107,7 @@ def _leverage(problem: Problem, best: NDArray[np.float64]) -> NDArray[np.float64
         design = np.zeros((len(rows), columns))
         if columns:
             design[:count] = objective.nuisance.design[counted].toarray() * root[:, None]
-            # The rows of priors follow; they hold the coefficients in part.
+            # The rows of priors follow; they partly determine the coefficients.
             ridge = objective.noise_db / objective.nuisance.prior
             design[count : objective.num_rows] = np.diag(ridge)[ridge > 0]
         result[counted] = leverage(rows, design)[:count]
@@ -115,11 +115,11 @@ def _leverage(problem: Problem, best: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def leverage(jacobian: NDArray[np.float64], design: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Leverage of each link [m]: how much its model follows its own measurement.
+    """Leverage of each link [m]: how closely its modelled value follows its own measurement.
 
     It is the diagonal of the projection onto the derivatives of the residuals, with the nuisance eliminated [m, d], and
     the columns of the nuisance, scaled like the residuals [m, q]: 0 for a link without influence, 1 for a link that
-    alone determines an unknown. The sum is the number of unknowns that the rows determine, also those of priors.
+    alone determines an unknown. The sum is the number of unknowns that the rows, including those of priors, determine.
 
     Example:
         >>> leverage(np.array([[1.0], [1.0], [0.0]]), np.zeros((3, 0))).round(2).tolist()
@@ -136,7 +136,7 @@ def leverage(jacobian: NDArray[np.float64], design: NDArray[np.float64]) -> NDAr
 
 
 class _Power(NamedTuple):
-    """Power of the paths of some links.
+    """Power of the paths of a set of links.
 
     Attributes:
         depth: Number of interactions of every link's strongest path [L].
@@ -179,10 +179,10 @@ FEWEST_CLUSTERS: Final = 8
 """Smallest number of clusters with links inside and outside a group."""
 
 MIXED: Final = 0.5
-"""Share of the variance of membership within clusters above which a group is not a place."""
+"""Smallest share of the variance of membership within clusters; with less, a group is a place."""
 
 SIGNIFICANCE: Final = 0.01
-"""Probability of a remark about any group of any column, or any direction of an antenna, if none differs."""
+"""Probability of a remark about any group of any column, or about any antenna direction, if none differs."""
 
 SMALLEST_DB: Final = 0.05
 """Smallest improvement of the RMSE for which a group or a direction is reported [dB]; a smaller one does not change
@@ -198,7 +198,7 @@ class Difference:
         label: The group's label in it.
         difference_db: Mean residual of the group minus that of its neighbours [dB].
         error_db: Standard error [dB].
-        chance: Probability of a difference as significant by chance, times the number of groups that were tested.
+        chance: Probability of a difference this significant by chance, times the number of groups that were tested.
     """
 
     column: str
@@ -213,8 +213,8 @@ def differing_groups(
 ) -> list[Difference]:
     """The groups of links, such as those of one device, whose residuals differ significantly from those of neighbours.
 
-    Only links of one transmitter and one place are compared: residuals and membership are taken relative to their means
-    over clusters of neighbouring links. A column that is constant in a place, such as a street, therefore shows
+    Only links of one transmitter at one place are compared: residuals and membership are taken relative to their means
+    over clusters of neighbouring links. A column that is constant at a place, such as a street, therefore shows
     nothing, and errors that neighbours share cancel. Each cluster is one observation of the difference, so that
     correlated errors within it do not count as independent (K.-Y. Liang, S. L. Zeger, Biometrika 73, 1986). The most
     significant group comes first.
@@ -261,7 +261,7 @@ SHARE: Final = 0.02
 """Share of links without a path above which the switches are tried; with a smaller share, the fit hardly changes."""
 
 FEWEST: Final = 5
-"""Number of links without a path above which the switches are tried; the table of rows names smaller numbers."""
+"""Number of links without a path above which the switches are tried; the table of rows shows smaller numbers."""
 
 
 def unreached_remark(problem: Problem, progress: Progress | None = None) -> tuple[Remark, ...]:
@@ -311,7 +311,7 @@ MOST_NUMBERS: Final = 12
 """Largest number of distinct numbers that are labels of groups, such as days or floors."""
 
 SIGNAL_CORRELATION: Final = 0.5
-"""Rank correlation with path loss above which whole numbers are levels of a signal, such as a channel quality."""
+"""Rank correlation with path loss above which whole numbers count as signal levels, such as channel quality."""
 
 FEWEST_OF_TRANSMITTER: Final = 2 * LINKS_PER_UNKNOWN
 """Number of links per transmitter needed to test its direction, which has two angles."""
@@ -330,9 +330,9 @@ class Direction(NamedTuple):
 
 
 def region_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
-    """Test whether the loss of a region, such as trees without a map, would explain the residuals of a calibration.
+    """Test whether the loss of a region, such as unmapped trees, would explain the residuals of a calibration.
 
-    Positions of the links must be known. Residuals that are larger out of sight are explained by that first.
+    Positions of the links must be known. A common loss out of sight is fitted first.
     """
     links = problem.setup.links
     if not isinstance(links, Measurements) or not problem.differentiable:
@@ -356,8 +356,8 @@ def _excess_db(problem: Problem, trail: Trail) -> NDArray[np.float64]:
 def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
     """Name the column that no nuisance uses and whose groups, such as devices, explain the residuals of a calibration.
 
-    Labels are texts, carriers, or a few whole numbers that do not follow the measured value, as the levels of a signal
-    do.
+    Labels are texts, carriers, or a few whole numbers that do not follow the measured value, unlike the levels of
+    a signal.
     """
     setup, links = problem.setup, problem.setup.links
     if not isinstance(links, Measurements):
@@ -403,11 +403,11 @@ def _are_labels(cells: pd.Series, path_loss_db: NDArray[np.float64]) -> bool:
 
 
 def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Remark, ...]:
-    """Test whether other directions than the stated ones would explain the residuals of transmit antennas.
+    """Test whether directions of transmit antennas other than the stated ones would explain the residuals.
 
     For each transmitter, this is an F test of two columns: the derivatives of path loss with respect to azimuth and
     downtilt at the calibrated values [d], in addition to the parameters, the nuisance and a gain of that transmitter.
-    The problem is on stored paths; a remark names the transmitters.
+    The problem must use stored paths; the remark names the transmitters.
     """
     setup, engine = problem.setup, problem.engine
     study, table = setup.study, setup.links.table
@@ -445,7 +445,7 @@ def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Rema
 def _derivatives(
     problem: Problem, engine: Replay | Chunked, best: NDArray[np.float64], transmitters: list[str]
 ) -> tuple[Evaluation, dict[str, int]]:
-    """Residuals and derivatives at the calibrated values, also by directions and gains of transmitters; columns."""
+    """Residuals, and derivatives also by directions and gains of transmitters, at the calibrated values; columns."""
     content = problem.setup.study.content()
     poses = {
         f"{POSE}{label}.{field}": {"bounds": [-1.0, 1.0], "start": 0.0}

@@ -77,10 +77,10 @@ class Run:
         problem: The problem, with the paths of the last trace.
         trail: The search.
         retrace_gap_db: Change of every link's path loss when traced again [links], [dB]; None if not traced again.
-        cheap: The cheap model, if the method had one.
+        cheap: The cheap model, if the method used one.
         enclosed: Antennas inside closed bodies; None if this was not checked.
         on_links: Remarks on ray mapping, links without a path, directions of antennas, and groups of links.
-        timing: Time of its parts.
+        timing: Time taken by its parts.
     """
 
     problem: Problem
@@ -139,7 +139,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
     chosen = fit_prediction_model(problem, trail, name, residuals, gap_db)
     table = table.assign(predicted_db=chosen.path_loss_db, scene_db=chosen.scene_db, basis=str(name))
     prediction = Prediction(chosen.model, chosen.materials, _residual_field(problem, table, validation))
-    # A ceiling predicts links without a path.
+    # With a ceiling, links without a path are predicted by the ceiling.
     if chosen.model.parameters is not None and objective.ceiling_db is None:
         without_path = ~table["has_path"].to_numpy(bool)
         fallback = fit_fallback(problem, without_path, *log_distance_errors(problem, models, validation))
@@ -197,7 +197,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
 def _retraced(
     gap_db: NDArray[np.float64] | None, counted: NDArray[np.bool_], tolerance_db: float
 ) -> tuple[Remark, ...]:
-    """A remark that path loss of links [L] changes with a new trace by more than the tolerance."""
+    """A remark if the path loss of links [L] changes by more than the tolerance in a new trace."""
     if gap_db is None or not (np.abs(gap_db[counted]) > tolerance_db).any():
         return ()
     change_db = np.abs(gap_db[counted])
@@ -230,7 +230,7 @@ def _residual_field(
 ) -> ResidualField | None:
     """The correlated part of the prediction model's residuals.
 
-    None if they are uncorrelated, or if predictions of held-out blocks do not improve by it.
+    None if the residuals are uncorrelated, or if this part does not improve predictions of held-out blocks.
     """
     if validation is not None and Model.RESIDUAL_FIELD in validation.errors:
         rmse_db = validation.table["rmse_db"]
@@ -294,9 +294,9 @@ def _replayed_paths(problem: Problem) -> Paths | None:
 def observable_fits(
     run: Run, draws: Mapping[str, Sequence[float]]
 ) -> tuple[dict[str, ObservableFit], dict[str, NDArray[np.float64]]]:
-    """The fit of every further observable by name, and its columns of the table of links.
+    """The fit of every further observable by name, and its columns in the table of links.
 
-    The columns are measured, initial and calibrated values, and biases [L], in the unit. Draws from the posterior, by
+    The columns are measured, initial and calibrated values, and biases [L], in its unit. Draws from the posterior, by
     name of the parameter, may be empty.
     """
     problem = run.problem
@@ -321,7 +321,7 @@ def observable_fits(
             if spread
             else biases
         )
-        # The error of a mean, and that of the parameters.
+        # The error of the mean, and the error due to the parameters.
         errors = np.sqrt(
             observable.std**2 / np.maximum(count, 1) + np.mean((of_draws - biases)[:, groups] ** 2, axis=0)
         )

@@ -40,7 +40,7 @@ class Result(Record):
 
     @classmethod
     def load(cls, folder: str | Path, *, allow_changed_inputs: bool = False) -> Result:
-        """Read a folder that `save` wrote; with `allow_changed_inputs`, although its files were changed since.
+        """Read a folder that `save` wrote; with `allow_changed_inputs`, even if its files were changed since.
 
         Raises:
             InputError: The folder contains no result, or a result of another version, or one that was damaged or
@@ -55,7 +55,7 @@ class Result(Record):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Warnings and advice, the judgement on held-out links, and the reason for the prediction model."""
+        """Warnings and advice, the judgement on held-out links, and the reason for the choice of prediction model."""
         return wording.remarks(self, "" if self.validation is None else self.validation.choice)
 
     @property
@@ -93,7 +93,7 @@ class Result(Record):
                 columns that the study names, and with its group column, if it has one. The study's column of
                 frequencies gives the carriers; without it, all links have the scene's carrier.
             progress: Called with the stage "tracing" after every launch.
-            allow_changed_inputs: Predict although a file of the scene or an antenna has changed since the calibration.
+            allow_changed_inputs: Predict even if a file of the scene or an antenna has changed since the calibration.
 
         Returns:
             Path loss with nuisances [links], [dB]; that of the fallback for a link without a path.
@@ -120,10 +120,10 @@ class Result(Record):
             links: The links, or a table, as for `predict`; their groups need no measurements.
             level: Probability that a measurement lies in the interval.
             progress: Called with the stage "tracing" after every launch.
-            allow_changed_inputs: Predict although a file of the scene or an antenna has changed since the calibration.
+            allow_changed_inputs: Predict even if a file of the scene or an antenna has changed since the calibration.
 
         Returns:
-            One row per link: path_loss_db, lower_db, upper_db [dB]; basis, the source of the interval; the three in the
+            One row per link: path_loss_db, lower_db, upper_db [dB]; basis, the source of the interval; the same in the
             measured quantity if that is not path loss; and remark, a warning about an unlikely antenna position.
 
         Raises:
@@ -187,8 +187,8 @@ class Result(Record):
     def apply(self, scene: object) -> None:
         """Set the calibrated materials in a `sionna.rt.Scene` in memory, at the study's carrier.
 
-        A warning names the carriers if the scene has another one. The constants stay when `scene.frequency` is set,
-        although ITU materials otherwise change with it.
+        A warning names the carriers if the scene has a different one. The constants do not change when
+        `scene.frequency` is set, unlike those of ITU materials.
 
         Raises:
             InputError: The object is not a scene of Sionna RT, or the scene lacks a material.

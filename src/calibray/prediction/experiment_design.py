@@ -12,8 +12,8 @@ standard deviations are computed in two ways, and their logarithms are added:
 
 Scatter shows little if a range of a parameter contains few draws. If separate ranges of a parameter fit, the
 probability of ruling out all but one is therefore added to the rank. Each range has values that explain the links so
-far, each with the excess of its sum of squares. At a candidate, the squared difference from the truth is added to this
-excess. The smallest sum in a range is the value that a fit would reach there with all other parameters free. A
+far, each with its excess sum of squares over the best. At a candidate, the squared difference from the truth is added
+to this excess. The smallest sum in a range is the value that a fit would reach there with all other parameters free. A
 range is ruled out if its smallest sum exceeds that of the true range by the quantile of an interval. For two models,
 this is the T-optimal design of A. C. Atkinson and V. V. Fedorov, The design of experiments for discriminating between
 two rival models, Biometrika 62, 1975, with the expectation over the truth of G. E. P. Box and W. J. Hill,

@@ -48,7 +48,7 @@ class HeldOutResiduals:
         basis: Description of the links to which they belong.
         links: Number of these links, or degrees of freedom if they are calibration links.
         errors_db: The residuals on held-out links [n], [dB]; empty if they belong to calibration links.
-        blocks: The same in two levels; None if no blocks were held out.
+        blocks: The same residuals on two levels; None if no blocks were held out.
     """
 
     rms_db: float | None
@@ -84,18 +84,18 @@ def fit_prediction_model(
 ) -> FittedModel:
     """Fit the chosen model to all links that have a weight.
 
-    An average has the scene of its first model, and the values of the second as further ones.
+    An average uses the scene of its first model, and also stores the parameters of the second.
 
     Args:
         problem: The problem.
         trail: Its search.
         name: The model; see `Model`.
         residuals: Its residuals on new links.
-        retrace_gap_db: Gap of every link between the search's paths and those traced with its optimum [L], [dB];
-            None if not traced again.
+        retrace_gap_db: Change of every link's path loss from the search's paths to those traced with its optimum [L],
+            [dB]; None if not traced again.
 
     Returns:
-        The fitted model. Predictions and exports trace with its materials, so its values at the links contain the gap.
+        The fitted model. Predictions and exports trace with its materials, so its values contain this change.
     """
     setup, parameters = problem.setup, problem.parameters
     uses_scene = name not in WITHOUT_MATERIALS
@@ -124,7 +124,7 @@ def fit_prediction_model(
         parameters.named(others[0].candidate) if others else None,
     )
     materials = parameters.materials(candidate, problem.setup.scene.materials) if uses_scene else None
-    # An exported scene has one material per mesh, that of the walls that facades are parts of, and links at the stated
+    # In an exported scene, each mesh has one material, facades have that of their walls, and links are at the stated
     # positions.
     walls = {name: section.of for name, section in setup.study.facades.items()}
     displaced = [name for name in parameters.names if displaces(name)]
@@ -154,7 +154,7 @@ class FittedVariant:
 
 
 def fit_variant(problem: Problem, trail: Trail, name: Model) -> FittedVariant:
-    """Search the minimum of a variant from the calibrated optimum and new starting points, where it has any."""
+    """Fit a variant, by a search from the calibrated optimum and new starting points if a search is needed."""
     if name == Model.INITIAL:
         objective = models.initial_objective(problem.objective, problem.setup)
         return FittedVariant(problem.parameters.start, objective, problem.before)
@@ -170,8 +170,8 @@ def fit_variant(problem: Problem, trail: Trail, name: Model) -> FittedVariant:
 def averaged_terms(few: tuple[FittedTerm, ...], more: tuple[FittedTerm, ...]) -> tuple[FittedTerm, ...]:
     """The mean of the terms of two models, of which the second has all terms of the first.
 
-    A term that the first lacks has half its coefficients. A group without a coefficient in one model has that of the
-    other.
+    A term that the first lacks gets half its coefficients. A group without a coefficient in one model gets that of the
+    other model.
     """
     known, averaged = {term.name: term for term in few}, []
     for term in more:
@@ -188,9 +188,9 @@ def averaged_terms(few: tuple[FittedTerm, ...], more: tuple[FittedTerm, ...]) ->
 
 
 def with_prior_mean(terms: tuple[FittedTerm, ...], study: StudyModel) -> tuple[FittedTerm, ...]:
-    """The terms of the log-distance model with obstruction, the loss out of sight with the mean of its prior.
+    """The terms of the log-distance model with obstruction, with the mean of the prior added to the loss out of sight.
 
-    The fit treats that mean as known, also if no link out of sight has a weight. A nuisance of the study by the same
+    The fit treats that mean as known, even if no link out of sight has a weight. A nuisance of the study in the same
     column has no such prior.
     """
     if any(term.by == OUT_OF_SIGHT for term in study.nuisance.values()):
@@ -220,7 +220,7 @@ def quantiles(absolute_errors: NDArray[np.float64]) -> tuple[float, ...]:
 def fitted_terms(
     objective: Objective, path_loss_db: NDArray[np.float64], study: StudyModel
 ) -> tuple[FittedTerm, ...]:
-    """Nuisance terms with the coefficients that fit best.
+    """Nuisance terms with their best-fit coefficients.
 
     Args:
         objective: The objective, which has the terms.

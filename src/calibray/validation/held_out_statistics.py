@@ -7,8 +7,8 @@ Statist. 49, 2021, for held-out links). Errors of links have heavier tails than 
 root mean square would be too wide at 90 %. With few errors, the largest are too uncertain, and Student's t is used
 instead.
 
-The law of distance is linear in the distance for times of flight, and linear in its logarithm for all others. Models
-and baselines have the same biases of devices, which the other links determine.
+For further observables, a baseline is linear in distance for times of flight, and otherwise linear in its logarithm.
+Models and baselines have biases of devices, which are fitted to the links that are not held out.
 """
 
 from __future__ import annotations
@@ -48,22 +48,22 @@ MOST_CLUSTERS: Final = 1000
 RESAMPLES: Final = 2000
 
 LEAST_GAIN: Final = 0.05
-"""Smallest decrease of the RMSE, as a share, with which another model is chosen. Smaller decreases came from one block
-of Boulder's, and the fitted model lost up to 3 dB in clusters kept apart; on planted misfits, none was this small."""
+"""Smallest relative decrease of the RMSE for which another model is chosen. In Boulder, smaller decreases came from one
+block, and the fitted model lost up to 3 dB in clusters kept apart; with planted misfits, no decrease was this small."""
 
 REACHED: Final = 0.9
 """Share of the held-out links that lie within the reach of the others."""
 
 AVERAGE_LINKS: Final = 8
-"""Weight of the mean square error of all links in that of links out of sight, as a number of links. A few links out of
-sight contain little information about errors."""
+"""Weight of all links' mean square error in the estimate for links out of sight, as a number of links. A few links out
+of sight contain little information about errors."""
 
 FEWEST_FOR_RANKS: Final = 40
 """Number of errors from which an interval is read off their ranks; with fewer, Student's t is assumed."""
 
 
 def spatial_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Divide positions [n, 2 or 3], [m], into compact blocks of about equal size: the block of each, from 0 [n].
+    """Divide positions [n, 2 or 3], [m], into compact blocks of about equal size, numbered from 0 [n].
 
     The largest block is halved across its longer side until there are enough; at most n are made.
 
@@ -88,14 +88,14 @@ def moving_end(links: Measurements) -> NDArray[np.float64]:
 
 
 def place_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Divide links with positions [n, 3], [m], like `spatial_blocks` in plan, each place within one block [n].
+    """Divide links by horizontal position [n, 3], [m], like `spatial_blocks`, but never divide a place [n].
 
     Example:
         >>> place_blocks(np.array([[0.0, 0, 1], [0.0, 0, 4], [0.0, 0, 7], [9.0, 0, 1]]), 2).tolist()
         [0, 0, 0, 1]
     """
     _, first, place = np.unique(position[:, :2], axis=0, return_index=True, return_inverse=True)
-    # In the order of the links, which decides between equal coordinates.
+    # Places keep the order of the links, which decides between equal coordinates.
     order = np.argsort(first)
     block = np.empty(len(first), dtype=np.int64)
     block[order] = spatial_blocks(position[first[order], :2], count)
@@ -105,8 +105,8 @@ def place_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]
 def compare(errors: NDArray[np.float64], baselines: Errors, position: NDArray[np.float64]) -> Judgement:
     """Compare a model with its best baseline, by residuals on the same held-out links [n], [dB].
 
-    The error of the difference comes from resampling clusters of links whose receivers [n, 3], [m], are neighbours, the
-    same ones for both models. Links with a non-finite residual are left out.
+    The error of the difference comes from resampling clusters of links whose receivers [n, 3], [m], are neighbours,
+    with the same clusters for both models. Links with a non-finite residual are left out.
     """
     table = np.stack([errors, *baselines.values()])
     finite = np.isfinite(table).all(axis=0)
@@ -121,7 +121,7 @@ def compare(errors: NDArray[np.float64], baselines: Errors, position: NDArray[np
     size = np.bincount(cluster)
     total = np.stack([np.bincount(cluster, weights=square[row]) for row in (0, best)])
     resampled = np.random.default_rng(0).integers(len(size), size=(RESAMPLES, len(size)))
-    # Clusters differ in size: sums of squares over sums of links.
+    # Clusters differ in size, so total squares are divided by the total number of links.
     model_rmse, baseline_rmse = np.sqrt(total[:, resampled].sum(axis=2) / size[resampled].sum(axis=1))
     # Resampling k clusters underestimates the variance over new clusters by (k - 1) / k.
     error = None
@@ -132,7 +132,7 @@ def compare(errors: NDArray[np.float64], baselines: Errors, position: NDArray[np
 
 
 def choose(errors: Errors, position: NDArray[np.float64]) -> str:
-    """Choose the model for predictions by held-out residuals [n], [dB], `Model.INITIAL` among them.
+    """Choose the model for predictions by held-out residuals [n], [dB], which include those of `Model.INITIAL`.
 
     The initial materials are kept until another model is better by more than the bootstrap error of the difference, and
     by more than `LEAST_GAIN`. The calibrated model is chosen only if it is significantly better than the one with a
@@ -153,14 +153,14 @@ def choose(errors: Errors, position: NDArray[np.float64]) -> str:
 
 
 def predicting(errors: Errors, position: NDArray[np.float64]) -> str:
-    """The prediction model if held-out residuals choose: the average of the model that they choose, if it has one."""
+    """The prediction model chosen by held-out residuals: the average that belongs to the chosen model, if any."""
     name = choose(errors, position)
     average = AVERAGE_OF.get(name, name)
     return average if average in errors else name
 
 
 def least(errors: Errors, names: tuple[str, ...]) -> str:
-    """The model with the lowest RMSE among those names that have residuals by model [n], [dB]."""
+    """The model with the lowest RMSE among the given names that have residuals [n], [dB]."""
     return min((name for name in names if name in errors), key=lambda name: float(np.mean(errors[name] ** 2)))
 
 
@@ -172,9 +172,9 @@ def two_levels(
 ) -> BlockErrors | None:
     """Variance of held-out errors [n], [dB], within and between blocks (analysis of variance of random effects).
 
-    A new street has its own error, so a few blocks contain less information than their many links. Positions [n, k],
-    [m], are of the links' ends; those of the links that the models were fitted to [m, k] are the other blocks' if None.
-    None with fewer than two blocks, or if there are no more links than blocks.
+    A new street has its own error, so a few blocks contain less information than their many links. `position` [n, k],
+    [m], is that of the links' ends; `fitted` [m, k] is that of the links the models were fitted to, the other blocks if
+    None. The result is None with fewer than two blocks, or if there are no more links than blocks.
 
     Example:
         >>> blocks = two_levels(np.array([3.0, 4, -4, -3, 1, 0]), np.array([0, 0, 1, 1, 2, 2]), np.eye(6))
@@ -185,10 +185,10 @@ def two_levels(
     count, links = len(size), len(errors)
     if count < 2 or links <= count:
         return None
-    # The mean over a block's links scatters by within / size about the error that they share.
+    # The mean over a block's links has the variance within / size about the error that they share.
     mean = np.bincount(index, errors) / size
     within = float(np.sum((errors - mean[index]) ** 2)) / (links - count)
-    # A block's mean error is not corrected in predictions, so it counts from zero.
+    # Predictions do not correct a block's mean error, so its deviation is measured from zero.
     between = max(float(np.mean(mean**2 - within / size)), 0.0) * (1.0 + 1.0 / count)
     distance = np.empty(links)
     for number in range(count):
@@ -214,9 +214,9 @@ def out_of_sight_ratio(errors: NDArray[np.float64], blocked: NDArray[np.bool_]) 
 
 
 def interval_half_width(absolute_errors: NDArray[np.float64], level: float) -> float:
-    """Half the width [dB] of the interval that contains a new error with a probability.
+    """Half the width [dB] of the interval that contains a new error with probability `level`.
 
-    Absolute errors are ascending [n], [dB].
+    Absolute errors are in ascending order [n], [dB].
 
     Example:
         >>> errors = np.sort(np.abs(np.random.default_rng(0).standard_normal(999)))
@@ -243,7 +243,7 @@ def held_out_gaps(
 ) -> dict[str, NDArray[np.float64]]:
     """Predicted minus measured values of every observable on held-out links: `MODELS` [3, L], in its unit.
 
-    They are predicted from the other links at the optimum, in the fields' units [d]; NaN if a link is not judged.
+    Biases are fitted to the other links. The optimum is in the fields' units [d]. A link that is not judged gets NaN.
     """
     if not problem.observed:
         return {}
@@ -263,7 +263,7 @@ def held_out_gaps(
 def observable_errors(
     gaps: Mapping[str, NDArray[np.float64]], study: StudyModel
 ) -> dict[str, ObservableErrors]:
-    """Root mean squares of gaps [3, L] by name of the observable; none without a judged link."""
+    """Root mean squares of gaps [3, L] by name of the observable; observables without a judged link are left out."""
     errors = {}
     for name, gap in gaps.items():
         judged = gap[:, np.isfinite(gap).all(axis=0)]

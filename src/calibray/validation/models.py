@@ -2,8 +2,8 @@
 
 The baselines are the log-distance model, also with the obstruction of the direct line, and kriging.
 
-The variants are the study's own model, its initial materials, a prior around the initial values, and with this prior
-offsets per transmitter and out of sight: what an engineer would try by hand. The best variant differs between
+The variants are the study's own model, its initial materials, a prior around the initial values, and, with this prior,
+offsets per transmitter and out of sight: models that an engineer would try by hand. The best variant differs between
 campaigns, so held-out links decide (`validate.py`). Both offsets have a prior around zero, which keeps them small where
 the links do not need them. One variant therefore has both. Further variants make the choice worse
 (docs/measurements/predictions.md).
@@ -53,13 +53,13 @@ WALL_DB: Final = 2.0
 prior. Outdoors, waves go around buildings; with 5 dB, the error on one cluster of Boulder kept apart was 17 dB."""
 
 ROUNDS: Final = 4
-"""Number of rounds in which the errors and the losses under their priors are fitted; more rounds change 0.01 dB."""
+"""Number of rounds in which the errors and the losses under their priors are fitted; more change results by 0.01 dB."""
 
 LEAST_NOISE_DB: Final = 1.0
 """Smallest error of the log-distance model against which priors are weighed [dB]."""
 
 MOST_KRIGED: Final = 1000
-"""Largest number of links for kriging: fitting the correlation factors their covariance some hundred times."""
+"""Largest number of links for kriging: fitting the correlation factors their covariance a few hundred times."""
 
 
 def without_scene(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
@@ -77,7 +77,7 @@ def without_scene(study: StudyModel, links: Measurements) -> NDArray[np.float64]
 
 
 class Baseline(NamedTuple):
-    """A model without paths: all its unknowns are nuisance coefficients, and its links with a weight determine them.
+    """A model without paths: all its unknowns are nuisance coefficients, which the links with a weight determine.
 
     Attributes:
         objective: The model as an objective.
@@ -88,7 +88,7 @@ class Baseline(NamedTuple):
     known_db: NDArray[np.float64]
 
     def path_loss_db(self) -> NDArray[np.float64]:
-        """Path loss at all links [links], [dB]; a group without links of a weight gets the mean of the others."""
+        """Path loss at all links [links], [dB]; a group whose links have no weight gets the mean of the others."""
         return self.objective.with_nuisance(self.known_db)
 
 
@@ -104,7 +104,7 @@ def log_distance(links: Measurements, objective: Objective, known_db: NDArray[np
     if np.count_nonzero(objective.weight) < 2:
         raise EngineError("the log-distance model needs at least two calibration links")
     # Bounds and priors of an offset or a slope do not apply to the law's intercept and slope; groups may deviate from
-    # these by as much as the study says.
+    # these as much as the study allows.
     terms = [
         replace(term, bounds=UNBOUNDED, prior=np.inf if term.labels == ("",) else term.prior)
         if term.by in (CONSTANT, LOG_DISTANCE)
@@ -121,7 +121,7 @@ def log_distance(links: Measurements, objective: Objective, known_db: NDArray[np
 
 
 def has_obstruction(links: Measurements) -> bool:
-    """Whether the links have the columns that follow from a scene, and the lines of some are blocked."""
+    """Whether the links have the columns that follow from a scene, and the direct line of any link is blocked."""
     return OUT_OF_SIGHT in links.frame and bool(links.table.numbers(OUT_OF_SIGHT).any())
 
 
@@ -143,7 +143,7 @@ def obstructed(links: Measurements, objective: Objective, known_db: NDArray[np.f
         known_db = known_db + OUT_OF_SIGHT_DB[0] * links.table.numbers(OUT_OF_SIGHT)
     nuisance = Nuisance(len(links), tuple(terms))
     model = replace(model, nuisance=nuisance)
-    # The priors are weighed against the errors that remain with the losses that these errors give.
+    # The errors set the weight of the priors, and the priors change the errors: iterate both.
     for _ in range(ROUNDS):
         model = replace(model, noise_db=max(float(model.rmse(known_db[None])[0]), LEAST_NOISE_DB))
     return Baseline(model, known_db)
@@ -188,7 +188,7 @@ def kriged(
 ) -> dict[Model, NDArray[np.float64]]:
     """The result of `kriging` under a name; empty if kriging is impossible.
 
-    There are too few or too many links, or all have the same position.
+    This is so with too few or too many links, or if all have the same position or no residual.
     """
     try:
         return {name: kriging(links, objective, trend_db)}
@@ -238,7 +238,7 @@ def fit_variants(
     Args:
         part: The problem; held-out links have weight 0.
         known_minima: Minima over more links by variant [k, d], as starting points. Without the minima of the study's
-            own model, its whole ranges are searched.
+            own model, the whole ranges of its parameters are searched.
 
     Returns:
         Each variant's problem and its minima, the best first [k, d], by name.
@@ -323,14 +323,14 @@ def _new_starts(problem: Problem) -> int:
 
 
 def initial_objective(objective: Objective, setup: Setup) -> Objective:
-    """The objective of the initial materials: with an offset of all links, unless the study declares one."""
+    """The objective of the initial materials: with a common offset of all links, unless the study declares one."""
     return _with_term(objective, CONSTANT, setup.links)
 
 
 def with_offsets(objective: Objective, links: Measurements) -> Objective | None:
     """The objective with offsets per transmitter and out of sight that have a prior; None if neither is possible.
 
-    There are no offsets per transmitter with one transmitter, or if a term already has groups.
+    There are no offsets per transmitter if there is only one transmitter, or if a term already has groups.
     """
     changed, labels = objective, transmitters(links)
     if len(np.unique(labels)) > 1 and all(len(term.labels) == 1 for term in objective.nuisance.terms):

@@ -78,7 +78,7 @@ def validate(
         raise InputError("validate: give blocks or by, not both")
     if blocks is not None and not (isinstance(blocks, Integral) and 2 <= blocks <= MOST_BLOCKS):
         raise InputError(
-            f"validate: blocks = {blocks!r}; must be 2 to {MOST_BLOCKS}, a whole number; each needs a calibration"
+            f"validate: blocks = {blocks!r}; must be a whole number from 2 to {MOST_BLOCKS}; each takes a calibration"
         )
     # Links that the study holds out are held out in turn like all others.
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
@@ -114,9 +114,9 @@ def validate_problem(
 ) -> Validation:
     """Compare models on all links of a problem, each block held out in turn.
 
-    Blocks are spatial, as many as stated or as in the study, or the labels of the column `by`. Known minima of the
-    study's own model over all links stand under its name [k, d]; they are searched if absent. The stage of `progress`
-    is "validating".
+    Blocks are spatial, as many as stated or as in the study, or the labels of the column `by`. `known_minima` has
+    minima over all links by model [k, d]; those of the study's own model are searched if absent. The stage of
+    `progress` is "validating".
 
     Raises:
         InputError: The links cannot be divided into these blocks.
@@ -151,7 +151,7 @@ def validate_problem(
 
 
 def _announce_new_groups(problem: Problem, block: NDArray[np.int64]) -> None:
-    """Say which offsets are unknown for held-out links, because all links of their group are in the same block [n]."""
+    """Warn which offsets are unknown for held-out links, because all links of their group are in the same block [n]."""
     counted = np.flatnonzero(block >= 0)
     stated = problem.setup.study.nuisance_terms
     for term in problem.objective.nuisance.terms:
@@ -169,7 +169,7 @@ def _announce_new_groups(problem: Problem, block: NDArray[np.int64]) -> None:
 
 
 def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:
-    """Block of every link, -1 where it has no weight, and the blocks' labels."""
+    """Block of every link, -1 for a link without weight, and the blocks' labels."""
     links, holdout = problem.setup.links, problem.setup.study.holdout
     if count is None and by is None and holdout is not None:
         count, by = holdout.blocks, holdout.by
@@ -186,7 +186,7 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
             link_labels = links.table.labels(by)
         names, block[counted] = np.unique(link_labels[counted], return_inverse=True)
         labels = tuple(map(str, names))
-    # What is left when the largest block is held out, and what is fitted to it.
+    # The links that are left when the largest block is held out, and the unknowns that are fitted to them.
     fewest = int(counted.sum()) - int(np.bincount(block[counted]).max())
     unknowns = counted.sum() - problem.freedom
     if len(labels) < 2 or counted.sum() < len(labels) or fewest <= unknowns:

@@ -62,7 +62,7 @@ def observables_table(observables: Mapping[str, ObservableErrors]) -> Table:
 class Validation(HeldOutErrors):
     """Held-out errors of several models on the same links, and the conclusions from them.
 
-    The error expected in a block is estimated on the other blocks, so that no block judges itself.
+    The error expected in a block is estimated on the other blocks, so that no block contributes to its own estimate.
     """
 
     @classmethod
@@ -90,7 +90,7 @@ class Validation(HeldOutErrors):
     def table(self) -> pd.DataFrame:
         """One row per model: RMSE, standard deviation [dB], log predictive density per link, and coverage.
 
-        Of the averages, only a chosen one has a row.
+        An average has a row only if it is the chosen model.
         """
         names = [name for name in self.errors if name == self.chosen or name not in AVERAGES]
         return pd.DataFrame({str(name): self._figures(name) for name in names}).T
@@ -122,7 +122,7 @@ class Validation(HeldOutErrors):
 
     @property
     def sentence(self) -> str:
-        """Whether calibration helped on held-out blocks, over which baseline, by how much, and how certain this is."""
+        """Whether calibration helped on held-out blocks, compared with which baseline, by how much, how certainly."""
         return judgement_text(self.judgement)
 
     @property
@@ -139,7 +139,7 @@ class Validation(HeldOutErrors):
         return float(np.sqrt(np.nanmean(self.errors[name][self.judged] ** 2)))
 
     def levels(self, name: str, links: Measurements) -> BlockErrors | None:
-        """Held-out residuals of a model within and between blocks; None if there are too few links."""
+        """Scatter of a model's held-out residuals within and between blocks; None if there are too few links."""
         position = np.hstack([links.tx, links.rx])[self.judged]
         return two_levels(self.errors[name][self.judged], self.block[self.judged], position)
 
