@@ -141,7 +141,7 @@ def test_a_candidate_of_another_type_is_no_entry():
     entry = LedgerEntry(np.array([80.0]), 1.0)
     columns = (entry.blob, 1.0, "", entry.digest("p", b"c"), None)
     assert isinstance(read_entry("p", b"c", columns), LedgerEntry)
-    assert read_entry("p", "inf", columns) == "a value of another type"
+    assert read_entry("p", "inf", columns) == "a value of the wrong type"
 
 
 def test_an_overlong_argument_is_not_said_again(tmp_path):

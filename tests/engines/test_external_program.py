@@ -286,7 +286,7 @@ def test_a_full_temporary_folder_is_not_the_programs_fault(tmp_path, monkeypatch
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "no-such-folder"))
     with engines.open_workers(workers) as opened:
         engine = engines.make(programs.study(tmp_path), ledger=tmp_path / "ledger.sqlite", workers=opened)
-        with pytest.raises(EngineError, match=r"no-such-folder.*make room, or name another folder.*TMPDIR"):
+        with pytest.raises(EngineError, match=r"no-such-folder.*free disk space, or set.*TMPDIR"):
             engine.path_loss(np.array([[3.0, 4.0, 5.0]]))
     assert engine.calls == 0
 

@@ -90,14 +90,14 @@ def doubles(*values: float) -> bytes:
         (("path_loss_db", doubles(70)), "8 bytes of path loss for 2 links"),
         (("path_loss_db", b"1234567"), "7 bytes of path loss"),
         (("path_loss_db", b""), "0 bytes of path loss"),
-        (("path_loss_db", doubles(72, 71)), "another checksum"),
-        (("path_loss_db", "72"), "a value of another type"),
-        (("failure", "it failed"), "another checksum"),
-        (("failure", 7.0), "another checksum"),
-        (("seconds", 0.25), "another checksum"),
-        (("digest", b"0" * 32), "another checksum"),
-        (("digest", "text"), "another checksum"),
-        (("digest", None), "another checksum"),
+        (("path_loss_db", doubles(72, 71)), "a wrong checksum"),
+        (("path_loss_db", "72"), "a value of the wrong type"),
+        (("failure", "it failed"), "a wrong checksum"),
+        (("failure", 7.0), "a wrong checksum"),
+        (("seconds", 0.25), "a wrong checksum"),
+        (("digest", b"0" * 32), "a wrong checksum"),
+        (("digest", "text"), "a wrong checksum"),
+        (("digest", None), "a wrong checksum"),
     ],
 )
 def test_a_damaged_entry_is_dropped_with_a_line_and_asked_again(path, caplog, change, message):
@@ -323,7 +323,7 @@ def test_a_damaged_answer_of_a_rescue_file_is_run_again(path, caplog):
     with closing(sqlite3.connect(file)) as connection, connection:
         connection.execute("UPDATE answers SET path_loss_db = ?", (doubles(82.0, np.inf),))
     assert resumed(path) == 1
-    assert "is damaged (another checksum); deleted, and run again" in caplog.text
+    assert "is damaged (a wrong checksum); deleted, and run again" in caplog.text
 
 
 def test_a_ledger_that_cannot_be_written_is_read(path, monkeypatch):

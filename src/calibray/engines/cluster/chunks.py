@@ -1,9 +1,9 @@
-"""Links in chunks: their division, work once per chunk on the workers (tracing, prediction), and replay in chunks.
+"""Division of links into chunks, work done once per chunk on the workers (tracing, prediction), and chunked replay.
 
-The division, and thus all numbers, depends only on the links and the study, never on the workers. The cache therefore
-contains chunks that an earlier command has traced. For replay, each chunk is traced and compiled on one worker, and
-stays there. Candidates are sent to the workers, which return path loss of their chunks; with `reducing` they return a
-few sums, for any number of links.
+The division, and thus every result, depends only on the links and the study, never on the workers. A command can
+therefore read from the cache chunks that an earlier command traced. For replay, each chunk is traced and compiled on
+one worker, and stays there. Candidates are sent to the workers, which return the path loss of their chunks; with
+`reducing` they return only a few sums, for any number of links.
 """
 
 from __future__ import annotations
@@ -48,19 +48,19 @@ CHUNK_LINKS: Final = 1000
 """Links per chunk if there are workers and the study states no number."""
 
 MOST_CHUNKS: Final = 64
-"""Largest number of chunks of this study: each compiles a program and returns its own sums."""
+"""Largest number of chunks if the study states no number of links: every chunk compiles a program and returns sums."""
 
 _SHARED: WeakValueDictionary[bytes, Shared[Any]] = WeakValueDictionary()
 
 _LATEST: Final[deque[Shared[Any]]] = deque(maxlen=1)
-"""Keeps the last unpacked content alive: between two chunks, nothing else may refer to it."""
+"""Keeps the last unpacked content alive: between two chunks, there may be no other reference to it."""
 
 
 @final
 class Shared(Generic[Content]):
     """Content that all chunks share, for instance an opened study; a process unpacks it once.
 
-    If the content is an opened study, few of its links suffice, because each chunk has its own.
+    A shared study needs to contain only one or a few links, because each chunk has its own links.
     """
 
     def __init__(self, content: Content) -> None:
@@ -103,9 +103,9 @@ def for_each_chunk(
 ) -> list[tuple[NDArray[np.int64], Answer]]:
     """Run a picklable function of the shared content and a chunk's links once for every chunk.
 
-    Objects that the work loads into `content` stay on the worker; if a worker dies, its chunk is done again. After
-    every chunk, `progress` is called with "tracing", the links done and all links. Returns the indices of every chunk's
-    links, and the results of the work.
+    Objects that the work loads into `content` stay on the worker; if a worker dies, its chunk is processed again. After
+    every chunk, `progress` is called with "tracing", the number of finished links and that of all links. Returns the
+    indices of every chunk's links, and the results of the work.
 
     Raises:
         EngineError: Workers die repeatedly, or none is left.
@@ -122,12 +122,12 @@ def _do_task(task: _Task[Any, Any]) -> Any:
 
 
 def identity(value: Content) -> Content:
-    """The argument itself, if the object kept with a chunk is already the answer or is sent as it is."""
+    """Return the argument, for objects that already are the answer of a chunk, or are sent unchanged."""
     return value
 
 
 def count_links(chunks: Sequence[NDArray[np.int64]], progress: Progress | None) -> Callable[[int], None]:
-    """A function of a finished chunk's number that reports the links done so far as "tracing"."""
+    """A function that is called with each finished chunk's number and reports the links done so far as "tracing"."""
     done, total = 0, sum(len(chunk) for chunk in chunks)
 
     def answered(index: int) -> None:
@@ -140,12 +140,12 @@ def count_links(chunks: Sequence[NDArray[np.int64]], progress: Progress | None) 
 
 
 def chunk_size(stated: int | None, count: int) -> int:
-    """Largest number of links of a chunk, from the number that the study states and the number of all links."""
+    """Largest number of links per chunk, from the number that the study states and the number of all links."""
     return stated or max(CHUNK_LINKS, -(-count // MOST_CHUNKS))
 
 
 def stated_chunk_size(study: OpenedStudy) -> int | None:
-    """The number of links of a chunk that a study states; None if it states none."""
+    """The number of links per chunk that a study states; None if it states none."""
     return getattr(study.engine, "chunk_links", None)
 
 
@@ -174,7 +174,7 @@ def select_links(links: Measurements, chunk: NDArray[np.int64]) -> Measurements:
 
 
 def seconds_to_trace(study: OpenedStudy, chunks: Sequence[NDArray[np.int64]]) -> float:
-    """Estimated time to trace chunks one after the other on two processor cores [s]."""
+    """Estimated time to trace the chunks sequentially on two processor cores [s]."""
     return sum(study.tracer.plan(select_links(study.links, chunk)).seconds for chunk in chunks)
 
 
@@ -184,18 +184,18 @@ def trace_in_chunks(
     """Trace a study's links in the same chunks as a calibration, or read them from the cache.
 
     With `check`, every chunk is traced again with twice the samples, unless samples are added in rounds. Returns the
-    path program of all links, and the changes of path loss when traced again, if `check`.
+    path program of all links and, with `check`, the changes in path loss.
 
     Raises:
         InputError: The links cannot be traced.
         EngineError: The paths do not fit into memory, or workers die repeatedly.
     """
     links, size = study.links, chunk_size(stated_chunk_size(study), len(study.links))
-    # Chunks bring their own links: the study that they share is sent with one.
+    # Every chunk brings its own links, so the shared study is sent with only one link.
     one_link = study.at(select_links(links, np.array([0])))
     answers = for_each_chunk(workers, partial(_trace_chunk, check), one_link, links, size, progress)
     paths = join_links([(chunk, chunk_paths) for chunk, (chunk_paths, _) in answers])
-    # Rounds of rays report how many rays were needed and what the last round changed: the worst chunk counts.
+    # Rounds of rays report how many rays were needed and what the last round changed; the worst chunk is reported.
     worst = {
         name: max(cast(float, chunk_paths.settings[name]) for _, (chunk_paths, _) in answers)
         for name in ("rays", "last_round_db")
@@ -229,7 +229,7 @@ _TRACING: Final = Lock()
 
 @dataclass(frozen=True, eq=False)
 class ChunkRecipe:
-    """What a chunk is made from.
+    """The content from which a chunk is made.
 
     Attributes:
         shared: The opened study.
@@ -280,7 +280,7 @@ class ChunkedReplay:
     """Links in chunks on workers, evaluated for any candidate; all chunks are opened together.
 
     Args:
-        workers: Keep the chunks.
+        workers: Workers that keep the chunks.
         study: The opened study.
         chunks: Indices of every chunk's links; together they contain every link once.
         opening: Opens the engine over a chunk's links; picklable.
@@ -289,7 +289,7 @@ class ChunkedReplay:
 
     Attributes:
         chunks: Indices of every chunk's links.
-        calls: Candidates evaluated.
+        calls: Number of candidates evaluated.
         parameters: The parameters whose values a candidate contains.
         materials: The materials before calibration, as in the trace.
     """

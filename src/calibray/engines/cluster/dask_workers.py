@@ -1,4 +1,4 @@
-"""The workers of a Dask cluster behind a scheduler."""
+"""The workers of a Dask cluster, reached through its scheduler."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ NO_WORKER_WAIT: Final = 600.0
 """Longest wait for a worker if none is left [s]."""
 
 MOST_DEATHS: Final = 4
-"""Number of workers that die on a chunk before the run ends; the chunk is then probably too large."""
+"""Number of workers that must die on one chunk to end the run; the chunk is then probably too large."""
 
 FETCH_WAIT: Final = POLL
-"""First wait for an answer that a worker has [s], doubled at each further request. In between, it is noticed if the
-worker died with the answer; an answer that takes long to send arrives in the end."""
+"""First wait for an answer that a worker holds [s]; the wait doubles with every further request, so that large answers
+arrive eventually. Between requests, we check whether the worker has died."""
 
 Answered = Callable[[int], None]
-"""Called with a chunk's number after its answer."""
+"""Called with a chunk's number after its answer has arrived."""
 
 
 def count_death(deaths: Counter[int], chunk: int) -> None:
@@ -143,7 +143,7 @@ class DaskWorkers:
                 future = self._client.submit(handle.make, handle.sources[index], workers=[home], pure=False)
                 handle.objects[index] = home, future
         objects = (handle.objects[index][1] for handle in handles)
-        # With pure=True, Dask would answer an equal question with the result of an earlier one.
+        # With pure=True, Dask would return the earlier result of an equal question.
         return self._client.submit(function, *objects, *arguments, workers=[home], pure=False)
 
     def _wait_for_any(self, futures: list[Future]) -> None:
@@ -155,7 +155,7 @@ class DaskWorkers:
             return
 
     def _fetch(self, future: Future, index: int, answers: dict[int, Any], patience: float) -> bool:
-        """Fetch an answer; False if it was lost with its worker, or takes longer to send than we wait for it [s]."""
+        """Fetch an answer; False if it was lost with its worker, or takes longer than `patience` [s] to send."""
         from distributed import KilledWorker
 
         try:
@@ -210,7 +210,7 @@ class DaskWorkers:
             if len(living) >= at_least or (living and waited > REPLACEMENT_WAIT):
                 return living
             if waited > NO_WORKER_WAIT:
-                raise EngineError(f"the Dask cluster has had no worker for {NO_WORKER_WAIT:g} s; start some")
+                raise EngineError(f"the Dask cluster has had no worker for {NO_WORKER_WAIT:g} s; start one")
             if not living and not warned:
                 _LOG.warning("the Dask cluster has no worker; waiting for one")
                 warned = True
@@ -230,7 +230,7 @@ def scheduler_client(scheduler: str) -> Iterator[Client]:
     _wait_for_scheduler(scheduler)
     try:
         client = Client(scheduler, timeout=SCHEDULER_WAIT)
-    # Programs other than a scheduler may answer Dask's greeting with anything.
+    # Programs other than a scheduler may answer Dask's handshake with anything.
     except (OSError, ValueError, TypeError, RuntimeError, AssertionError) as error:
         _refuse(scheduler, str(error))
     with client:

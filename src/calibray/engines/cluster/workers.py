@@ -4,8 +4,8 @@ Objects that are kept with a chunk are made on one worker and stay there. Functi
 returns only their results. Chunks are numbered and results return in that order, so sums over chunks do not depend on
 the workers.
 
-Workers on this machine are processes that communicate through pipes only. A pipe is inherited by its process. No port
-is open, so no other user of the machine can send code to a worker or to the main process.
+Workers on this machine are processes that communicate only through pipes, which they inherit. No port is open, so no
+other user of the machine can send code to a worker or to the main process.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from calibray.support.cache_folder import cache_folder
 from calibray.support.memory import available_memory
 
 ALWAYS_ALLOWED: Final = 8
-"""Number of worker processes that is allowed on any machine, even with few cores."""
+"""Number of worker processes that are allowed on any machine, even one with few cores."""
 
 END_WAIT: Final = 5.0
 """Longest wait for a process to end before it is killed [s]."""
@@ -43,7 +43,7 @@ _NUMBER: Final = itertools.count()
 _CAN_PIN: Final = hasattr(os, "sched_setaffinity")
 
 ObjectKey = tuple[int, int]
-"""The number of a handle and of a chunk."""
+"""Numbers of a handle and of a chunk, which together identify an object."""
 
 
 @runtime_checkable
@@ -51,7 +51,7 @@ class Workers(Protocol):
     """Runs the work of an engine: this process, processes on this machine, or a Dask cluster."""
 
     def executor(self) -> Executor | None:
-        """An executor for the calls of an external program; None to run one call after the other."""
+        """An executor for the calls of an external program; None to run them sequentially."""
         ...
 
     def keep(self, make: Callable[[Any], Any], sources: Sequence[Any]) -> Sized:
@@ -68,7 +68,7 @@ class Workers(Protocol):
         *arguments: Any,
         answered: Answered | None = None,
     ) -> list[Any]:
-        """Call a picklable function on the objects that are kept with every chunk, and return the results by chunk.
+        """Call a picklable function on the objects kept with every chunk, and return the results by chunk.
 
         The first arguments of the function are the objects, given by their handles from `keep`; the other arguments are
         the same for all chunks. `answered` is called with a chunk's number after its answer.
@@ -81,17 +81,17 @@ class Workers(Protocol):
 
 @final
 class InProcess:
-    """This process works on one chunk after the other.
+    """This process works on one chunk at a time.
 
     It keeps `at_most` chunks, and makes others again for each question. If None, chunks are kept until they use a third
-    of the memory that was free at the start, because what is derived from them needs as much again.
+    of the memory that was free at the start, because objects derived from them need as much again.
     """
 
     def __init__(self, at_most: int | None = None) -> None:
         self._at_most, self._reserve = at_most, available_memory() * 2 // 3
 
     def executor(self) -> None:
-        """None: calls run one after the other."""
+        """None, because calls run sequentially."""
         return
 
     def keep(self, make: Callable[[Any], Any], sources: Sequence[Any]) -> Sized:
@@ -148,10 +148,10 @@ class _Question:
 
     Attributes:
         function: The function to call.
-        arguments: Its last arguments.
-        keys: The objects that are its first arguments.
+        arguments: Its arguments after the objects.
+        keys: Keys of the objects that are its first arguments.
         recipes: How to make objects that the worker does not have yet.
-        handles: Handles that are still in use; objects of others are dropped.
+        handles: Handles that are still in use; objects of other handles are dropped.
     """
 
     function: Callable[..., Any]
@@ -187,7 +187,7 @@ class _Worker:
 class LocalWorkers:
     """Processes on this machine, started on first use, each with its share of the processor cores.
 
-    A chunk stays in one process. If a process dies, another one replaces it and makes the chunk's objects again.
+    A chunk stays in one process. If a process dies, another one replaces it and makes its chunks' objects again.
     `open_executor` returns an executor for the calls of an external program.
     """
 
@@ -221,7 +221,7 @@ class LocalWorkers:
             try:
                 answers = self._ask(function, handles, arguments, answered)
             except BaseException:
-                # Other processes may be in the middle of an answer.
+                # Other processes may still be sending an answer.
                 self.close()
                 raise
         return [answers[index] for index in range(len(answers))]
@@ -235,7 +235,7 @@ class LocalWorkers:
     ) -> dict[int, Any]:
         self._start_all()
         count, answers = len(handles[0]), {}
-        # A chunk's worker follows from its number, so that it finds the chunk's objects there the next time.
+        # A chunk's number determines its worker, so that the next question finds the chunk's objects there.
         waiting = [list(range(home, count, self._count))[::-1] for home in range(self._count)]
         while len(answers) < count:
             for home, worker in enumerate(self._workers):
@@ -309,7 +309,7 @@ class LocalWorkers:
             for key, handle in zip(keys, handles, strict=True)
             if key not in worker.objects
         }
-        # What the worker has after this question: it drops objects of handles that are not in use.
+        # The objects that the worker has after this question: it drops those whose handles are not in use.
         worker.objects = {key for key in worker.objects if key[0] in alive} | set(keys)
         return _Question(function, arguments, keys, recipes, alive)
 
@@ -376,7 +376,7 @@ def _sendable(error: Exception) -> Exception:
     """An error that can be sent to the main process."""
     try:
         pickle.loads(pickle.dumps(error))
-    except Exception:  # whatever a foreign class raises
+    except Exception:  # a foreign class may raise anything
         return EngineError(f"{type(error).__name__}: {error}")
     return error
 
@@ -417,8 +417,8 @@ def open_workers(workers: int | None = None, scheduler: str | None = None) -> It
             client = opened.enter_context(scheduler_client(scheduler))
             yield DaskWorkers(lambda: client, lambda: client.get_executor(pure=False))
         elif workers is not None:
-            # Processes and threads start on first use: an engine needs one of them. Each thread starts one external
-            # program after the other and waits for it.
+            # Processes and threads start on first use, because an engine needs only one of these kinds. Each thread
+            # runs one external program at a time.
             local = LocalWorkers(workers, lambda: opened.enter_context(ThreadPoolExecutor(workers)))
             opened.callback(local.close)
             yield local

@@ -28,7 +28,7 @@ ANSWER: Final = "path_loss_db"
 OBSERVABLES: Final = "observables"
 PATH_LOSS_DB: Final = (20.0, 300.0)  # range of a plausible answer
 RESPONSE_BYTES: Final = (16 << 20, 4 << 10)  # largest response: fixed part, and per link
-RAYS_BYTES: Final = (16 << 20, 64 << 10)  # the same with rays: some hundred paths per link
+RAYS_BYTES: Final = (16 << 20, 64 << 10)  # the same with rays: a few hundred paths per link
 _WITHOUT_PATH: Final = (None, "inf", "Infinity")
 
 
@@ -128,7 +128,7 @@ def _write_materials(group: h5py.Group, materials: Mapping[str, Material]) -> No
     for number, (name, material) in enumerate(materials.items()):
         key = name.replace("/", "_")
         if key in ("", ".") or key in group:
-            key = f"{key}{number}"  # no name of a group, or that of another material
+            key = f"{key}{number}"  # not a valid group name, or the name of another material
         group.create_group(key).attrs.update({"name": name, **asdict(material)})
 
 
@@ -190,7 +190,7 @@ def read_rays(path: Path, num_links: int) -> bytes:
 
 
 def _read_bytes(path: Path, limit: int) -> bytes:
-    """The bytes of a response. Only a regular file is read, because a program may leave anything there."""
+    """The bytes of a response. Only a regular file is read, because a program may leave anything at this path."""
     try:
         # O_NOFOLLOW does not follow a link; O_NONBLOCK does not wait for the writer of a FIFO.
         handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)

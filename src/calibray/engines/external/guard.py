@@ -20,12 +20,12 @@ import sys
 import time
 from contextlib import suppress
 
-# Without `site`, the guard starts in half the time; LIBRARIES is the folder that Calibray has psutil from.
+# Without `site`, the guard starts in half the time; LIBRARIES is the folder from which Calibray imports psutil.
 if __name__ == "__main__":
     sys.path.append(sys.argv[1])
 
 HEAD, TAIL = 500, 1500  # bytes that are kept from the start and the end of an output
-KILL_TIME = 5.0  # how long to go on killing [s]
+KILL_TIME = 5.0  # longest time to keep killing processes [s]
 POLL = 0.5  # interval between checks that Calibray is still alive and, in Calibray, whether to stop [s]
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 
@@ -84,7 +84,7 @@ def main(timeout: float, words: list[str]) -> dict[str, object]:
 
 
 def _prctl():
-    """The system call that sets who adopts orphans and who dies with whom; on Linux only."""
+    """The system call by which a process adopts orphans or dies with its parent; a dummy except on Linux."""
     if sys.platform != "linux":
         return lambda option, value: None
     library = ctypes.CDLL(None)
@@ -127,7 +127,7 @@ def _listen(process: subprocess.Popen, deadline: float, signals: int, outputs: d
 
 def _kill_tree(process: subprocess.Popen) -> None:
     """Kill the program's group, and then all descendants of this process until none is left."""
-    # Here the guard adopts orphans; elsewhere they are found only if they are listed before their parent ends.
+    # On Linux the guard adopts orphans; elsewhere they are found only if they are listed before their parent ends.
     adopts = sys.platform == "linux"
     if adopts:
         _kill_group(process)
@@ -144,7 +144,7 @@ def _kill_tree(process: subprocess.Popen) -> None:
             with suppress(psutil.Error):
                 descendant.kill()
         psutil.wait_procs(descendants, timeout=0.01)
-        # A process may have started others meanwhile, and this process has adopted the children of those killed.
+        # Processes may have started others meanwhile, and this process has adopted the children of those it killed.
         descendants = guard.children(recursive=True)
 
 

@@ -59,7 +59,7 @@ class Outcome:
 
     Attributes:
         path_loss_db: Path loss [L], [dB]; +inf for a link without a path, and for all links if the attempts failed.
-        seconds: Time of all attempts together [s].
+        seconds: Total duration of all attempts [s].
         failure: Error of the last attempt; empty if it succeeded.
         rays: The response of a program that answers with rays, from which path loss follows, or further observables [K,
             L] in SI units as little-endian doubles; otherwise empty.
@@ -79,7 +79,7 @@ class ExternalProgram:
         words: The program and its arguments. The files' paths replace `{request}` and `{response}`, and are appended if
             these are absent.
         folder: Folder to run it in.
-        timeout: Time limit of one attempt [s].
+        timeout: Time limit for one attempt [s].
         retries: Number of further attempts after a failure.
         file_format: "json" or "hdf5".
         rays: Whether it answers with a ray table instead of path loss.
@@ -104,7 +104,7 @@ class ExternalProgram:
                 )
 
     def run(self, request: Request, stop: Event | None = None) -> Outcome:
-        """Call the program for one candidate, and after a failure again until no attempts are left.
+        """Call the program for one candidate; after a failure, call it again until no attempts are left.
 
         A failure is returned instead of raised, so that it costs one candidate and not the batch. Another thread sets
         `stop` to kill the program.
@@ -252,7 +252,7 @@ def _call_folder() -> Iterator[Path]:
 def _unwritable(error: OSError) -> EngineError:
     return EngineError(
         f"temporary folder {error.filename or 'of the system'}: the files of a call cannot be written "
-        f"({error.strerror or error}); make room, or name another folder with the variable TMPDIR"
+        f"({error.strerror or error}); free disk space, or set the variable TMPDIR to another folder"
     )
 
 

@@ -3,7 +3,7 @@
 A rescue file is written next to the ledger or, if that folder is gone or full, into the user's own state folder or the
 temporary folder. The next run with the ledger reads it.
 
-Claims state which run works on which candidate, so that two runs with one ledger do not both pay for it. A claim is
+Claims state which run works on which candidate, so that two runs with one ledger do not both compute it. A claim is
 valid while its run renews it, and ends at once if the run's process has certainly ended. Each observer uses its own
 clock to time renewals, because the clocks of two machines may differ by hours.
 """
@@ -46,7 +46,7 @@ _observed: dict[tuple[str, bytes, str], tuple[float, float]] = {}
 
 
 def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Sequence[bytes]) -> list[bytes]:
-    """Claim candidates within a transaction of the caller, and return those that no other run has claimed."""
+    """Claim candidates within the caller's transaction, and return those that no other run has claimed."""
     now, owner = time.time(), json.dumps(ProcessOwner.current().record())
     _active_runs.add(run)
     claimed = []
@@ -136,9 +136,9 @@ class LedgerEntry:
 
     Attributes:
         path_loss_db: Path loss [L], [dB]; +inf for a link without a path.
-        seconds: Time of the call [s].
+        seconds: Duration of the call [s].
         failure: Error message; empty if the call succeeded.
-        rays: The response with its rays, as the program wrote it; empty without rays.
+        rays: Rays or further observables, as in `engines.protocol.Answer`; empty without either.
     """
 
     path_loss_db: NDArray[np.float64]
@@ -162,7 +162,7 @@ class LedgerEntry:
 
     @property
     def fault(self) -> str:
-        """The reason why an engine cannot have given this answer; empty if it can."""
+        """The reason why an engine cannot have given this answer; empty if the answer is possible."""
         values, (lower, upper) = self.path_loss_db, RANGE_DB
         outside = ~((values >= lower) & (values <= upper) | np.isposinf(values))
         if outside.any():
@@ -175,17 +175,17 @@ class LedgerEntry:
 def read_entry(
     problem: str, candidate: bytes, columns: tuple[object, ...], num_links: int | None = None
 ) -> LedgerEntry | str:
-    """Read an entry from a row of a ledger (path loss as bytes, seconds, failure, digest, rays), or its damage."""
+    """Read an entry from a ledger row (path loss as bytes, seconds, failure, digest, rays); text if it is damaged."""
     blob, seconds, failure, digest, rays = columns
     if not (isinstance(problem, str) and isinstance(candidate, bytes) and isinstance(blob, bytes)):
-        return "a value of another type"
+        return "a value of the wrong type"
     if not (isinstance(seconds, float) and isinstance(failure, str) and isinstance(rays, bytes | None)):
-        return "a value of another type"
+        return "a value of the wrong type"
     if len(blob) % 8 or (num_links is not None and len(blob) != 8 * num_links):
         return f"{len(blob)} bytes of path loss" + ("" if num_links is None else f" for {num_links} links")
     entry = LedgerEntry(np.frombuffer(blob, "<f8").copy(), seconds, failure, rays or b"")
     if digest != entry.digest(problem, candidate):
-        return "another checksum"
+        return "a wrong checksum"
     return entry.fault or entry
 
 
@@ -195,7 +195,7 @@ def key(candidate: NDArray[np.float64]) -> bytes:
 
 
 VERSION: Final = 2
-ENDINGS: Final = ("", "-wal", "-shm", "-journal")  # names of the files that SQLite writes, after the ledger's
+ENDINGS: Final = ("", "-wal", "-shm", "-journal")  # endings that SQLite appends to the ledger's name
 LOCK_WAIT: Final = 60.0  # longest wait for other writers [s]
 _PROBLEMS: Final = """CREATE TABLE IF NOT EXISTS problems (
     problem TEXT PRIMARY KEY, engine TEXT NOT NULL, parameters TEXT NOT NULL) WITHOUT ROWID"""
@@ -228,12 +228,12 @@ def check_own_file(path: Path) -> None:
             continue
         if not stat.S_ISREG(status.st_mode):
             raise InputError(
-                f"{file}: must be a file of the ledger's own, but is a link, a folder, a device or a FIFO; move it "
+                f"{file}: must be a regular file of the ledger, but is a link, a folder, a device or a FIFO; move it "
                 "away, or name another folder"
             )
         if status.st_nlink > 1:
             raise InputError(
-                f"{file}: must be a file of the ledger's own, but has {status.st_nlink} names (hard links); replace "
+                f"{file}: must be a file with a single name, but has {status.st_nlink} names (hard links); replace "
                 "it with a copy, or name another folder"
             )
 
@@ -292,14 +292,14 @@ def _set_up(connection: sqlite3.Connection, path: Path) -> None:
 def insert_problem(
     connection: sqlite3.Connection, problem: str, engine: str, parameters: Sequence[str]
 ) -> None:
-    """Write the parameter names of a problem's candidates, unless they are there."""
+    """Write the parameter names of a problem's candidates, unless the ledger already contains them."""
     connection.execute(
         "INSERT OR IGNORE INTO problems VALUES (?, ?, ?)", (problem, engine, json.dumps(list(parameters)))
     )
 
 
 def insert_answer(connection: sqlite3.Connection, problem: str, candidate: bytes, entry: LedgerEntry) -> None:
-    """Write an answer, unless there already is one."""
+    """Write an answer, unless there is one already."""
     now = datetime.now(UTC).isoformat(timespec="milliseconds")
     digest = entry.digest(problem, candidate)
     connection.execute(
@@ -312,7 +312,7 @@ def insert_answer(connection: sqlite3.Connection, problem: str, candidate: bytes
 
 @contextmanager
 def transaction(connection: sqlite3.Connection) -> Iterator[None]:
-    """Several statements that are committed together, or not at all."""
+    """Commit several statements together, or none of them."""
     connection.execute("BEGIN IMMEDIATE")
     try:
         yield
@@ -326,12 +326,12 @@ def transaction(connection: sqlite3.Connection) -> Iterator[None]:
 
 def explain(error: sqlite3.Error | OSError) -> str:
     """The text of a ledger error, with its remedy."""
-    # The lower byte is the kind of error; the upper ones are details.
+    # The lowest byte is the kind of error; the others are details.
     code = (getattr(error, "sqlite_errorcode", None) or 0) & 0xFF
     damaged = "move it away and start again, or recover its contents with `sqlite3 FILE .recover`"
     remedy = {
-        sqlite3.SQLITE_FULL: "make room on the disk and start again",
-        sqlite3.SQLITE_IOERR: "make room on the disk, or repair it, and start again",
+        sqlite3.SQLITE_FULL: "free disk space and start again",
+        sqlite3.SQLITE_IOERR: "free disk space, or repair the disk, and start again",
         sqlite3.SQLITE_BUSY: f"another program has locked it for {LOCK_WAIT:g} s: end that and start again",
         sqlite3.SQLITE_LOCKED: "another program has locked it; end that program and start again",
         sqlite3.SQLITE_READONLY: "make it and its folder writable and start again",
@@ -352,7 +352,7 @@ def write_rescue_file(ledger: Path, fill: Callable[[sqlite3.Connection], None]) 
         file = folder / f"{prefix}{uuid.uuid4().hex}{SUFFIX}"
         partial = file.with_suffix(".part")
         try:
-            if folder != ledger.parent:  # a ledger's folder that somebody removed stays removed
+            if folder != ledger.parent:  # a removed ledger folder is not created again
                 folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             with closing(sqlite3.connect(partial, isolation_level=None)) as connection:
                 fill(connection)

@@ -57,7 +57,7 @@ class Ledger:
             database.check_own_file(self.path)
             self._connection = self._connect()
             try:
-                # SQLite opens the file by its name: it may have been exchanged.
+                # SQLite opens the file by name, so it may have been replaced meanwhile.
                 database.check_own_file(self.path)
                 database.set_up(self._connection, self.path)
                 self._file = _identity(self.path)
@@ -71,7 +71,7 @@ class Ledger:
 
     def _connect(self) -> sqlite3.Connection:
         file = self.path
-        if self.read_only:  # SQLite writes files next to a database even to read it, so a copy is read
+        if self.read_only:  # SQLite writes files next to a database even when reading it, so a copy is read
             self._copy = tempfile.TemporaryDirectory(prefix="calibray-ledger-", ignore_cleanup_errors=True)
             file = Path(self._copy.name) / LEDGER_FILE
             for ending in ("", "-wal"):
@@ -139,7 +139,7 @@ class Ledger:
         return None
 
     def claim(self, problem: str, candidates: Sequence[bytes], num_links: int) -> list[bytes]:
-        """Claim candidates that this run will pay for; `commit` and the end of `working` release the claims.
+        """Claim candidates that this run will compute; `commit` and the end of `working` release the claims.
 
         Returns the candidates without an answer that no other run has claimed.
 
@@ -191,7 +191,7 @@ class Ledger:
         parameters: Sequence[str],
         answers: Sequence[tuple[bytes, database.LedgerEntry]],
     ) -> str:
-        """Keep answers that the ledger could not store in a rescue file, and return a sentence that names it."""
+        """Write answers that the ledger could not store to a rescue file, and return a sentence that names the file."""
 
         def fill(connection: sqlite3.Connection) -> None:
             database.set_up(connection, self.path)
@@ -217,7 +217,7 @@ class Ledger:
             ).rowcount
 
     def table(self, path_loss: bool = False) -> pd.DataFrame:
-        """All RT calls in the order of their commits; damaged calls are left out with a warning.
+        """All RT calls in the order in which they were committed; damaged calls are left out with a warning.
 
         Columns are `problem` (the start of its fingerprint), `engine`, `time`, `seconds`, `status` ("ok" or "failed"),
         `message`, one per parameter and, with `path_loss`, one per link: `link_1`, `link_2`, ... [dB].

@@ -1,4 +1,4 @@
-"""Recorded: an engine whose answers go through a ledger."""
+"""Recorded: an engine whose answers are stored in a ledger."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LONGEST_WAIT: Final = 1.0
 
 @final
 class Recorded:
-    """An engine behind a ledger, which does not repeat a candidate that any run has completed.
+    """An engine with a ledger; it does not repeat candidates that any run has completed.
 
     Args:
         engine: The engine.
@@ -79,7 +79,7 @@ class Recorded:
         """Path loss and the requested further observables; see `Observing.respond`.
 
         Raises:
-            InputError: Derivatives are wanted.
+            InputError: Derivatives are requested.
         """
         if derivatives:
             raise InputError(
@@ -89,7 +89,7 @@ class Recorded:
         return gather_responses(answers, (len(candidates), self._engine.num_links), len(wanted), first)
 
     def _all_answers(self, candidates: NDArray[np.float64]) -> tuple[list[Answer], bool]:
-        """The answers to candidates, and whether these candidates are the first ones."""
+        """The answers to candidates, and whether these candidates are the first batch."""
         first = self.calls + self.hits == 0
         answers = list(self.answers(check_candidates(candidates, len(self.parameters))))
         if first and all(answer.failure for answer in answers) and not self._ledger.read_only:
@@ -99,7 +99,7 @@ class Recorded:
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
         """Answer candidates from the ledger or otherwise the engine, until `stop` is set; see `Answering.answers`."""
         values, stop = candidates, stop or Event()
-        # The same candidate may occur several times in one batch, and is run once.
+        # A candidate that occurs several times in one batch is run only once.
         missing: dict[bytes, list[int]] = {}
         for index, value in enumerate(values):
             missing.setdefault(key(value), []).append(index)
@@ -117,7 +117,7 @@ class Recorded:
             before = len(missing)
             yield from self._from_ledger(missing)
             if len(missing) == before and missing:
-                # Another run has claimed these candidates and pays for them.
+                # Another run has claimed these candidates and computes them.
                 if self._progress is not None:
                     self._progress("waiting", max(0, awaited - len(missing)), max(awaited, len(missing)))
                 time.sleep(pause)
@@ -148,7 +148,7 @@ class Recorded:
                     stop.set()
                     unsaved = [(candidate, entry)]
                     with suppress(EngineError):
-                        for other in answers:  # one by one, because the engine may fail after some
+                        for other in answers:  # one by one, because the engine may fail midway
                             unsaved.append((keys[other.index], _entry(other)))
                     if isinstance(error, KeyboardInterrupt):
                         for paid in unsaved:
@@ -156,7 +156,7 @@ class Recorded:
                         raise
                     rescued = self._ledger.rescue(self._problem, self._name, self.parameters.names, unsaved)
                     raise EngineError(f"{error}. {rescued}") from None
-                # The candidate itself is an RT call, its repeats in the batch are not.
+                # The candidate itself is an RT call; its repeats in the batch are not.
                 self.hits += len(indices[candidate]) - 1
                 yield from (_answer(index, entry) for index in indices[candidate])
 
