@@ -177,7 +177,7 @@ def test_an_edited_result_is_refused_unless_it_is_meant(tmp_path):
     content = json.loads(file.read_text())
     file.write_text(json.dumps(content | {"fit": content["fit"] | {"rmse_db": 0.001}}))
     with pytest.raises(
-        InputError, match=r"result\.json: changed since Calibray wrote it.*--allow-changed-inputs"
+        InputError, match=r"result\.json: has changed since Calibray wrote it.*--allow-changed-inputs"
     ):
         Result.load(tmp_path)
     assert Result.load(tmp_path, allow_changed_inputs=True).rmse_db == 0.001

@@ -1,6 +1,6 @@
 """Calibrate the radio materials of a ray-traced scene from measurements.
 
-Most users need `Study`, `calibrate` and `Result`. Names are imported when first used, so that importing the package is
+Most users need `Study`, `calibrate` and `Result`. Names are imported on first use, so that importing the package is
 fast.
 
 Example:

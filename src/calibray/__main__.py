@@ -1,4 +1,4 @@
-"""`python -m calibray` runs `calibray` where the command is not on the path."""
+"""Makes `python -m calibray` equivalent to the command `calibray`, for when the command is not on the path."""
 
 from calibray.cli import main
 

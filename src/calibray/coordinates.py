@@ -1,8 +1,8 @@
-"""The position of a scene on the globe.
+"""Geographic coordinates of a scene.
 
 A scene has a local frame: x points east and y points north from an origin. Map projections distort lengths (UTM by up
-to 0.4 m per kilometre). The default frame is therefore a projection centred on the scene: PROJ's azimuthal equidistant
-projection (`aeqd`), whose lengths are accurate to 1 mm per kilometre over several kilometres.
+to 0.4 m per kilometre). The default frame is therefore PROJ's azimuthal equidistant projection (`aeqd`), centred on the
+scene: its lengths are accurate to 1 mm per kilometre within several kilometres of the centre.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ if TYPE_CHECKING:
     from pyproj import CRS, Transformer
 
 WGS84: Final = "EPSG:4326"
-"""Reference system of satellite receivers: longitude and latitude."""
+"""Coordinate reference system of GPS receivers: longitude and latitude."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame of a scene: a projection in metres, and the point in it that is the scene's origin.
+    """The frame of a scene: a map projection in metres, and the scene's origin in that projection.
 
     Attributes:
-        crs: The projection, anything that PROJ reads: `EPSG:32632`, a `+proj` string, WKT.
-        easting: x of the origin in the projection [m].
-        northing: y of the origin in the projection [m].
-        height: Height of z = 0 [m], above the same datum as other heights.
+        crs: The projection in any form that PROJ reads, such as `EPSG:32632`, a `+proj` string or WKT.
+        easting: Easting of the origin in the projection [m].
+        northing: Northing of the origin in the projection [m].
+        height: Height of z = 0 [m], above the same vertical datum as the other heights.
 
     Raises:
-        InputError: PROJ does not know the projection, it is not in metres with x to the east and y to the north, or a
-            number is not finite.
+        InputError: PROJ does not know the projection; it is not in metres with x pointing east and y pointing north; or
+            the origin is not finite.
     """
 
     crs: str
@@ -48,33 +48,33 @@ class Frame:
 
     def __post_init__(self) -> None:
         if not np.isfinite([self.easting, self.northing, self.height]).all():
-            raise InputError(f"frame {self.record()}: the origin must be finite numbers of metres")
+            raise InputError(f"frame {self.record()}: easting, northing and height must be finite")
         projection = parse_crs(self.crs)
         axes = {(axis.direction, axis.unit_name) for axis in projection.axis_info[:2]}
-        # Some projections count to the west and the south (EPSG:2048); a scene in them would be turned by 180 degrees.
+        # In some projections (EPSG:2048), x points west and y south, which would rotate a scene by 180 degrees.
         if not projection.is_projected or axes != {("east", "metre"), ("north", "metre")}:
             raise InputError(
-                f"crs = {self.crs!r}: {projection.name} is not a projection in metres with x to the east and y to the "
-                "north; name one, such as the UTM zone EPSG:326xx, or omit it for a local one"
+                f"crs = {self.crs!r}: {projection.name} is not a projection in metres with x pointing east and y "
+                "pointing north; give one, such as the UTM zone EPSG:326xx, or omit crs to use a local projection"
             )
 
     @classmethod
     def local(cls, longitude: float, latitude: float, height: float = 0.0) -> Frame:
-        """The frame centred on a point; distances from this point are not distorted.
+        """Make the local frame centred on a point; distances from this point are not distorted.
 
-        Longitude is east of Greenwich and latitude north of the equator [deg]; `height` is that of z = 0 [m].
+        Longitude is east of Greenwich and latitude north of the equator [deg]; `height` is the height of z = 0 [m].
 
         Raises:
             InputError: The point is not on the globe.
         """
         _check_degrees(np.array([longitude]), np.array([latitude]))
-        # A tenth of a microdegree is 1 cm: the string stays short and states the origin exactly.
+        # 1e-7 degrees is 1 cm. Rounded, the string is short and states the origin exactly.
         centre = f"+lat_0={round(float(latitude), 7)!r} +lon_0={round(float(longitude), 7)!r}"
         return cls(f"+proj=aeqd {centre} +datum=WGS84 +units=m", height=height)
 
     @classmethod
     def utm(cls, longitude: float, latitude: float, height: float = 0.0) -> Frame:
-        """The UTM zone of a point, with the origin at the nearest whole metre; arguments as for `local`.
+        """Make the frame of the UTM zone of a point, with the origin rounded to whole metres; arguments as for `local`.
 
         Raises:
             InputError: The point is not on the globe, or too close to a pole for UTM.
@@ -82,7 +82,7 @@ class Frame:
         _check_degrees(np.array([longitude]), np.array([latitude]))
         if not -80 <= latitude <= 84:
             raise InputError(f"latitude = {latitude:g}: must be -80 to 84 degrees for UTM; use a local frame")
-        # 180 degrees east would be zone 61. The wider zones of Norway and Svalbard are ignored: their neighbours serve.
+        # 180 degrees east would be zone 61. The wider zones of Norway and Svalbard are ignored: regular ones suffice.
         zone = min(int((longitude + 180) // 6) + 1, 60)
         crs = f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
         easting, northing, _ = cls(crs).to_scene([longitude], [latitude])[0]
@@ -93,7 +93,7 @@ class Frame:
         """Read a frame from the dictionary that `record` returned.
 
         Raises:
-            InputError: It is not such a record.
+            InputError: The record is not such a dictionary.
         """
         keys = ("easting", "northing", "height")
         if not isinstance(record, Mapping) or not isinstance(record.get("crs"), str):
@@ -117,20 +117,20 @@ class Frame:
         Args:
             longitude: East of Greenwich [n], [deg]; or x in the units of `crs`.
             latitude: North of the equator [n], [deg]; or y in the units of `crs`.
-            height: Height [n] or one for all [m], above the same datum as the frame's.
-            crs: Reference system of the coordinates.
+            height: Height [n], or one value for all [m], above the same vertical datum as the frame's.
+            crs: Coordinate reference system of the positions.
 
         Returns:
             Positions x, y, z [n, 3], [m].
 
         Raises:
-            InputError: A coordinate is not on the globe, or outside the projection.
+            InputError: A position is not on the globe, or lies outside the projection's area of validity.
         """
         x, y, z = (np.asarray(part, dtype=float) for part in np.broadcast_arrays(longitude, latitude, height))
         if crs == WGS84:
             _check_degrees(x, y)
         easting, northing = transformer(crs, self.crs).transform(x, y)
-        # PROJ answers with infinity outside of a projection, without an error.
+        # Outside a projection's area of validity, PROJ returns infinity and no error.
         outside = np.flatnonzero(~np.isfinite(np.ravel(easting) + np.ravel(northing)))
         if len(outside):
             raise InputError(
@@ -147,7 +147,7 @@ class Frame:
 
 
 def parse_crs(crs: object) -> CRS:
-    """Look up a coordinate reference system: anything that PROJ reads.
+    """Look up a coordinate reference system, given in any form that PROJ reads.
 
     Raises:
         InputError: PROJ does not know it.
@@ -166,10 +166,10 @@ def parse_crs(crs: object) -> CRS:
 def transformer(source: object, target: object) -> Transformer:
     """The transformation between two coordinate reference systems, with x (longitude) always first.
 
-    It is opened once per process, which takes up to 0.3 s.
+    It is created once per process, which takes up to 0.3 s.
 
     Raises:
-        InputError: PROJ does not know one of them.
+        InputError: PROJ does not know one of the two systems.
     """
     pyproj = library("pyproj", "geo")
     return pyproj.Transformer.from_crs(parse_crs(source), parse_crs(target), always_xy=True)
@@ -178,19 +178,19 @@ def transformer(source: object, target: object) -> Transformer:
 def find_projection(
     x: NDArray[np.float64], y: NDArray[np.float64], frame: Frame, low: Sequence[float], high: Sequence[float]
 ) -> str | None:
-    """Find the map projection that places positions on a scene.
+    """Find the map projection of coordinates by testing which projection places them on a scene.
 
-    Candidates are the UTM zone of the scene, Web Mercator, and the projections of the EPSG that cover the scene.
+    Candidates are the UTM zone of the scene, Web Mercator, and the EPSG projections that cover the scene.
 
     Args:
-        x: Coordinates to the east [n].
-        y: Coordinates to the north [n].
+        x: Eastings [n].
+        y: Northings [n].
         frame: The scene's frame.
-        low: West and south end of the scene [2], [m].
-        high: East and north end [2], [m].
+        low: West and south bounds of the scene [2], [m].
+        high: East and north bounds of the scene [2], [m].
 
     Returns:
-        The projection with the most positions on the scene; None if no projection places half of them there.
+        The projection that places the most positions on the scene; None if no projection places half of them there.
 
     Example:
         >>> frame = Frame.local(11.5755, 48.1374)
@@ -202,24 +202,24 @@ def find_projection(
     here = pyproj.aoi.AreaOfInterest(longitude, latitude, longitude, latitude)
     known = pyproj.database.query_crs_info("EPSG", pyproj.enums.PJType.PROJECTED_CRS, here, contains=True)
     utm = [Frame.utm(longitude, latitude).crs] if -80 <= latitude <= 84 else []
-    # At least half of the positions must lie on the scene; of equal shares the first candidate wins.
+    # At least half of the positions must lie on the scene; of candidates with equal shares, the first is used.
     best, most = None, 0.5
-    # Points of equal coordinates in two geodetic datums are less than 3 km apart, most less than 1 km.
+    # Points with equal coordinates in two geodetic datums are less than 3 km apart, usually less than 1 km.
     reach = 3000.0 + 2 * float(np.max(np.subtract(high, low)))
     for crs in dict.fromkeys([*utm, "EPSG:3857", *sorted(f"EPSG:{info.code}" for info in known)]):
         try:
-            # Without its datum a projection is computed fast, and off by less than the shift between datums.
+            # Without the datum, projecting is fast, and the error is less than the shift between datums.
             east, north = pyproj.Proj(crs)(longitude, latitude)
             if not np.hypot(np.median(x) - east, np.median(y) - north) < reach:
                 continue
             placed = frame.to_scene(x, y, 0.0, crs)[:, :2]
         except (InputError, pyproj.exceptions.ProjError):
-            continue  # the scene is outside the projection, or it is none of the globe
+            continue  # the scene is outside the projection, or the projection is not of the Earth
         share = float(((placed >= np.asarray(low)) & (placed <= np.asarray(high))).all(axis=1).mean())
         if share > most or (best is None and share == most):
             best, most = crs, share
         if most == 1.0:
-            break  # no other is better, and opening each takes up to 0.3 s
+            break  # no other candidate can be better, and opening each takes up to 0.3 s
     return best
 
 

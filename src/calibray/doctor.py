@@ -1,7 +1,7 @@
-"""Whether tracing and replay work on this machine, and what to do if not.
+"""Checks whether tracing and replay work on this machine, and suggests remedies if they do not.
 
-Versions alone do not show this, so Dr.Jit, Sionna RT and JAX each run a small test. The tests run in subprocesses,
-because a libLLVM that Dr.Jit cannot use kills the process.
+Version numbers alone do not show this, so Dr.Jit, Sionna RT and JAX each run a small test. The tests run in
+subprocesses, because a libLLVM that Dr.Jit cannot use kills the process.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from calibray.tracing import llvm
 from calibray.tracing.llvm import Llvm
 
 CHECK_TIMEOUT = 300.0
-"""Longest time of one check [s]; the first import from a slow disk dominates."""
+"""Time limit of one check [s]; the first import from a slow disk takes most of this time."""
 
-# Name and, if any, extra: "numpy>=2.0", "pyarrow>=16; extra == 'parquet'".
+# Package name and, if present, extra: "numpy>=2.0", "pyarrow>=16; extra == 'parquet'".
 _REQUIREMENT = re.compile(r"""^([\w.-]+)(?:.*extra == ['"]([\w-]+)['"])?""")
 
-# Extras for work on Calibray itself; users do not need them.
+# Extras for developing Calibray itself; users do not need them.
 _DEVELOPER_EXTRAS = frozenset({"test", "docs", "lint"})
 
-# Sum of min(0, 2) .. min(3, 2). An unusable LLVM fails to compile the minimum; a sum alone compiles.
+# Sum of min(0, 2) to min(3, 2). An unusable LLVM cannot compile the minimum, although it can compile a sum.
 _KERNEL = """
 import importlib, sys
 import drjit
@@ -38,7 +38,7 @@ if total != 5.0:
     sys.exit(f"the sum is {total}, not 5")
 """
 
-# A closed box has the direct path and one reflection from each of its six faces.
+# In a closed box there are the direct path and one reflection from each of the six faces.
 _TRACE = """
 import sys
 import mitsuba
@@ -69,7 +69,7 @@ class Check:
         name: The library.
         passed: Whether it works.
         detail: What the check found, or how it failed.
-        remedy: The remedy if it failed.
+        remedy: What to do if the check failed.
     """
 
     name: str
@@ -83,11 +83,11 @@ class Diagnosis:
     """The state of a machine, as `calibray doctor` prints it.
 
     Attributes:
-        versions: Python, Calibray and each package with its version, or with the command that installs it.
-        variant: The Mitsuba variant that is used for tracing.
+        versions: Python, Calibray and each package, with its version or the command that installs it.
+        variant: The Mitsuba variant used for tracing.
         cuda_devices: Number of GPUs on which Mitsuba can trace.
-        libraries: Every libLLVM on this machine.
-        checks: The checks; each depends on the earlier ones.
+        libraries: Every libLLVM found on this machine.
+        checks: The results of the checks.
     """
 
     versions: tuple[tuple[str, str], ...]
@@ -102,7 +102,7 @@ class Diagnosis:
         return all(check.passed for check in self.checks)
 
     def table(self) -> Table:
-        """Versions, libraries, checks with remedies, and a verdict, in two columns without headings."""
+        """A table of versions, libraries, checks with remedies, and the verdict, in two columns without headings."""
         rows = [
             *self.versions,
             ("Mitsuba variant", self.variant),
@@ -119,7 +119,7 @@ class Diagnosis:
 
 
 def examine() -> Diagnosis:
-    """Check this machine, which takes a few seconds; an unusable machine raises no exception."""
+    """Check this machine, which takes a few seconds; no exception is raised if it is unusable."""
     variant = llvm.mitsuba_variant()
     return Diagnosis(
         versions=versions(),
@@ -131,9 +131,9 @@ def examine() -> Diagnosis:
 
 
 def check_tracing(variant: str) -> tuple[Check, ...]:
-    """Check what tracing with a Mitsuba variant needs: libLLVM on the CPU, then Dr.Jit, then Sionna RT.
+    """Check what tracing with a Mitsuba variant needs: libLLVM (on the CPU only), then Dr.Jit, then Sionna RT.
 
-    Returns the checks up to the first failure; later checks depend on it.
+    Returns the checks up to and including the first failure, because the later checks depend on it.
     """
     remedy = "update the NVIDIA driver, or set CUDA_VISIBLE_DEVICES= to trace on the CPU"
     checks = []
@@ -154,8 +154,8 @@ def check_tracing(variant: str) -> tuple[Check, ...]:
 def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> Check:
     """Run Python code in a subprocess to check a library.
 
-    The code prints its findings, or fails with an exception, an exit status or a signal. The check's detail is the
-    output, or the line that names the cause of the failure.
+    The code prints its findings, or fails with an exception, an exit status or a signal. The detail of the
+    check is the output, or the lines that state why it failed.
     """
     command = [sys.executable, "-c", code, *arguments]
     try:
@@ -166,9 +166,9 @@ def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> 
         return Check(name, True, run.stdout.strip() or "works", remedy)
     lines = run.stderr.strip().splitlines() or [f"exit status {run.returncode} without a message"]
     if run.returncode < 0:
-        # LLVM prints its reason first, then its stack.
+        # LLVM prints the reason first, then a stack trace.
         return Check(name, False, f"killed by {signal.Signals(-run.returncode).name}: {lines[0]}", remedy)
-    # Of chained exceptions the first is the cause. An exit message is the last line.
+    # In a chain of exceptions, the first is the cause. An exit message is the last line.
     reasons = [line for line in lines if re.match(r"[\w.]*(Error|Exception)\b", line)] or lines[-1:]
     return Check(name, False, "; ".join(reasons), remedy)
 
@@ -185,7 +185,7 @@ def versions() -> tuple[tuple[str, str], ...]:
         name, extra = _REQUIREMENT.findall(requirement)[0]
         if extra not in _DEVELOPER_EXTRAS:
             packages.setdefault(name, f"pip install 'calibray[{extra}]'" if extra else f"pip install {name}")
-        # Sionna RT requires certain versions of these two, which its own installation brings.
+        # Sionna RT requires specific versions of these two packages and installs them.
         if name == "sionna-rt":
             packages |= {needed: "pip install --force-reinstall sionna-rt" for needed in ("mitsuba", "drjit")}
     installed = {name: _version(name) or f"not installed: {command}" for name, command in packages.items()}

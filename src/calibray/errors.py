@@ -1,15 +1,15 @@
-"""The two exceptions of Calibray: for bad input, and for an engine that failed while running."""
+"""Calibray's two exceptions: for invalid input, and for an engine that failed while running."""
 
 from __future__ import annotations
 
 from typing import Final
 
 LONGEST_MESSAGE: Final = 4000
-"""Largest number of characters of a message; a value from the input may have any length."""
+"""Largest number of characters of a message; a value quoted from the input may be of any length."""
 
 
 def _bounded(message: str) -> str:
-    """The start and the end of a message that is too long; the end states the remedy."""
+    """Shorten a message that is too long to its start and its end, which states the remedy."""
     if len(message) <= LONGEST_MESSAGE:
         return message
     return f"{message[: LONGEST_MESSAGE - 1000]} ... {message[-900:]}"
@@ -18,8 +18,8 @@ def _bounded(message: str) -> str:
 class InputError(ValueError):
     """Input that cannot be used.
 
-    The message names the place (file, row, key), the value, the bound and the remedy. The command line prints it
-    alone, without a traceback, and exits with 2.
+    The message states the location (file, row, key), the value, the bound and the remedy. The command line prints only
+    this message, without a traceback, and exits with status 2.
     """
 
     def __str__(self) -> str:
@@ -27,7 +27,7 @@ class InputError(ValueError):
 
 
 class EngineError(RuntimeError):
-    """An engine that failed while running; everything computed before is kept. The command line exits with 1."""
+    """An engine failed while running; results computed before are kept. The command line exits with status 1."""
 
     def __str__(self) -> str:
         return _bounded(super().__str__())

@@ -1,8 +1,8 @@
-"""Radio materials: the constants of a surface, and the laws of ITU-R P.2040 that give them by material name.
+"""Radio materials: the constants of a surface, and the laws of ITU-R P.2040 from which named materials take them.
 
-Revision P.2040-1 differs from the later ones below 100 GHz (concrete 5.31 became 5.24, glass 6.27 became 6.31). -2 and
--3 print the same Table 3. -4 keeps those rows and adds rows above 100 GHz and new materials. Sionna RT 2.2 follows -4,
-so the default "P.2040-3" gives the same numbers below 100 GHz.
+Below 100 GHz, P.2040-1 differs from the later revisions (concrete has 5.31 instead of 5.24, glass 6.27 instead of
+6.31). P.2040-2 and -3 have the same Table 3. P.2040-4 keeps its rows and adds rows above 100 GHz and new materials.
+Sionna RT 2.2 follows P.2040-4; below 100 GHz, the default "P.2040-3" gives the same values.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from calibray.errors import InputError
 from calibray.support.messages import did_you_mean
 
 FREQUENCIES: Final = (1e6, 1e12)
-"""Range of carriers [Hz]; a value outside was probably stated in MHz or GHz."""
+"""Range of valid carrier frequencies [Hz]; a value outside it was probably stated in MHz or GHz."""
 
 
 def check_frequency(frequency: object) -> float:
-    """A carrier frequency [Hz] as a number.
+    """Check a carrier frequency [Hz] and convert it to a float.
 
     Raises:
         InputError: It is not a number within `FREQUENCIES`.
@@ -57,7 +57,7 @@ FIELDS: Final = (
 """The numeric fields of a `Material`, in the order of the columns of a constants matrix."""
 
 SCALAR_CONSTANTS: Final = FIELDS[:5]
-"""The fields that Sionna's scene files contain, and its materials as single-precision numbers."""
+"""The fields that a Sionna scene file can contain; Sionna RT stores them in single precision."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Bound:
     Attributes:
         lower: Smallest possible value, in the field's unit.
         upper: Largest possible value, in the field's unit.
-        unit: Unit of the field, "1" for a pure number.
+        unit: Unit of the field, "1" if it is dimensionless.
         open_below: Whether `lower` itself is excluded.
     """
 
@@ -100,31 +100,31 @@ BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
         "lambda_": Bound(0.0, 1.0, "1"),
     }
 )
-"""Bounds of each field: those of Sionna RT, whose gains are not finite with an exponent of 127, and a thickness greater
-than 0."""
+"""Bounds of each field: those of Sionna RT, with a thickness greater than 0, and exponents of at most 126, because an
+exponent of 127 gives gains that are not finite."""
 
 SCATTERING_PATTERNS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {"lambertian": (), "directive": ("alpha_r",), "backscattering": ("alpha_r", "alpha_i", "lambda_")}
 )
-"""Scattering patterns, each with the fields that shape it."""
+"""Scattering patterns, each with the fields that it depends on."""
 
 
 @dataclass(frozen=True)
 class Material:
-    """The radio constants of a surface: a slab of one homogeneous, non-magnetic medium.
+    """The radio constants of a surface, modelled as a slab of a homogeneous, non-magnetic medium.
 
     Attributes:
         relative_permittivity: Real part of the relative permittivity [1], at least 1.
         conductivity: Conductivity [S/m], at least 0.
         thickness: Thickness of the slab [m], greater than 0.
-        scattering_coefficient: Scattering coefficient S [1], the share of the reflected amplitude that is scattered
+        scattering_coefficient: Scattering coefficient S [1], the fraction of the reflected amplitude that is scattered
             diffusely, in [0, 1].
         xpd_coefficient: Cross-polarization discrimination coefficient K_x [1] of diffuse fields, in [0, 1].
         scattering_pattern: "lambertian", "directive" or "backscattering" (Degli-Esposti et al., IEEE Trans.
             Antennas and Propagation 55(1), 2007).
         alpha_r: Exponent [1] of the lobe around the specular direction, 1 to 126; rounded for Sionna RT.
         alpha_i: Exponent [1] of the lobe back towards the source, 1 to 126; rounded for Sionna RT.
-        lambda_: Share [1] of the diffuse energy in the lobe around the specular direction, in [0, 1].
+        lambda_: Fraction [1] of the diffuse energy in the lobe around the specular direction, in [0, 1].
 
     Raises:
         InputError: A constant is not a finite number within `BOUNDS`, or the pattern is unknown.
@@ -164,7 +164,7 @@ def _within_bounds(name: str, value: Any) -> float:
 
 
 def constants_matrix(materials: Mapping[str, Material]) -> NDArray[np.float64]:
-    """Constants of materials [materials, fields], columns in the order of `FIELDS`, in the fields' units.
+    """The constants of materials as a matrix [materials, fields], in the order of `FIELDS` and in their units.
 
     Example:
         >>> constants_matrix({"walls": Material(5.24, 0.14, 0.3)})[0, :3].tolist()
@@ -200,7 +200,7 @@ def frequency_independent_law(material: Material) -> ItuLaw:
 
 
 def law_with_stated(law: ItuLaw, material: Material, stated: Collection[str]) -> ItuLaw:
-    """The law of a material of which some fields are stated as numbers, which do not depend on frequency."""
+    """The law of a material whose `stated` fields have explicit values, which do not depend on frequency."""
     # P.2040: permittivity a f^b, conductivity c f^d.
     if "relative_permittivity" in stated:
         law = law._replace(a=material.relative_permittivity, b=0.0)
@@ -215,7 +215,7 @@ def _table(rows: Mapping[str, tuple[tuple[float, ...], ...]]) -> _Table:
 
 
 def _extended(base: _Table, rows: Mapping[str, tuple[tuple[float, ...], ...]]) -> _Table:
-    """A table with additional rows after those of `base`, whose rows apply if ranges overlap."""
+    """A table with `rows` added after those of `base`; where frequency ranges overlap, the rows of `base` apply."""
     return _table({name: (*base.get(name, ()), *rows.get(name, ())) for name in {**base, **rows}})
 
 
@@ -283,7 +283,7 @@ _P2040_4: Final = _extended(
 ITU_MATERIALS: Final[Mapping[str, _Table]] = MappingProxyType(
     {"P.2040-1": _P2040_1, "P.2040-2": _P2040_2, "P.2040-3": _P2040_2, "P.2040-4": _P2040_4}
 )
-"""ITU-R P.2040 Table 3 by revision and material; if ranges overlap, the first row applies, as in Sionna RT."""
+"""ITU-R P.2040 Table 3 by revision and material; where ranges overlap, the first row applies, as in Sionna RT."""
 
 DEFAULT_REVISION: Final = "P.2040-3"
 
@@ -291,14 +291,14 @@ DEFAULT_REVISION: Final = "P.2040-3"
 def itu_material(
     name: str, frequency: float, thickness: float = 0.1, revision: str = DEFAULT_REVISION, **scattering: Any
 ) -> Material:
-    """Make a material of ITU-R P.2040 Table 3 at one frequency.
+    """Make a material from ITU-R P.2040 Table 3 at a given frequency.
 
     Args:
-        name: Name as in Sionna RT, for instance "concrete" or "very_dry_ground".
-        frequency: Frequency [Hz], within the range of the material's law, ends included.
-        thickness: Thickness of the slab [m]; P.2040 states none, and 0.1 m is Sionna RT's default.
+        name: Name of the material as in Sionna RT, for instance "concrete" or "very_dry_ground".
+        frequency: Frequency [Hz], within the range of the material's law, limits included.
+        thickness: Thickness of the slab [m]; P.2040 does not state one, and 0.1 m is the default of Sionna RT.
         revision: Revision of the recommendation, a key of `ITU_MATERIALS`.
-        **scattering: Further fields of the `Material`, for instance ``scattering_coefficient=0.3``.
+        **scattering: Other fields of the `Material`, for instance ``scattering_coefficient=0.3``.
 
     Returns:
         The material, with the law's permittivity [1] and conductivity [S/m].
@@ -322,7 +322,7 @@ def itu_material(
 
 
 def itu_law(name: str, frequency: float, revision: str = DEFAULT_REVISION) -> ItuLaw:
-    """Find the row of ITU-R P.2040 Table 3 for a material, named as in Sionna RT, and a frequency [Hz].
+    """Find the row of ITU-R P.2040 Table 3 that applies to a material, named as in Sionna RT, at a frequency [Hz].
 
     Raises:
         InputError: The revision or the name is unknown, or no law covers the frequency.

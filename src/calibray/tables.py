@@ -1,7 +1,7 @@
-"""Tables as data; rendering of tables and sentences as plain text and HTML.
+"""Tables as data, and the rendering of tables and sentences as plain text and HTML.
 
-Control characters and markup are escaped, because names come from files. Short forms are for the Python prompt and
-notebooks.
+Control characters and markup are escaped, because names come from files. The Python prompt and notebooks show short
+forms.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from typing import Final, Literal
 from calibray.support.messages import printable
 
 LISTED: Final = 12
-"""Largest number of rows, names or findings that are listed; the others are only counted."""
+"""Largest number of rows, names or findings that are listed; any others are only counted."""
 
 WIDEST: Final = 100_000
-"""Characters per line outside of a terminal, and in one that is too narrow: many, so that no cell is cut."""
+"""Characters per line if the output is not a terminal, or the terminal is too narrow; so large that no cell is cut."""
 
 ROWS: Final = 10
-"""Largest number of rows of a table at the prompt; the others are only counted."""
+"""Largest number of rows of a table shown at the prompt; any others are only counted."""
 
 CHARACTERS: Final = 60
-"""Largest number of characters of a cell or a name; longer ones are cut."""
+"""Largest number of characters shown of a cell or a name; longer ones are cut."""
 
 SENTENCE: Final = 200
-"""Largest number of characters of a sentence; longer ones are cut."""
+"""Largest number of characters shown of a sentence; longer ones are cut."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Column:
     """A column of a table.
 
     Attributes:
-        name: Meaning of its cells; empty for the column that names the rows.
-        unit: Unit of all its cells; empty if they have no unit or different ones.
+        name: The quantity in its cells; empty for the column of row names.
+        unit: Unit of all its cells; empty if they have no unit or different units.
         align: "left" for text, "right" for numbers.
 
     Example:
@@ -56,7 +56,7 @@ class Column:
 
 
 def numbers(name: str = "", unit: str = "") -> Column:
-    """A column of numbers, aligned to the right."""
+    """Make a right-aligned column of numbers."""
     return Column(name, unit, "right")
 
 
@@ -65,8 +65,8 @@ class Table:
     """A table with cells of text.
 
     Attributes:
-        title: Its title; may be empty.
-        columns: Its columns.
+        title: The title; may be empty.
+        columns: The columns.
         rows: The cells of every row, one per column.
 
     Raises:
@@ -91,7 +91,7 @@ class Table:
 
     @property
     def titled(self) -> bool:
-        """Whether the title is above the table; otherwise it is the heading of the first column."""
+        """Whether the title is shown above the table; otherwise it is the heading of the first column."""
         return bool(self.title) and bool(self.columns[0].heading)
 
     @property
@@ -106,7 +106,7 @@ class Table:
         return (first, *(column.heading for column in self.columns[1:]))
 
     def head(self, count: int) -> Table:
-        """The first rows, and a last row with the number of rows that are left out, if any.
+        """The first `count` rows, and a last row with the number of rows left out, if any.
 
         Example:
             >>> Table("", (Column("link"),), (("a",), ("b",), ("c",))).head(1).rows
@@ -119,7 +119,7 @@ class Table:
 
 
 def render(*parts: Table | str) -> str:
-    """Render tables and sentences as plain text, with an empty line between them; empty strings are omitted.
+    """Render tables and sentences as plain text, with a blank line between them; empty strings are omitted.
 
     Example:
         >>> print(render("study.toml", Table("Cost", (Column(), numbers()), (("tracing", "0.3 s"),))))
@@ -135,7 +135,7 @@ def render(*parts: Table | str) -> str:
 
 
 def render_html(*parts: Table | str) -> str:
-    """Render tables and sentences as HTML: elements `p` and `table`, without scripts and links.
+    """Render tables and sentences as HTML: elements `p` and `table`, without scripts or links.
 
     Example:
         >>> render_html("a < b")
@@ -147,7 +147,7 @@ def render_html(*parts: Table | str) -> str:
 
 
 def rows_text(rows: Sequence[int]) -> str:
-    """List rows of a file; if there are many, only the first ones; empty without rows.
+    """List row numbers of a file; if there are many, only the first ones; empty if there are none.
 
     Example:
         >>> rows_text([3, 4, 9])
@@ -163,7 +163,7 @@ def rows_text(rows: Sequence[int]) -> str:
 
 
 def decibels(value: float | None) -> str:
-    """Format a value [dB] for tables with two decimals; a dash if unknown."""
+    """Format a value [dB] for tables with two decimals, or a dash if it is unknown."""
     return "-" if value is None else f"{value:.2f}"
 
 
@@ -178,7 +178,7 @@ def short_html(*parts: Table | str) -> str:
 
 
 def named(names: Iterable[str], count: int = 4) -> str:
-    """List names with commas between them; if there are many, only the first ones.
+    """List names separated by commas; if there are many, only the first ones.
 
     Example:
         >>> named(["east", "west"])
@@ -216,7 +216,7 @@ def _lines(table: Table) -> str:
     for index, (column, heading) in enumerate(zip(table.columns, table.headings, strict=True)):
         # The first column names the rows, and a single column contains sentences.
         is_text = column.align == "left" and (index > 0 or len(table.columns) == 1)
-        # Rich measures the longest word, also where it may not wrap.
+        # Rich takes the longest word as the least width, even where a cell must not wrap.
         cells = (heading, *(row[index] for row in table.rows))
         least = None if is_text else max(cell_len(printable(cell)) for cell in cells)
         grid.add_column(
@@ -229,7 +229,7 @@ def _lines(table: Table) -> str:
     width = get_terminal_size((WIDEST, 1)).columns
     for number, row in enumerate(table.rows):
         if number and len(row) == 1 and width < WIDEST:
-            grid.add_row()  # between sentences that take several lines
+            grid.add_row()  # separates sentences that may span several lines
         grid.add_row(*(Text(printable(cell)) for cell in row))
     console = Console(file=StringIO(), width=WIDEST, color_system=None)
     if Measurement.get(console, console.options, grid).minimum <= width < WIDEST:
@@ -273,5 +273,5 @@ def _fitted(parts: Iterable[Table | str]) -> Iterator[Table | str]:
 
 
 def _short(text: str, length: int) -> str:
-    """Text on one line of limited length, with line breaks and control characters escaped."""
+    """Cut a text to a maximum length and escape line breaks and control characters."""
     return printable(text if len(text) <= length else f"{text[: length - 3]}...")

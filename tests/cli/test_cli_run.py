@@ -244,7 +244,10 @@ def test_predict_takes_the_measured_table_and_the_results_own(folder, ran, tmp_p
         (("predict", "{folder}", "{file}"), "is not a result of `calibray run`"),
         (("predict", "{result}", "{twice}"), "has the columns 'path_loss_db' and 'input_path_loss_db'"),
         (("predict", "{result}", "{folder}/absent.csv"), "absent.csv: no such file"),
-        (("predict", "{result}", "{bare}", "-o", "{folder}/out.xlsx"), "tables end in .csv or .parquet"),
+        (
+            ("predict", "{result}", "{bare}", "-o", "{folder}/out.xlsx"),
+            "a table must end in .csv or .parquet",
+        ),
     ],
 )
 def test_bad_arguments_are_one_message_and_leave_nothing(folder, ran, tmp_path, arguments, message):

@@ -1,1 +1,1 @@
-"""Support: code without radio: caches, output files, messages, progress, interruption."""
+"""Support code independent of radio: caches, output files, messages, progress and interruption."""

@@ -1,7 +1,7 @@
-"""Calibray's cache folder: data kept between runs that can be computed again.
+"""Calibray's cache folder: data that is kept between runs and can be computed again.
 
-The folder is `CALIBRAY_CACHE`, otherwise `calibray` in the user's cache folder; an empty `CALIBRAY_CACHE` disables
-caching.
+The folder is given by the environment variable `CALIBRAY_CACHE`, otherwise it is `calibray` in the user's cache folder.
+An empty `CALIBRAY_CACHE` disables caching.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from platformdirs import user_cache_path
 
 CACHE_VARIABLE: Final = "CALIBRAY_CACHE"
 COMPILED_BYTES: Final = 512 * 2**20
-"""Size limit of compiled programs [bytes]."""
+"""Limit on the total size of compiled programs [bytes]."""
 _NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 _DIGEST_BYTES: Final = hashlib.sha256().digest_size
-"""Bytes of the SHA-256 at the start of each entry."""
+"""Length of the SHA-256 digest at the start of each entry [bytes]."""
 _PRUNED_AT: Final = 16
-"""The size of all entries is checked once per this number of written entries: with 7,000 entries it takes 0.08 s, as
-long as the compilation of a small program."""
+"""The total size is checked once per this number of written entries. With 7,000 entries, a check takes 0.08 s, as long
+as compiling a small program."""
 
 
 def cache_folder() -> Path | None:
-    """The cache folder, which need not exist; None if caching is disabled."""
+    """The path of the cache folder, which need not exist; None if caching is disabled."""
     folder = os.environ.get(CACHE_VARIABLE)
     if folder is None:
         return user_cache_path("calibray", appauthor=False)
@@ -39,16 +39,16 @@ def cache_folder() -> Path | None:
 
 @dataclass(frozen=True)
 class Store:
-    """Checksummed entries in a folder that nobody else can write to, for data that must be trusted.
+    """Checksummed entries in a folder to which no other user can write, for data that must be trusted.
 
-    An entry is complete or absent: it is moved into place once it is written, and a damaged entry is removed when it is
-    read. Entries that cannot be read or written are skipped without an error.
+    An entry is complete or absent: it is moved into place once it is fully written, and a damaged entry is removed when
+    it is read. Entries that cannot be read or written are skipped without an error.
 
     Attributes:
         path: The folder, which need not exist.
         suffix: The file extension of the entries.
-        limit: Size limit [bytes]; the entries read least recently are removed above it, after one written entry in
-            `_PRUNED_AT`.
+        limit: Limit on the total size [bytes]. Above it, the least recently read entries are removed, on about one
+            write in `_PRUNED_AT`.
     """
 
     path: Path
@@ -57,7 +57,7 @@ class Store:
 
     @property
     def trusted(self) -> bool:
-        """Whether the folder, created if needed, belongs to the user and nobody else can write to it."""
+        """Whether the folder, created if needed, belongs to the user and no other user can write to it."""
         with suppress(OSError), self._folder():
             return True
         return False
@@ -72,7 +72,7 @@ class Store:
                 if hashlib.sha256(value).digest() == digest:
                     os.utime(stream.fileno() if os.utime in os.supports_fd else file)
                     return value
-            # The digest is another one: the entry is damaged.
+            # The digest differs, so the entry is damaged.
             os.unlink(file, dir_fd=folder)
         return None
 
@@ -90,22 +90,22 @@ class Store:
                 with suppress(OSError):
                     os.unlink(partial, dir_fd=folder)
                 raise
-            # The digest of the name decides, so that about one new entry in `_PRUNED_AT` causes a check.
+            # The digest of the name determines whether to check, so that about one new entry in `_PRUNED_AT` does.
             if hashlib.sha256(name.encode()).digest()[0] % _PRUNED_AT == 0:
                 self._remove_oldest()
 
     @contextmanager
     def _folder(self) -> Iterator[int | None]:
-        """Open the folder, created if needed, and check who may write to it.
+        """Open the folder, creating it if needed, and check who can write to it.
 
-        The check applies to the open folder. If others can write to a folder above it, another folder may have its path
-        a moment later.
+        The check applies to the opened folder. If others can write to a parent folder, they may replace the folder at
+        this path afterwards.
 
         Yields:
-            Its descriptor; None on Windows, which keeps other users out of a user's folders.
+            The folder's descriptor; None on Windows, which keeps other users out of a user's folders.
 
         Raises:
-            OSError: It cannot be opened, is a link, belongs to another user, or others can write to it.
+            OSError: The folder cannot be opened, is a link, belongs to another user, or others can write to it.
         """
         self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
         if os.open not in os.supports_dir_fd:
@@ -123,7 +123,7 @@ class Store:
             os.close(folder)
 
     def entries(self) -> list[Path]:
-        """The files of the entries, most recently read first; no other file of the folder."""
+        """The files of the entries, most recently read first; other files in the folder are left out."""
         ages = []
         with suppress(OSError):
             for path in self.path.glob(f"*{self.suffix}"):
@@ -142,7 +142,7 @@ class Store:
                     path.unlink()
 
     def _file(self, name: str, folder: int | None) -> str:
-        """The file of an entry, relative to the folder if that is open."""
+        """The file of an entry, relative to the folder if the folder is open."""
         file = f"{name}{self.suffix}"
         return file if folder is not None else str(self.path / file)
 

@@ -1,7 +1,7 @@
-"""One restrained style for every figure: colours that colour-blind people can distinguish, few lines, units on axes.
+"""The common style of all figures: colours that colour-blind people can distinguish, few lines, units on axes.
 
-The colours of lines are those of Okabe and Ito (2008). A figure in a page takes its line and text colour from the page,
-so that it is readable on light and dark backgrounds.
+Most line colours are those of Okabe and Ito (2008). A figure in an HTML page takes the colours of its lines and text
+from the page, so that it is readable on light and dark backgrounds.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ BLUE: Final = "#0072b2"
 ORANGE: Final = "#d55e00"
 GREEN: Final = "#009e73"
 PALETTE: Final = ("#cc79a7", "#e69f00", "#56b4e9", "#8c5a3c", "#882255", "#6f7f2e", "#5c6bc0", "#777777")
-"""Colours for lines beyond the named ones."""
+"""Colours for further lines, in addition to the named colours."""
 
 COLORS: Final = {"gwo": GREEN, "sgwo-im": BLUE, "space-mapping": FAINT, "auto": ORANGE}
-"""The paper's methods, and Calibray's own."""
+"""Colour of each optimizer: the paper's methods, and Calibray's own."""
 
 _VARIABLES: Final = {INK: "--ink", FAINT: "--faint", LINE: "--line", PAPER: "--paper", BLUE: "--accent"}
 _SETTINGS: Final[dict[Any, Any]] = {
     "font.family": "sans-serif",
     "font.size": 10,
     "text.color": INK,
-    # Names come from files, and a dollar sign in one is a dollar sign.
+    # Names come from files; a dollar sign in a name must not start a formula.
     "text.parse_math": False,
     "axes.labelcolor": INK,
     "axes.edgecolor": FAINT,
@@ -54,13 +54,13 @@ _SETTINGS: Final[dict[Any, Any]] = {
 
 @contextmanager
 def styled(text_as: str = "path") -> Iterator[None]:
-    """The style, while the context is open; letters of SVG are outlines ("path") or in the reader's font ("none")."""
+    """Apply the style within the context; SVG text is stored as outlines ("path") or as characters ("none")."""
     with rc_context({**_SETTINGS, "svg.fonttype": text_as}):
         yield
 
 
 def plain_figure(x: str, y: str, width: float = 6.4, height: float = 4.2) -> tuple[Figure, Axes]:
-    """An empty figure of one panel in the style of all; the labels state units, width and height are in inches."""
+    """Make an empty single-panel figure in the common style; labels state units, width and height are in inches."""
     with styled():
         figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
         axes = figure.add_subplot()
@@ -69,14 +69,14 @@ def plain_figure(x: str, y: str, width: float = 6.4, height: float = 4.2) -> tup
 
 
 def residual_figure(x: str) -> tuple[Figure, Axes]:
-    """An empty figure for residuals of links' path loss, with a line at zero."""
+    """Make an empty figure for the path-loss residuals of links, with a line at zero."""
     figure, axes = plain_figure(x, "Predicted − measured [dB]")
     axes.axhline(0, color=INK, lw=0.8)
     return figure, axes
 
 
 def dress(axes: Axes, x: str, y: str) -> None:
-    """Label axes, and remove elements without information."""
+    """Label the axes, and remove elements that carry no information."""
     axes.set(xlabel=x, ylabel=y)
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y", color=LINE)
@@ -84,12 +84,12 @@ def dress(axes: Axes, x: str, y: str) -> None:
 
 
 def plain_number(value: float) -> str:
-    """Write a number without an exponent, as 1,000,000 or 0.00001."""
+    """Format a number without an exponent, such as 1,000,000 or 0.00001."""
     return f"{value:,.12f}".rstrip("0").rstrip(".")
 
 
 def logarithmic(axes: Axes, direction: Literal["x", "y"]) -> None:
-    """Make an axis logarithmic with its numbers written out, because texts in these figures cannot contain formulas."""
+    """Make an axis logarithmic, with numbers written out, because text in these figures cannot contain formulas."""
     axes.set(**{f"{direction}scale": "log"})
     axis = axes.xaxis if direction == "x" else axes.yaxis
     low, high = sorted(axis.get_view_interval())
@@ -100,7 +100,7 @@ def logarithmic(axes: Axes, direction: Literal["x", "y"]) -> None:
 
 
 def write(figure: Figure, path: Path) -> Path:
-    """Write a figure as SVG if the file has this extension, otherwise as PNG, and return the file."""
+    """Write a figure as SVG if the file name ends in .svg, otherwise as PNG; return the file."""
     with styled(), replacing(path) as partial:
         if path.suffix == ".svg":
             FigureCanvasSVG(figure).print_svg(partial, metadata={"Date": None})
@@ -110,7 +110,7 @@ def write(figure: Figure, path: Path) -> Path:
 
 
 def inline(figure: Figure, name: str) -> str:
-    """A figure as an SVG element that takes its colour and its font from the surrounding page.
+    """Make an SVG element of a figure that takes its colours and font from the surrounding page.
 
     Its ids begin with `name`, and it has no external references.
     """
@@ -123,7 +123,7 @@ def inline(figure: Figure, name: str) -> str:
         FigureCanvasSVG(figure).print_svg(written, metadata=nothing)
     text = written.getvalue()
     text = text[text.index("<svg") :]
-    # A style sheet inside would rule the whole page, whose own says the same; HTML knows the names of its parts.
+    # A style sheet in the SVG would apply to the whole page, which has the same rules; HTML needs no namespaces.
     text = re.sub(r"<style.*?</style>", "", text, flags=re.DOTALL)
     text = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", text)
     text = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{name}-", text)

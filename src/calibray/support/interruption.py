@@ -1,4 +1,4 @@
-"""Ctrl-C during compiled code, where libraries convert it to their own error or drop it."""
+"""Handling of Ctrl-C during compiled code, in which libraries convert it to their own error or drop it."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ INTERRUPTED: Final = 128 + signal.SIGINT
 """Exit status after Ctrl-C: 128 plus the number of the signal, as in shells."""
 
 GRACE: Final = 1.0
-"""Time for an interruption to reach the code that saves results, before it is raised again [s]."""
+"""Time that an interruption is given to reach the code that saves results, before it is raised again [s]."""
 
 
 @contextmanager
 def unwrap_interruption() -> Iterator[None]:
-    """Raise KeyboardInterrupt in place of the error that a library made from it.
+    """Raise KeyboardInterrupt instead of the error to which a library converted it.
 
     Yields:
         Nothing; the block may call Dr.Jit or import compiled modules.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C caused the error of a library.
-        RuntimeError: Raised in the block, with another cause.
-        SystemError: The same.
-        ImportError: The same.
+        KeyboardInterrupt: Ctrl-C caused the library's error.
+        RuntimeError: The block raised it for another reason.
+        SystemError: As for RuntimeError.
+        ImportError: As for RuntimeError.
     """
     try:
         yield
-    # Dr.Jit raises RuntimeError in a loop, the interpreter SystemError in an import, Mitsuba ImportError in its own.
+    # In a loop, Dr.Jit raises RuntimeError; during imports, the interpreter raises SystemError, Mitsuba ImportError.
     except (RuntimeError, SystemError, ImportError) as error:
         cause: BaseException | None = error
         while cause is not None:
@@ -44,17 +44,17 @@ def unwrap_interruption() -> Iterator[None]:
 
 @contextmanager
 def ensure_interruption() -> Iterator[None]:
-    """Make sure that Ctrl-C ends the block, whatever a library does with it.
+    """Ensure that Ctrl-C ends the block, even if a library handles or drops the interruption.
 
-    Compiled code may drop an interruption that occurs in its callbacks, or raise another error. Inside this context
-    `raise_pending_interruption` raises a dropped one again, and any error after Ctrl-C counts as an interruption.
+    Compiled code may drop an interruption that occurs in its callbacks, or raise another error. Within this context,
+    `raise_pending_interruption` raises a dropped interruption again, and any error after Ctrl-C is treated as one.
 
     Yields:
         Nothing. Outside the main thread, or if another handler for Ctrl-C is set, the block runs unchanged.
 
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed; its cause is the error that followed, if any.
-        Exception: Raised in the block without Ctrl-C.
+        Exception: The block raised it, and Ctrl-C was not pressed.
     """
     handled = (
         threading.current_thread() is threading.main_thread()
@@ -76,16 +76,16 @@ def ensure_interruption() -> Iterator[None]:
 
 
 def raise_pending_interruption() -> None:
-    """Raise a KeyboardInterrupt that was dropped within `ensure_interruption`, after a grace period.
+    """Raise again a KeyboardInterrupt that was dropped within `ensure_interruption`, after a grace period.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C was pressed more than `GRACE` ago, and the block still runs.
+        KeyboardInterrupt: Ctrl-C was pressed more than `GRACE` seconds ago, and the block is still running.
     """
     if _pressed and time.monotonic() - _pressed[-1] > GRACE:
         raise KeyboardInterrupt
 
 
-# Times of Ctrl-C within `ensure_interruption`. Global, because a process has one handler for the signal.
+# Times at which Ctrl-C was pressed within `ensure_interruption`; global, because a process has one signal handler.
 _pressed: list[float] = []
 
 
@@ -96,10 +96,10 @@ def _press(_: int, __: FrameType | None) -> None:
 
 @contextmanager
 def defer_interruption() -> Iterator[None]:
-    """Delay Ctrl-C to the end of a short block that must not be interrupted.
+    """Delay Ctrl-C until the end of a short block that must not be interrupted.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C was pressed in the block.
+        KeyboardInterrupt: Ctrl-C was pressed during the block.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

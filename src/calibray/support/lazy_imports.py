@@ -1,4 +1,4 @@
-"""Imports on first use: names of a package, so that importing it is fast, and optional libraries."""
+"""Imports on first use: of the names in a package, so that importing it is fast, and of optional libraries."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def lazy_attributes(
 ) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
     """Make `__all__`, `__getattr__` and `__dir__` of a package (PEP 562) from the names that its modules define.
 
-    The names of a module are words of one text; a name without words is the module itself.
+    `modules` maps each module to its names, separated by spaces; an empty text stands for the module itself.
     """
     homes = {name: module for module, words in modules.items() for name in words.split() or [module]}
 
@@ -27,7 +27,7 @@ def lazy_attributes(
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module = import_module(f"{package}.{homes[name]}")
         value = getattr(module, name) if modules[homes[name]] else module
-        # Set as an attribute, so that Python does not call this function again.
+        # Stored as an attribute, so that Python does not call this function again for this name.
         setattr(sys.modules[package], name, value)
         return value
 
@@ -38,7 +38,7 @@ def lazy_attributes(
 
 
 def library(name: str, extra: str) -> ModuleType:
-    """Import an optional module, which an extra of Calibray installs.
+    """Import an optional module, which is installed by one of Calibray's extras.
 
     Raises:
         InputError: The module is not installed, or cannot be loaded.

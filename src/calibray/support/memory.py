@@ -1,4 +1,4 @@
-"""The resources of this machine that the process may use: memory, and threads of BLAS."""
+"""Limits on the resources that the process may use: memory, and BLAS threads."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 
 LEAST_ADDRESS_SPACE: Final = 2_900_000_000
-"""Limit of the address space below which libraries cannot be loaded or end the process [bytes]."""
+"""Smallest limit on the address space [bytes]; below it, libraries fail to load or terminate the process."""
 
 CONTROL_GROUP = Path("/sys/fs/cgroup")
-"""Control group (version 2) of a container, with its memory limit."""
+"""Control group (version 2) of a container, which states its memory limit."""
 
 
 def check_address_space() -> None:
-    """Refuse to work if the address space (`ulimit -v`) is too small for the libraries.
+    """Refuse to start if the address space (`ulimit -v`) is too small for the libraries.
 
     Raises:
         InputError: The limit is below `LEAST_ADDRESS_SPACE`.
@@ -41,14 +41,14 @@ def check_address_space() -> None:
 
 
 def available_memory() -> int:
-    """Memory that can be allocated before the system ends the process or refuses more [bytes].
+    """Memory that can be allocated before the system kills the process or refuses further allocations [bytes].
 
-    This is the smallest amount that the system, the container and the limit of the address space (`ulimit -v`) leave.
+    This is the smallest of the amounts left by the system, the container and the address space limit (`ulimit -v`).
     """
-    import psutil  # not needed to check the limit of the address space
+    import psutil  # imported here because `check_address_space` runs without it
 
     free = [psutil.virtual_memory().available]
-    # psutil does not know limits. The file of the container holds "max" if there is none; file caches can be freed.
+    # psutil ignores limits. memory.max of the container contains "max" if there is no limit; file caches can be freed.
     with suppress(OSError, ValueError, StopIteration):
         limit = int((CONTROL_GROUP / "memory.max").read_text())
         lines = (CONTROL_GROUP / "memory.stat").read_text().splitlines()
@@ -63,14 +63,14 @@ def available_memory() -> int:
 
 
 def single_blas_thread(wanted: bool = True) -> AbstractContextManager[object]:
-    """Context in which the linear algebra uses one thread; without effect unless requested."""
+    """Make a context in which linear algebra uses a single thread; without effect if `wanted` is False."""
     return _libraries().limit(limits=1, user_api="blas") if wanted else nullcontext()
 
 
 @cache
 def _libraries() -> ThreadpoolController:
-    """The loaded libraries; cached, because the search reads all memory maps of the process."""
-    # Import SciPy's library as well, so that it is among them.
+    """The loaded BLAS libraries; cached, because finding them reads all memory maps of the process."""
+    # SciPy is imported first, so that its BLAS library is among them.
     import scipy.linalg  # noqa: F401
     from threadpoolctl import ThreadpoolController
 
@@ -78,10 +78,10 @@ def _libraries() -> ThreadpoolController:
 
 
 SECONDS: Final = 20.0
-"""Time limit for reading a small file [s]; on a busy machine, most of it is the start of the process."""
+"""Time limit for reading a small file [s]; on a busy machine, most of the time is spent on starting the process."""
 
 REFUSED: Final = 3
-"""Exit status of code that refuses its file; the reason is on stdout."""
+"""Exit status of code that refuses its input file; it prints the reason to stdout."""
 
 _LIMITS: Final = """
 import sys
@@ -98,19 +98,19 @@ def refuse(reason):
 
 
 def run_limited(code: str, memory: int, size: int) -> bool:
-    """Run code in another process, which can import the same modules as this one.
+    """Run code in a separate process, which can import the same modules as this process.
 
     Args:
-        code: The code. It may call `refuse(reason)`.
-        memory: Limit of the address space [bytes].
-        size: Size of the file that is read [bytes], which determines the time limit.
+        code: The code, which may call `refuse(reason)`.
+        memory: Limit on the address space [bytes].
+        size: Size of the file that the code reads [bytes], which determines the time limit.
 
     Returns:
-        Whether the code finished; False if the process failed.
+        True if the code finished; False if the process failed.
 
     Raises:
-        InputError: The code refused the file, for the reason given.
-        TimeoutError: The code did not finish; the message states the time limit.
+        InputError: The code refused the file; the message states the reason.
+        TimeoutError: The code did not finish in time; the message states the time limit.
     """
     if not sys.executable:
         return True  # an embedded interpreter cannot start another one
@@ -121,7 +121,7 @@ def run_limited(code: str, memory: int, size: int) -> bool:
         done = subprocess.run(
             [sys.executable, "-c", program],
             stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace", timeout=limit, check=False,
-            # Threads would count against the limit of the address space.
+            # Each thread would take up part of the limited address space.
             env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
         )  # fmt: skip
     except subprocess.TimeoutExpired:

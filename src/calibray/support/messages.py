@@ -1,4 +1,4 @@
-"""Parts of messages: suggestions for unknown names, values short enough to read, durations."""
+"""Parts of messages, such as suggestions for unknown names, shortened values and durations."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ MAX_LENGTH: Final = 80
 MAX_LISTED: Final = 20
 """Number of names, or of errors, above which a message does not list them all."""
 MAX_COMPARED: Final = 2_000
-"""Largest number of names with which a misspelled one is compared."""
+"""Largest number of valid names with which an unknown name is compared."""
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """The remedy for an unknown name at the end of a message: a close valid name, otherwise the first twenty.
+    """Suggest a remedy for an unknown name: a similar valid name, or otherwise the first `MAX_LISTED` valid names.
 
     Example:
         >>> did_you_mean("concret", ["brick", "concrete"])
@@ -36,7 +36,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def shortened(text: str, longest: int = MAX_LENGTH) -> str:
-    """Shorten a text for a message: its start and its end, if it has more than `longest` characters.
+    """Shorten a text to its start and its end if it has more than `longest` characters.
 
     Example:
         >>> shortened("abcdefghijkl", longest=9)
@@ -49,9 +49,9 @@ def shortened(text: str, longest: int = MAX_LENGTH) -> str:
 
 
 def printable(text: str, keep: str = "") -> str:
-    r"""Escape the characters of a text that a terminal or an editor would interpret: names come from files.
+    r"""Escape the characters of a text that a terminal or an editor would interpret, because names come from files.
 
-    Characters in `keep`, for instance line breaks, stay; the others become escape sequences of Python.
+    Characters in `keep`, for instance line breaks, are kept; the others become Python escape sequences.
 
     Example:
         >>> printable("RSS\x1b[2J\n[engine]")
@@ -68,7 +68,7 @@ def printable(text: str, keep: str = "") -> str:
 
 
 def first_line(error: Exception) -> str:
-    """The first line of an error's message, or its type if it has none.
+    """The first line of an error's message, or the error's type if it has no message.
 
     Example:
         >>> first_line(KeyError())
@@ -78,7 +78,7 @@ def first_line(error: Exception) -> str:
 
 
 def type_name(value: object) -> str:
-    """The name of a value's type, with its package unless that is Python itself.
+    """The name of a value's type, preceded by its package unless the type is built in.
 
     Example:
         >>> type_name(None), type_name(ValueError()), type_name(get_close_matches)
@@ -89,7 +89,7 @@ def type_name(value: object) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """A number with its noun, whose plural ends in s.
+    """A number followed by its noun; the plural is formed with an s.
 
     Example:
         >>> counted(1, "link"), counted(1200, "link")
@@ -99,7 +99,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def command(*words: object) -> str:
-    """A command in the form for a terminal, with quotes where a shell needs them.
+    """Format a command for a terminal, with quotes where a shell needs them.
 
     Example:
         >>> command("report", "my result")
@@ -109,7 +109,7 @@ def command(*words: object) -> str:
 
 
 def percent(share: float) -> str:
-    """Write a share as a whole number of per cent.
+    """Format a fraction as a whole percentage.
 
     Example:
         >>> percent(0.954), percent(0.001)
@@ -119,7 +119,7 @@ def percent(share: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Write a time [s] in seconds, minutes, hours or days, with the precision of an estimate.
+    """Format a time [s] in seconds, minutes, hours or days, rounded as an estimate.
 
     Example:
         >>> duration(26_700.0)

@@ -1,10 +1,10 @@
-"""Output files: refused before the work if they cannot be written, and always written completely.
+"""Output files, which are checked before any computation starts and are always written completely.
 
-An output never replaces an input, a link or a device, or a file that Calibray did not write or that has changed since.
-Calibray signs the files that it writes: `.calibray` in the same folder lists the digest and the name of each.
+An output never replaces an input, a link or a device, nor, by default, a file that Calibray did not write or that has
+changed since. Calibray signs its files: `.calibray` in the same folder lists the digest and the name of each.
 
-All files are written by `replacing`: under a random name in the same folder, created by this process and not through a
-link, and then moved into place in one step.
+`replacing` writes each file under a random name in the same folder, creates it without following links, and then moves
+it into place in one step.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Final, NoReturn
 from calibray.errors import InputError
 from calibray.support.messages import shortened, type_name
 
-PARTIAL: Final = ".part"  # end of the name of an unfinished file
-SIGNATURES: Final = ".calibray"  # a line per file written, its SHA-256 and its name; only appended to
-SIGNATURES_LIMIT: Final = 2**26  # largest signature file that is read [bytes]; a line takes about 80
+PARTIAL: Final = ".part"  # ending of the name of an unfinished file
+SIGNATURES: Final = ".calibray"  # one line per written file: SHA-256 and name; lines are only appended
+SIGNATURES_LIMIT: Final = 2**26  # size limit of a signature file [bytes]; a line takes about 80
 PATH_SEAL: Final = b"calibray/paths sha256 "  # start of a path file
 STALE_SECONDS: Final = 60.0  # age at which an unfinished file is removed if its process has ended
 
-_UNFINISHED: Final = re.compile(r"\.([0-9]{1,10})-[0-9a-f]{32}" + re.escape(PARTIAL))  # with the process
+_UNFINISHED: Final = re.compile(r"\.([0-9]{1,10})-[0-9a-f]{32}" + re.escape(PARTIAL))  # with the process id
 _SIGNATURE_LINE: Final = re.compile(rb"[0-9a-f]{64}  ")  # start of each line of a signature file
-# Windows has neither flag: its links need special rights, and it has no FIFO in a folder.
+# Windows has neither of the first two flags: links need special rights there, and folders contain no FIFOs.
 NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
 
 
 def as_path(name: object, role: str) -> Path:
-    """The path of a file or folder that a caller names; `role` starts the message.
+    """Convert a file or folder name given by a caller to a path; error messages start with `role`.
 
     Raises:
         InputError: The name is neither text nor a path.
@@ -50,18 +50,18 @@ def as_path(name: object, role: str) -> Path:
 
 
 def exists(file: str | Path) -> bool:
-    """Whether a file exists, also through a link. Folders, devices and invalid names give False."""
+    """Whether a file exists; links are followed. Folders, devices and invalid names give False."""
     try:
         return Path(file).is_file()
     except (OSError, ValueError):
         return False
 
 
-# Checks before the work; nothing is created yet.
+# Checks before the computation; they create nothing.
 
 
 def check_folder(folder: str | Path) -> Path:
-    """Refuse a folder into which no file can be written; the folder need not exist.
+    """Refuse a folder to which no file can be written; the folder need not exist.
 
     Raises:
         InputError: The folder, or the folder in which it would be created, is a file or cannot be written to.
@@ -71,20 +71,20 @@ def check_folder(folder: str | Path) -> Path:
     if not nearest.is_dir():
         raise InputError(f"output folder {target}: {nearest} is a file; name another folder")
     if not os.access(nearest, os.W_OK | os.X_OK):
-        raise InputError(f"output folder {target}: {nearest} cannot be written; name another folder")
+        raise InputError(f"output folder {target}: {nearest} cannot be written to; choose another folder")
     return target
 
 
 def check_outputs(
     folder: str | Path, names: Sequence[str], inputs: Iterable[Path] = (), overwrite: bool = False
 ) -> Path:
-    """Refuse a folder into which files cannot be written, or that contains files that must not be replaced.
+    """Refuse a folder to which files cannot be written, or that contains files that must not be replaced.
 
-    `inputs` are files that the work reads, which are never replaced. With `overwrite`, files that Calibray did not
-    write are replaced.
+    `inputs` are the files that the computation reads, which are never replaced. With `overwrite`, files that Calibray
+    did not write are replaced.
 
     Raises:
-        InputError: See `check_folder` and `check_replaceable`; or `.calibray` in the folder is not Calibray's.
+        InputError: As for `check_folder` and `check_replaceable`; or `.calibray` in the folder is not Calibray's.
     """
     target, sources = check_folder(folder), list(inputs)
     _check_signature_file(target)
@@ -94,39 +94,39 @@ def check_outputs(
 
 
 def check_file(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = False) -> Path:
-    """Refuse a file that cannot be written; it need not exist, but its folder must. Else as `check_outputs`.
+    """Refuse a file that cannot be written; it need not exist, but its folder must. See also `check_outputs`.
 
     Raises:
-        InputError: It is a folder, its folder does not exist or cannot be written to, or an error of `check_outputs`.
+        InputError: The file is a folder; its folder does not exist or cannot be written to; or as for `check_outputs`.
     """
     target = _valid_name(file, "output file")
     if target.is_dir():
         raise InputError(f"output file {target}: is a folder; name a file in it")
     if not target.parent.is_dir():
         raise InputError(
-            f"output file {target}: there is no folder {target.parent}; make it, or name another"
+            f"output file {target}: there is no folder {target.parent}; create it, or choose another folder"
         )
     if not os.access(target.parent, os.W_OK | os.X_OK):
-        raise InputError(f"output file {target}: {target.parent} cannot be written; name another")
+        raise InputError(f"output file {target}: {target.parent} cannot be written to; choose another folder")
     _check_signature_file(target.parent)
     check_replaceable(target, inputs, overwrite)
     return target
 
 
 def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool = False) -> None:
-    """Refuse to replace a file that must be kept; a file that does not exist may be written.
+    """Refuse to replace a file that must be kept; a file that does not exist passes.
 
     Raises:
-        InputError: It is an input, a link, a device or a folder; or a file that Calibray did not write, or that has
-            changed since, unless `overwrite`.
+        InputError: The file is an input, a link, a device or a folder; or, unless `overwrite`, Calibray did not write
+            it, or it has changed since.
     """
     status = _status(file, "output file")
     if status is None:
         return
     if stat.S_ISLNK(status.st_mode):
-        raise InputError(f"output file {file}: is a link; name the file that it leads to, or another")
+        raise InputError(f"output file {file}: is a link; give the file to which it points, or another file")
     if not stat.S_ISREG(status.st_mode):
-        raise InputError(f"output file {file}: is a folder, a device or a FIFO; name a file")
+        raise InputError(f"output file {file}: is a folder, a device or a FIFO; give a file")
     for source in inputs:
         if source.exists() and file.samefile(source):
             raise InputError(f"output file {file}: is an input; name another")
@@ -138,7 +138,7 @@ def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool =
 
 
 def check_unchanged(file: Path) -> None:
-    """Refuse a file that Calibray signed and that has changed since; an unsigned file may have any content.
+    """Refuse a file that has changed since Calibray signed it; an unsigned file may have any content.
 
     Raises:
         InputError: The file has changed since it was written.
@@ -146,13 +146,13 @@ def check_unchanged(file: Path) -> None:
     signatures = [line for line in _signatures(file.parent) if line.partition("  ")[2] == file.name]
     if signatures and _signature(file, file.name) not in signatures:
         raise InputError(
-            f"{file}: changed since Calibray wrote it, so its numbers may be wrong; run the study again, or "
+            f"{file}: has changed since Calibray wrote it, so its values may be wrong; run the study again, or "
             "give --allow-changed-inputs (allow_changed_inputs=True)"
         )
 
 
 def is_unchanged_output(file: Path) -> bool:
-    """Whether Calibray wrote a file in its present form: it is signed, or it is a path file, which has its own seal."""
+    """Whether Calibray wrote a file as it is now: the file is signed, or it is a path file, which has its own seal."""
     if _signature(file, file.name) in _signatures(file.parent):
         return True
     with file.open("rb") as stream:
@@ -160,7 +160,7 @@ def is_unchanged_output(file: Path) -> bool:
 
 
 def _valid_name(path: str | Path, role: str) -> Path:
-    """The path of an output; refused if a file cannot have this name."""
+    """Convert the name of an output to a path; refuse a name that no file can have."""
     target = as_path(path, role)
     _status(target, role)
     return target
@@ -174,13 +174,13 @@ def _status(path: Path, role: str) -> os.stat_result | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
-        raise InputError(f"{name}: cannot be looked up ({error.strerror}); name another") from None
+        raise InputError(f"{name}: cannot be accessed ({error.strerror}); choose another name") from None
     except ValueError as error:
-        raise InputError(f"{name}: cannot be a name ({error}); name another") from None
+        raise InputError(f"{name}: is not a valid name ({error}); choose another") from None
 
 
 def _signatures(folder: Path) -> list[str]:
-    """The lines of a folder's signature file; none if there is no such file, or if it is not Calibray's."""
+    """The lines of a folder's signature file; empty if there is no such file or it is not Calibray's."""
     try:
         with _open_signatures(folder, os.O_RDONLY) as stream:
             return stream.read().decode("utf-8", errors="replace").splitlines()
@@ -190,21 +190,21 @@ def _signatures(folder: Path) -> list[str]:
 
 def _check_signature_file(folder: Path) -> None:
     """Refuse a folder whose signature file is not Calibray's, because files there could not be signed."""
-    # Without permission to read it, writing fails later with the same message as for any other file.
+    # If it may not be read, writing fails later with the same message as for any other file.
     with suppress(OSError), _open_signatures(folder, os.O_RDONLY):
         pass
 
 
 def _open_signatures(folder: Path, flags: int) -> BinaryIO:
-    """Open the signature file of a folder, with flags of `os.open`.
+    """Open the signature file of a folder with the given flags of `os.open`.
 
     Raises:
-        InputError: It is a link, a folder or a device; another user owns it; it is too large; or another program wrote
-            it.
-        OSError: It does not exist or cannot be opened.
+        InputError: The file is a link, a folder or a device; it belongs to another user; it is too large; or another
+            program wrote it.
+        OSError: The file does not exist or cannot be opened.
     """
     path = folder / SIGNATURES
-    # Opening a FIFO or a device may block or have effects, so the status is checked before and after.
+    # Opening a FIFO or a device may block or have side effects, so the status is checked before and after.
     with suppress(FileNotFoundError):
         _check_signature_status(path, path.lstat())
     stream = os.fdopen(
@@ -244,7 +244,7 @@ def _signature(file: Path, name: str) -> str:
 
 
 def file_digest(file: Path) -> str:
-    """The SHA-256 of a file's content."""
+    """The SHA-256 digest of a file's content."""
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -254,32 +254,32 @@ def file_digest(file: Path) -> str:
 
 @contextmanager
 def replacing(path: Path, signed: bool = True) -> Iterator[Path]:
-    """Write a file under a temporary name; it is signed and moved into place once it is complete.
+    """Write a file under a temporary name; sign it and move it into place once it is complete.
 
-    Files with their own seal need not be signed. Yields the temporary file in the same folder, which exists and is
-    empty; it is removed if writing fails.
+    Files with their own seal need not be signed. Yields the temporary file, which is empty and in the same folder; it
+    is removed if writing fails.
 
     Raises:
-        InputError: The file is a link, a device or a folder, `.calibray` is not Calibray's, or somebody replaced the
-            temporary file.
+        InputError: The file is a link, a device or a folder, `.calibray` is not Calibray's, or another program
+            replaced the temporary file.
     """
     check_replaceable(
         path, overwrite=True
-    )  # whether a regular file may be replaced was checked before the work
+    )  # whether a regular file may be replaced was checked before the computation
     _remove_unfinished(path)
     partial = path.with_name(f"{path.name}.{os.getpid()}-{uuid.uuid4().hex}{PARTIAL}")
     descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | NO_LINK, 0o666)
     try:
         with os.fdopen(descriptor, "wb") as created:
             yield partial
-            # Whoever else may write to the folder could have put a link or another file under the name. The file that
-            # was created is open until here, so that no other file can have its number.
+            # Another user with write access to the folder could have put a link or another file under this name. The
+            # created file stays open until here, so that no other file can get its inode number.
             if not os.path.samestat(partial.lstat(), os.fstat(created.fileno())):
                 raise InputError(
-                    f"output file {path}: another program replaced {partial}; name another folder"
+                    f"output file {path}: another program replaced {partial}; choose another folder"
                 )
         if signed:
-            # Signed first: after a kill between the two steps, the next run must still recognise the file as its own.
+            # Signed first: if the process is killed between the two steps, the next run must still recognise the file.
             _sign(partial, path)
         partial.replace(path)
     finally:
@@ -287,9 +287,9 @@ def replacing(path: Path, signed: bool = True) -> Iterator[Path]:
 
 
 def _sign(partial: Path, path: Path) -> None:
-    """Add the line of a file to the folder's signatures."""
+    """Add the signature line of a file to the folder's signature file."""
     signature = _signature(partial, path.name)
-    # A file that does not exist has not been signed lately; a line that stands there twice does no harm.
+    # The search is skipped for a new file, which is rarely signed already; a repeated line does no harm.
     if path.exists() and signature in _signatures(path.parent):
         return
     with _open_signatures(path.parent, os.O_RDWR | os.O_CREAT | os.O_APPEND) as stream:
@@ -297,9 +297,9 @@ def _sign(partial: Path, path: Path) -> None:
 
 
 def _remove_unfinished(path: Path) -> None:
-    """Remove unfinished files of processes that were killed while they wrote this file."""
+    """Remove the unfinished files of processes that were killed while writing this file."""
     final = path.name
-    # A scene's folder has thousands of files, and a path of each takes long to make.
+    # A scene's folder may have thousands of files, and making a Path of each takes long.
     with os.scandir(path.parent) as entries:
         unfinished = [
             (path.with_name(entry.name), match)
@@ -311,7 +311,7 @@ def _remove_unfinished(path: Path) -> None:
         try:
             status = partial.lstat()
             if stat.S_ISREG(status.st_mode) and time.time() - status.st_mtime > STALE_SECONDS:
-                os.kill(int(match[1]), 0)  # raises ProcessLookupError if it has ended
+                os.kill(int(match[1]), 0)  # raises ProcessLookupError if the process has ended
         except ProcessLookupError:
             partial.unlink(missing_ok=True)
         except (OSError, OverflowError):
@@ -330,7 +330,7 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def append_text(path: Path, text: str) -> None:
-    """Append to a file of finished work, which is created if it does not exist.
+    """Append to a text file of finished results, creating it if it does not exist.
 
     Raises:
         InputError: The file is a link, a device or a folder.
@@ -345,30 +345,30 @@ if TYPE_CHECKING:
 
 TABLES: Final = (".csv", ".parquet")
 
-# Computed by spreadsheets, or marked already.
+# Texts that a spreadsheet would evaluate as a formula, or that are already marked with an apostrophe.
 _FORMULA: Final = re.compile("'*[=+\\-@\t\r\n\uff1d\uff0b\uff0d\uff20].", re.DOTALL)
 
 
 def check_table(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = False) -> Path:
-    """Refuse a table that cannot be written: see `check_file`; the name must end in .csv or .parquet.
+    """Refuse a table that cannot be written (see `check_file`); the name must end in .csv or .parquet.
 
     Raises:
-        InputError: The extension is another one, or an error of `check_file`.
+        InputError: The name has another extension, or as for `check_file`.
     """
     target = check_file(file, inputs, overwrite)
     if target.suffix.lower() not in TABLES:
-        raise InputError(f"output file {target}: tables end in {' or '.join(TABLES)}; name it so")
+        raise InputError(f"output file {target}: a table must end in {' or '.join(TABLES)}; rename it")
     return target
 
 
 def write_table(path: str | Path, table: pd.DataFrame) -> None:
-    """Write a CSV or Parquet file, without the index, and move it into place; errors as for `growing_table`."""
+    """Write a CSV or Parquet file, without the index, and move it into place; errors are as for `growing_table`."""
     with growing_table(path) as append:
         append(table)
 
 
 def csv_text(table: pd.DataFrame, float_format: str | None = None, header: bool = True) -> str:
-    """A table as CSV without its index; texts that a spreadsheet would compute are marked by an apostrophe."""
+    """Format a table as CSV without its index; texts that a spreadsheet would evaluate start with an apostrophe."""
     names = [formula_free(name) for name in table.columns]
     safe, returns = table.set_axis(names, axis=1), any("\r" in str(name) for name in names)
     for number, kind in enumerate(table.dtypes):  # by position, since names may repeat
@@ -381,13 +381,13 @@ def csv_text(table: pd.DataFrame, float_format: str | None = None, header: bool 
         header=header,
         float_format=float_format,
         lineterminator="\n",
-        # Python's writer does not quote a carriage return, which readers take for the end of a line.
+        # Python's writer does not quote a carriage return, which readers interpret as the end of a line.
         quoting=csv.QUOTE_NONNUMERIC if returns else csv.QUOTE_MINIMAL,
     )
 
 
 def formula_free(cell: Any) -> Any:
-    """Mark a text that a spreadsheet would read as a formula; numbers and other texts are unchanged.
+    """Put an apostrophe before text that a spreadsheet would read as a formula; all else is unchanged.
 
     Example:
         >>> formula_free("=HYPERLINK(1)"), formula_free("-80.5"), formula_free("- east")
@@ -403,7 +403,7 @@ def formula_free(cell: Any) -> Any:
 
 
 def without_formula_mark(cell: str) -> str:
-    """Remove the mark that `formula_free` adds."""
+    """Remove the apostrophe that `formula_free` adds."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
@@ -411,12 +411,12 @@ def without_formula_mark(cell: str) -> str:
 def growing_table(path: str | Path) -> Iterator[Callable[[pd.DataFrame], None]]:
     """Write a CSV or Parquet file in parts and move it into place once it is complete.
 
-    Yields a function that appends rows without their index; all calls must have the columns and types of the first one.
+    Yields a function that appends rows without their index; all tables must have the columns and types of the first.
 
     Raises:
-        InputError: An error of `check_table`, or Parquet without pyarrow, or a column changes its type.
+        InputError: As for `check_table`; pyarrow, which Parquet needs, is missing; or a column changes its type.
     """
-    # Whether the file may be replaced was checked before the work.
+    # Whether the file may be replaced was checked before the computation.
     target = check_table(path, overwrite=True)
     write = _csv if target.suffix.lower() == ".csv" else _parquet
     with replacing(target) as partial, write(partial, target) as append:
@@ -450,7 +450,7 @@ def _parquet(partial: Path, target: Path) -> Iterator[Callable[[pd.DataFrame], N
             try:
                 rows = pyarrow.Table.from_pandas(table, schema, preserve_index=False)
             except (pyarrow.ArrowInvalid, pyarrow.ArrowTypeError) as error:
-                raise InputError(f"{target}: cannot be Parquet ({error}); write CSV") from None
+                raise InputError(f"{target}: cannot be written as Parquet ({error}); write CSV") from None
             if not writers:
                 writers.append(stack.enter_context(parquet.ParquetWriter(partial, rows.schema)))
             writers[0].write_table(rows)

@@ -1,18 +1,18 @@
-"""Reporting the progress of long work."""
+"""Reporting the progress of long computations."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 Progress = Callable[[str, int, int | None], None]
-"""Called with the stage ("tracing", "calibrating", ...), the amount done, and the total amount; None if unknown.
+"""Called with the stage ("tracing", "calibrating", ...), the amount done, and the total amount or None if unknown.
 
-What a stage has found so far follows its name after a colon: "calibrating: best RMSE 3.10 dB".
+An interim result follows the name of the stage after a colon: "calibrating: best RMSE 3.10 dB".
 """
 
 
 def with_stage(progress: Progress | None, stage: str) -> Progress | None:
-    """Report progress under another stage, such as "checking" for a trace that checks another one.
+    """Report progress under a different stage name, such as "checking" for a trace that checks another trace.
 
     Example:
         >>> progress = with_stage(lambda *parts: print(*parts), "checking")
@@ -25,7 +25,7 @@ def with_stage(progress: Progress | None, stage: str) -> Progress | None:
 
 
 def with_total(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Report the progress of one of several parts, after the amount `before`, as that of the whole work.
+    """Report the progress of one part as progress of the whole; `before` is the amount done in earlier parts.
 
     Example:
         >>> progress = with_total(lambda *parts: print(*parts), 100, 250)

@@ -1,4 +1,4 @@
-"""Strict models of file contents, which refuse unknown keys and wrong types, and messages about what they refuse."""
+"""Strict models of file contents, which refuse unknown keys and wrong types, and their error messages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Text = Annotated[str, Field(min_length=1)]
 
 
 class Section(BaseModel):
-    """A table of a file: strict and immutable."""
+    """A strict, immutable model of a table in a file."""
 
     model_config = CLOSED | ConfigDict(frozen=True)
 
@@ -57,16 +57,16 @@ def explain(
     source: str,
     tagged: Sequence[str] = (),
 ) -> InputError:
-    """One message for all errors, with one line each: file, dotted key, value, bound.
+    """Combine all errors in one message, with one line per error: file, dotted key, value, bound.
 
-    For misspelled keys, it suggests keys of the model. `tagged` are tables of which there are several kinds,
-    distinguished by their `name`.
+    The message suggests valid keys for misspelled ones. `tagged` lists the tables that have several kinds,
+    distinguished by their key `name`.
     """
     lines: dict[str, str] = {}
     for fault in error.errors():
         location = fault["loc"]
         if location[:1] and location[0] in tagged:
-            # Pydantic puts the kind after the table's name, but it is not a key of the file.
+            # Pydantic puts the kind after the table's name, but the kind is not a key in the file.
             location = (location[0], "name") if "tag" in fault["type"] else (location[0], *location[2:])
         path = _path(location, content, fault["type"] == "missing")
         key = dotted(path)
@@ -76,9 +76,9 @@ def explain(
             line = f"{key}: {_WORDS['missing']}"
         else:
             text = describe_fault(fault)
-            # A message about a whole table names the key itself.
+            # A message about a whole table already contains the key.
             line = text if text.startswith(key) else f"{key}{_shown(path, content)}: {text}"
-        # A value that matches none of several types has one error per type.
+        # A value that matches none of several allowed types causes one error per type.
         if key not in lines:
             lines[key] = line
         elif fault["type"] in _WORDS and not lines[key].endswith(text := describe_fault(fault)):
@@ -90,7 +90,7 @@ def explain(
 
 
 def describe_fault(fault: Mapping[str, Any]) -> str:
-    """The message of one of Pydantic's errors, without the value."""
+    """The message for an error reported by Pydantic, without the value."""
     context = fault.get("ctx") or {}
     if isinstance(cause := context.get("error"), InputError):
         return str(cause)
@@ -99,7 +99,7 @@ def describe_fault(fault: Mapping[str, Any]) -> str:
 
 
 def dotted(path: Sequence[str | int]) -> str:
-    """A key in the form of TOML, for instance ``parameters."walls.thickness".bounds[1]``."""
+    """Format a key as in TOML, for instance ``parameters."walls.thickness".bounds[1]``."""
     text = ""
     for part in path:
         if isinstance(part, int):
@@ -111,7 +111,7 @@ def dotted(path: Sequence[str | int]) -> str:
 
 
 def _path(location: Sequence[str | int], content: Any, missing: bool) -> tuple[str | int, ...]:
-    """Pydantic's location without the parts that name a type; only the last key may be missing from the content."""
+    """Remove the names of types from Pydantic's location; only the last key may be missing from the content."""
     path: list[str | int] = []
     for index, part in enumerate(location):
         last = index == len(location) - 1
@@ -128,14 +128,14 @@ def _path(location: Sequence[str | int], content: Any, missing: bool) -> tuple[s
 
 
 def _shown(path: Sequence[str | int], content: Any) -> str:
-    """The value at a path, if it is short enough to help."""
+    """The value at a path as ` = VALUE`, shortened; empty for a table."""
     for part in path:
         content = content[part]
     return "" if isinstance(content, Mapping) else f" = {shortened(repr(content))}"
 
 
 def _keys(model: Any, path: Sequence[str | int]) -> list[str]:
-    """The keys of a model at a path, of all kinds of tables that are possible there."""
+    """The keys of a model at a path, for all kinds of tables allowed there."""
     models = [model]
     for part in path:
         models = [table for known in models for table in _tables(_annotation(known, str(part)))]
@@ -143,7 +143,7 @@ def _keys(model: Any, path: Sequence[str | int]) -> list[str]:
 
 
 def _annotation(model: Any, key: str) -> Any:
-    """The type of a key of a model, or of any key of a mapping; None if it is neither."""
+    """The type of a key in a model, or of the values in a mapping; None if it is neither."""
     if annotations := _annotations(model):
         return annotations.get(key)
     arguments = get_args(model)
@@ -157,6 +157,6 @@ def _annotations(model: Any) -> dict[str, Any]:
 
 
 def _tables(annotation: Any) -> list[Any]:
-    """The types that a key may have, except None."""
+    """The types that the value of a key may have, except None."""
     options = get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
     return [option for option in options if option is not type(None)]
