@@ -159,7 +159,7 @@ class Moves:
         return moved, replace(lengths, points=points)
 
     def _redraw_coordinate(self, population: Population) -> Population:
-        """Redraw one parameter from its values in the population, smoothed by Gaussian kernels of local width."""
+        """Redraw one parameter from its values in the population, smoothed by Gaussian kernels of adapted width."""
         random, (count, width) = self.random, population.point.shape
         chosen, point, log_ratio = random.integers(0, width, count), population.point.copy(), np.zeros(count)
         near = max(2, count // NEIGHBOURHOOD)

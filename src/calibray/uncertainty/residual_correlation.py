@@ -166,7 +166,7 @@ def variogram(
 
     A rising variogram indicates correlated errors [m], [dB], and a flat one indicates independent errors. Positions
     [m, k], [m], are those of the receivers or of both ends. The result is the mean distance [8], [m], the semivariance
-    [8], [dB^2], and the number of pairs [8] of 8 classes with about as many pairs each; of fewer if pairs are few.
+    [8], [dB^2], and the number of pairs [8], for classes with about equally many pairs; fewer than 8 if pairs are few.
     """
     chosen = evenly_spaced(len(errors), MOST_LINKS)
     distance, half = pdist(position[chosen]), 0.5 * pdist(errors[chosen, None], "sqeuclidean")
@@ -215,7 +215,7 @@ def whitener(
 ) -> Whitener:
     """Make the whitener of errors of links whose ends have positions [m, k], [m].
 
-    The errors were multiplied by `scale` [m], which makes the uncorrelated part equal for all links. The covariance of
+    The errors were multiplied by `scale` [m], so the uncorrelated part has the same variance for all. The covariance of
     the correlated part, a share of the variance from 0 to below 1, falls to 1/e at the distance `range_m` [m]. Up to
     `exact` links, the covariance is factored exactly. `neighbours` are computed if None.
     """
