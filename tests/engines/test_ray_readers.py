@@ -267,7 +267,7 @@ REFUSED = {
             pd.read_parquet(folder / "raypaths.parquet").iloc[1:].to_parquet(folder / "raypaths.parquet")
         ),
         {},
-        "gains of ru_id",
+        "gains for ru_id",
     ),
     "a missing matrix": (
         write_deepmimo,
@@ -323,5 +323,5 @@ def test_paths_of_sionna_at_another_carrier_are_refused(paths: rt.Paths) -> None
 def test_a_folder_without_paths_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"raypaths\.parquet"):
         read(tmp_path)
-    with pytest.raises(InputError, match="two points more"):
+    with pytest.raises(InputError, match="two more points"):
         rows_of([Polyline(np.zeros((2, 3)), ["reflection"], -80.0)], "made up")

@@ -150,7 +150,7 @@ def test_an_edge_where_two_houses_meet_has_the_stated_material(tmp_path: Path) -
 
 
 WRONG = {
-    "points of the path missing": (lambda t: t.drop(t.index[t.point == 3][0] - 1), "count up by 1"),
+    "points of the path missing": (lambda t: t.drop(t.index[t.point == 3][0] - 1), "increase by 1"),
     "a receiver missing": (lambda t: t[t.type != "receiver"], "the last its receiver"),
     "an unknown type": (lambda t: t.replace({"type": {"reflection": "R"}}), "'R'"),
     "an unknown material": (
@@ -336,7 +336,7 @@ def test_paths_of_a_study_belong_to_its_links(tmp_path: Path) -> None:
     assert np.bincount(paths.link).tolist() == [2, 1, 2, 2, 2, 2, 2, 2]
     np.testing.assert_allclose(path_loss(paths)[2:], path_loss(traced)[2:], atol=1e-5)
     moved = rows.assign(z=rows.z + 0.5 * (rows.type == "receiver"))
-    with pytest.raises(InputError, match=r"connect other positions than the links.* 0\.5 m away"):
+    with pytest.raises(InputError, match=r"connect positions other than those of the links.* 0\.5 m away"):
         cb.read_rays(moved[moved.path % 2 == 0].assign(delay=np.nan).drop(columns="delay"), study)
 
 
@@ -371,7 +371,7 @@ def test_an_offset_of_all_direct_paths_is_named(yard: Tracer, rows: pd.DataFrame
     one = int(rows.path[rows.type == "reflection"].iloc[0])
     direct = rows.groupby("path").point.transform("max") == 1
     number = int(rows.path[direct].iloc[0])
-    with pytest.raises(InputError, match=rf"path {number}, a direct one, is 12\.0 dB below"):
+    with pytest.raises(InputError, match=rf"path {number}, a direct path, is 12\.0 dB below"):
         read(rows.assign(power_db=rows.power_db - 12 * (rows.path == number) - 90 * (rows.path == one)), yard)
     read(rows, yard, antennas=None)
     assert not caplog.records
@@ -398,7 +398,7 @@ def test_antennas_of_a_study_are_those_of_the_table(tmp_path: Path) -> None:
         ({"frequency": "3.5e9"}, "frequency = '3.5e9': must be in 1e"),
         ({"frequency": 3.5}, "frequency = 3.5: must be in 1e"),
         ({"antennas": ("iso", "iso")}, "must be two Antenna"),
-        ({"tx_power_dbm": 30.0}, "is for files of Wireless InSite"),
+        ({"tx_power_dbm": 30.0}, "applies only to Wireless InSite files"),
     ],
 )
 def test_arguments_that_do_not_go_with_a_table_are_refused(
@@ -488,5 +488,5 @@ def test_paths_of_a_link_with_other_ends_are_refused_although_the_study_has_the_
     """Left out, the link would lack their power."""
     first = rows["path"] == rows["path"][0]
     rows.loc[first & (rows["type"] == "transmitter"), "z"] += 100.0
-    with pytest.raises(InputError, match="other ends than the other paths of its link"):
+    with pytest.raises(InputError, match="not have the same ends as the other paths of its link"):
         compile_rays(RayTable.of(SourceTable(rows)), RaySetting(yard.scene, FREQUENCY, None, LINKS))

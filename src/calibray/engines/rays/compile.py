@@ -1,7 +1,7 @@
-"""Converts a ray table to a path program and back, with checks and the correction of every path's power.
+"""Convert a ray table to a path program and back, with checks and the correction of every path's power.
 
 The correction is the power that the engine states divided by the power of the replay. It contains properties that only
-the engine knows, such as its antennas: replay at other constants multiplies it by the ratio of the replayed powers.
+the engine knows, such as its antennas. Replay at other constants multiplies the replayed power by the correction.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from calibray.tracing.settings import Antenna
 _LOG: Final = logging.getLogger(__name__)
 
 UNKNOWN: Final = Antenna("iso", "VH")
-"""The antenna at an end whose real antenna is unknown: it loses no polarization, and the correction contains the
-rest."""
+"""Antenna assumed at an end whose real antenna is unknown: its two ports lose no polarization, and the correction
+contains the rest."""
 
 FREE_SPACE_DB: Final = 1.0
-"""Largest difference of a direct path from its free-space power if antennas are known [dB]: engines' tables of a
-pattern differ by tenths, while transmitted power or watts instead of decibels cause tens."""
+"""Largest deviation of a direct path from free-space power if antennas are known [dB]: pattern tables of engines differ
+by tenths of a decibel, while a wrong transmitted power or watts instead of decibels cause tens of decibels."""
 
 DIRECT_GAIN_DB: Final = 60.0
 """Largest total gain of both antennas of a direct path [dB]: two dishes of 30 dBi."""
 
 HIGH_GAIN_DB: Final = 25.0
-"""Gain of both antennas above which a warning follows [dB]: a sector antenna of 18 dBi and a receiver of 7 dBi."""
+"""Total gain of both antennas above which a warning is issued [dB]: 18 dBi of a sector antenna plus 7 dBi."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class RaySetting:
         scene: The scene, with the constants that the engine used.
         frequency: Carrier frequency [Hz].
         antennas: Transmit and receive antenna; None if they are unknown.
-        links: The links of the program; those of the table if None.
+        links: The links of the program; the links of the table if None.
     """
 
     scene: Scene
@@ -64,12 +64,12 @@ class RaySetting:
 
     @classmethod
     def of(cls, study: OpenedStudy) -> RaySetting:
-        """The links of a study at its start values; antennas that the study does not state are unknown."""
+        """The setting of a study at its start values; antennas that the study does not state are unknown."""
         return cls(study.scene, study.radio.frequency, study.known_antennas, study.links)
 
 
 def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
-    """Compile the paths of a table; one of power 0 is absent.
+    """Compile the paths of a table; paths of power 0 are left out.
 
     Raises:
         InputError: The table does not agree with the scene, the links or itself, or has neither links nor power.
@@ -82,7 +82,7 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
                 f"{table.source}: no path has a power above 0; export the rays of at least one link"
             )
     ends, link, chosen = _assign_links(table, setting.links)
-    # Paths of no link, numbered -1, come first and are left out.
+    # Paths that belong to no link have the number -1; they come first and are left out.
     order = np.argsort(link, kind="stable")[(link < 0).sum() :]
     table, link = table.take(order), link[order]
     _check_repeats(table, link)
@@ -109,7 +109,7 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
 
 
 def rays_of(paths: Paths) -> RayTable:
-    """The ray table of a path program, with the power of every path for the program's materials.
+    """The ray table of a path program, with the power of every path at the constants of the program's materials.
 
     Raises:
         InputError: A path has no power.
@@ -190,7 +190,7 @@ def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
 
 
 def _stated_materials(table: RayTable, scene: Scene) -> NDArray[np.int64]:
-    """Index of the stated material, or of that of the stated object; -1 if neither is stated [P, D]."""
+    """Index of the stated material, or of the stated object's material; -1 if neither is stated [P, D]."""
     names = {name: index for index, name in enumerate(scene.materials)}
     by_object = {item.name: names[item.material] for item in scene.objects}
     index = np.full(table.kind.shape, -1)
@@ -210,14 +210,14 @@ def _stated_materials(table: RayTable, scene: Scene) -> NDArray[np.int64]:
         stated = table.material == name
         if (stated & (index >= 0) & (index != names[name])).any():
             raise InputError(
-                f"{table.source}: states the material {name!r} for an object of another material of the scene"
+                f"{table.source}: states the material {name!r} for an object that has another material in the scene"
             )
         index[stated] = names[name]
     return index
 
 
 def _check_straight(hits: Hits, transmits: NDArray[np.bool_]) -> None:
-    # The angle of the bend times the shorter segment: by how much its end is off.
+    # The bend angle times the length of the shorter segment is the displacement of its end.
     bend = np.linalg.norm(hits.leaving - hits.incident, axis=1) * hits.length
     if (transmits & (bend > 4 * TOLERANCE)).any():
         number = int(np.argmax(np.where(transmits, bend, 0)))
@@ -254,15 +254,15 @@ def _assign_links(
         InputError: No path belongs to a link, or the paths of a link have different ends.
     """
     own = np.hstack([table.tx, table.rx])
-    # Without labels, positions that nearly agree are the same; rounding would part some of them.
+    # Without labels, nearly equal positions count as the same; rounding would separate a few of them.
     label = join_positions(own) if table.link is None else table.link
     _, first, link = np.unique(label, return_index=True, return_inverse=True)
     link = link.reshape(-1)
     apart = np.abs(own - own[first][link]).max(axis=1)
     if (apart > TOLERANCE).any():
         raise InputError(
-            f"{table.source}: path {table.path[int(np.argmax(apart))]} has other ends than the other paths of its "
-            "link; correct them"
+            f"{table.source}: path {table.path[int(np.argmax(apart))]} does not have the same ends as the other paths "
+            "of its link; correct them"
         )
     if links is None:
         return LinkPositions(own[first, :3], own[first, 3:]), link, None
@@ -271,8 +271,8 @@ def _assign_links(
     if (lost := off > TOLERANCE).any():
         worst = int(np.argmin(np.where(lost, off, np.inf)))
         fault = (
-            f"{table.source}: {lost.sum()} of {len(lost)} paths connect other positions than the links, as path "
-            f"{table.path[worst]}: the nearest link is {off[worst]:.3g} m away"
+            f"{table.source}: {lost.sum()} of {len(lost)} paths connect positions other than those of the links, e.g. "
+            f"path {table.path[worst]}: the nearest link is {off[worst]:.3g} m away"
         )
         if lost.all():
             raise InputError(
@@ -297,7 +297,7 @@ def _check_repeats(table: RayTable, link: NDArray[np.int64]) -> None:
 
 
 def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], known: bool) -> None:
-    """Refuse a direct path whose power no antenna explains."""
+    """Refuse a direct path whose power no antenna can explain."""
     direct = np.diff(paths.first) == 0
     replayed = (
         powers(paths) if known else (paths.spreading * speed_of_light / paths.frequency / (4 * np.pi)) ** 2
@@ -311,11 +311,9 @@ def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], kno
         what = "with the antennas stated" if known else "between isotropic antennas"
         common = ""
         if np.ptp(off[direct]) < FREE_SPACE_DB and direct.sum() > 1:
-            common = (
-                "; all direct paths differ by this, as by the transmitted power or a cable loss: subtract it"
-            )
+            common = "; all direct paths differ by this amount, e.g. transmitted power or a cable loss: subtract it"
         raise InputError(
-            f"{table.source}: path {table.path[worst]}, a direct one, is {abs(off[worst]):.1f} dB {side} free space "
+            f"{table.source}: path {table.path[worst]}, a direct path, is {abs(off[worst]):.1f} dB {side} free space "
             f"{what}; power_db must be the path gain, received minus transmitted power, with antenna gains{common}"
             + ("; omit the antennas if they are not those of the engine" if known else "")
         )

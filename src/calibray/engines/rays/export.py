@@ -20,10 +20,10 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths
 
 RESPONSE: Final = "its response"
-"""Name of a response in messages."""
+"""Name of the response in messages."""
 
 FAINT: Final = 0.1
-"""Weight of a path without power in its link, relative to the only path of a link."""
+"""Constant added to every path's share of its link's power, so that paths without power keep a small weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class Export:
     """The rays of one call.
 
     Attributes:
-        paths: Its rays as a program, whose powers at the scene's constants are those of the engine.
+        paths: The rays as a path program; at the scene's constants, its powers are those of the engine.
         level_db: Power of every path [P], [dB].
     """
 
@@ -68,14 +68,14 @@ class Export:
 
     @property
     def weight(self) -> NDArray[np.float64]:
-        """Weight of every path [P]: its share of the link's power, and a small constant."""
+        """Weight of every path [P]: its share of the link's power, plus a small constant."""
         power = 10 ** (self.level_db / 10)
         return power / np.bincount(self.paths.link, power)[self.paths.link] + FAINT
 
 
 @final
 class Exporting:
-    """An engine that answers with rays and stores them, so that it is called once for each candidate.
+    """An engine that answers with rays and stores them, so that it is called only once for each candidate.
 
     Attributes:
         parameters: The parameters whose values a candidate contains.

@@ -50,7 +50,7 @@ def rows_of(paths: Iterable[Polyline], source: str) -> SourceTable:
         if len(path.points) != len(path.types) + 2:
             raise InputError(
                 f"{source}: path {number} has {len(path.points)} points and {len(path.types)} interactions; it needs "
-                "two points more than interactions, its transmitter and its receiver"
+                "two more points than interactions, for its transmitter and its receiver"
             )
     count = [len(path.points) for path in paths]
     per_path = {
@@ -66,7 +66,7 @@ def rows_of(paths: Iterable[Polyline], source: str) -> SourceTable:
 
 
 def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
-    """The rows of a ray table, a file of one, or the paths of another program.
+    """The rows of a ray table, of a file that contains one, or of the paths of another program.
 
     Raises:
         InputError: The file or folder is malformed or not of a known kind, or the power is not a number.
@@ -76,8 +76,8 @@ def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
     insite = isinstance(rays, str | Path) and Path(rays).suffix.lower() == ".p2m"
     if tx_power_dbm is not None and not insite:
         raise InputError(
-            f"tx_power_dbm = {tx_power_dbm:g}: is for files of Wireless InSite (.p2m); in a table, subtract it from "
-            "the received power, so that power_db is the path gain"
+            f"tx_power_dbm = {tx_power_dbm:g}: applies only to Wireless InSite files (.p2m); in a table, subtract it "
+            "from the received power, so that power_db is the path gain"
         )
     if isinstance(rays, pd.DataFrame):
         return SourceTable(rays)
@@ -86,7 +86,7 @@ def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
     if is_sionna_paths(rays):
         return read_sionna_paths(rays)
     if isinstance(rays, Paths):
-        raise InputError("rays: these are Paths of Calibray already; use them without read_rays")
+        raise InputError("rays: these are already Paths of Calibray; use them without read_rays")
     if not isinstance(rays, str | Path):
         raise InputError(
             f"rays: is a {type(rays).__name__}; must be a DataFrame, a dict with one list per column, the name of a "
@@ -108,14 +108,14 @@ def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
 
 
 INSITE_TYPES: Final = {"R": "reflection", "D": "diffraction", "DS": "diffuse", "T": "transmission"}
-"""Interactions by their letters; foliage (F, X) is not a surface with a material."""
+"""Types of interaction by their letters; foliage (F, X) is not a surface with a material."""
 
 
 def read_insite(file: Path, tx_power_dbm: float | None) -> SourceTable:
     """Read the paths of one transmitter from a text file `*.paths.*.p2m` of Remcom Wireless InSite.
 
     Lines that begin with # are comments. The first line is the number of receivers. For each receiver, its number and
-    its number of paths follow and, if there are any paths, a line of sums. A path has a line of nine numbers (number,
+    its number of paths follow and, if there are any paths, a line of totals. A path has a line of nine numbers (number,
     number of interactions, received power [dBm], phase [deg], time of arrival [s], four angles [deg]) or of eight
     without the phase, a line such as Tx-R-D-Rx, and a line for each point.
 
@@ -145,7 +145,7 @@ def _insite_paths(file: Path, rest: Iterator[tuple[int, str]], tx_power_dbm: flo
     (receivers,) = _insite_numbers(file, next(rest), 1)
     for _ in range(int(receivers)):
         _, count = _insite_numbers(file, next(rest), 2)
-        # The line of sums.
+        # The line of totals.
         if count:
             next(rest)
         for _ in range(int(count)):
@@ -193,9 +193,9 @@ AODT_TYPES: Final = {
 def read_aodt(folder: Path) -> SourceTable:
     """Read the first time step with paths of NVIDIA's Aerial Omniverse Digital Twin, a folder with two tables.
 
-    Both name the time, the radio unit and the user equipment. `raypaths` has a row for each path, with its points in
-    units of the scene (centimetres) and its types of interaction. `cirs` has a row for each pair of
-    antenna elements, with lists of complex gains and delays [s] in the order of the paths.
+    Both tables state the time, the radio unit and the user equipment. `raypaths` has a row for each path, with its
+    points in units of the scene (centimetres) and its types of interaction. `cirs` has a row for each pair of antenna
+    elements, with lists of complex gains and delays [s] in the order of the paths.
 
     Powers are summed over the antenna elements of the user equipment and averaged over those of the radio unit.
 
@@ -210,14 +210,14 @@ def read_aodt(folder: Path) -> SourceTable:
         table.frame["time_idx"].to_numpy() if "time_idx" in table.frame else np.zeros(len(table))
         for table in (rays, gains)
     ]
-    # A first step without paths may have rows in one of the tables only.
+    # A first step without paths may have rows in only one of the tables.
     frames = [table.frame[time == times[0].min()] for table, time in zip((rays, gains), times, strict=True)]
     responses = {key: rows for key, rows in frames[1].groupby(AODT_PAIR, sort=False)}
     paths = []
     for pair, rows in frames[0].groupby(AODT_PAIR, sort=False):
         if pair not in responses:
             raise InputError(
-                f"{gains.source}: has no gains of ru_id, ue_id = {pair}, which have {len(rows)} paths"
+                f"{gains.source}: has no gains for ru_id, ue_id = {pair}, which have {len(rows)} paths"
             )
         power, delay = _aodt_response(gains.source, pair, responses[pair], len(rows))
         for number, (points, types) in enumerate(zip(rows["points"], rows["interaction_types"], strict=True)):
@@ -239,8 +239,8 @@ def _aodt_response(
     ]
     if wrong := [len(values) for column in lists for values in column if len(values) != count]:
         raise InputError(
-            f"{source}: {wrong[0]} gains of ru_id, ue_id = {pair}, but raypaths has {count} paths of them; export both "
-            "tables of the same run"
+            f"{source}: {wrong[0]} gains for ru_id, ue_id = {pair}, but raypaths has {count} paths; export both tables "
+            "from the same run"
         )
     real, imaginary, delay = (np.array(column) for column in lists)
     transmitting = len({_aodt_element(item) for item in rows[AODT_ELEMENT]}) if AODT_ELEMENT in rows else 1
@@ -262,7 +262,7 @@ def _aodt_numbers(source: str, name: str, values: Any) -> NDArray[np.float64]:
 
 
 def _aodt_element(element: Any) -> Any:
-    """An antenna element, of which exports state a number, a list or a dictionary, such as row, column and port."""
+    """An antenna element, which exports state as a number, a list or a dictionary, such as row, column and port."""
     if isinstance(element, dict):
         return tuple(element.values())
     return tuple(element) if np.ndim(element) else element
@@ -320,7 +320,7 @@ def read_deepmimo(folder: Path) -> SourceTable:
 
 
 def _deepmimo_files(folder: Path) -> Iterator[Path]:
-    """The matrices of powers."""
+    """The files of the power matrices."""
     for ending in ("mat", "npz"):
         yield from sorted(folder.glob(f"power_t*.{ending}"))
 
@@ -334,7 +334,7 @@ def _deepmimo_paths(file: Path) -> Iterator[Polyline]:
     power, delay, inter = (np.atleast_2d(matrices[name]) for name in ("power", "delay", "inter"))
     tx, rx = matrices["tx_pos"].reshape(-1, 3), matrices["rx_pos"].reshape(-1, 3)
     place = matrices["inter_pos"]
-    if place.ndim == 3:  # one interaction at most
+    if place.ndim == 3:  # at most one interaction
         place = place[:, :, None]
     if (
         not (power.shape == delay.shape == inter.shape == place.shape[:2])
@@ -360,7 +360,7 @@ def _deepmimo_paths(file: Path) -> Iterator[Polyline]:
 
 
 def _matrix(file: Path) -> NDArray[np.float64]:
-    """The one matrix of a file."""
+    """The only matrix in a file."""
     try:
         if file.suffix == ".npz":
             with ZipFile(file) as parts:
@@ -451,6 +451,6 @@ def _sionna_polylines(paths: Any) -> Iterator[Polyline]:
 
 
 def _sionna_positions(ends: Any, count: int) -> NDArray[np.float64]:
-    """Positions of the ends [count, 3]; ports at one position are listed one after the other."""
+    """Positions of the ends [count, 3]; ports at one position are listed consecutively."""
     positions = np.array(ends, dtype=float).T
     return positions[:: len(positions) // count]

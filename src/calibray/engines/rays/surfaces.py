@@ -18,7 +18,7 @@ TOLERANCE: Final = 0.02
 """Largest distance of an interaction from its surface [m]; coordinates rounded to centimetres lie within 0.009 m."""
 
 SAME: Final = 1e-3
-"""Faces coincide at a point if their distances from it differ by less [m]."""
+"""Faces coincide at a point if their distances from it differ by less than this [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Surfaces:
 
     Attributes:
         corners: [F, 3, 3], [m].
-        normal: Unit normals, on either side [F, 3].
+        normal: Unit normals, pointing to either side [F, 3].
         material: Index in `Scene.materials` [F].
     """
 
@@ -69,14 +69,14 @@ class Surfaces:
         return index[close], face[close], distance[close]
 
     def distance(self, point: NDArray[np.float64], faces: NDArray[np.bool_]) -> float:
-        """Distance of one point [3] from the nearest of some faces [F], [m]."""
+        """Distance of a point [3] from the nearest face in the mask `faces` [F], [m]."""
         corners = self.corners[faces]
         nearest = _nearest(corners, np.broadcast_to(point, (len(corners), 3)))
         return float(np.linalg.norm(nearest - point, axis=1).min(initial=np.inf))
 
     def _box_pairs(self, point: NDArray[np.float64], within: float) -> Iterator[tuple[NDArray, NDArray]]:
         low, high = self.corners.min(axis=1) - within, self.corners.max(axis=1) + within
-        # About 0.5 GB at once.
+        # About 0.5 GB at a time.
         size = max(20_000_000 // max(len(low), 1), 1)
         for start in range(0, len(point), size):
             part = point[start : start + size, None]
@@ -93,13 +93,13 @@ class Hits:
 
     Attributes:
         point: [n, 3], [m].
-        incident: Unit vectors of travel before [n, 3].
-        leaving: Unit vectors of travel after [n, 3].
-        length: The shorter one of the two segments [n], [m].
+        incident: Unit vectors of propagation before the interaction [n, 3].
+        leaving: Unit vectors of propagation after the interaction [n, 3].
+        length: Length of the shorter of the two adjacent segments [n], [m].
         reflects: Whether the mirror law must hold [n].
-        diffracts: Whether an edge diffracts, whose faces may have two materials [n].
+        diffracts: Whether an edge diffracts the wave; the edge's faces may have different materials [n].
         material: Index of the stated material; -1 if none is stated [n].
-        label: What messages call them [n].
+        label: Their names in messages [n].
     """
 
     point: NDArray[np.float64]
@@ -126,16 +126,16 @@ def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.
 
     Raises:
         InputError: A point is on no surface (of its material), faces of different materials coincide there, or no
-            surface reflects the wave into the direction of the path.
+            surface reflects the wave in the direction of the path.
     """
     index, face, distance = surfaces.near(hits.point, TOLERANCE)
     free = (hits.material < 0) | hits.diffracts
     right = free[index] | (hits.material[index] == surfaces.material[face])
     index, face, distance = index[right], face[right], distance[right]
     error = hits.mirror_error(index, surfaces.normal[face])
-    # A point that is off by the tolerance turns both segments.
+    # A point displaced by the tolerance changes the directions of both segments.
     bent = hits.reflects[index] & (error > 4 * TOLERANCE)
-    # For each point, faces that obey the mirror law come first, the nearest of them foremost.
+    # For each point, faces that obey the mirror law come first, in order of distance.
     order = np.lexsort((distance, bent, index))
     index, face, distance, bent = index[order], face[order], distance[order], bent[order]
     matched, first = np.unique(index, return_index=True)
@@ -146,7 +146,7 @@ def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.
     if bent[first].any():
         worst = int(np.argmax(np.where(bent[first], error[order][first], 0)))
         raise InputError(
-            f"{hits.label[worst]}: is not a reflection on the surface of "
+            f"{hits.label[worst]}: is not a reflection from the surface of "
             f"{names[surfaces.material[face[first[worst]]]]!r} there: it violates the mirror law by "
             f"{error[order][first[worst]]:.3g} m; export the vertices with more digits, or correct its type"
         )
@@ -208,14 +208,14 @@ def find_edge(surfaces: Surfaces, hits: Hits, number: int) -> Edge:
     """The edge of a diffraction: of all pairs of faces there, the one that obeys Keller's law best.
 
     Raises:
-        InputError: No two faces form an edge there that diffracts into the direction of the path.
+        InputError: No two faces form an edge there that diffracts the wave in the direction of the path.
     """
     _, faces, _ = surfaces.near(hits.point[[number]], TOLERANCE)
     edges = [_edge(surfaces, hits, number, (a, b)) for a in faces.tolist() for b in faces.tolist() if a != b]
     usable = [edge for edge in edges if edge is not None and edge.error <= 4 * TOLERANCE]
     if not usable:
         raise InputError(
-            f"{hits.label[number]}: no edge of the scene diffracts the wave into the direction of the path there; "
+            f"{hits.label[number]}: no edge of the scene diffracts the wave in the direction of the path there; "
             "check the vertex, or remove the path"
         )
     # Of pairs with the same error, the 0-face is the one that the wave meets most directly.

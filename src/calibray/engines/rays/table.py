@@ -41,24 +41,24 @@ ENDS: Final = ("transmitter", "receiver")
 REQUIRED: Final = ("path", "point", "type", "x", "y", "z")
 POWERS: Final = ("power_db", "gain_real", "gain_imag")
 OPTIONAL: Final = ("material", "object", "link", "delay", *POWERS)
-"""Columns that a table may lack: a misspelt one would be ignored."""
+"""Optional columns of a table; without a check, a misspelt name would be ignored."""
 
 QUANTITIES: Final = {
     "power": "power_db", "gain": "power_db", "loss": "power_db", "delay": "delay", "material": "material",
 }  # fmt: skip
-"""Beginnings of names, with the column that such a name states."""
+"""Beginnings of column names, with the column that each one probably means."""
 
 MISSPELT: Final = 0.8
-"""Smallest similarity at which an unknown column counts as a misspelt one: `line` is not `link`."""
+"""Smallest similarity at which an unknown column counts as misspelt: `line` does not count as a misspelt `link`."""
 
 MOST_POINTS: Final = RANGES["max_depth"][1] + 2
 """Largest number of points of a path: the largest number of interactions of a trace, plus both ends."""
 
 NO_POWER: Final = {"power_db": "-inf", "gain_real": "0", "gain_imag": "0"}
-"""What columns state for a path without power."""
+"""Values of the columns for a path without power."""
 
 POWER_ZERO_DB: Final = -10_000.0
-"""Level in place of -inf [dB]: its power is 0 in double precision."""
+"""Level used instead of -inf [dB]: its power is 0 in double precision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class RayTable:
         material: Names of materials, empty where not stated [P, D].
         object: Names of objects, empty where not stated [P, D].
         power: Path gain [P], 0 for an absent path; None if not stated.
-        delay: [P], [s]; None if not stated.
+        delay: Propagation delay [P], [s]; None if not stated.
     """
 
     source: str
@@ -93,7 +93,7 @@ class RayTable:
 
     @classmethod
     def of(cls, table: SourceTable, axes: str = "x y z") -> RayTable:
-        """Read rows into paths; `axes` names the table's axes that are the scene's x, y and z, such as "x -z y".
+        """Read paths from rows; `axes` names the table's axes that are the scene's x, y and z, such as "x -z y".
 
         Raises:
             InputError: A column is missing or malformed, a path is incomplete, or a value is impossible.
@@ -109,8 +109,8 @@ class RayTable:
         kind = _kinds(table, row_path, step, count)
         if wrong := np.flatnonzero((point[order] - point[order][first][row_path]) != step).tolist():
             raise InputError(
-                f"{table.cell(wrong[0], 'point')}: the points of path {label[row_path[wrong[0]]]} must count up by 1 "
-                "without gap or repetition; complete the path"
+                f"{table.cell(wrong[0], 'point')}: the points of path {label[row_path[wrong[0]]]} must increase by 1 "
+                "without gaps or repetitions; complete the path"
             )
         position = _positions(table, axes)
         inner = kind != 0
@@ -139,7 +139,7 @@ class RayTable:
         )
 
     def take(self, index: NDArray[np.int64]) -> RayTable:
-        """The table of some of its paths [n], in a given order."""
+        """The table with the paths at the indices [n], in this order."""
         taken = {
             item.name: value[index]
             for item in fields(self)
@@ -183,7 +183,7 @@ def _checked_rows(table: SourceTable) -> SourceTable:
 
 
 def _with_known_names(table: SourceTable) -> SourceTable:
-    """The table with the names of its known columns as documented; refuses a name that seems to be misspelt."""
+    """The table with its known columns named as documented; refuses a name that seems to be misspelt."""
     known = (*REQUIRED, *OPTIONAL)
     given = [str(name) for name in table.frame]
     names = [name if (name := text.strip().casefold()) in known else text for text in given]
@@ -202,7 +202,7 @@ def _with_known_names(table: SourceTable) -> SourceTable:
 
 
 def _meant(name: str, absent: set[str]) -> str | None:
-    """The column that a table lacks and an unknown name seems to state, or None."""
+    """The absent column that an unknown name probably means, or None."""
     quantity = re.match(rf"(?:path_?|received_?)?({'|'.join(QUANTITIES)})", name)
     if quantity and (known := QUANTITIES[quantity[1]]) in absent:
         return known
@@ -225,8 +225,8 @@ def _kinds(
         row = int(np.argmax(shared[row_path]))
         raise InputError(
             f"{table.cell(row, 'path')}: {table.frame['path'].iloc[row]} is the number of several paths "
-            f"({sources[row_path[row]]} transmitters); numbers must be unique in the table, also between links: number "
-            "all paths anew, or remove repeated rows"
+            f"({sources[row_path[row]]} transmitters); numbers must be unique in the table, even across links: "
+            "renumber all paths, or remove repeated rows"
         )
     last = step == count[row_path] - 1
     wrong = (
@@ -270,9 +270,9 @@ def _link(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray | None:
 
 
 def _names(table: SourceTable, name: str) -> NDArray:
-    """Numbers, which sort as numbers, or otherwise labels [rows]."""
+    """Whole numbers of a column, which sort as numbers, or otherwise its labels [rows]."""
     column = table.column(name)
-    # Whole numbers are floats in MATLAB, and in pandas if any row has a gap.
+    # Whole numbers are floats in MATLAB, and in pandas if any row is empty.
     whole = pd.api.types.is_float_dtype(column) and (column % 1 == 0).all()
     if whole or pd.api.types.is_integer_dtype(column):
         return table.numbers(name).astype(np.int64)
@@ -280,13 +280,13 @@ def _names(table: SourceTable, name: str) -> NDArray:
 
 
 def _per_path(table: SourceTable, name: str, row_path: NDArray[np.int64]) -> NDArray[np.float64]:
-    """A number of the whole path [P]."""
+    """A number that applies to the whole path [P]."""
     numbers = table.assign(**{name: table.numbers(name, gaps=True)})
     return _stated(numbers, name, row_path).to_numpy(np.float64)
 
 
 def _stated(table: SourceTable, name: str, row_path: NDArray[np.int64]) -> pd.Series:
-    """A value of the whole path, which must be the same in all rows that state it [P]."""
+    """A value that applies to the whole path, and must be the same in all rows that state it [P]."""
     groups = table.column(name).groupby(row_path)
     number = groups.nunique().to_numpy()
     row = int(np.argmax((number != 1)[row_path]))
@@ -385,7 +385,7 @@ def _parsed(content: Path | BytesIO | str | Mapping[Any, Any], source: str) -> S
             frame = pd.DataFrame(json.loads(content) if isinstance(content, str) else content)
     except InputError:
         raise
-    # A text nested too deeply is a RuntimeError.
+    # Text nested too deeply raises a RuntimeError.
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         fault = shortened(str(error))
         raise InputError(f"{source}: not a ray table ({fault}); see docs/reference/ray-table.md") from None
