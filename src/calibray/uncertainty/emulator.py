@@ -290,7 +290,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
     else:
         return None
     better = np.argsort(calls.value, kind="stable")[: max(2, len(calls.value) // 2)]
-    # If leave-one-out errors exceed those that the process expects, the drawn functions spread by the same factor.
+    # If leave-one-out errors exceed the expected ones, the spread of the drawn functions grows by the same factor.
     stretch = max(
         1.0, standardized_error(process, better), standardized_error(process, np.arange(len(calls.value)))
     )

@@ -241,7 +241,7 @@ def _student(freedom: NDArray[np.float64], constant: NDArray[np.float64]) -> Tai
 
 @cache
 def gross() -> Tail:
-    """Gaussian errors, a share `GROSS_SHARE` of which has a standard deviation `GROSS_RATIO` times as large."""
+    """Gaussian errors; a share `GROSS_SHARE` of them has a standard deviation larger by `GROSS_RATIO`."""
     share, times = GROSS_SHARE, GROSS_RATIO
     ratio, fall = share / (1.0 - share) / times, 0.5 * (1.0 - 1.0 / times**2)
     constant = float(np.log1p(-share) - 0.5 * np.log(2 * np.pi))

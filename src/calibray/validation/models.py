@@ -150,7 +150,7 @@ def obstructed(links: Measurements, objective: Objective, known_db: NDArray[np.f
 
 
 def _free_name(by: str, terms: Sequence[Term]) -> str:
-    """A name for a term by a column that no other term has."""
+    """A name, unused by the other terms, for a term by a column."""
     names = {term.name for term in terms}
     plain = by.replace("_", " ") if by in (OUT_OF_SIGHT, WALLS) else by
     return next(name for name in (plain, f"{plain} of all", f"{plain} of all links") if name not in names)
