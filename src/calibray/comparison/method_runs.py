@@ -159,7 +159,7 @@ class BudgetedMethod:
         return BudgetedMethod(name, method, budget)
 
     def key(self, seed: int) -> RunKey:
-        """The key of the run with a seed; its budget is 0 if the method stops by itself."""
+        """The key of the run with the given seed; its budget is 0 if the method stops by itself."""
         return self.method, 0 if self.stops_by_itself else self.budget, seed
 
     def optimizer(self, problem: ComparisonProblem, seed: int) -> Optimizer:
@@ -270,7 +270,7 @@ class RunFile:
                 self._runs[run.method, run.budget, run.seed] = run
 
     def find(self, key: RunKey) -> MethodRun | None:
-        """The finished run with a key, or None."""
+        """The finished run with the given key, or None."""
         return self._runs.get(key)
 
     def add(self, run: MethodRun) -> MethodRun:

@@ -104,7 +104,7 @@ def for_each_chunk(
     """Run a picklable function of the shared content and a chunk's links once for every chunk.
 
     Objects that the work loads into `content` stay on the worker; if a worker dies, its chunk is processed again. After
-    every chunk, `progress` is called with "tracing", the number of finished links and that of all links. Returns the
+    every chunk, `progress` is called with "tracing", the numbers of finished and of all links. Returns the
     indices of every chunk's links, and the results of the work.
 
     Raises:
@@ -337,7 +337,7 @@ class ChunkedReplay:
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss of every link and its derivatives, all sent to this process; see `Differentiable`."""
+        """Path loss of every link and its derivatives, collected in this process; see `Differentiable`."""
         values = check_candidates(candidates, len(self.parameters))
         loss = np.empty((len(values), len(self._study.links)))
         jacobian = np.empty((*loss.shape, len(self.parameters)))
@@ -349,7 +349,7 @@ class ChunkedReplay:
     def respond(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
     ) -> Responses:
-        """Path loss and further observables of every link, all sent to this process; see `Observing.respond`."""
+        """Path loss and further observables of every link, collected in this process; see `Observing.respond`."""
         values = check_candidates(candidates, len(self.parameters))
         answers = self._answers("respond", values, wanted, derivatives)
         return of_links([part for _, part in answers], list(self.chunks))

@@ -106,7 +106,7 @@ class ExternalProgram:
     def run(self, request: Request, stop: Event | None = None) -> Outcome:
         """Call the program for one candidate; after a failure, call it again until no attempts are left.
 
-        A failure is returned instead of raised, so that it costs one candidate and not the batch. Another thread sets
+        A failure is returned instead of raised, so that only one candidate is lost, not the batch. Another thread sets
         `stop` to kill the program.
 
         Raises:

@@ -190,7 +190,7 @@ def read_entry(
 
 
 def key(candidate: NDArray[np.float64]) -> bytes:
-    """A candidate [d] in the form of the ledger: little-endian doubles, with -0.0 as 0.0."""
+    """A candidate [d] in the ledger's format: little-endian doubles, with -0.0 as 0.0."""
     return (np.asarray(candidate, dtype="<f8") + 0.0).tobytes()
 
 

@@ -37,7 +37,7 @@ class Ledger:
     """RT calls by problem and candidate.
 
     Args:
-        path: The SQLite file; created with its folder if absent. A file that cannot be written is only read.
+        path: The SQLite file; created with its folder if absent. A file that cannot be written is opened read-only.
 
     Attributes:
         read_only: Whether the file cannot be written.
