@@ -66,7 +66,7 @@ def test_a_frame_survives_its_record():
         ("EPSG:999999", "PROJ does not know"),
         ("EPSG:2263", "in metres"),
         # Transverse Mercator of southern Africa: x counts to the west and y to the south.
-        ("EPSG:2048", "with x to the east and y to the north"),
+        ("EPSG:2048", "with x pointing east and y pointing north"),
     ],
 )
 def test_systems_without_metres_are_refused(crs, message):

@@ -90,7 +90,7 @@ def test_a_validation_of_other_links_is_refused_before_it_replaces_that_of_a_res
     content = result.study.content()
     content["scene"]["frequency"] = 7e9
     for other, study, words in (
-        (twice, result.study, r"of other links \(12"),
+        (twice, result.study, r"different links \(12"),
         (validation, Study.from_content(content), "belongs to another study"),
     ):
         with pytest.raises(InputError, match=words):
