@@ -414,7 +414,7 @@ def test_a_scene_is_used_at_the_carrier_of_its_constants_only(tmp_path: Path) ->
         lambda scene: cb.trace(scene, ends, frequency=4e9, samples=10_000),
         lambda scene: cb.read_rays(tmp_path / "rays.csv", scene, frequency=4e9),
     ):
-        with pytest.raises(InputError, match="constants are those at 1 GHz; read it at 4 GHz"):
+        with pytest.raises(InputError, match="constants are valid only at 1 GHz; read it at 4 GHz"):
             use(concrete)
     free = read_scene("sionna:simple_wedge", 1e9, {"concrete": Material(5.0, 0.1, 0.2)})
     assert free.frequency is None

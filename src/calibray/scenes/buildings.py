@@ -1,7 +1,7 @@
-"""The building of a position: all objects that touch in plan are one building.
+"""Assignment of positions to buildings: objects that touch in plan form one building.
 
-The edges of all triangles except the ground's are drawn on a raster of the plan. Cells that touch, corners included,
-form one building. Streets separate buildings; a wall with its windows, or a row of houses, is one building.
+The edges of all triangles except those of the ground are rasterized in plan. Cells that touch, also at corners, form
+one building. Streets separate buildings; a wall with its windows, or a row of houses, is one building.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from numpy.typing import NDArray
 from calibray.scenes.triangles import LEVEL, Triangles
 
 CELL: Final = 1.0
-"""Width of a raster cell [m]; objects less than one or two cells apart touch."""
+"""Width of a raster cell [m]; objects count as touching if their gap is less than one to two cells."""
 
 MAX_CELLS: Final = 8_000_000
-"""Largest number of raster cells, which limits memory; larger scenes get wider cells."""
+"""Largest number of raster cells, which limits memory use; larger scenes get wider cells."""
 
 MAX_POINTS: Final = 2_000_000
-"""Largest number of points on edges that are held in memory at once."""
+"""Largest number of points along edges that are in memory at once."""
 
 
 def building_numbers(triangles: Triangles, position: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Number of the building [n], from 0, that contains each position [n, 3], [m], or is nearest to it in plan.
+    """Number [n], from 0, of the building that contains each position [n, 3], [m], or is nearest to it in plan.
 
-    The number is -1 everywhere if the scene is only ground.
+    All numbers are -1 if the scene consists only of ground.
     """
-    # SciPy's spatial modules are slow to import, and few callers of this package need them.
+    # Imported here because SciPy's spatial modules are slow to import and few users of this package need them.
     from scipy import ndimage
     from scipy.spatial import KDTree
 
@@ -39,23 +39,23 @@ def building_numbers(triangles: Triangles, position: NDArray[np.float64]) -> NDA
         return np.full(len(position), -1)
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     cell = max(CELL, float(np.sqrt(np.prod(np.maximum(high - low, CELL)) / MAX_CELLS)))
-    # One cell more, for the corners at the upper bounds.
+    # One additional cell, for corners at the upper bounds.
     built = np.zeros(tuple(((high - low) / cell).astype(np.int64) + 1), dtype=bool)
     for point in _edge_cells((corners - low) / cell):
         built[point[:, 0], point[:, 1]] = True
     label = np.zeros(built.shape, dtype=np.int32)
     ndimage.label(built, structure=np.ones((3, 3)), output=label)
     tree = KDTree(np.argwhere(built), compact_nodes=False, balanced_tree=False)
-    # Cell k extends from k to k + 1; its centre is nearest, not its lower corner.
+    # Cell k extends from k to k + 1; distances are measured from its centre, not its lower corner.
     _, nearest = tree.query((position[:, :2] - low) / cell - 0.5)
     return np.asarray(label[built][nearest] - 1, dtype=np.int64)
 
 
 def _edge_cells(corners: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
-    """Raster cells along the edges of triangles [F, 3, 2], in batches; successive cells of an edge are neighbours."""
+    """Raster cells along the edges of triangles [F, 3, 2], in batches; successive cells of an edge are adjacent."""
     start = corners.reshape(-1, 2)
     step = np.roll(corners, -1, axis=1).reshape(-1, 2) - start
-    # Steps of at most one cell along either axis, so that an edge has no gap.
+    # Steps of at most one cell along each axis, so that an edge has no gaps.
     count = np.ceil(np.abs(step).max(axis=1)).astype(np.int64) + 1
     ends = np.cumsum(count)
     first = 0
@@ -72,21 +72,21 @@ def _edge_cells(corners: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
 def footprints(
     triangles: Triangles, west: float, south: float, east: float, north: float
 ) -> list[NDArray[np.float64]]:
-    """Outlines of everything that lies, wholly or partly, within an area given by its bounds [m], except the ground.
+    """Outlines of all level surfaces except the ground that are wholly or partly within the given bounds [m].
 
-    They are closed lines without a repeated first corner, each [n, 2], [m].
+    They are closed lines [n, 2], [m], whose first corner is not repeated.
     """
     normal = triangles.normal
     area = np.linalg.norm(normal, axis=1)
     corners = triangles.corners
     low, high = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
     least, most = np.array([west, south]), np.array([east, north])
-    # Faces around the area too: half a roof has another outline.
+    # Faces near the area are included, because the outline of half a roof would be wrong.
     around = (most - least) / 2
     inside = (high > least - around).all(axis=1) & (low < most + around).all(axis=1)
     lying = (np.abs(normal[:, 2]) > LEVEL * area) & (area > 0)
     chosen = np.flatnonzero(lying & inside & ~triangles.ground)
-    # All faces counter-clockwise from above, so that a shared edge occurs once in each direction.
+    # All faces are made counter-clockwise seen from above, so that a shared edge occurs once in each direction.
     turned = normal[chosen, 2] < 0
     face = np.where(turned[:, None, None], corners[chosen][:, ::-1], corners[chosen])
     points = face.reshape(-1, 3)
@@ -104,9 +104,9 @@ def footprints(
 
 
 def _loops(faces: NDArray[np.int64]) -> list[list[int]]:
-    """Closed lines around faces that share edges; an edge that two faces share is inside."""
+    """Closed lines around groups of faces that share edges; an edge shared by two faces is inside a group."""
     size = int(faces.max(initial=0)) + 1
-    # An edge as one number, which sorts faster than a pair.
+    # Each edge is encoded as one number, which sorts faster than a pair.
     edges = np.unique(faces * size + np.roll(faces, -1, axis=1))
     starts, ends = np.divmod(edges, size)
     alone = ~np.isin(ends * size + starts, edges) & (starts != ends)

@@ -1,11 +1,11 @@
-"""Triangle meshes: joined and welded, read from PLY and OBJ files, and written as PLY.
+"""Triangle meshes: joining, welding, reading PLY and OBJ files, and writing PLY files.
 
-Mitsuba and Sionna RT find wedges between faces that share vertices within one mesh. Where two meshes meet, there is no
-wedge and therefore no diffraction.
+Sionna RT finds wedges only between faces that share vertices within one mesh. Where two meshes meet, there is no wedge
+and therefore no diffraction.
 
-Mitsuba trusts mesh files. A vertex index out of range ends the process or removes a reflection without a message; rays
-never hit vertices that are not numbers. `read_mesh` refuses these files before Mitsuba reads them. Integer coordinates,
-which are legal, remove the reflections of the whole mesh: the tracer gets a copy in single precision.
+Mitsuba does not validate mesh files. With a vertex index out of range, the process crashes or a reflection is missing
+without a message; rays never hit faces whose vertices are NaN. `read_mesh` refuses such files. Integer coordinates are
+valid, but with them Mitsuba loses all reflections from the mesh, so the tracer reads a floating-point copy.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from calibray.errors import InputError
 from calibray.support.messages import first_line, shortened
 
 MILLIMETRE: Final = 0.001
-"""Unit of corners that are whole numbers [m]."""
+"""Unit of integer corner coordinates [m]."""
 
 WIDEST: Final = 50_000.0
-"""Largest extent of a scene that is made [m]; a wider one is probably not in metres about a local origin."""
+"""Largest extent of a new scene [m]; a wider one is probably not in metres, or is not near a local origin."""
 
 LARGEST_COORDINATE: Final = 1e9
-"""Largest coordinate of a vertex or an antenna [m], as of a position in a path file."""
+"""Largest coordinate of a vertex or an antenna [m]; the same limit applies to positions in path files."""
 
 SMALL: Final = 4096
-"""Largest PLY file that is parsed once per process [bytes], such as that of a building. A run reads its scene up to
-five times; a scene of 2,367 buildings is read in 2.8 s the first time, and in 0.8 s again."""
+"""Largest PLY file whose mesh is cached within a process [bytes], such as that of one building. A run reads its scene
+up to five times. Reading a scene of 2,367 buildings takes 2.8 s the first time and 0.8 s after that."""
 
 _HEADER: Final = re.compile(
     rb"ply\r?\n(?:(?:comment|obj_info)\b.*\n)*"
@@ -50,14 +50,14 @@ _TEXT_FACE: Final = re.compile(r"\s*3(\s+\d{1,9}){3}(\s.*)?")  # a face row of a
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh; faces that share an edge share its vertices.
+    """A triangle mesh; adjacent faces share the vertices of their common edge.
 
     Attributes:
         vertices: Positions [V, 3], [m].
         faces: Vertex indices of each triangle, counter-clockwise seen from outside [F, 3].
-        step: Spacing of the numbers with which its file stores the largest coordinate [m]; 0 if that is negligible.
-        misread: Whether the tracer gets a copy as PLY: a file stores coordinates as integers, or the shape is a
-            rectangle, which is not a mesh in Mitsuba.
+        step: Spacing of floating-point numbers at the largest coordinate in the file [m]; 0 if it is negligible.
+        misread: Whether the tracer must read a PLY copy instead: the file stores integer coordinates, Mitsuba would
+            shear the shape, or the shape is a rectangle, which is not a mesh in Mitsuba.
     """
 
     vertices: NDArray[np.float64]
@@ -71,9 +71,9 @@ class MeshObject:
     """One object of a scene file.
 
     Attributes:
-        name: Name of the object, different from the name of any material.
-        material: Name of its material.
-        mesh: Its surface.
+        name: Name of the object, which differs from the names of all materials.
+        material: Name of the object's material.
+        mesh: Surface of the object.
     """
 
     name: str
@@ -82,7 +82,7 @@ class MeshObject:
 
 
 def join_meshes(meshes: Iterable[Mesh]) -> Mesh:
-    """Join at least one mesh into one; vertices of different meshes stay separate, and unused ones are dropped."""
+    """Join one or more meshes; vertices of different meshes stay separate, and unused vertices are dropped."""
     parts = list(meshes)
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])
@@ -94,10 +94,10 @@ def join_meshes(meshes: Iterable[Mesh]) -> Mesh:
 def weld(
     triangles: NDArray[np.int64], position: Callable[[NDArray[np.int64]], NDArray[np.float64]] | None = None
 ) -> Mesh:
-    """Make a mesh of triangles with integer corners [F, 3, 3]: equal corners become one vertex.
+    """Make a mesh from triangles with integer corners [F, 3, 3]; equal corners become one vertex.
 
     Triangles are counter-clockwise seen from outside; those with two equal corners are dropped. Corners are
-    in units of `MILLIMETRE`; `position` gives the position [n, 3], [m], of corners [n, 3] if it is another one.
+    in units of `MILLIMETRE`, unless `position` converts corners [n, 3] to positions [n, 3], [m].
 
     Example:
         >>> weld(np.array([[[0, 0, 0], [5, 0, 0], [0, 5, 0]], [[5, 0, 0], [5, 5, 0], [0, 5, 0]]])).faces
@@ -112,13 +112,13 @@ def weld(
 
 
 def read_mesh(file: Path, kind: str) -> Mesh:
-    """Read a mesh file, "ply" or "obj", and refuse what Mitsuba would trace wrongly or crash on.
+    """Read a mesh file of kind "ply" or "obj", and refuse a file that Mitsuba would trace wrongly or crash on.
 
     Polygons of an OBJ file are split into triangles.
 
     Raises:
-        InputError: The file cannot be read, is damaged or has no face; a vertex is not finite; a face has a corner that
-            is not a vertex; or, in a PLY file, a face is not a triangle.
+        InputError: The file cannot be read, is damaged or has no face; a vertex is not finite; a face refers to a
+            vertex that does not exist; or, in a PLY file, a face is not a triangle.
     """
     try:
         content = file.read_bytes()
@@ -130,7 +130,7 @@ def read_mesh(file: Path, kind: str) -> Mesh:
         return _read_ply(content) if len(content) > SMALL else _read_small_ply(content)
     except InputError as error:
         fault = str(error)
-    except Exception as error:  # trimesh raises whatever its parser runs into
+    except Exception as error:  # trimesh's parser may raise any exception
         fault = f"cannot be read as PLY ({first_line(error)})"
     raise InputError(f"mesh {file}: {fault}; export it again, as triangles")
 
@@ -146,12 +146,12 @@ def _read_small_ply(content: bytes) -> Mesh:
 def _read_ply(content: bytes) -> Mesh:
     from trimesh.exchange.ply import load_ply
 
-    # trimesh takes almost any line for a header line, and comments for UTF-8.
+    # trimesh accepts almost any line as a header line, and expects comments in UTF-8.
     header = _HEADER.match(content)
     if header is None:
         raise InputError("is not a PLY file, or its header is damaged")
     body = content[header.end() :]
-    # trimesh refuses a binary file whose size differs from what its header declares, before it allocates anything.
+    # Before it allocates memory, trimesh refuses a binary file whose size differs from that declared in its header.
     with np.errstate(all="ignore"):
         loaded = load_ply(
             BytesIO(_COMMENT.sub(b"", header[0]) + body), fix_texture=False, skip_materials=True
@@ -168,7 +168,7 @@ def _read_ply(content: bytes) -> Mesh:
         _check_text_faces(body.decode(), elements)
         corners = face["data"][name]
     else:
-        # trimesh takes the number of corners of all faces from the first one.
+        # trimesh assumes that all faces have as many corners as the first one.
         counts, corners = face["data"][name]["f0"], face["data"][name]["f1"]
         if (other := np.flatnonzero(counts != 3)).size:
             raise InputError(f"face {other[0]} has {counts[other[0]]} corners, must have 3")
@@ -176,7 +176,7 @@ def _read_ply(content: bytes) -> Mesh:
         [np.asarray(vertex["data"][axis], dtype=np.float64).ravel() for axis in "xyz"], axis=1
     )
     if len(vertices) != vertex["length"] or corners.shape != (face["length"], 3):
-        raise InputError("is cut short, or has a face with other than three corners")
+        raise InputError("is truncated, or has a face that does not have three corners")
     _check_range(vertices)
     if (wrong := (corners < 0) | (corners >= len(vertices)) | (corners != np.floor(corners))).any():
         row, corner = np.argwhere(wrong)[0]
@@ -184,14 +184,14 @@ def _read_ply(content: bytes) -> Mesh:
             f"face {row} names vertex {corners[row, corner]:g}, must be 0 to {len(vertices) - 1}"
         )
     misread = any(kind.kind != "f" for kind in stored)
-    # Only single precision is coarse enough to matter.
+    # Only in single precision is the spacing large enough to matter.
     is_single = any(kind == np.dtype(np.float32).newbyteorder(kind.byteorder) for kind in stored)
     step = float(np.spacing(np.float32(np.abs(vertices).max()))) if is_single else 0.0
     return Mesh(vertices, corners.astype(np.int64), step, misread)
 
 
 def _check_range(vertices: NDArray[np.float64]) -> None:
-    """Refuse vertices that are not finite, or so far away that areas overflow in single precision."""
+    """Refuse vertices that are not finite, or so far from the origin that areas overflow in single precision."""
     if (wrong := ~(np.abs(vertices) <= LARGEST_COORDINATE)).any():
         row, axis = np.argwhere(wrong)[0]
         raise InputError(
@@ -201,7 +201,7 @@ def _check_range(vertices: NDArray[np.float64]) -> None:
 
 
 def _check_text_faces(text: str, elements: dict[str, dict[str, Any]]) -> None:
-    """Refuse face rows of a text PLY file that trimesh would cut, round or drop without a message."""
+    """Refuse face rows of a text PLY file that trimesh would truncate, round or drop without a message."""
     lengths = {name: element["length"] for name, element in elements.items()}
     first = sum(lengths[name] for name in takewhile(lambda name: name != "face", lengths))
     for index, line in enumerate(text.splitlines()[first : first + lengths["face"]]):
@@ -211,8 +211,8 @@ def _check_text_faces(text: str, elements: dict[str, dict[str, Any]]) -> None:
 
 def _read_obj(content: bytes) -> Mesh:
     """Read vertices and faces; as in Mitsuba, corners that differ in texture or normal are different vertices."""
-    # trimesh does not serve here: it drops faces that it cannot read, takes index 0 for the first vertex, and misreads
-    # faces whose corners are written in different forms (1/1/1 next to 1).
+    # trimesh is not used here: it drops faces that it cannot read, interprets index 0 as the first vertex, and misreads
+    # faces whose corners are written in different forms (1/1/1 and 1).
     positions: list[list[float]] = []
     vertices: dict[tuple[int, str], int] = {}
     faces: list[tuple[int, int, int]] = []
@@ -237,7 +237,7 @@ def _read_obj(content: bytes) -> Mesh:
                 for index, (_, _, attributes) in zip(indices, parts, strict=True)
                 if index is not None
             )
-            # A polygon as a fan of triangles around its first corner.
+            # A polygon becomes a fan of triangles around its first corner.
             faces += [(first, second, third) for second, third in pairwise(rest)]
     if not faces:
         raise InputError("has no faces")
@@ -247,7 +247,7 @@ def _read_obj(content: bytes) -> Mesh:
 
 
 def _obj_index(number: float, count: int) -> int | None:
-    """Index of the vertex that a number names: from 1, or backwards from the last one; None if there is none."""
+    """Index of a vertex given its number, from 1, or from -1 backwards; None if there is no such vertex."""
     index = number - 1 if number > 0 else number + count
     return int(index) if 0 <= index < count and index == np.floor(index) else None
 
@@ -262,10 +262,10 @@ def _number(word: str) -> float:
 def ply_bytes(mesh: Mesh) -> bytes:
     """Encode a mesh as a binary little-endian PLY file; equal meshes give equal bytes.
 
-    Vertices are rounded to 32-bit floats, or stored as 64-bit ones where that would lose more than a tenth of a
-    millimetre.
+    Vertices are stored as 32-bit floats, or as 64-bit floats if rounding to 32 bits could cause errors of more than
+    about a tenth of a millimetre.
     """
-    # Single precision halves the file; beyond 4 km, its steps are 0.5 mm or more.
+    # Single precision halves the file size; beyond 4 km, its spacing is 0.5 mm or more.
     is_coarse = np.spacing(np.float32(np.abs(mesh.vertices).max(initial=0.0))) > 3e-4
     name, stored = ("double", "<f8") if is_coarse else ("float", "<f4")
     header = (

@@ -1,9 +1,9 @@
-"""The obstruction of links by buildings and regions, and the columns of links that follow from scene and positions.
+"""Obstruction of links by buildings and regions of extra loss, and link columns computed from scene and positions.
 
-The straight line runs through buildings, over roofs and across walls. Buildings extend from the ground to their roofs.
-A line is inside a building if a roof is above it. All lengths follow from the crossings of the line with the scene's
-triangles, in plan for roofs and in space for walls. Regions of extra loss, such as trees, are upright prisms over
-polygons, through which rays pass undeflected.
+The straight line between the ends of a link may pass through buildings, over roofs and through walls. Buildings extend
+from the ground to their roofs, so a line is inside a building where a roof is above it. All lengths are computed from
+the crossings of the line with the scene's triangles, in plan for roofs and in space for walls. Regions of extra loss,
+such as trees, are vertical prisms over polygons, through which rays pass undeflected.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from calibray.scenes.triangles import BATCH, LEVEL, Triangles, read_triangles, v
 from calibray.support.lazy_imports import library
 
 STEP: Final = 5.0
-"""Length of the steps in which lines follow the ground [m]. Lengths in a wood over hills of 50 m then err by 0.1 m."""
+"""Step at which lines are compared with the ground [m]; lengths in a wood on hills of 50 m then err by 0.1 m."""
 
 LINES: Final = 5000
-"""Largest number of lines that are divided at once; each may have hundreds of steps."""
+"""Largest number of lines processed at once; each may have hundreds of steps."""
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Prisms over polygons in plan; where they overlap, they count once.
+    """Vertical prisms over polygons; where prisms overlap, the length counts once.
 
     Attributes:
         outline: Shapely polygons [n] in the scene's frame [m].
-        bottom: Height at which each begins [n], [m].
-        top: Height at which each ends [n], [m].
-        ground: Height of the ground [k], [m], from which heights are measured, at x and y [k], [m], NaN where there is
-            none; if None, they are measured from z = 0.
+        bottom: Height of the bottom of each prism [n], [m].
+        top: Height of the top of each prism [n], [m].
+        ground: Function that gives the height of the ground [k], [m], at x and y [k], [m], or NaN where there is none.
+            Heights are measured from the ground; if None, from z = 0.
     """
 
     outline: NDArray[Any]
@@ -59,7 +59,7 @@ class Region:
             >>> belt.length_inside(start, end).tolist()
             [20.0, 0.0]
         """
-        # Over hills, each line is divided: only some at once.
+        # Over hills, each line is divided into steps, so lines are processed in batches.
         parts = [self._lengths(start[k : k + LINES], end[k : k + LINES]) for k in range(0, len(start), LINES)]
         return np.concatenate([np.zeros(0), *parts])
 
@@ -71,7 +71,7 @@ class Region:
         low, high = np.zeros(len(line)), np.ones(len(line))
         if self.ground is None:
             low, high = _between(start[line, 2], end[line, 2], self.bottom[prism], self.top[prism])
-        # Lines beside the heights of a prism are dropped before the costly intersection in plan.
+        # Lines that miss a prism in height are dropped before the expensive intersection in plan.
         near = high > low
         line, prism, low, high = line[near], prism[near], low[near], high[near]
         step = (end - start)[line]
@@ -82,10 +82,10 @@ class Region:
         parts, of = shapely.get_parts(
             shapely.intersection(lines[line[sloping]], self.outline[prism[sloping]]), return_index=True
         )
-        piece = shapely.get_type_id(parts) == 1  # a touched corner is a point
+        piece = shapely.get_type_id(parts) == 1  # a line that only touches a corner gives a point
         parts, of = parts[piece], sloping[of[piece]]
         ends = np.stack([shapely.get_coordinates(shapely.get_point(parts, k)) for k in (0, -1)], axis=1)
-        # Shares of the line at which the pieces begin and end, by projection in plan.
+        # Fractions of the line at which the pieces begin and end, by projection in plan.
         away = ((ends - start[line[of], None, :2]) * step[of, None, :2]).sum(axis=2) / plan[of, None] ** 2
         away = np.clip(np.sort(away, axis=1), low[of, None], high[of, None])
         spans.append(np.column_stack([line[of], away, prism[of]])[away[:, 1] > away[:, 0]])
@@ -96,7 +96,7 @@ class Region:
     def _over_ground(
         self, spans: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """The parts of spans (line, lower, upper, prism) between the heights above the ground, in steps over hills."""
+        """The parts of spans (line, lower, upper, prism) between bottom and top above the ground, found in steps."""
         if self.ground is None:
             return spans
         step = (end - start)[spans[:, 0].astype(np.int64)]
@@ -123,7 +123,7 @@ def united(
         return
     event = np.concatenate([spans[:, [0, 1]], spans[:, [0, 2]]])
     change = np.repeat([1, -1], count)
-    # Where one span ends as the next begins, the begin comes first, so that they are one piece.
+    # Where one span ends and the next begins, the beginning is sorted first, so that the two form one piece.
     order = np.lexsort((-change, event[:, 1], event[:, 0]))
     depth = np.cumsum(change[order])
     begins = (depth == 1) & (change[order] == 1)
@@ -138,9 +138,9 @@ def _between(
     bottom: NDArray[np.float64],
     top: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The part of lines between two heights, as shares of the line [k] each; empty if low exceeds high."""
+    """The part of each line between two heights, as two fractions of the line [k]; empty unless high exceeds low."""
     rise = last - first
-    # A level line is between the heights all along or nowhere.
+    # A level line is between the heights along its whole length or nowhere.
     level = np.abs(rise) < 1e-9
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = np.sort([(bottom - first) / rise, (top - first) / rise], axis=0)
@@ -154,25 +154,25 @@ OUT_OF_SIGHT: Final = "out_of_sight"
 WALLS: Final = "walls_crossed"
 
 OBSTACLES: Final = (OUT_OF_SIGHT, WALLS, "obstruction_m", "knife_edge_db")
-"""Columns of links that follow from a scene: whether the straight line between the ends is blocked, how many walls it
-crosses, its length inside buildings [m], and the knife-edge loss of the highest roof [dB]."""
+"""Link columns computed from a scene: whether the straight line between the ends is blocked, how many walls it crosses,
+its length inside buildings [m], and the knife-edge diffraction loss of the dominant roof edge [dB]."""
 
 SAME_CROSSING: Final = 1e-3
-"""Crossings closer than this count as one, on an edge that two triangles share [m]."""
+"""Distance below which two crossings count as one, as on an edge that two triangles share [m]."""
 
 CLEAR: Final = -0.78
-"""Fresnel parameter below which an edge causes no loss (ITU-R P.526-15, section 4.1)."""
+"""Fresnel parameter at or below which an edge causes no loss (ITU-R P.526-15, section 4.1)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Obstruction:
-    """What the straight lines between the ends of links meet.
+    """Obstacles on the straight lines between the ends of links.
 
     Attributes:
         length_m: Length inside buildings [n], [m].
         walls: Number of walls crossed [n].
-        clearance: Largest Fresnel parameter of a roof's edge for a wavelength of 1 m [n]; -inf over no building.
-        other_floor: Whether a floor over the whole scene lies between the ends [n].
+        clearance: Largest Fresnel parameter of a roof edge at a wavelength of 1 m [n]; -inf if a line crosses no roof.
+        other_floor: Whether a floor that spans the scene lies between the ends [n].
     """
 
     length_m: NDArray[np.float64]
@@ -181,7 +181,7 @@ class Obstruction:
     other_floor: NDArray[np.bool_]
 
     def columns(self, wavelength: NDArray[np.float64] | float) -> dict[str, NDArray[np.float64]]:
-        """The values of `OBSTACLES` [n] by name, for a wavelength [m] of all links or of each [n]."""
+        """The columns `OBSTACLES` [n] by name, for one wavelength [m], or one for each link [n]."""
         values = (self.out_of_sight, self.walls, self.length_m, self.knife_edge_db(wavelength))
         return {name: value.astype(np.float64) for name, value in zip(OBSTACLES, values, strict=True)}
 
@@ -191,19 +191,19 @@ class Obstruction:
         return (self.length_m > 0) | (self.walls > 0) | self.other_floor
 
     def knife_edge_db(self, wavelength: NDArray[np.float64] | float) -> NDArray[np.float64]:
-        """Diffraction loss of the highest roof edge as a knife edge [n], [dB], by ITU-R P.526-15 equation 31.
+        """Knife-edge diffraction loss of the dominant roof edge [n], [dB], by ITU-R P.526-15 equation 31.
 
-        The wavelength [m] is that of all links or of each [n].
+        The wavelength [m] is one value for all links, or one for each link [n].
         """
         parameter = self.clearance / np.sqrt(wavelength)
-        # The bound also keeps lines without a roof, whose clearance is -inf, out of the root.
+        # The bound also replaces the clearance -inf of lines without a roof, which the equation cannot use.
         above = np.maximum(parameter, CLEAR) - 0.1
         loss_db = 6.9 + 20 * np.log10(np.sqrt(above**2 + 1) + above)
         return np.where(parameter > CLEAR, loss_db, 0.0)
 
 
 def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[np.float64]) -> Obstruction:
-    """Obstruction of links with ends [n, 3], [m]; triangles of the ground are obstacles only as floors between them.
+    """Compute the obstruction of links with ends [n, 3], [m]; ground triangles block only as floors between the ends.
 
     Example:
         A roof 10 m high over the square from (0, 0) to (10, 10) m, and one wall at x = 0:
@@ -221,7 +221,7 @@ def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[n
     level = np.abs(normal[:, 2]) > LEVEL * area
     length, clearance = np.zeros(len(start)), np.full(len(start), -np.inf)
     walls = np.zeros(len(start), dtype=np.int64)
-    # Lines from a common end are sorted by azimuth; the end with fewer positions serves.
+    # Lines with a common end are sorted by azimuth; the ends with fewer distinct positions are used as origins.
     swap = len(np.unique(end[:, :2], axis=0)) < len(np.unique(start[:, :2], axis=0))
     first, last = (end, start) if swap else (start, end)
     roofs, sides = obstacles[level & (area > 0)], obstacles[~level & (area > 0)]
@@ -229,10 +229,10 @@ def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[n
     for line, face in _pairs(first, last, roofs):
         below, parameter = _under(first[line], last[line], roofs[face])
         np.maximum.at(clearance, line, parameter)
-        # Roofs that the line passes above give the edge's clearance but no span.
+        # Roofs below the line give a clearance but no span.
         inside = below[:, 1] > below[:, 0]
         spans.append(np.column_stack([line.astype(np.float64), below])[inside])
-    # Below several roofs at once, such as floors of one building, a length counts once.
+    # A length below several roofs, such as the floors of one building, counts once.
     for line, lower, upper in united(np.concatenate([np.zeros((0, 3)), *spans])):
         np.add.at(length, line, upper - lower)
     length *= np.linalg.norm(end - start, axis=1)
@@ -242,7 +242,7 @@ def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[n
         for distance in (crossing(first[line], last[line], sides[face]),)
     ]
     crossed = np.concatenate([np.zeros((0, 2)), *crossings])
-    # By line, then by distance.
+    # Sorted by line, then by distance.
     crossed = crossed[np.lexsort(crossed.T[::-1])]
     separate = np.ones(len(crossed), dtype=bool)
     separate[1:] = (np.diff(crossed[:, 0]) > 0) | (np.diff(crossed[:, 1]) > SAME_CROSSING)
@@ -253,9 +253,9 @@ def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[n
 def _on_other_floor(
     triangles: Triangles, start: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Whether one end [n, 3], [m], has fewer sheets of the ground below it and more above it than the other [n].
+    """Whether one end [n, 3], [m], has fewer ground sheets below it and more above it than the other end [n].
 
-    Where the ground ends, or a floor has a hole, the numbers do not tell.
+    If one count is equal at both ends, as where a floor has a hole, the result is False.
     """
     points, index = np.unique(np.concatenate([start, end]), axis=0, return_inverse=True)
     below, above = np.zeros(len(points), dtype=np.int64), np.zeros(len(points), dtype=np.int64)
@@ -271,9 +271,9 @@ def _on_other_floor(
 def _pairs(
     first: NDArray[np.float64], last: NDArray[np.float64], corners: NDArray[np.float64]
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Lines and triangles that may cross in plan, by their indices in batches.
+    """Indices of lines and triangles that may cross in plan, in batches.
 
-    The line's azimuth lies between those of the triangle's corners.
+    The azimuth of such a line lies between the azimuths of the triangle's corners.
     """
     if not len(corners):
         return
@@ -284,16 +284,16 @@ def _pairs(
         lines = np.flatnonzero(of.reshape(-1) == number)
         lines = lines[np.argsort(azimuth[lines], kind="stable")]
         sorted_azimuth = azimuth[lines]
-        # Once more a turn on, so that a range across 180 degrees is one piece.
+        # Repeated one turn later, so that a range of azimuths across 180 degrees is contiguous.
         twice = np.concatenate([sorted_azimuth, sorted_azimuth + 2 * np.pi])
         relative = corners[:, :, :2] - origin
         direction = np.arctan2(relative[..., 1], relative[..., 0])
-        # The corners' azimuths relative to the first corner's, in (-pi, pi]: a range across 180 degrees stays whole.
+        # Azimuths relative to the first corner's, in (-pi, pi], so that a range across 180 degrees stays contiguous.
         turn = np.angle(np.exp(1j * (direction - direction[:, :1])))
         low, high = direction[:, 0] + turn.min(axis=1), direction[:, 0] + turn.max(axis=1)
         around = high - low > np.pi * (1 - 1e-9)  # the origin is inside the triangle or on its side
         low, high = np.where(around, -np.pi, low) - 1e-12, np.where(around, np.pi, high) + 1e-12
-        # `twice` covers -pi to 3 pi; ranges that begin below are found one turn on.
+        # `twice` covers -pi to 3 pi; ranges that begin below -pi are searched one turn later.
         shift = np.where(low < -np.pi, 2 * np.pi, 0.0)
         begin = np.searchsorted(twice, low + shift, "left")
         count = np.searchsorted(twice, high + shift, "right") - begin
@@ -314,9 +314,9 @@ def _pairs(
 def _under(
     first: NDArray[np.float64], last: NDArray[np.float64], corners: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where lines pass below level triangles [n, 2], as shares of the line, and the Fresnel parameter of their edges.
+    """Where lines pass below level triangles [n, 2], as fractions of the line, and Fresnel parameters of their edges.
 
-    The part of the line over the triangle in plan follows from clipping at its three sides.
+    The part of the line within the triangle in plan is found by clipping at the triangle's three sides.
     """
     step = last - first
     low, high = np.zeros(len(first)), np.ones(len(first))
@@ -331,23 +331,23 @@ def _under(
             share = -distance / slope
             low = np.where(slope > 0, np.maximum(low, share), low)
             high = np.where(slope < 0, np.minimum(high, share), high)
-            # A line parallel to a side and outside of it misses the triangle.
+            # A line that is parallel to a side and outside it misses the triangle.
             high = np.where((slope == 0) & (distance < 0), -1.0, high)
         over = high > low
-        # Height of the triangle's plane above the line, linear along it.
+        # Height of the triangle's plane above the line, which varies linearly along the line.
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         ends = np.stack([low, high])
         point = first + ends[..., None] * step
         offset = point[..., :2] - corners[:, 0, :2]
         roof = corners[:, 0, 2] - (normal[:, :2] * offset).sum(axis=-1) / normal[:, 2]
         above = np.where(over, roof - point[..., 2], -1.0)
-        # Share at which the line passes through the plane; used only where the signs at both ends differ.
+        # Fraction at which the line passes through the plane; used only where the signs at the two ends differ.
         zero = low + (high - low) * above[0] / (above[0] - above[1])
         lower = np.where(above[0] > 0, low, zero)
         upper = np.where(above[1] > 0, high, zero)
         # Fresnel parameter h sqrt(2 / lambda (1 / d1 + 1 / d2)), ITU-R P.526-15 equation 26, for a wavelength of 1 m
         length = np.linalg.norm(step, axis=1)
-        # Roofs above an antenna itself would give an infinite parameter.
+        # A roof directly above an antenna would give an infinite parameter.
         away = np.clip(ends, 1e-6, 1 - 1e-6)
         parameter = above * np.sqrt(2 / length * (1 / away + 1 / (1 - away)))
     below = over & ((above[0] > 0) | (above[1] > 0))
@@ -369,7 +369,7 @@ def crossing(
     """
     step = last - first
     one, other = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
-    # Intersection of Moller and Trumbore: barycentric u, v and the share of the line from one triple product.
+    # u, v and the fraction of the line all follow from triple products.
     across = np.cross(step, other)
     offset = first - corners[..., 0, :]
     normal = np.cross(offset, one)
@@ -382,16 +382,16 @@ def crossing(
 
 
 REGION: Final = "region_m"
-"""Column of the length of the straight line inside regions of extra loss [m]."""
+"""Column with the length of the straight line inside regions of extra loss [m]."""
 
 CLUTTER: Final = "clutter_db"
-"""Column of the clutter loss of ITU-R P.2108 at one end [dB]."""
+"""Column with the clutter loss at one end by ITU-R P.2108 [dB]."""
 
 CLUSTER: Final = "cluster"
-"""Column of labels of squares in which receivers form groups."""
+"""Column with the label of the grid square that contains the receiver, for grouping links."""
 
 COLUMNS: Final = (*OBSTACLES, REGION, CLUTTER)
-"""All columns that follow from the scene."""
+"""The numeric columns computed from the scene and the positions."""
 
 
 def with_obstruction(
@@ -403,18 +403,18 @@ def with_obstruction(
     clutter: bool = False,
     cluster_m: float | None = None,
 ) -> Measurements:
-    """The links with the columns that follow from the scene; columns of these names in their table are kept.
+    """Add the columns computed from the scene to links; existing columns with these names are kept.
 
     Args:
         links: The links.
         scene: The scene.
-        frequency: Carrier [Hz] of the links that state none.
-        regions: The regions of extra loss by name; if there are none, `REGION` is left out.
-        clutter: Whether `CLUTTER` is wanted.
-        cluster_m: Side of the squares of `CLUSTER`, a lattice through the scene's origin; left out if None.
+        frequency: Carrier frequency [Hz], used if the links do not state it.
+        regions: The regions of extra loss by name; `REGION` is added only if there are any.
+        clutter: Whether to add `CLUTTER`.
+        cluster_m: Side of the squares of `CLUSTER` [m], a grid through the scene's origin; None to omit the column.
 
     Raises:
-        InputError: A carrier is outside the range of the clutter loss.
+        InputError: A carrier frequency is outside the range of the clutter loss.
     """
     carrier = frequency if links.frequency is None else links.frequency
     added: dict[str, NDArray[np.float64] | NDArray[np.str_]] = {}
@@ -433,20 +433,20 @@ def with_obstruction(
 
 
 SHORTEST: Final = 250.0
-"""Shortest path that the recommendation covers, with one end in clutter [m]."""
+"""Shortest path length that ITU-R P.2108 covers with one end in clutter [m]."""
 
 CARRIERS: Final = (0.5e9, 67e9)
-"""Carriers that it covers [Hz]."""
+"""Range of carrier frequencies that ITU-R P.2108 covers [Hz]."""
 
 
 def clutter_loss_db(distance: ArrayLike, frequency: ArrayLike) -> NDArray[np.float64]:
-    """Median clutter loss at one end, over locations in urban or suburban clutter [n], [dB].
+    """Median loss over locations in urban or suburban clutter at one end [n], [dB], by ITU-R P.2108-1 section 3.2.
 
-    Distances are the lengths of the paths [n], [m]; the carrier is that of all or of each [n], [Hz]. The loss is 0 for
-    paths shorter than `SHORTEST`, which the recommendation does not cover.
+    `distance` is the length of each path [n], [m]; `frequency` is one carrier frequency for all, or one for each path
+    [n], [Hz]. The loss is 0 for paths shorter than `SHORTEST`, which the recommendation does not cover.
 
     Raises:
-        InputError: A carrier is outside `CARRIERS`.
+        InputError: A carrier frequency is outside `CARRIERS`.
 
     Example:
         >>> clutter_loss_db([100.0, 1000.0, 5000.0], 3.5e9).round(2).tolist()
@@ -461,7 +461,7 @@ def clutter_loss_db(distance: ArrayLike, frequency: ArrayLike) -> NDArray[np.flo
             "leave this nuisance out"
         )
     length_km = np.asarray(distance, dtype=float) / 1e3
-    # Beyond 2 km the loss is that at 2 km (equation 6).
+    # Beyond 2 km, the loss equals that at 2 km (equation 6).
     capped_km = np.clip(length_km, SHORTEST / 1e3, 2.0)
     long_db = -2 * np.log10(10 ** (-5 * np.log10(carrier_ghz) - 12.5) + 10**-16.5)  # equation 4
     short_db = 32.98 + 23.9 * np.log10(capped_km) + 3 * np.log10(carrier_ghz)  # equation 5

@@ -1,9 +1,9 @@
-"""Scenes: a Mitsuba XML file read into materials and objects, and rewritten for the tracer.
+"""Scenes: reading the materials and objects of a Mitsuba XML file, and rewriting the file for the tracer.
 
-In the scene for the tracer, each surface material is a plain `radio-material` of Sionna's with explicit constants and a
-name that Calibray chooses. This keeps the constants in one place (`Material`), allows a frequency outside an ITU table
-if the study gives the constants (NVlabs/sionna-rt#71, #72), and avoids Sionna's rules on names: an ITU name needs the
-prefix `itu_`, and an object must not have the name of a material.
+In the scene for the tracer, each surface material is a plain Sionna `radio-material` with explicit constants and a name
+that Calibray chooses. This keeps the constants in one place (`Material`), allows frequencies outside the range of an
+ITU law if the study gives the constants (NVlabs/sionna-rt#71, #72), and avoids Sionna's naming rules: an ITU name needs
+the prefix `itu_`, and an object must not have the name of a material.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ from calibray.support.output_files import check_outputs, replacing, write_text
 from calibray.tables import hertz
 
 DEFAULT_THICKNESS: Final = 0.1
-"""Sionna's default thickness of a material [m]."""
+"""Sionna RT's default thickness of a material [m]."""
 
 TRACED: Final = "mat-calibray-"
-"""Prefix of the ids of materials in the scene for the tracer; the index in `Scene.materials` follows."""
+"""Prefix of material ids in the scene for the tracer, followed by the index in `Scene.materials`."""
 
 ITU_NAMES: Final = frozenset(name for table in ITU_MATERIALS.values() for name in table)
-"""Names of materials in any revision of ITU-R P.2040; Sionna RT reserves them."""
+"""Names of the materials in all revisions of ITU-R P.2040; Sionna RT reserves them."""
 
 _MATERIAL_FIELDS: Final = frozenset(entry.name for entry in fields(Material))
 _BULK_FIELDS: Final = frozenset({"relative_permittivity", "conductivity"})
@@ -64,7 +64,7 @@ _BULK_FIELDS: Final = frozenset({"relative_permittivity", "conductivity"})
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One mesh of a scene: its id without the prefix `mesh-`, and the name of its material."""
+    """A mesh of a scene: its id without the prefix `mesh-`, and the name of its material."""
 
     name: str
     material: str
@@ -75,14 +75,14 @@ class Scene:
     """A scene as read from its file.
 
     Attributes:
-        source: The user's name for the scene: a path or `sionna:NAME`.
+        source: The scene as the user named it: a path or `sionna:NAME`.
         path: The XML file.
-        materials: The materials that objects use, by name, at the frequency for which the scene was read.
-        objects: The meshes, in the file's order.
+        materials: The materials that objects use, by name, with their constants at `frequency`.
+        objects: The meshes, in file order.
         xml: The scene for the tracer; the id of material k of `materials` is `mat-calibray-k`.
-        laws: How the constants of each material depend on frequency: ITU-R's law for ITU materials, otherwise constant.
-        sizes: Size of every object.
-        frequency: The frequency for which the scene was read [Hz]; None if its constants hold at all frequencies.
+        laws: Frequency law of each material: that of ITU-R P.2040 for ITU materials, otherwise constant.
+        sizes: Bounds and size of each object.
+        frequency: The frequency for which the scene was read [Hz]; None if the constants are valid at all frequencies.
     """
 
     source: str
@@ -96,18 +96,18 @@ class Scene:
 
     @property
     def local_origin(self) -> NDArray[np.float64]:
-        """Origin of the frame in which the scene is traced [3], [m]; zero unless the scene lies far from its origin."""
+        """Origin of the frame in which the scene is traced [3], [m]; zero unless the scene is far from (0, 0, 0)."""
         return local_origin(self.sizes)
 
     def check_frequency(self, frequency: float) -> None:
-        """Refuse another frequency [Hz] than that of the constants.
+        """Refuse a frequency [Hz] at which the constants are not valid.
 
         Raises:
-            InputError: The scene was read for another frequency, and its constants depend on it.
+            InputError: The scene was read for a different frequency, and its constants depend on frequency.
         """
         if self.frequency is not None and frequency != self.frequency:
             raise InputError(
-                f"scene {self.source}: its constants are those at {hertz(self.frequency)}; read it at "
+                f"scene {self.source}: its constants are valid only at {hertz(self.frequency)}; read it at "
                 f"{hertz(frequency)} with read_scene"
             )
 
@@ -123,16 +123,17 @@ def read_scene(
     Args:
         source: Path of the XML file, or `sionna:NAME` for a scene bundled with Sionna RT.
         frequency: Carrier frequency [Hz], at which ITU materials are evaluated.
-        overrides: Constants that replace the file's, by material name: a `Material`, or a mapping with any of its
-            fields, with `itu` naming an ITU-R P.2040 material, or with the `revision` of that or of the file's.
-        split: Separate materials for some objects: by name of the new material, a pattern of object names in which `*`
-            matches any text. If the name ends in `*`, each object gets its own material, with `*` replaced by the
-            object's name.
+        overrides: Constants that replace those in the file, by material name: a `Material`, or a mapping of its fields.
+            The mapping may also contain `itu`, an ITU-R P.2040 material, and `revision`, which applies to `itu` or to
+            the ITU material in the file.
+        split: Separate materials for certain objects: maps the name of each new material to a pattern of object names,
+            in which `*` matches any text. If the material name ends in `*`, each object gets its own material, with `*`
+            replaced by the object's name.
 
     Raises:
         InputError: The file does not exist or is not a Mitsuba scene; a mesh is missing or malformed; a material has no
-            radio constants; an override names no material of the scene; a pattern matches no object, or objects of
-            different materials; or a frequency lies outside an ITU range.
+            radio constants; an override is for a material that the scene does not have; a pattern matches no object,
+            or objects with different materials; or the frequency is outside the range of an ITU law.
     """
     overrides, split = dict(overrides or {}), dict(split or {})
     path = scene_path(str(source))
@@ -153,7 +154,7 @@ def read_scene(
         if originals.setdefault(name, original) != original:
             raise InputError(
                 f"[objects] {name}: its objects have the materials {originals[name]!r} and {original!r}; "
-                "name one material for each"
+                "use a separate entry for each"
             )
         if name not in materials:
             constants = _merge(overrides.get(original), overrides.get(name) if name != original else None)
@@ -185,12 +186,12 @@ def read_scene(
 
 
 def has_copied_meshes(scene: Scene) -> bool:
-    """Whether the tracer reads copies of meshes: the scene is traced in a local frame, or a shape would be misread."""
+    """Whether the tracer reads copies of meshes, because of a local frame or a shape that it would misread."""
     return bool(scene.local_origin.any()) or any(size.misread for size in scene.sizes)
 
 
 def xml_with_copied_meshes(scene: Scene, folder: Path) -> str:
-    """Make the XML that the tracer loads instead of `Scene.xml`, with copies of the meshes in the local frame.
+    """Make XML that the tracer loads instead of `Scene.xml`, and write copies of meshes in the local frame to a folder.
 
     Raises:
         InputError: A mesh cannot be copied.
@@ -204,17 +205,17 @@ def xml_with_copied_meshes(scene: Scene, folder: Path) -> str:
 
 
 def check_material_name(name: str, materials: Mapping[str, object], location: str) -> None:
-    """Refuse a material that a scene does not have; `location` is where the user wrote its name.
+    """Refuse a material that a scene does not have; `location` states where the user gave the name.
 
     Raises:
-        InputError: The scene has no such material; the message suggests the nearest name.
+        InputError: The scene has no such material; the message suggests a similar name.
     """
     if name not in materials:
         raise InputError(f"{location}: the scene has no material {name!r}; {did_you_mean(name, materials)}")
 
 
 def is_itu_name(name: str) -> bool:
-    """Whether Sionna RT reserves a material's name, with or without `itu_`, for ITU-R P.2040."""
+    """Whether Sionna RT reserves a name, with or without the prefix `itu_`, for an ITU-R P.2040 material."""
     return name in ITU_NAMES or name.startswith(("itu_", "itu-"))
 
 
@@ -240,7 +241,7 @@ def _material_name(bsdf: ElementTree.Element) -> str:
 def _file_material_name(
     shape: ElementTree.Element, definitions: Mapping[str, ElementTree.Element], path: Path
 ) -> str:
-    """The material that the file gives an object."""
+    """The name of the material that the file assigns to an object."""
     nested = shape.find("bsdf")
     if nested is not None:
         return _material_name(nested)
@@ -254,14 +255,14 @@ def _file_material_name(
 
 
 def _matches(object_name: str, pattern: str) -> bool:
-    # Only `*` has a meaning: names of objects contain brackets and question marks.
+    # Only `*` is a wildcard, because object names may contain brackets and question marks.
     return fnmatchcase(object_name, escape(pattern).replace("[*]", "*"))
 
 
 def _split_name(
     object_name: str, split: Mapping[str, str], definitions: Mapping[str, ElementTree.Element]
 ) -> str | None:
-    """The separate material of an object: that of the first matching pattern; None if no pattern matches."""
+    """The separate material of an object, from the first matching pattern; None if no pattern matches."""
     name = next((name for name, pattern in split.items() if _matches(object_name, pattern)), None)
     if name is None:
         return None
@@ -292,7 +293,7 @@ def _material(
     frequency: float,
     path: Path,
 ) -> tuple[Material, ItuLaw]:
-    """The constants of one material, from the override or otherwise the file, and their law over frequency."""
+    """The constants of a material, from the override or otherwise from the file, and their frequency law."""
     if isinstance(override, Material):
         return override, frequency_independent_law(override)
     constants = {key: value for key, value in (override or {}).items() if value is not None}
@@ -333,7 +334,7 @@ def _file_material(name: str, bsdf: ElementTree.Element | None, frequency: float
 
 
 def _itu_type(name: str, bsdf: ElementTree.Element | None) -> str | None:
-    """The ITU name that Sionna derives from a BSDF: its `type` string, or its own name after `itu_`."""
+    """The ITU name that Sionna derives from a BSDF: its `type` string, or its own name without the prefix `itu_`."""
     has_itu_name = name.startswith(("itu_", "itu-"))
     declared = None if bsdf is None else bsdf.find("string[@name='type']")
     if (
@@ -346,7 +347,7 @@ def _itu_type(name: str, bsdf: ElementTree.Element | None) -> str | None:
 
 
 def _floats(bsdf: ElementTree.Element | None) -> dict[str, float]:
-    """The numbers of a BSDF that are fields of a material."""
+    """The numbers in a BSDF that are fields of a material."""
     constants = {}
     for element in [] if bsdf is None else bsdf.findall("float"):
         name, value = element.get("name", ""), element.get("value")
@@ -359,12 +360,12 @@ def _floats(bsdf: ElementTree.Element | None) -> dict[str, float]:
 
 
 def _slab(bsdf: ElementTree.Element | None) -> dict[str, float]:
-    """The numbers of a BSDF that describe the slab and its surface, not the bulk."""
+    """The numbers in a BSDF that describe the slab and its surface, not the bulk medium."""
     return {key: value for key, value in _floats(bsdf).items() if key not in _BULK_FIELDS}
 
 
 def material_element(identifier: str, material: Material) -> ElementTree.Element:
-    """Make the BSDF of a material, with the constants that Sionna's scene files can contain."""
+    """Make the BSDF of a material, with the constants that a Sionna scene file can contain."""
     bsdf = ElementTree.Element("bsdf", {"type": "radio-material", "id": identifier})
     for name in SCALAR_CONSTANTS:
         ElementTree.SubElement(bsdf, "float", {"name": name, "value": repr(getattr(material, name))})
@@ -378,20 +379,21 @@ def export_scene(
     copy_meshes: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Write a scene file with other constants; it refers to the original meshes or to copies, and keeps the frame.
+    """Write a scene file with new constants and the same frame; it refers to the original meshes or to copies.
 
-    Materials and objects get names that Sionna RT accepts (`exported_names`). Sionna's scene files support the
-    Lambertian scattering pattern only; set another pattern after loading the scene.
+    Materials and objects get names that Sionna RT accepts (`exported_names`). Sionna scene files support only
+    the Lambertian scattering pattern; set other patterns after loading the scene.
 
     Args:
         scene: The scene as it was read.
         materials: Constants by material name.
         target: File to write.
-        copy_meshes: Whether to copy the meshes next to the file, so that the folder is complete.
-        overwrite: Let copies replace files that Calibray did not write; meshes of the scene are never replaced.
+        copy_meshes: Whether to copy the meshes to a folder next to the file, so that the scene is self-contained.
+        overwrite: Whether copies may replace files that Calibray did not write; the scene's own meshes are never
+            replaced.
 
     Raises:
-        InputError: A material of the scene is missing, or a copy would replace a protected file.
+        InputError: A material of the scene has no constants, or a copy would replace a protected file.
         OSError: A file cannot be written.
     """
     missing = [name for name in scene.materials if name not in materials]
@@ -427,9 +429,9 @@ def export_scene(
 
 
 def exported_names(names: Iterable[str]) -> dict[str, str]:
-    """The names of materials in an exported scene: letters, digits, `_` and `-`, and no name twice.
+    """Choose unique material names of letters, digits, `_` and `-` for an exported scene.
 
-    Sionna RT refuses a plain `radio-material` with an ITU name, so this name becomes `calibrated-NAME`. Mitsuba
+    Sionna RT refuses a plain `radio-material` with an ITU name, which therefore becomes `calibrated-NAME`. Mitsuba
     misreads names with dots, quotes or line breaks.
 
     Example:
@@ -442,7 +444,7 @@ def exported_names(names: Iterable[str]) -> dict[str, str]:
 
 
 def _copy(mesh: Path, folder: Path, copies: dict[str, Path], overwrite: bool) -> Path:
-    """Copy a mesh; meshes of the same name from different folders get numbers."""
+    """Copy a mesh; meshes with the same name from different folders are numbered."""
     stem, number = plain_name(mesh.stem), 1
     name = f"{stem}{mesh.suffix}"
     while copies.setdefault(name, mesh) != mesh:

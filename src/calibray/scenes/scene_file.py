@@ -1,4 +1,4 @@
-"""The XML file of a scene: located, parsed and checked before a ray tracer reads it; written for new scenes."""
+"""The XML file of a scene: finding, parsing and checking it before a ray tracer reads it, and writing new ones."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from calibray.support.output_files import check_outputs, exists, write_bytes, wr
 BUNDLED_PREFIX: Final = "sionna:"
 
 SHAPES: Final = ("cube", "obj", "ply", "rectangle")
-"""Types of shapes that are triangle meshes. Mitsuba's compressed `serialized` meshes are refused, because their size is
-known only after Mitsuba has decompressed them."""
+"""Types of shapes that consist of triangles. Mitsuba's compressed `serialized` meshes are refused, because their size
+is known only after decompression."""
 
 MESHES: Final = "meshes"
 """Folder for meshes, next to the scene file."""
 
 MAX_DEPTH: Final = 64
-"""Largest depth of nested elements in a scene file."""
+"""Largest nesting depth of elements in a scene file."""
 
 _NOT_RADIO: Final = frozenset(
     (
@@ -47,7 +47,7 @@ _NOT_RADIO: Final = frozenset(
         "texture",
     )
 )
-"""Elements of Mitsuba's scenes without effect on radio waves."""
+"""Elements of Mitsuba scenes that have no effect on radio waves."""
 
 _PROPERTIES: Final[Mapping[str, tuple[str, ...]]] = {
     "boolean": tuple(
@@ -57,18 +57,18 @@ _PROPERTIES: Final[Mapping[str, tuple[str, ...]]] = {
     "string": ("filename",),
     "transform": ("to_world", "toWorld"),
 }
-"""Properties of shapes by element, in the spelling of Mitsuba 3 and of earlier versions."""
+"""Properties of shapes by element, as spelled in Mitsuba 3 and in earlier versions."""
 
 _FRAME_COMMENT: Final = "calibray frame "
 
 
 def plain_name(name: str) -> str:
-    """A name for files and objects: only letters, digits, `_` and `-`."""
+    """Convert a name to one for files and objects, with only letters, digits, `_` and `-`."""
     return re.sub(r"[^0-9A-Za-z_-]+", "_", name)
 
 
 def unique_names(names: Iterable[str], taken: Collection[str] = (), kind: str = "_") -> list[str]:
-    """Plain names without duplicates, also of names that are taken: `NAME-2`, or `NAME-KIND` if that is taken.
+    """Make plain names unique: a repeated name becomes `NAME-2`, and one that is `taken` becomes `NAME-KIND`.
 
     Example:
         >>> unique_names(["Town hall", "Town/hall", '"><x'])
@@ -88,7 +88,7 @@ def unique_names(names: Iterable[str], taken: Collection[str] = (), kind: str = 
 
 
 def scene_path(source: str) -> Path:
-    """Find the XML file of a scene, its path or `sionna:NAME` for one bundled with Sionna RT.
+    """Find the XML file of a scene, given its path, or `sionna:NAME` for a scene bundled with Sionna RT.
 
     Raises:
         InputError: There is no such file or bundled scene, or Sionna RT is not installed.
@@ -118,7 +118,7 @@ def scene_path(source: str) -> Path:
 
 
 def read_content(path: Path) -> bytes:
-    """Read the bytes of a scene file; an unchanged file is read once.
+    """Read the bytes of a scene file; an unchanged file is read only once.
 
     Raises:
         OSError: The file cannot be read.
@@ -133,7 +133,7 @@ def _content(path: Path, *_: int) -> bytes:
 
 
 def parse(path: Path, source: str) -> ElementTree.Element:
-    """Parse the XML of a scene; `source` is the user's name for it.
+    """Parse the XML of a scene; `source` is the scene as the user named it.
 
     Raises:
         InputError: The file cannot be read, is not well-formed, is nested too deeply, or is not a Mitsuba scene.
@@ -166,7 +166,7 @@ def find_scene(source: str | Path) -> tuple[Path, ElementTree.Element]:
 
 
 class _ShallowTree(ElementTree.TreeBuilder):
-    """Builds the elements and refuses deep nesting, on which recursive code would overflow the stack."""
+    """Builds the elements and refuses deep nesting, which would overflow the stack in recursive code."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -184,9 +184,9 @@ class _ShallowTree(ElementTree.TreeBuilder):
 
 
 def shape_mesh(shape: ElementTree.Element, path: Path) -> Mesh | None:
-    """Read the mesh of a shape, and refuse a shape that cannot be traced. Its transform is not applied.
+    """Read the mesh of a shape without applying its transform, and refuse a shape that cannot be traced.
 
-    The result is None for a rectangle or cube, which have no file.
+    The result is None for a rectangle or a cube, which has no file.
 
     Raises:
         InputError: The shape is not a triangle mesh or has a degenerate transform, or its mesh is missing or malformed.
@@ -214,7 +214,7 @@ def shape_mesh(shape: ElementTree.Element, path: Path) -> Mesh | None:
 
 
 def _check_transform(shape: ElementTree.Element, path: Path) -> None:
-    """Refuse a transform that flattens a shape or moves it to infinity: rays would pass without a message."""
+    """Refuse a transform that flattens a shape or moves it to infinity: rays would miss it without a message."""
     for step in shape.findall("transform/*"):
         words = [value for key, value in step.attrib.items() if key in ("x", "y", "z", "value", "angle")]
         try:
@@ -235,8 +235,8 @@ def _check_transform(shape: ElementTree.Element, path: Path) -> None:
 def keep_traced_elements(root: ElementTree.Element, path: Path) -> None:
     """Reduce a scene to the elements that a trace needs, so that Mitsuba reads no others.
 
-    Mitsuba would load textures, emitters and sensors, and end the process on some that are malformed. They have no
-    effect on radio waves and are dropped.
+    Mitsuba would load textures, emitters and sensors, and certain malformed ones crash the process. They have no effect
+    on radio waves and are dropped.
 
     Raises:
         InputError: The scene includes another file, or has an element, a property or a parameter that Calibray does not
@@ -289,15 +289,15 @@ def write_scene(
 ) -> Path:
     """Write a new scene: `scene.xml`, and `meshes/NAME.ply` for each object; returns the XML file.
 
-    A material whose `type` names one of ITU-R P.2040 takes permittivity and conductivity from there. The frame is kept
-    in a comment, from which `read_frame` reads it. With `overwrite`, files are replaced that Calibray did not write.
+    A material whose `type` is an ITU-R P.2040 material takes its permittivity and conductivity from there. The frame is
+    stored in a comment, which `read_frame` reads. With `overwrite`, files that Calibray did not write are replaced.
 
     Raises:
-        InputError: The folder cannot be written, or a file there must not be replaced; nothing is written then.
+        InputError: The folder cannot be written to, or a file in it must not be replaced. No file is then written.
     """
     meshes = {f"{item.name}.ply": item.mesh for item in objects}
     check_outputs(folder, ["scene.xml"], overwrite=overwrite)
-    # The meshes of another folder must not be replaced through a link.
+    # Meshes in another folder must not be replaced through a link.
     if (folder / MESHES).is_symlink():
         raise InputError(
             f"output folder {folder}: {folder / MESHES} is a link; remove it, or name another folder"
@@ -341,7 +341,7 @@ def frame_comment(frame: Frame) -> str:
 
 
 def read_frame(source: str | Path) -> Frame | None:
-    """Read the position of a scene on the globe; None if its file does not state it.
+    """Read the geographic frame of a scene; None if its file states none.
 
     Raises:
         InputError: The scene does not exist, or its file states an invalid frame.

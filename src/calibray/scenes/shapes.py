@@ -1,8 +1,8 @@
-"""Shapes of a scene in the scene frame: transforms applied in double precision, sizes, and copies for the tracer.
+"""Shapes of a scene in the scene frame: double-precision transforms, sizes, and copies for the tracer.
 
-A ray tracer computes in single precision, which separates points by 0.1 mm at 1 km from the origin and by 0.5 m at UTM
-northings. A scene far from the origin is therefore traced in a local frame: its meshes are read and moved in double
-precision here, and only then rounded.
+A ray tracer computes in single precision, whose spacing is about 0.1 mm at 1 km from the origin and 0.5 m at UTM
+northings. A scene far from the origin is therefore traced in a local frame: this module reads and moves its meshes in
+double precision, and only then rounds them.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ from calibray.support.messages import shortened
 FAR: Final = 1000.0
 """Coordinate beyond which a scene may be traced in a local frame [m].
 
-Single precision rounds by at most 0.03 mm up to here. Three scenes of 100 m that were moved by 1 km kept all paths,
-with path loss within 0.001 dB. Moved by 2 km, path loss changed by 0.0015 dB, and at 10 km paths were found twice.
+Up to this distance, single-precision rounding errors are at most 0.03 mm. When three scenes of 100 m were moved by
+1 km, all paths were kept and path loss stayed within 0.001 dB. At 2 km, path loss changed by 0.0015 dB, and at 10 km,
+paths were found twice.
 """
 
 COARSE: Final = 1e-3
-"""Spacing of stored coordinates above which there is a warning [m]; path loss changes by more than 0.005 dB."""
+"""Spacing of stored coordinates above which a warning is given [m]; path loss changes by more than 0.005 dB."""
 
 TOO_COARSE: Final = 1e-2
 """Spacing of stored coordinates above which a scene cannot be traced [m]: walls no longer meet, and paths are lost."""
@@ -38,21 +39,21 @@ TOO_COARSE: Final = 1e-2
 _SQUARE: Final = Mesh(
     np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float), np.array([[0, 1, 2], [0, 2, 3]])
 )
-"""Mitsuba's rectangle."""
+"""Mitsuba's `rectangle` shape."""
 
 
 @dataclass(frozen=True)
 class SurfaceSize:
-    """Position and size of the surface of an object.
+    """Bounds and size of an object's surface.
 
     Attributes:
-        low: Least coordinates [3], [m].
+        low: Smallest coordinates [3], [m].
         high: Largest coordinates [3], [m].
-        area: Its area [m^2].
-        sides: Total length of the sides of its triangles [m].
-        step: Spacing of the numbers with which its file stores the largest coordinate [m]; 0 if that is negligible.
-        misread: Whether Mitsuba would misread it: its file stores coordinates as integers, or its transform rotates
-            about a vector that is not a unit vector.
+        area: Area [m^2].
+        sides: Total length of the sides of all triangles [m].
+        step: Spacing of floating-point numbers at the largest coordinate in the file [m]; 0 if it is negligible.
+        misread: Whether the tracer needs a copy: the file stores integer coordinates, the shape is a rectangle, or its
+            transform rotates about a vector that is not a unit vector.
     """
 
     low: tuple[float, float, float]
@@ -64,7 +65,7 @@ class SurfaceSize:
 
     @classmethod
     def of(cls, mesh: Mesh) -> SurfaceSize:
-        """Measure a mesh."""
+        """Compute the bounds and size of a mesh."""
         corners = mesh.vertices[mesh.faces]
         sides = np.roll(corners, -1, axis=1) - corners
         area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum() / 2
@@ -83,7 +84,7 @@ def read_surface(shape: ElementTree.Element, path: Path) -> Mesh:
     """Read the surface of a shape in the scene frame.
 
     Raises:
-        InputError: As for `place_mesh`, or the file stores coordinates in steps of more than `TOO_COARSE`.
+        InputError: As for `place_mesh`, or the spacing of the stored coordinates exceeds `TOO_COARSE`.
     """
     mesh = place_mesh(shape, path)
     if mesh.step > TOO_COARSE:
@@ -96,7 +97,7 @@ def read_surface(shape: ElementTree.Element, path: Path) -> Mesh:
 
 
 def place_mesh(shape: ElementTree.Element, path: Path) -> Mesh:
-    """Read the mesh of a shape, also of a rectangle or cube, and apply its transform.
+    """Read the mesh of a shape, or make that of a rectangle or cube, and apply the shape's transform.
 
     Raises:
         InputError: As for `shape_mesh`, or the transform has an element that Calibray does not know.
@@ -117,13 +118,13 @@ def place_mesh(shape: ElementTree.Element, path: Path) -> Mesh:
     sheared = any(
         abs(np.linalg.norm(_axes(turn, 0.0)) - 1) > 1e-6 for turn in shape.findall("transform/rotate")
     )
-    # The file's numbers are in its own unit, such as millimetres, which the transform scales to metres.
+    # The file may use a unit such as millimetres, which the transform scales to metres.
     step = mesh.step * float(np.linalg.norm(matrix[:3, :3], 2))
     return replace(mesh, vertices=vertices, step=step, misread=mesh.misread or sheared)
 
 
 def transform_matrix(shape: ElementTree.Element, path: Path) -> NDArray[np.float64]:
-    """Compute the transform of a shape in double precision, a matrix for homogeneous coordinates [4, 4].
+    """Compute the transform of a shape in double precision, as a matrix for homogeneous coordinates [4, 4].
 
     Raises:
         InputError: An element is not a translate, scale, rotate or matrix, or has the wrong number of values.
@@ -131,7 +132,7 @@ def transform_matrix(shape: ElementTree.Element, path: Path) -> NDArray[np.float
     matrix = np.eye(4)
     for step in shape.findall("transform/*"):
         try:
-            # Mitsuba applies the elements in the order of the file.
+            # Mitsuba applies the elements in file order.
             matrix = _step_matrix(step) @ matrix
         except ValueError:
             raise InputError(
@@ -142,7 +143,7 @@ def transform_matrix(shape: ElementTree.Element, path: Path) -> NDArray[np.float
 
 
 def _step_matrix(step: ElementTree.Element) -> NDArray[np.float64]:
-    """The matrix of one element of a transform [4, 4]."""
+    """The matrix [4, 4] of one element of a transform."""
     matrix = np.eye(4)
     if step.tag == "translate":
         matrix[:3, 3] = _axes(step, 0.0)
@@ -166,7 +167,7 @@ def _step_matrix(step: ElementTree.Element) -> NDArray[np.float64]:
 
 
 def _axes(step: ElementTree.Element, default: float) -> NDArray[np.float64]:
-    """The values of an element along the axes [3]."""
+    """The values of an element along the x, y and z axes [3]."""
     if (text := step.get("value")) is not None:
         values = _numbers(text)
         if len(values) not in (1, 3):
@@ -180,7 +181,7 @@ def _numbers(text: str) -> NDArray[np.float64]:
 
 
 def _cube() -> Mesh:
-    """Mitsuba's cube; its faces share no vertices, so its edges do not diffract."""
+    """Mitsuba's `cube` shape; its faces share no vertices, so its edges do not diffract."""
     turns = [[0, 0, 0], [180, 0, 0], [90, 0, 0], [-90, 0, 0], [0, 90, 0], [0, -90, 0]]
     face = _SQUARE.vertices + np.array([0.0, 0.0, 1.0])
     vertices = [Rotation.from_euler("xyz", turn, degrees=True).apply(face) for turn in turns]
@@ -191,16 +192,16 @@ def _cube() -> Mesh:
 def local_origin(sizes: tuple[SurfaceSize, ...]) -> NDArray[np.float64]:
     """Choose the origin [3], [m], of the frame in which a scene is traced.
 
-    If the scene lies far from the origin of its coordinates, it is the centre of the scene, rounded to metres. Far
-    means beyond `FAR`, and farther than the scene is wide, so that the local frame gains at least one bit. Otherwise it
-    is zero.
+    For a scene far from the origin of its coordinates, the local origin is the scene's centre, rounded to metres. Far
+    means farther than `FAR` and than the scene's width, so that the local frame gains at least one bit of precision.
+    Otherwise the local origin is zero.
     """
     if not sizes:
         return np.zeros(3)
     low = np.min([size.low for size in sizes], axis=0)
     high = np.max([size.high for size in sizes], axis=0)
     furthest = max(float(np.abs(low).max()), float(np.abs(high).max()))
-    # A local origin at most halves the coordinates of a scene that is as large as it is far away.
+    # If a scene is as wide as it is far from the origin, a local origin at most halves its coordinates.
     if furthest <= max(FAR, float((high - low).max())):
         return np.zeros(3)
     return np.rint((low + high) / 2)
@@ -209,7 +210,7 @@ def local_origin(sizes: tuple[SurfaceSize, ...]) -> NDArray[np.float64]:
 def write_local_shape(
     shape: ElementTree.Element, path: Path, origin: NDArray[np.float64], target: Path
 ) -> None:
-    """Replace a shape by a single-precision mesh in a local frame with its origin at `origin` [3], [m].
+    """Replace the mesh of a shape with a copy, written to `target`, in the local frame with origin `origin` [3], [m].
 
     Raises:
         InputError: The mesh cannot be read.

@@ -1,4 +1,4 @@
-"""The meshes of a scene for use outside the tracer (checks, maps and drawings), and its ground."""
+"""The triangles of a scene and its ground, for use outside the tracer (checks, maps and drawings)."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from calibray.scenes.scene_file import find_scene
 from calibray.scenes.shapes import place_mesh, read_surface
 
 LEVEL: Final = 0.5
-"""A face is level, like a roof or the ground, if the vertical part of its unit normal is above this [1]."""
+"""A face is level, like a roof or the ground, if the vertical component of its unit normal exceeds this [1]."""
 
 STEEP: Final = 0.1
-"""A face is a wall if the vertical part of its unit normal is at most this [1]."""
+"""A face is a wall if the vertical component of its unit normal is at most this [1]."""
 
 WITHOUT_GAPS: Final = 0.9
-"""Share of its extent that a sheet over the whole scene covers, such as a floor or a ceiling [1]."""
+"""A level object that covers more than this fraction of its bounding box is a sheet, such as a floor or ceiling."""
 
 BATCH: Final = 2_000_000
-"""Largest number of pairs of a line and a triangle in memory at once; each needs about 100 bytes."""
+"""Largest number of line-triangle pairs in memory at once; each pair needs about 100 bytes."""
 
 _EDGE: Final = 1e-9
-"""Points up to this distance outside a triangle count as over it, as a share of its size [1]."""
+"""Tolerance within which points outside a triangle count as over it, relative to the triangle's size [1]."""
 
 
 def read_meshes(source: str | Path) -> Iterator[MeshObject]:
-    """Read the meshes of a scene in the scene frame, one after the other; faces are reversed if the file flips normals.
+    """Read the meshes of a scene in the scene frame, one at a time; faces are reversed if the file flips normals.
 
     Raises:
         InputError: The scene or a mesh cannot be read, or the scene has no mesh.
@@ -63,7 +63,7 @@ class Triangles:
         vertex: Positions [V, 3], [m].
         face: Vertex indices of each triangle [F, 3].
         material: Index of each triangle's material in `Scene.materials` [F].
-        ground: Whether a triangle belongs to a sheet under the whole scene, such as terrain [F].
+        ground: Whether each triangle belongs to a ground sheet, such as terrain, a floor or a ceiling [F].
         left_out: Names of the objects that could not be read.
     """
 
@@ -75,12 +75,12 @@ class Triangles:
 
     @property
     def corners(self) -> NDArray[np.float64]:
-        """Positions of the corners of each triangle [F, 3, 3], [m]."""
+        """Positions [F, 3, 3], [m], of the corners of each triangle."""
         return self.vertex[self.face]
 
     @property
     def normal(self) -> NDArray[np.float64]:
-        """Normals, whose length is the area of the triangle [F, 3], [m^2]."""
+        """Normals [F, 3], [m^2], with the areas of the triangles as their lengths."""
         corners = self.corners
         return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
 
@@ -88,7 +88,7 @@ class Triangles:
 def read_triangles(scene: Scene) -> Triangles:
     """Read the triangles of a scene.
 
-    Objects whose file can no longer be read are left out and named.
+    Objects whose files can no longer be read are left out and listed in `left_out`.
     """
     materials = list(scene.materials)
     meshes: list[Mesh] = []
@@ -120,9 +120,9 @@ def read_triangles(scene: Scene) -> Triangles:
 
 
 def _ground(triangles: Triangles, owner: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Triangles of the objects that are level and extend under most of the scene [F].
+    """Whether each triangle belongs to a level object that extends over most of the scene [F].
 
-    A mesh of all roofs is also level and wide, but it has gaps, or lies above the walls.
+    A mesh of all roofs is also level and wide, but has gaps and lies above the mean height of the walls.
     """
     ground = np.zeros(len(owner), dtype=bool)
     if not len(owner):
@@ -131,14 +131,14 @@ def _ground(triangles: Triangles, owner: NDArray[np.int64]) -> NDArray[np.bool_]
     area, height = np.linalg.norm(normal, axis=1), corners[:, :, 2].mean(axis=1)
     level = np.abs(normal[:, 2]) > LEVEL * area
     steep = area * ~level
-    # Mean height of the walls: a roof over most of the scene is above it, the ground below.
+    # Mean height of the walls: roofs over most of the scene are above it, the ground is below it.
     walls = float(np.average(height, weights=steep)) if steep.any() else np.inf
     extent = np.ptp(triangles.vertex[:, :2], axis=0)
     for number in np.unique(owner):
         mask = owner == number
         own_extent = np.ptp(corners[mask][:, :, :2].reshape(-1, 2), axis=0)
         if (own_extent > LEVEL * extent).all() and area[mask & level].sum() > 0.95 * area[mask].sum():
-            # Area in plan over the area of the bounding box.
+            # Ratio of the area in plan to the area of the bounding box.
             covered = np.abs(normal[mask, 2]).sum() / own_extent.prod()
             below = np.average(height[mask], weights=area[mask]) < walls
             ground |= mask & bool(covered > WITHOUT_GAPS or (covered > LEVEL and below))
@@ -146,10 +146,10 @@ def _ground(triangles: Triangles, owner: NDArray[np.int64]) -> NDArray[np.bool_]
 
 
 def is_ground(mesh: Mesh, extent: NDArray[np.float64]) -> bool:
-    """Whether a mesh is a sheet under the whole scene, of an extent east and north [2], [m].
+    """Whether a mesh is a level sheet over most of a scene with the given extent east and north [2], [m].
 
-    This is stricter than `Triangles.ground`, which also counts a ceiling as ground: here a ceiling covers the rooms. No
-    face may be steep, and the mesh must cover most of the scene.
+    Unlike in `Triangles.ground`, every face must be level. The mesh must span 80 % of the scene in each direction and
+    cover half of its area; its height does not matter.
     """
     sides = mesh.vertices[mesh.faces[:, 1:]] - mesh.vertices[mesh.faces[:, :1]]
     normal = np.cross(sides[:, 0], sides[:, 1])
@@ -162,9 +162,9 @@ def is_ground(mesh: Mesh, extent: NDArray[np.float64]) -> bool:
 def ground_heights(
     triangles: Triangles, x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Heights of the lowest ground [ny, nx], [m], over a grid of ascending, equally spaced x [nx] and y [ny].
+    """Heights [ny, nx], [m], of the lowest ground on a grid of ascending, equally spaced x [nx] and y [ny], [m].
 
-    Where there is no ground, the height is that of the scene's lowest point.
+    Where there is no ground, the height of the scene's lowest point is used.
     """
     heights = np.full((len(y), len(x)), np.inf)
     corners = triangles.corners[triangles.ground]
@@ -176,7 +176,7 @@ def ground_heights(
     within = np.arange(len(triangle)) - np.repeat(np.cumsum(columns * rows) - columns * rows, columns * rows)
     column = first[0][triangle] + within % np.maximum(columns, 1)[triangle]
     row = first[1][triangle] + within // np.maximum(columns, 1)[triangle]
-    # Barycentric coordinates u, v of the points; an upright triangle has none.
+    # Barycentric coordinates u, v of the points; they are undefined for a vertical triangle.
     origin, along, across = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
     area = np.where(area == 0, np.nan, area)[triangle]
@@ -192,14 +192,14 @@ def ground_heights(
 def vertical_crossings(
     corners: NDArray[np.float64], points: NDArray[np.float64]
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]:
-    """Triangles that vertical lines through points cross, in batches: triangle, point and height [m] of each crossing.
+    """Find where vertical lines through points cross triangles, in batches: triangle, point and height [m].
 
-    The points [n, 3] are sorted by x.
+    The points [n, 3], [m], must be sorted by x.
     """
-    # The lines are moved by a fraction of a micrometre: through an edge shared by two triangles they would cross both.
+    # The lines are shifted by less than a micrometre; a line through an edge shared by two triangles would cross both.
     x, y = points[:, 0] + 3.1e-7, points[:, 1] + 1.7e-7
     low, high = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
-    # Sorted by x, the points over the width of a triangle are one range.
+    # As the points are sorted by x, those within a triangle's width are contiguous.
     first = np.searchsorted(x, low[:, 0], "left")
     count = np.searchsorted(x, high[:, 0], "right") - first
     batch = np.cumsum(count) // BATCH
@@ -226,6 +226,6 @@ def vertical_crossings(
 def _grid_index(
     axis: NDArray[np.float64], value: NDArray[np.float64], side: Literal["left", "right"]
 ) -> NDArray[np.int64]:
-    """Index of values on a grid axis, with a tolerance for points on the edge of a triangle."""
+    """Index of values on a grid axis, with a tolerance for points on the edges of triangles."""
     tolerance = _EDGE * max(float(np.ptp(axis)), 1.0) * (1 if side == "right" else -1)
     return np.searchsorted(axis, value + tolerance, side=side)
