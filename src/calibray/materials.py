@@ -39,7 +39,7 @@ def check_frequency(frequency: object) -> float:
         isinstance(frequency, Real) and lowest <= float(frequency) <= highest
     ):
         raise InputError(
-            f"frequency = {frequency!r}: must be in {lowest:g} to {highest:g} Hz; 28.5 GHz is written 28.5e9"
+            f"frequency = {frequency!r}: must be in {lowest:g} to {highest:g} Hz; write 28.5 GHz as 28.5e9"
         )
     return float(frequency)
 

@@ -247,7 +247,7 @@ def _check_carriers(links: Measurements, frequency: NDArray[np.float64]) -> None
         first = int(np.flatnonzero(outside)[0])
         raise InputError(
             f"{links.source}, row {links.row[first]}: the frequency {frequency[first]:g} must be in {lowest:g} to "
-            f"{highest:g} Hz ({outside.sum()} of {len(links)} rows); 28.5 GHz is written 28.5e9"
+            f"{highest:g} Hz ({outside.sum()} of {len(links)} rows); write 28.5 GHz as 28.5e9"
         )
     if (count := len(np.unique(frequency))) > MAX_CARRIERS:
         raise InputError(
