@@ -1,6 +1,6 @@
-"""Check the documentation: linked files and headings, make targets, commands, scripts and options, length of pages.
+"""Check the documentation: linked files and headings, make targets, commands, scripts, options, and page lengths.
 
-Usage: `python tools/check_docs.py`. It lists the faults, and exits with 1 if there are any.
+Usage: `python tools/check_docs.py`. It lists the faults, and exits with status 1 if there are any.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from calibray.cli.app import app
 ROOT = Path(__file__).resolve().parents[1]
 
 KINDS = ("tutorial", "guides", "reference", "explanation")
-"""Folders of documentation by kind, whose pages are short."""
+"""Folders of documentation whose pages must be short."""
 
 PYTHON_FILES = [
     file
@@ -32,7 +32,7 @@ LONGEST = 1500
 _FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 _HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
-# At the start of a line of code; settings such as PYTHON=python3.12 may come before the target.
+# Commands start a line of code; settings such as PYTHON=python3.12 may come before the target.
 _OPTIONS = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?calibray ([a-z][\w-]*)((?: (?!#).*)?)$", re.MULTILINE)
 _SCRIPT = re.compile(r"python ((?:benchmarks|tools|examples)/[\w/]+\.py)((?: (?!#)[^\n`]*)?)")
 _COMMAND = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?(make|calibray)(?: \w+=\S+)* ([a-z][\w-]*)", re.MULTILINE)
@@ -115,7 +115,7 @@ def missing_modules(text: str) -> Iterator[str]:
         text: The Markdown text.
 
     Yields:
-        Each such file. A name without its folder may be in any folder.
+        Each such file. A name without a folder may refer to a file in any folder.
     """
     for name in re.findall(r"`([a-z0-9_/-]+\.py)`", _FENCE.sub("", text)):
         if not any(file.as_posix().endswith("/" + name) for file in PYTHON_FILES):
@@ -129,7 +129,7 @@ def missing_scripts(text: str) -> Iterator[str]:
         text: Markdown, or the source of a module whose docstring has commands.
 
     Yields:
-        Each such script or option. An option may be that of a module next to the script that it imports.
+        Each such script or option. Modules that a script imports from its folder may also define its options.
     """
     for script, rest in _SCRIPT.findall(re.sub(r"\\\n\s*", "", text)):
         file = ROOT / script

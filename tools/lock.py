@@ -21,8 +21,8 @@ def needed(
 
     Args:
         package: Name of an installed package.
-        extras: Which of its extras are wanted.
-        found: Versions of the packages met so far, each with its extras; those below this one are added.
+        extras: Extras of the package to include.
+        found: Versions of the packages found so far, each with its extras; the dependencies of `package` are added.
 
     Returns:
         Name and installed version of each package in `found`.

@@ -1,4 +1,4 @@
-"""Run every Calibray command of the documentation, page by page, in folders with the files that a reader has.
+"""Run every Calibray command in the documentation, page by page, in folders with the files that a reader has.
 
 Usage: `python tools/run_docs.py [PAGE...]`, for instance `python tools/run_docs.py README.md docs/index.md`. Failures
 are printed with their messages, and the exit status is then 1. A page with commands needs an entry in `PREPARED`.
@@ -57,7 +57,7 @@ LEFT_OUT = {
     "calibray run study.toml --out result --scheduler": "needs a cluster; tests/engines/test_dask.py starts one",
     "calibray compare study.toml": "takes an hour; tests/comparison/test_comparison.py runs a small one",
 }
-"""First words of the commands that are not run, and the reason."""
+"""Commands that are not run, by their first words, with the reason."""
 
 
 def nothing(folder: Path) -> None:
@@ -178,7 +178,7 @@ PREPARED: dict[str, tuple[Callable[[Path], None], ...]] = {
     "examples/README.md": (repository,),
     "examples/octave_canyon/README.md": (repository,),
 }
-"""How the files of a page are prepared: once for all its blocks, or once per block."""
+"""Functions that prepare the files of each page: one for all its blocks, or one per block."""
 
 
 @dataclass(frozen=True)
@@ -186,11 +186,11 @@ class Ran:
     """The outcome of a command.
 
     Attributes:
-        page: The page that prints it.
+        page: The page that contains the command.
         command: The command.
-        seconds: Its time [s].
+        seconds: Time that it took [s].
         failure: Its messages if it failed; empty otherwise.
-        reason: Why it was not run; empty if it was.
+        reason: Why it was not run; empty if it was run.
     """
 
     page: str
@@ -201,7 +201,7 @@ class Ran:
 
 
 def commands(text: str) -> list[list[str]]:
-    """Commands of every block of code that has any, with continued lines joined."""
+    """Commands of every code block that has any, with continuation lines joined."""
     shell = (block for language, block in _BLOCK.findall(text) if language in {"", "sh"})
     blocks = (re.sub(r"\\\n\s*", "", block).splitlines() for block in shell)
     typed = ([match[1] for line in block if (match := _TYPED.match(line))] for block in blocks)
@@ -209,14 +209,14 @@ def commands(text: str) -> list[list[str]]:
 
 
 def run_page(page: str, blocks: list[list[str]]) -> Iterator[Ran]:
-    """Run the commands of a page one after the other, as a reader would.
+    """Run the commands of a page in order, as a reader would.
 
     Args:
-        page: The page, from the repository's root.
+        page: The page, relative to the repository's root.
         blocks: Its commands, block by block.
 
     Yields:
-        The outcome of each.
+        The outcome of each command.
     """
     prepared = PREPARED.get(page, ())
     if len(prepared) not in {1, len(blocks)}:
@@ -263,7 +263,7 @@ def main(pages: list[str]) -> int:
     """Run the commands of pages and print the outcomes.
 
     Args:
-        pages: The pages, from the repository's root; all if empty.
+        pages: The pages, relative to the repository's root; all if empty.
 
     Returns:
         The number of commands that failed.

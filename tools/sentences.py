@@ -18,7 +18,7 @@ MIN_WORDS = 6
 
 
 def main() -> None:
-    """Print the sentences, each with the file that it is from."""
+    """Print the sentences, each with the file that contains it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--count", type=int, default=50)

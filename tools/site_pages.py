@@ -33,7 +33,7 @@ def on_config(config: Any) -> Any:
         config: The site's configuration.
 
     Returns:
-        The same.
+        The same configuration.
     """
     studies = [
         {_title(file): f"case-studies/{file.name}"} for file in sorted((DOCS / "case-studies").glob("*.md"))
@@ -55,7 +55,7 @@ def on_files(files: Any, config: Any) -> Any:
         config: The site's configuration.
 
     Returns:
-        The same.
+        The same files, with the new pages.
     """
     pages = {
         f"{API}/calibray.md": _interface("calibray", "The public interface"),

@@ -2,8 +2,8 @@
 
     python tools/structure.py [CHECKOUT] [--static]
 
-Imports for type checking count as imports. The second half runs the demo's study on replay in another process, where
-file access is counted; it needs an environment with Calibray's dependencies. `--static` omits it.
+Imports for type checking count as imports. The second half runs the demo's study on replay in another process, which
+counts the files read; it needs an environment with Calibray's dependencies. `--static` omits it.
 """
 
 from __future__ import annotations
@@ -82,12 +82,12 @@ def room(path: str) -> str:
 
 
 def dotted(path: str) -> str:
-    """The name that a file is imported by."""
+    """The name by which a file is imported."""
     return ".".join([PACKAGE, *Path(path).with_suffix("").parts]).removesuffix(".__init__")
 
 
 def imported(tree: ast.Module, path: str) -> Iterator[str]:
-    """Names that a module imports anywhere in it, imports for type checking included."""
+    """Names that a module imports at any level, including imports for type checking."""
     above = [PACKAGE, *Path(path).parent.parts]
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -146,7 +146,7 @@ def circles(graph: Graph) -> list[list[str]]:
 
 
 def single_importers(graph: Graph) -> int:
-    """Number of modules that exactly one other module imports, packages' `__init__` apart."""
+    """Number of modules, other than `__init__`, that exactly one other module imports."""
     importers: dict[str, set[str]] = {}
     for path, targets in graph.items():
         for target in targets:
@@ -160,11 +160,11 @@ WALKS = {
     "measured row": "measurements/reading.py",
     "blocks": "validation/validate.py",
 }
-"""The module that a topic starts from."""
+"""The module where each topic starts."""
 
 
 def walks(graph: Graph) -> dict[str, int]:
-    """Number of modules of its room that a topic leads through; without circles of files, it returns to none."""
+    """Number of modules that each topic's starting module imports within its room, directly or indirectly, plus one."""
     lengths = {}
     for topic, start in WALKS.items():
         reached: set[str] = set()
@@ -209,7 +209,7 @@ def _numeric(value: ast.expr) -> bool:
 
 
 def many_arguments(trees: dict[str, ast.Module]) -> int:
-    """Number of functions with more than six arguments, `self` and `cls` apart."""
+    """Number of functions with more than six arguments, not counting `self` and `cls`."""
     count = 0
     for tree in trees.values():
         for node in ast.walk(tree):
@@ -229,7 +229,7 @@ def comment_share(package: Path, trees: dict[str, ast.Module]) -> float:
 
 
 def functions(trees: dict[str, ast.Module]) -> list[tuple[int, str]]:
-    """Length in lines and place of every function, docstring included."""
+    """Length in lines, docstring included, and place of every function."""
     return [
         ((node.end_lineno or node.lineno) - node.lineno + 1, f"{path}:{node.name}")
         for path, tree in trees.items()
@@ -239,7 +239,7 @@ def functions(trees: dict[str, ast.Module]) -> list[tuple[int, str]]:
 
 
 def environment(checkout: Path) -> dict[str, str]:
-    """The environment of a process that uses a checkout's package; no trace is kept from run to run."""
+    """The environment of a process that uses a checkout's package, without a cache of traces."""
     return os.environ | {"PYTHONPATH": str(checkout / "src"), "CALIBRAY_CACHE": ""}
 
 
@@ -253,7 +253,7 @@ def counts(checkout: Path) -> dict[str, int]:
 
 
 def seconds_to_import(module: str, checkout: Path) -> float:
-    """Median time [s] to import a module, of fresh processes."""
+    """Median time [s] to import a module in a new process."""
     code = f"import time; start = time.perf_counter(); import {module}; print(time.perf_counter() - start)"
     command = [sys.executable, "-c", code]
     times = [
@@ -268,7 +268,7 @@ def table(checkout: Path, static: bool = False) -> list[tuple[str, str]]:
 
     Args:
         checkout: Root of the checkout.
-        static: Whether to leave out what has to be run.
+        static: Whether to omit figures that need a run.
 
     Returns:
         Rows of a label and a figure.
@@ -309,7 +309,7 @@ def table(checkout: Path, static: bool = False) -> list[tuple[str, str]]:
 
 
 def main() -> None:
-    """Print the table of the checkout named, or of this one."""
+    """Print the table of the checkout given as an argument, or of this one."""
     words = [word for word in sys.argv[1:] if word != "--static"]
     checkout = Path(words[0] if words else Path(__file__).parents[1]).resolve()
     for label, figure in table(checkout, "--static" in sys.argv):

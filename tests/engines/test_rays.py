@@ -167,7 +167,10 @@ WRONG = {
     "relative delays": (lambda t: t.assign(delay=t.delay - t.delay.min()), "not relative to the first path"),
     "positions in degrees": (lambda t: t.assign(x=t.x / 111e3, y=t.y / 111e3), "check units"),
     "a bent transmission": (lambda t: t.replace({"type": {"reflection": "transmission"}}), "bends by"),
-    "a straight reflection": (lambda t: t.replace({"type": {"transmission": "reflection"}}), "mirror law"),
+    "a straight reflection": (
+        lambda t: t.replace({"type": {"transmission": "reflection"}}),
+        "law of reflection",
+    ),
     "no diffracting edge": (
         lambda t: t.replace({"type": {"reflection": "diffraction"}}),
         "no edge of the scene",

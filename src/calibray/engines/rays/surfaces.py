@@ -96,7 +96,7 @@ class Hits:
         incident: Unit vectors of propagation before the interaction [n, 3].
         leaving: Unit vectors of propagation after the interaction [n, 3].
         length: Length of the shorter of the two adjacent segments [n], [m].
-        reflects: Whether the mirror law must hold [n].
+        reflects: Whether the law of reflection must hold [n].
         diffracts: Whether an edge diffracts the wave; the edge's faces may have different materials [n].
         material: Index of the stated material; -1 if none is stated [n].
         label: Their names in messages [n].
@@ -121,8 +121,8 @@ class Hits:
 def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.int64], float]:
     """Face of every interaction [n], and the largest distance from it [m]; `names` are those of the materials.
 
-    Among the nearby faces, a reflection gets the nearest one that obeys the mirror law, and other interactions get the
-    nearest.
+    Of the nearby faces, a reflection gets the nearest one that obeys the law of reflection, and any other interaction
+    the nearest.
 
     Raises:
         InputError: A point is on no surface (of its material), faces of different materials coincide there, or no
@@ -135,7 +135,7 @@ def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.
     error = hits.mirror_error(index, surfaces.normal[face])
     # A point displaced by the tolerance changes the directions of both segments.
     bent = hits.reflects[index] & (error > 4 * TOLERANCE)
-    # For each point, faces that obey the mirror law come first, in order of distance.
+    # For each point, faces that obey the law of reflection come first, in order of distance.
     order = np.lexsort((distance, bent, index))
     index, face, distance, bent = index[order], face[order], distance[order], bent[order]
     matched, first = np.unique(index, return_index=True)
@@ -147,7 +147,7 @@ def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.
         worst = int(np.argmax(np.where(bent[first], error[order][first], 0)))
         raise InputError(
             f"{hits.label[worst]}: is not a reflection from the surface of "
-            f"{names[surfaces.material[face[first[worst]]]]!r} there: it violates the mirror law by "
+            f"{names[surfaces.material[face[first[worst]]]]!r} there: it violates the law of reflection by "
             f"{error[order][first[worst]]:.3g} m; export the vertices with more digits, or correct its type"
         )
     _refuse_ambiguous(surfaces, hits, (index, face, distance, bent), first, names)
