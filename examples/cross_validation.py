@@ -1,9 +1,9 @@
-"""Hold out one block of links after another, calibrate on the rest, and print the RMSE on each block.
+"""Hold out blocks of links in turn, calibrate on the other links, and print the RMSE on each block.
 
 Usage: `python examples/cross_validation.py examples/nist_boulder.toml`
 
-Every link is held out once, together with its neighbours. The scene is traced once, with the initial materials, and not
-again with the calibrated ones. `calibray validate` does the same with blocks of equal size.
+Every link is held out once, together with its neighbours. The scene is traced only once, with the initial materials,
+not again with the calibrated ones. `calibray validate` does the same with blocks of equal size.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import calibray as cb
 from calibray.tables import Column, Table, numbers, render
 
 BLOCKS = {
-    "nist_boulder": {  # along the street in sight from west to east, and along the other from near to far
+    "nist_boulder": {  # from west to east along the street in sight, and from near to far along the other street
         "1": "(set == 'LOS' and rx_x_m < -8) or (set == 'NLOS' and rx_y_m < 45)",
         "2": "(set == 'LOS' and -8 <= rx_x_m < 8) or (set == 'NLOS' and 45 <= rx_y_m < 80)",
         "3": "(set == 'LOS' and rx_x_m >= 8) or (set == 'NLOS' and rx_y_m >= 80)",
@@ -37,7 +37,7 @@ def main(file: str) -> None:
     """Cross-validate a study.
 
     Args:
-        file: The study file, one of those in `BLOCKS`.
+        file: The study file; its name must be in `BLOCKS`.
     """
     study = cb.Study.load(file)
     engine = cb.engines.make(study)

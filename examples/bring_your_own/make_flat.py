@@ -1,10 +1,9 @@
-"""Make the flat of this folder: a plan as somebody draws it, and what a laptop received from three access points in it.
+"""Make the example flat: a hand-drawn floor plan, and the power that a laptop receives from three access points.
 
     python examples/bring_your_own/make_flat.py
 
-Everything is synthetic, so the truth is known: `flat/truth.json` holds the materials that the walls were given and
-what the access points transmit. `flat/plan.csv`, `flat/access_points.csv` and `flat/rss.csv` are all that a calibration
-gets to see.
+Everything is synthetic, so the truth is known: `flat/truth.json` contains the materials of the walls and the EIRP of
+the access points. A calibration sees only `flat/plan.csv`, `flat/access_points.csv` and `flat/rss.csv`.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ SEED = 34
 FREQUENCY = 2.44e9  # [Hz]
 DEPTH = 4
 HEIGHT = 1.5  # [m]
-SAMPLES = 30  # of one value: what a laptop averages while it is turned about
+SAMPLES = 30  # per value: the laptop averages them while it is turned
 
 PLANTED = {
     "brick_wall": {"relative_permittivity": 5.1, "conductivity": 0.06},
@@ -41,7 +40,7 @@ WALLS = [
 
 
 def spots() -> np.ndarray:
-    """Where the laptop was held, x and y [n, 2], [m]."""
+    """Positions of the laptop, x and y [n, 2], [m]."""
     return np.array([(x, y) for x in (0.9, 2.3, 3.7, 4.8, 6.4, 7.7, 9.0) for y in (0.9, 2.4, 4.9, 6.2)])
 
 
@@ -58,7 +57,7 @@ def received() -> list[list[np.ndarray]]:
 
 
 def measure(gains: list[list[np.ndarray]], rng: np.random.Generator) -> pd.DataFrame:
-    """What the laptop shows at every spot, one column an access point [dBm]."""
+    """Power shown by the laptop at every spot, one column per access point [dBm]."""
     table = pd.DataFrame(spots(), columns=["x", "y"])
     for point, (name, eirp) in enumerate(EIRP_DBM.items()):
         power = [

@@ -1,11 +1,11 @@
-"""Make the hill of this folder: houses on a slope, and the log of a scanner carried past them along a GPX track.
+"""Make the example hill: houses on a slope, and the log of a scanner carried past them along a GPX track.
 
     python examples/bring_your_own/make_hill.py
 
-Everything is synthetic, so the truth is known: `hill/truth.json` holds the materials that walls and ground were given
-and what the mast transmits. The other files are all that a calibration gets to see: `houses.geojson`, footprints with
-heights; `ground.tif`, a height model above the sea; `walk.gpx`, a point every five seconds; `power.csv`, five values a
-second without positions; `masts.csv`, the mast's place and its height above the ground.
+Everything is synthetic, so the truth is known: `hill/truth.json` contains the materials of walls and ground and the
+EIRP of the mast. A calibration sees only the other files: `houses.geojson`, footprints with heights; `ground.tif`, a
+height model above sea level; `walk.gpx`, a point every five seconds; `power.csv`, five values per second without
+positions; `masts.csv`, the mast's position and its height above the ground.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ PLANTED = {
 }
 MAST = (-6.0, 0.0, 8.0)  # [m], its height above the ground
 EIRP_DBM = 31.0  # unknown to the user
-FLOOR_DBM = -115.0  # [dBm] below which the scanner reports nothing
-SPEED, RATE, TRACKED = 1.2, 5, 5  # [m/s], values a second, [s] between two points of the track
+FLOOR_DBM = -115.0  # [dBm], below which the scanner reports nothing
+SPEED, RATE, TRACKED = 1.2, 5, 5  # [m/s], values per second, [s] between track points
 GPS_ERROR = 0.4  # [m], standard deviation in x and in y
 HEIGHT = 1.5  # [m]
 START = pd.Timestamp("2026-05-04T09:00:00Z")
@@ -45,7 +45,7 @@ HOUSES = [
     (-60, -28, -25, -12, 9.0), (-12, -30, 20, -14, 11.0), (30, -26, 70, -11, 8.5),
 ]  # fmt: skip
 CORNERS = [(-78, -6), (-20, -6), (22, 4), (84, 2), (84, -4), (10, -8)]
-"""The way, x and y [m]: up the street, and back half of it."""
+"""Corners of the track, x and y [m]: up the street, then halfway back."""
 
 
 def write_houses() -> None:
@@ -61,7 +61,7 @@ def write_houses() -> None:
 
 
 def write_ground() -> None:
-    """Write the height model: 240 m above the sea, rising to the north-east, with a bump."""
+    """Write the height model: 240 m above sea level, rising to the north-east, with a bump."""
     west, south = FRAME.to_geographic([(-240.0, -240.0, 0.0)])[0][:2]
     east, north = FRAME.to_geographic([(240.0, 240.0, 0.0)])[0][:2]
     count = 17
@@ -78,20 +78,20 @@ def write_ground() -> None:
 
 
 def way(seconds: np.ndarray) -> np.ndarray:
-    """Where the scanner is, x and y [n, 2], [m]."""
+    """Positions of the scanner, x and y [n, 2], [m]."""
     corners = np.array(CORNERS, dtype=float)
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     return np.stack([np.interp(SPEED * seconds, along, corners[:, axis]) for axis in (0, 1)], axis=1)
 
 
 def duration() -> int:
-    """How long the walk takes [s]."""
+    """Duration of the walk [s]."""
     length = np.linalg.norm(np.diff(np.array(CORNERS), axis=0), axis=1).sum()
     return int(length / SPEED)
 
 
 def received() -> list[np.ndarray]:
-    """Amplitudes of the paths from the mast to where the scanner is in the midst of every second."""
+    """Amplitudes of the paths from the mast to the scanner's position in the middle of every second."""
     with TemporaryDirectory() as folder:
         found, frame = read_footprints(FOLDER / "houses.geojson", "height_m")
         bounds = found.bounds + 50 * np.array([-1, -1, 1, 1])
@@ -100,7 +100,7 @@ def received() -> list[np.ndarray]:
         overhead = SceneSurfaces.read(scene)
 
         def placed(points: np.ndarray, height: float) -> np.ndarray:
-            """Places of `FRAME` in the scene's, above its ground."""
+            """Convert positions from `FRAME` to the frame of the scene, with heights above its ground."""
             degrees = FRAME.to_geographic(np.column_stack([points, np.zeros(len(points))]))
             place = frame.to_scene(degrees[:, 0], degrees[:, 1], 0.0)
             place[:, 2] = overhead.ground_height(place[:, 0], place[:, 1]) + height
@@ -112,10 +112,10 @@ def received() -> list[np.ndarray]:
 
 
 def measure(gains: list[np.ndarray], rng: np.random.Generator) -> pd.DataFrame:
-    """What the scanner writes."""
+    """The table that the scanner writes."""
     rows = []
     for value in range(duration() * RATE):
-        # Along one second the amplitudes stay, the phases do not.
+        # Within one second, amplitudes are constant and phases random.
         power = sample(gains[value // RATE], EIRP_DBM, rng)
         loud = round(power, 1) if power > FLOOR_DBM else None
         rows.append(((START + pd.Timedelta(seconds=value / RATE)).isoformat(), "mast-1", loud))
@@ -123,7 +123,7 @@ def measure(gains: list[np.ndarray], rng: np.random.Generator) -> pd.DataFrame:
 
 
 def track(rng: np.random.Generator) -> str:
-    """What the satellite receiver writes, as GPX."""
+    """The GPX track that the satellite receiver writes."""
     seconds = np.arange(0, duration() + TRACKED, TRACKED)
     recorded = way(seconds) + rng.normal(0.0, GPS_ERROR, (len(seconds), 2))
     degrees = FRAME.to_geographic(np.column_stack([recorded, np.zeros(len(seconds))]))

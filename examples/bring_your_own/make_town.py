@@ -1,11 +1,11 @@
-"""Make the town of this folder: a map as OpenStreetMap has it, and the logs of two phones carried through it.
+"""Make the example town: a map in OpenStreetMap's format, and the logs of two phones carried through the town.
 
     python examples/bring_your_own/make_town.py
 
-Everything is synthetic, so the truth is known: `truth.json` holds the materials that the walls and the ground were
-given, what the transmitters and the phones add, the noise floor and the error of recorded positions. `town.osm`,
-`rsrp.csv` and `cells.csv` are all that a calibration gets to see. Numbers come from one seed: the same script writes
-the same files on one machine.
+Everything is synthetic, so the truth is known: `truth.json` contains the materials of the walls and the ground, the
+EIRP of the cells, the gains of the phones, the noise floor and the error of recorded positions. A calibration sees only
+`town.osm`, `rsrp.csv` and `cells.csv`. All random numbers come from one seed, so the script always writes the same
+files on the same machine.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ GROUND = {"relative_permittivity": 3.6, "conductivity": 0.05}
 EIRP_DBM = {"cell-1": -22.0, "cell-2": -19.5}  # of one resource element, unknown to the user
 PHONE_DB = {"phone-a": 0.0, "phone-b": -4.0}
 MASTS = {"cell-1": (-35.0, 2.0, 6.0), "cell-2": (32.0, -48.0, 6.0)}  # [m], lamp posts in two streets
-FLOOR_DBM = -118.0  # [dBm] below which a phone reports nothing
+FLOOR_DBM = -118.0  # [dBm], below which a phone reports nothing
 PHONE_HEIGHT = 1.5  # [m]
 GPS_ERROR = 0.5  # [m], standard deviation in x and in y
-SAMPLES = 10  # of one phone at one stop
+SAMPLES = 10  # per phone and stop
 PLAIN = {"building": "yes"}
 
 
 def houses() -> list[tuple[list[tuple[float, float]], dict[str, str]]]:
-    """Outlines [m] and tags: a street from west to east, another from north to south, houses along both."""
+    """Outlines [m] and tags of houses along two streets, one from west to east and one from north to south."""
     box = lambda west, south, east, north: [(west, south), (east, south), (east, north), (west, north)]  # noqa: E731
     return [
         (box(-90, 10, -62, 24), {**PLAIN, "height": "14"}),
@@ -77,7 +77,7 @@ def write_map(path: Path) -> None:
 
 
 def stops() -> np.ndarray:
-    """Where the phones were held, x and y [n, 2], [m]: up and down both streets."""
+    """Positions of the phones, x and y [n, 2], [m]: up and down both streets."""
     east = [(x, y) for x in range(-85, 81, 6) for y in (-6.0, 6.5)]
     north = [(x, y) for y in [*range(-70, -14, 6), *range(16, 41, 6)] for x in (27.5, 36.0)]
     return np.array(east + north, dtype=float)

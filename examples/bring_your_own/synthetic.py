@@ -1,4 +1,4 @@
-"""What the makers of these examples share: amplitudes under planted materials, and what fading makes of them."""
+"""Functions shared by the scripts that make these examples: path amplitudes for planted materials, and fading."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def amplitudes(
         masts: Transmitter positions [m].
         places: Receiver positions [n, 3], [m].
         frequency: Carrier [Hz].
-        planted: Constants in place of the scene's, by material.
-        settings: How to trace.
+        planted: Constants that replace those of the scene, by material.
+        settings: Settings of the trace.
 
     Returns:
-        By mast and place, the amplitudes of the paths between them.
+        The amplitudes of the paths, by mast and place.
     """
     links = SimpleNamespace(
         tx=np.repeat(list(masts), len(places), axis=0), rx=np.tile(places, (len(masts), 1))
@@ -50,9 +50,9 @@ def amplitudes(
 
 
 def sample(gains: np.ndarray, level_dbm: float, rng: np.random.Generator) -> float:
-    """Power of one sample [dBm], of paths' amplitudes and what is added to their power.
+    """Power of one sample [dBm], from the amplitudes of the paths and the level to add.
 
-    From sample to sample the phone moves by wavelengths: the phases of the paths are free.
+    Between samples the phone moves by several wavelengths, so the phases of the paths are random.
     """
     field = (gains * np.exp(2j * np.pi * rng.uniform(size=len(gains)))).sum()
     return level_dbm + 20 * np.log10(max(abs(field), 1e-12))

@@ -1,14 +1,14 @@
 function [links, paths] = rays_to_links(rays, folder)
 %RAYS_TO_LINKS Tables of links and paths from the rays of MATLAB's ray tracing.
-%   [LINKS, PATHS] = RAYS_TO_LINKS(RAYS) takes what raytrace(tx, rx) gives, a cell array of comm.Ray objects with a row
-%   for each transmitter and a column for each receiver. LINKS has a structure for each pair with a ray, PATHS one for
-%   each ray. Structures with the same fields as comm.Ray do as well, so Octave can read rays that MATLAB has saved.
+%   [LINKS, PATHS] = RAYS_TO_LINKS(RAYS) takes the output of raytrace(tx, rx): a cell array of comm.Ray objects with a
+%   row for each transmitter and a column for each receiver. LINKS has a structure for each pair with a ray, PATHS one for
+%   each ray. Structures with the fields of comm.Ray are also accepted, so Octave can read rays that MATLAB has saved.
 %
 %   RAYS_TO_LINKS(RAYS, FOLDER) writes them to links.csv, which Calibray reads as a table of links, and to paths.csv.
 %
-%   The path loss of a link [dB] adds the powers of its rays, as objective.combining = "power" does. Angles are in degrees
-%   as comm.Ray has them: azimuth from the x axis (or the east) towards y (or the north), elevation from the horizon.
-%   Geographic rays give columns of latitude and longitude [deg] and height [m]: say position = "geographic" then.
+%   The path loss of a link [dB] sums the powers of its rays, like objective.combining = "power". Angles are in degrees,
+%   as in comm.Ray: azimuth from the x axis (or east) towards y (or north), elevation from the horizon. Geographic rays
+%   give columns of latitude and longitude [deg] and height [m]; the study then needs position = "geographic".
 if ~iscell(rays)
     error('rays_to_links:input', 'rays must be a cell array as raytrace gives it; put a single array of rays into {}');
 end

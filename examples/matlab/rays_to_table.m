@@ -1,11 +1,11 @@
 function rays_to_table(rays, file)
 %RAYS_TO_TABLE Ray table of the rays of MATLAB's ray tracing.
-%   RAYS_TO_TABLE(RAYS, FILE) writes what raytrace(tx, rx) gives, a cell array of comm.Ray objects with a row for each
-%   transmitter and a column for each receiver, as a ray table in CSV, which calibray.read_rays reads
-%   (docs/reference/ray-table.md). Structures with the same fields as comm.Ray do as well.
+%   RAYS_TO_TABLE(RAYS, FILE) writes the output of raytrace(tx, rx), a cell array of comm.Ray objects with a row for
+%   each transmitter and a column for each receiver, as a CSV ray table, which calibray.read_rays reads
+%   (docs/reference/ray-table.md). Structures with the fields of comm.Ray are also accepted.
 %
-%   The power of a ray is -PathLoss, which has no antenna gains. Positions are those of MATLAB's site, in metres: use
-%   Cartesian rays. Interactions keep their own type and, where MATLAB states it, the name of their material.
+%   The power of a ray is -PathLoss, which includes no antenna gains. Positions are in MATLAB's Cartesian frame, in
+%   metres: use Cartesian rays. Interactions keep their type and, if MATLAB states it, the name of their material.
 if ~iscell(rays)
     error('rays_to_table:input', 'rays must be a cell array as raytrace gives it; put a single array of rays into {}');
 end

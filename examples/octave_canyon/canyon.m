@@ -1,7 +1,7 @@
 function canyon(request_file, response_file, walls)
-  % Path loss in a straight street canyon by the image method: the direct path and one reflection each off the ground and
-  % both walls. Plain code for MATLAB and GNU Octave 7 or later; docs/reference/program-files.md describes the two files.
-  % With 'half-space' as third argument it is a simpler model: nothing comes back from behind a surface.
+  % Path loss in a straight street canyon by the image method: the direct path and one reflection each off the ground
+  % and both walls. The code runs in MATLAB and GNU Octave 7 or later. docs/reference/program-files.md describes its files.
+  % With 'half-space' as the third argument, surfaces are half-spaces: nothing is reflected from their rear face.
   request = jsondecode(fileread(request_file));
   if ~strcmp(request.schema, 'calibray.request') || request.version ~= 1
     error('%s version %d: this program reads calibray.request version 1', request.schema, request.version);
@@ -22,7 +22,7 @@ function canyon(request_file, response_file, walls)
 end
 
 function loss = path_loss(request, simple)
-  % Path loss of every link [dB], +Inf without a path.
+  % Path loss of every link [dB]; +Inf if it has no path.
   wavelength = 299792458 / request.frequency;
   planes = {  % point, normal into the street, material
     [0 0 0], [0 0 1], 'ground'
@@ -54,10 +54,10 @@ function gain = direct(tx, rx, wavelength)
 end
 
 function gain = reflected(tx, rx, point, normal, material, frequency, wavelength, simple)
-  image = tx - 2 * dot(tx - point, normal) * normal;  % the transmitter behind the mirror
+  image = tx - 2 * dot(tx - point, normal) * normal;  % image source of the transmitter
   distance = norm(rx - image);
   out = (rx - image) / distance;                       % direction after the reflection
-  in = out - 2 * dot(out, normal) * normal;            % and before it
+  in = out - 2 * dot(out, normal) * normal;            % direction before it
   [te, tm] = slab(-dot(in, normal), material, frequency, wavelength, simple);
   across = cross(in, normal);
   if norm(across) < 1e-12
