@@ -220,7 +220,7 @@ def test_a_scene_is_checked(tmp_path):
     canyon = check_scene("sionna:simple_street_canyon")
     text = render(*report.findings(canyon), report.objects(canyon))
     assert "can be used" in text
-    assert "12 of 12 faces with the normal inward" in text
+    assert "12 of 12 faces with normals that point inward" in text
     assert "building_6" in text
     extract = write_extract(tmp_path / "town.osm", [(SQUARE, {"building": "yes"})])
     scene_command("osm", extract, "-o", tmp_path / "out")

@@ -119,7 +119,7 @@ def test_a_mesh_in_millimetres_that_its_shape_scales_is_sound(tmp_path):
 def test_names_that_sionna_refuses_are_found(tmp_path):
     constants = {"relative_permittivity": 5.0, "conductivity": 0.1, "thickness": 0.1}
     assert problems(check(tmp_path, cube(), {"concrete": constants})) == [
-        "has a name of ITU-R P.2040, which Sionna RT refuses"
+        "has an ITU-R P.2040 name, which Sionna RT refuses"
     ]
     assert problems(check(tmp_path, cube(), STONE, name="stone")) == [
         "has the name of a material, which Sionna RT refuses"
@@ -189,4 +189,4 @@ def test_a_road_in_the_plane_of_the_ground_is_named(tmp_path):
     finding = next(item for item in check_scene(write_scene(tmp_path, plane, materials)).findings if not item.subject
                    and "parallel" in item.problem)  # fmt: skip
     assert finding.severity == "warning"
-    assert "(such as 'mesh-road' at 'mesh-ground'), 2 of them of another material" in finding.problem
+    assert "(such as 'mesh-road' and 'mesh-ground'), 2 of them to one of another material" in finding.problem

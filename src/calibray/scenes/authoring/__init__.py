@@ -1,6 +1,6 @@
-"""Making scenes: from OpenStreetMap extracts, vector files and height models, and from floor plans.
+"""Making scenes from OpenStreetMap extracts, vector files, height models and floor plans.
 
-Names are loaded when first used, because each source needs other libraries.
+Names are loaded when first used, because each kind of source needs different libraries.
 """
 
 from typing import TYPE_CHECKING

@@ -1,13 +1,13 @@
-"""Walls, windows, roofs and undersides of buildings, raised on cells: adjacent pieces of ground.
+"""Extrusion of buildings into walls, windows, roofs and undersides over cells, which are adjacent areas of ground.
 
 In each cell, every building that covers it occurs once, between its bottom and its top. Where buildings overlap, the
-taller one is used. Where parts of a building are mapped, they replace the building's outline. Neighbouring cells have
+taller one is used. Where parts of a building are mapped, they replace the building's outline. Adjacent cells have
 the same corners along their common border, so walls and roofs that meet share their vertices.
 
-A wall exists at each height where one side of a border is built and the other is not. Between neighbours of different
-heights it begins at the lower roof, and between neighbours of equal height there is no wall. A column of corners is at
-each end of a border. All walls that meet there use the same corners, so the surface is closed and its wedges are
-connected. Lengths are whole millimetres, so that corners are either equal or different.
+A wall exists at each height where one side of a border is built and the other is not. Between buildings of different
+heights it begins at the lower roof, and between buildings of equal height there is no wall. All walls that meet at an
+end of a border use the same column of corners, so the surface is closed and its wedges are connected. Lengths are whole
+millimetres, so that corners are either identical or clearly different.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ Interval = tuple[float, float, int]
 Length = TypeVar("Length", int, float)
 
 THINNEST: Final = GRID / 2
-"""Intervals thinner than this come from rounding and are dropped [m]."""
+"""Intervals thinner than this are rounding artefacts and are dropped [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """A piece of ground, a shapely Polygon [m], and the buildings on it from below, not overlapping."""
+    """An area of ground, a shapely Polygon [m], and the buildings on it, from the lowest up, without overlap."""
 
     polygon: Any
     stands: tuple[Interval, ...]
@@ -48,9 +48,9 @@ class Cell:
 def split_overlaps(
     footprints: Footprints, bottom: NDArray[np.float64], top: NDArray[np.float64]
 ) -> tuple[list[Cell], int]:
-    """Divide buildings into cells, given the heights [m] at which each begins and ends in the scene's frame [n].
+    """Divide buildings into cells, given the bottom and top of each in the scene's frame [n], [m].
 
-    Returns the cells, and the number of footprints that share ground with another one.
+    Returns the cells, and the number of footprints that overlap another footprint.
     """
     shapely = library("shapely", "scenes")
     tree = shapely.STRtree(footprints.polygon)
@@ -68,7 +68,7 @@ def split_overlaps(
             cells += [Cell(part, (stand,)) for part in shapely.get_parts(footprints.polygon[single])]
             continue
         pieces, covers = _overlay(footprints.polygon[members])
-        # Smaller overlaps come from rounding to the grid [m^2].
+        # Smaller overlaps result from rounding to the grid [m^2].
         shared = (covers.sum(axis=0) > 1) & (shapely.area(pieces) > 0.1)
         overlapping += int(covers[:, shared].any(axis=1).sum())
         for piece, cover in zip(pieces, covers.T, strict=True):
@@ -81,21 +81,21 @@ def split_overlaps(
 
 
 def _overlay(polygons: NDArray[Any]) -> tuple[list[Any], NDArray[np.bool_]]:
-    """The pieces into which all borders cut the ground, and which polygon covers which piece [n, pieces]."""
+    """The pieces into which the borders cut the ground, and whether each polygon covers each piece [n, pieces]."""
     shapely = library("shapely", "scenes")
     borders = shapely.union_all(shapely.boundary(polygons), grid_size=GRID)
     pieces = shapely.get_parts(shapely.polygonize([borders]))
     inside = shapely.point_on_surface(pieces)
     covers = np.zeros((len(polygons), len(pieces)), dtype=bool)
     point, polygon = shapely.STRtree(polygons).query(inside, predicate="within")
-    # A piece lies wholly inside or outside each polygon, so one point of it decides.
+    # Each piece is wholly inside or outside each polygon, so one point inside the piece is enough.
     covers[polygon, point] = True
     built = covers.any(axis=0)
     return list(pieces[built]), covers[:, built]
 
 
 def _stack(stands: list[Interval]) -> tuple[Interval, ...]:
-    """Resolve overlaps in height: the common part belongs to the building with the higher top."""
+    """Resolve overlaps in height: the overlap belongs to the building with the higher top."""
     stack: list[Interval] = []
     for bottom, top, owner in sorted(stands, key=lambda stand: (-stand[1], stand[0], stand[2])):
         free = [(bottom, top, owner)]
@@ -126,22 +126,22 @@ Point = tuple[int, int]  # x, y [mm]
 Edge = tuple[Point, Point]
 Corner = tuple[int, int, int]  # x, y, z [mm]
 Stand = tuple[int, int, int]  # bottom [mm], top [mm], number of the building
-Strips = dict[Edge, list[tuple[Point, int]]]  # where the strips of an edge begin, and the kind of each
+Strips = dict[Edge, list[tuple[Point, int]]]  # start and kind of each strip of an edge
 
 
 @dataclass(frozen=True)
 class Windows:
-    """How outer walls are divided into alternating upright strips of wall and window, with wall at both ends.
+    """Division of outer walls into alternating vertical strips of wall and window, with wall at both ends.
 
-    The strips are as high as the wall, so the share is the same at the height of every antenna. A strip of wall at both
-    ends keeps the wedges at the corners of the building in one material.
+    The strips are as high as the wall, so the fraction of window does not depend on the height of an antenna. The
+    strips of wall at both ends keep the wedges at the corners of the building in one material.
 
     Attributes:
-        share: Share of window in each wall, from 0 to below 1 [1].
-        module: Approximate distance between the centres of two windows [m].
+        share: Fraction of window in each wall, from 0 to below 1 [1].
+        module: Approximate distance between the centres of adjacent windows [m].
 
     Raises:
-        InputError: A number is out of its bounds.
+        InputError: A number is out of bounds.
     """
 
     share: float
@@ -149,7 +149,7 @@ class Windows:
 
     def __post_init__(self) -> None:
         if not 0 <= self.share < 1:
-            raise InputError(f"window share = {self.share!r}: must be from 0 to below 1")
+            raise InputError(f"window share = {self.share!r}: must be at least 0 and less than 1")
         if not (np.isfinite(self.module) and self.module > 0):
             raise InputError(f"module = {self.module!r}: must be a finite number of metres greater than 0")
 
@@ -176,7 +176,7 @@ class Windows:
 
 @dataclass(frozen=True, eq=False)
 class Shell:
-    """The surface of buildings as triangles.
+    """The surfaces of buildings as triangles.
 
     Attributes:
         corners: Corners, counter-clockwise seen from outside [F, 3, 3], [mm].
@@ -192,10 +192,10 @@ class Shell:
 def extrude(
     cells: Sequence[Cell], windows: Windows | None = None, ground: NDArray[np.float64] | None = None
 ) -> Shell:
-    """Raise buildings on their cells, with heights in the scene's frame.
+    """Extrude buildings from their cells, with heights in the scene's frame.
 
-    Without `windows` walls are whole. `ground` is the height of the ground under each building [n], [m]; bodies on it
-    stay open at the bottom, and the shell is closed otherwise. None closes all bodies.
+    Without `windows`, walls are not divided. `ground` is the height of the ground under each building [n], [m]; bodies
+    that stand on the ground are open at the bottom, all others are closed. With None, all bodies are closed.
     """
     outlines = [_rings(cell.polygon) for cell in cells]
     standing = [
@@ -233,7 +233,7 @@ def to_millimetres(length: float) -> int:
 
 
 def _rings(polygon: Any) -> list[list[Point]]:
-    """Corners of the rings of a polygon, the interior on their left, without repeating the first corner."""
+    """Corners of the rings of a polygon, with the interior to the left; the first corner is not repeated."""
     oriented = library("shapely", "scenes").orient_polygons(polygon)
     rings = (oriented.exterior, *oriented.interiors)
     return [[(to_millimetres(x), to_millimetres(y)) for x, y in ring.coords[:-1]] for ring in rings]
@@ -244,7 +244,7 @@ def _edges(ring: Sequence[Point]) -> Iterator[Edge]:
 
 
 def _wall_stands(standing: Sequence[tuple[Stand, ...]], cell_of: dict[Edge, int], edge: Edge) -> list[Stand]:
-    """The buildings to the left of an edge, at the heights where there is none to its right [mm]."""
+    """The buildings to the left of an edge, over the heights without a building to its right [mm]."""
     opposite = cell_of.get((edge[1], edge[0]))
     free = list(standing[cell_of[edge]])
     for low, high, _ in standing[opposite] if opposite is not None else ():
@@ -259,7 +259,7 @@ def _strips(walls: dict[Edge, list[Stand]], windows: Windows | None) -> Strips:
     strips: Strips = {}
     for edge, stands in walls.items():
         if stands:
-            # Divided in one direction only: rounding from the other end could differ by a millimetre.
+            # Divided in one direction only, because rounding from the other end could differ by a millimetre.
             start, end = min(edge), max(edge)
             forward = windows.divide((start, end))
             ends = [*(point for point, _ in forward[1:]), end]
@@ -269,7 +269,7 @@ def _strips(walls: dict[Edge, list[Stand]], windows: Windows | None) -> Strips:
 
 
 def _columns(walls: dict[Edge, list[Stand]], strips: Strips) -> dict[Point, list[int]]:
-    """Heights at which a wall that meets a corner begins or ends [mm], ascending."""
+    """Heights at which the walls that meet at each corner begin or end [mm], ascending."""
     levels: dict[Point, set[int]] = defaultdict(set)
     for (start, end), stands in walls.items():
         heights = {height for low, high, _ in stands for height in (low, high)}
@@ -281,14 +281,14 @@ def _columns(walls: dict[Edge, list[Stand]], strips: Strips) -> dict[Point, list
 def wall_triangles(
     left: Point, right: Point, left_levels: Iterable[int], right_levels: Iterable[int], low: int, high: int
 ) -> Iterator[tuple[Corner, Corner, Corner]]:
-    """Divide an upright rectangle into triangles, counter-clockwise seen from the right of the line left to right.
+    """Divide a vertical rectangle into triangles, counter-clockwise seen from the right of the line left to right.
 
-    All numbers are in mm. `left` and `right` are x and y of the sides; `left_levels` and `right_levels` are the heights
-    of the corners on their columns, both ends included, ascending. Yields three corners of each triangle.
+    All numbers are in mm. `left` and `right` are x and y of the sides. `left_levels` and `right_levels` are the heights
+    of the corners on the sides, ascending, with both ends included. Yields the three corners of each triangle.
     """
     left_column = [(*left, level) for level in left_levels if low <= level <= high]
     right_column = [(*right, level) for level in right_levels if low <= level <= high]
-    # Climb both columns together; each step up one side makes a triangle with the current corner of the other.
+    # Both columns are climbed together: each step up one side makes a triangle with the current corner of the other.
     i = j = 0
     while i < len(left_column) - 1 or j < len(right_column) - 1:
         left_done, right_done = i == len(left_column) - 1, j == len(right_column) - 1
@@ -306,7 +306,7 @@ def _lids(
     strips: Strips,
     ground: Sequence[int] | None,
 ) -> Shell:
-    """Roofs, and undersides of the bodies that are above the ground."""
+    """Roofs, and undersides of bodies that do not stand on the ground."""
     shapely = library("shapely", "scenes")
     rings = [[_with_strips(ring, strips) for ring in cell_rings] for cell_rings in outlines]
     polygons = np.array([shapely.Polygon(outer, holes) for outer, *holes in rings], dtype=object)
@@ -315,7 +315,7 @@ def _lids(
     corners, owner, kind = [np.zeros((0, 3, 3), dtype=np.int64)], [], []
     for index, stands in enumerate(standing):
         flat = triangles[first[index] : first[index + 1]]
-        # A body that touches the next one above or below it has no lid there.
+        # Where a body touches the next one above or below it, there is no roof or underside.
         bottoms, tops = {low for low, _, _ in stands}, {high for _, high, _ in stands}
         lids = [(high, building, ROOF) for _, high, building in stands if high not in bottoms]
         lids += [
@@ -336,7 +336,7 @@ def _with_strips(ring: Sequence[Point], strips: Strips) -> list[Point]:
 
 
 def triangulate(polygons: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Triangulate polygons [n], [mm], holes allowed, without new corners.
+    """Triangulate polygons [n], [mm], which may have holes, without adding corners.
 
     Returns the corners of the triangles, counter-clockwise [F, 3, 2], [mm], and the polygon of each [F], ascending.
     """

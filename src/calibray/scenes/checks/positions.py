@@ -1,4 +1,4 @@
-"""Positions in a scene: under a roof, under the ground, outside the scene, behind walls; and moved out of buildings."""
+"""Checks of positions against a scene (roofs, ground, bounds, walls), and moving positions out of buildings."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from calibray.scenes.triangles import BATCH, STEEP, Triangles, is_ground, vertic
 from calibray.support.lazy_imports import library
 
 KERB: Final = 2.0
-"""Largest height of what covers no ground, above the lowest point of a scene [m]."""
+"""Height above the lowest point of a scene up to which objects, such as kerbs, do not count as buildings [m]."""
 
 CLEARANCE: Final = 0.05
-"""A surface is above an antenna if it is higher by more than this [m]."""
+"""A surface counts as above an antenna if it is higher by more than this [m]."""
 
 CONTACT: Final = 0.01
-"""An antenna nearer to a level surface touches it [m]. At 1 mm, Sionna RT misses the reflections of this surface on all
-links, at 3 mm on most, and at 10 mm on none."""
+"""An antenna closer than this to a level surface touches it [m]. At 1 mm, Sionna RT misses reflections from the surface
+on all links, at 3 mm on most, and at 10 mm on none."""
 
 BEYOND: Final = "outside the scene"
 UNDER: Final = "under the ground"
@@ -34,7 +34,7 @@ INSIDE: Final = "inside a building"
 
 
 def _surfaces(source: str | Path) -> list[Mesh]:
-    """The surfaces of all shapes of a scene, also of rectangles and cubes, with their transforms.
+    """Read the surfaces of all shapes of a scene, including rectangles and cubes, in the scene frame.
 
     Raises:
         InputError: The scene or a shape cannot be read, or the scene has no shape.
@@ -52,7 +52,7 @@ def _is_wall(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class SceneSurfaces:
-    """The faces of a scene, with walls separated from ground, floors and roofs.
+    """The faces of a scene; walls are separate from ground, floors and roofs.
 
     Attributes:
         level: Corners of the faces that are not walls [F, 3, 3], [m].
@@ -66,7 +66,7 @@ class SceneSurfaces:
 
     @classmethod
     def read(cls, source: str | Path) -> SceneSurfaces:
-        """Read the faces of a scene in the scene frame: the path of a Mitsuba XML file, or `sionna:NAME`.
+        """Read the faces of a scene in the scene frame; `source` is the path of a Mitsuba XML file, or `sionna:NAME`.
 
         Raises:
             InputError: The scene cannot be read.
@@ -93,7 +93,7 @@ class SceneSurfaces:
         return above > 0
 
     def underground(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Mask [n] of the points [n, 3], [m], that lie below all surfaces at their position.
+        """Mask [n] of the points [n, 3], [m], that are below all surfaces at their position in plan.
 
         Raises:
             InputError: shapely is not installed.
@@ -114,7 +114,7 @@ class SceneSurfaces:
         return np.bincount(index[near], minlength=len(position)) > 0
 
     def outside(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
-        """Mask [n] of the points [n, 3], [m], that lie outside the scene's bounds in plan by more than a margin [m]."""
+        """Mask [n] of the points [n, 3], [m], that are outside the scene's bounds in plan by more than a margin [m]."""
         position = np.asarray(points, dtype=float).reshape(-1, 3)[:, :2]
         low, high = self.bounds[:2] - margin, self.bounds[3:5] + margin
         return np.asarray(((position < low) | (position > high)).any(axis=1))
@@ -141,7 +141,7 @@ class SceneSurfaces:
         return lowest
 
     def lowest_surface(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """The same, +inf where the scene has no surface."""
+        """Height of the lowest surface, as `ground_height`, but +inf where the scene has no surface."""
         position = np.column_stack([np.asarray(x, dtype=float), np.asarray(y, dtype=float)])
         index, height = self._surfaces(position)
         lowest = np.full(len(position), np.inf)
@@ -149,21 +149,21 @@ class SceneSurfaces:
         return lowest
 
     def _count_surfaces(self, position: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Number of surfaces at each position, and number of those above it [n]."""
+        """Number of surfaces at each position in plan, and number of surfaces above it [n]."""
         index, height = self._surfaces(position)
         above = height > position[index, 2] + CLEARANCE
         return np.bincount(index, minlength=len(position)), np.bincount(index[above], minlength=len(position))
 
     @cached_property
     def _tree(self) -> Any:
-        """An index over the faces that are not walls, in plan."""
+        """Spatial index, in plan, of the faces that are not walls."""
         shapely = library("shapely", "scenes")
         return shapely.STRtree(shapely.polygons(self.level[:, :, :2]))
 
     def _surfaces(self, position: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """All surfaces at some positions: index of the position, and height of the surface [m]."""
+        """All surfaces at the given positions: index of the position, and height of the surface [m]."""
         shapely = library("shapely", "scenes")
-        # On an edge of two faces, a point has both; callers compare counts with zero or each other, not with one.
+        # A point on an edge belongs to both faces; callers compare counts with zero or each other, not with one.
         index, face = self._tree.query(shapely.points(position[:, :2]), predicate="intersects")
         a, b, c = np.moveaxis(self.level[face], 1, 0)
         normal = np.cross(b - a, c - a)
@@ -172,9 +172,9 @@ class SceneSurfaces:
 
 
 def count_crossings(corners: NDArray[np.float64], start: ArrayLike, end: ArrayLike) -> NDArray[np.int64]:
-    """Count the surfaces that straight lines cross.
+    """Count the triangles [F, 3, 3] that each straight line crosses; the ends of the lines are [n, 3], [m].
 
-    Triangles are [F, 3, 3], the ends of the lines [n, 3], [m].
+    Crossings closer to each other than `SAME_CROSSING` count once.
 
     Example:
         >>> sheet = np.array([[[1, -9, -9], [1, 9, -9], [1, 0, 9]]], float)
@@ -186,16 +186,16 @@ def count_crossings(corners: NDArray[np.float64], start: ArrayLike, end: ArrayLi
     counts = [np.zeros(0, dtype=np.int64)]
     for number in range(0, len(first), batch):
         part = slice(number, number + batch)
-        # Misses are NaN, which sorts last and is no new crossing.
+        # Misses are NaN: they sort last and do not count as crossings.
         distance = np.sort(crossing(first[part, None], last[part, None], corners), axis=1)
         counts.append((np.diff(distance, axis=1, prepend=-np.inf) > SAME_CROSSING).sum(axis=1))
     return np.concatenate(counts)
 
 
 def building_outlines(source: str | Path) -> Any:
-    """The area that buildings and other bodies of a scene cover in plan, a shapely geometry [m]; empty without a body.
+    """The area that buildings and other bodies of a scene cover in plan, as a shapely geometry [m]; may be empty.
 
-    Faces less than `KERB` above the scene's lowest point cover nothing: kerbs, floors, the ground.
+    Faces less than `KERB` above the scene's lowest point are ignored: kerbs, floors, the ground.
 
     Raises:
         InputError: The scene cannot be read, or shapely is not installed.
@@ -213,16 +213,16 @@ def building_outlines(source: str | Path) -> Any:
 def move_outside(
     points: ArrayLike, outlines: Any, clearance: float = 1.0, furthest: float = 20.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Move positions inside buildings to the nearest position outside.
+    """Move positions inside buildings to the nearest position outside them.
 
     Args:
         points: Positions [n, 3], [m]; heights do not change.
         outlines: The area that buildings cover, from `building_outlines`.
         clearance: Distance of a moved position from the wall [m].
-        furthest: Positions that would move farther than this are not moved [m].
+        furthest: Positions that would have to move farther than this become NaN [m].
 
     Returns:
-        The positions [n, 3], [m], NaN if not moved out; and the distance that each was moved [n], [m].
+        The positions [n, 3], [m], NaN where the distance exceeds `furthest`; and the distance moved [n], [m].
 
     Raises:
         InputError: The clearance is not greater than 0, or a position is not finite.
@@ -238,12 +238,12 @@ def move_outside(
     if not clearance > 0:
         raise InputError(f"clearance = {clearance!r}: must be greater than 0 m")
     if not np.isfinite(moved).all():
-        raise InputError("positions must be finite numbers of metres; correct or remove the others")
+        raise InputError("positions must be finite numbers, in metres; correct or remove the others")
     inside = np.flatnonzero(shapely.contains_xy(outlines, moved[:, 0], moved[:, 1]))
     distance = np.zeros(len(moved))
     if not len(inside):
         return moved, distance
-    # With mitred corners, positions leave a straight wall at a right angle.
+    # With mitred corners, positions move away from a straight wall at a right angle.
     border = shapely.boundary(shapely.buffer(outlines, clearance, join_style="mitre"))
     lines = shapely.shortest_line(shapely.points(moved[inside, :2]), border)
     nearest = shapely.get_coordinates(lines).reshape(-1, 2, 2)[:, 1]
@@ -254,10 +254,10 @@ def move_outside(
 
 
 def locate(triangles: Triangles, points: NDArray[np.float64]) -> NDArray[np.str_]:
-    """The location of every point [n, 3], [m]: `BEYOND`, `UNDER` or `INSIDE`; empty in the open.
+    """The location of each point [n, 3], [m]: `BEYOND`, `UNDER` or `INSIDE`; empty in the open.
 
     A point is inside a building if a vertical ray upwards crosses an odd number of surfaces, as in any closed body.
-    Sheets under the whole scene are ground.
+    Surfaces that belong to `Triangles.ground` are ground.
     """
     if not len(triangles.face):
         return np.full(len(points), "")
@@ -274,6 +274,6 @@ def locate(triangles: Triangles, points: NDArray[np.float64]) -> NDArray[np.str_
         np.add.at(ground_below, point, is_ground & ~above)
     beyond = ((unique[:, :2] < scene_low[:2]) | (unique[:, :2] > scene_high[:2])).any(axis=1)
     under = ((ground > 0) & (ground_below == 0)) | (unique[:, 2] < scene_low[2] - CLEARANCE)
-    # Upwards from inside a closed body, a line crosses its surface an odd number of times.
+    # A line upwards from inside a closed body crosses its surface an odd number of times.
     location = np.select([beyond, under, over_building % 2 == 1], [BEYOND, UNDER, INSIDE], "")
     return location[inverse.reshape(-1)]

@@ -1,4 +1,4 @@
-"""Faults of a scene, detected before an hour of tracing: materials, names, units and meshes."""
+"""Detection of faults in a scene's materials, names, units and meshes before a long trace."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from calibray.support.progress import Progress
 
 Severity = Literal["error", "warning", "note"]
 
-_FLAT: Final = 1e-10  # a face of less area counts as empty [m^2]
+_FLAT: Final = 1e-10  # area below which a face counts as empty [m^2]
 
 CLOSE: Final = 0.01
-"""Distance below which Sionna RT confuses parallel faces [m]. 10 m from the origin, it reflected twice from sheets 1 mm
-apart and found no path through walls 0.1 to 5 mm apart; at 10 mm, both were right. At 900 m, it needed 100 mm."""
+"""Distance below which Sionna RT confuses parallel faces [m]. At 10 m from the origin, it reflected twice from sheets
+1 mm apart and found no path through walls 0.1 to 5 mm apart; a gap of 10 mm was enough. At 900 m, it took 100 mm."""
 
-_PARALLEL: Final = 0.999  # least cosine between the normals of parallel faces
+_PARALLEL: Final = 0.999  # smallest cosine of the angle between the normals of parallel faces
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One fault of a scene or of positions in it.
+    """One fault in a scene, or in positions in a scene.
 
     Attributes:
-        severity: "error" if Sionna RT or Calibray will refuse the scene, "warning" if results may be wrong, otherwise
+        severity: "error" if Sionna RT or Calibray refuses the scene, "warning" if results may be wrong, otherwise
             "note".
         subject: The object, material or file concerned; empty for the scene itself.
-        problem: The fault.
-        remedy: What to do about it.
+        problem: Description of the fault.
+        remedy: How to correct it.
     """
 
     severity: Severity
@@ -56,15 +56,15 @@ class MeshFaults:
 
     Attributes:
         name: Name of the object.
-        material: Name of its material.
+        material: Name of the object's material.
         vertices: Number of vertices.
         faces: Number of triangles.
-        open_edges: Edges with a face on one side only, even if corners at one position count as one.
+        open_edges: Edges that belong to one face only, even if vertices at the same position are merged.
         unwelded_edges: Edges at which two faces meet without sharing vertices, so that no wedge is found.
         crowded_edges: Edges that more than two faces share, so that no wedge is found.
-        flipped_faces: Faces whose normal points inward, or against the normals of their neighbours.
-        empty_faces: Faces without area.
-        repeated_faces: Faces with the same corners as another one.
+        flipped_faces: Faces whose normals point inward, or opposite to those of their neighbours.
+        empty_faces: Faces with zero area.
+        repeated_faces: Faces with the same corners as another face.
     """
 
     name: str
@@ -86,8 +86,8 @@ class SceneCheck:
     Attributes:
         source: The scene that was checked.
         bounds: West, south, bottom, east, north and top [6], in the scene's unit.
-        objects: Its meshes and their faults.
-        findings: The faults, worst first.
+        objects: The meshes of the scene and their faults.
+        findings: The faults, most severe first.
     """
 
     source: str
@@ -97,14 +97,14 @@ class SceneCheck:
 
     @property
     def faces(self) -> int:
-        """Number of triangles of all meshes."""
+        """Total number of triangles in all meshes."""
         return sum(item.faces for item in self.objects)
 
 
 def check_scene(source: str | Path, progress: Progress | None = None) -> SceneCheck:
-    """Find the size, meshes and faults of a scene, a Mitsuba XML file or `sionna:NAME`.
+    """Examine the size, meshes and faults of a scene: a Mitsuba XML file, or `sionna:NAME`.
 
-    `progress` is called with ("examining", meshes done, meshes in all).
+    `progress` is called with ("examining", meshes done, total number of meshes).
 
     Raises:
         InputError: The scene does not exist or is not a Mitsuba scene, or a mesh is missing or cannot be read.
@@ -151,16 +151,21 @@ def _mesh_findings(item: MeshFaults) -> list[Finding]:
         (
             item.flipped_faces,
             "note",
-            f"{share} with the normal inward or against their neighbours'; Sionna RT accepts this, but other programs "
-            f"may not",
-            "recalculate normals outside (Blender: Shift-N)",
+            f"{share} with normals that point inward or opposite to those of their neighbours; Sionna RT accepts this, "
+            f"but other programs may not",
+            "recalculate normals to point outside (Blender: Shift-N)",
         ),
-        (item.empty_faces, "warning", f"{share} without area", "dissolve degenerate faces, and export again"),
+        (
+            item.empty_faces,
+            "warning",
+            f"{share} with zero area",
+            "dissolve degenerate faces, and export again",
+        ),
         (
             item.repeated_faces,
             "warning",
-            f"{share} that coincide with another one: paths through them may be lost, and reflections counted twice",
-            "remove the copies",
+            f"{share} that duplicate another face: paths through them may be lost, and reflections counted twice",
+            "remove the duplicates",
         ),
     )
     return [
@@ -180,12 +185,12 @@ def _material_findings(root: ElementTree.Element, objects: Sequence[MeshFaults])
             problem = f"a BSDF of type {bsdf.get('type')!r} has no id"
             yield Finding("error", "", problem, "give it the id mat-NAME")
         elif bsdf.get("type") != "itu-radio-material" and name in ITU_NAMES:
-            remedy = f"name it mat-itu_{name} for ITU's constants, or choose another name"
-            yield Finding("error", identifier, "has a name of ITU-R P.2040, which Sionna RT refuses", remedy)
+            remedy = f"name it mat-itu_{name} to use the ITU constants, or choose another name"
+            yield Finding("error", identifier, "has an ITU-R P.2040 name, which Sionna RT refuses", remedy)
     for name, count in Counter(shape.get("id") for shape in root.findall("shape")).items():
         if name is not None and count > 1:
             yield Finding(
-                "error", name, f"is the id of {count} objects, which Sionna RT refuses", "rename one"
+                "error", name, f"is the id of {count} objects, which Sionna RT refuses", "make the ids unique"
             )
     for item in objects:
         if item.material not in defined:
@@ -197,7 +202,7 @@ def _material_findings(root: ElementTree.Element, objects: Sequence[MeshFaults])
 
 
 def scale_findings(low: NDArray[np.float64], high: NDArray[np.float64]) -> Iterator[Finding]:
-    """Faults of unit and origin, from the corners of the scene's bounds [3]."""
+    """Faults in unit and origin, found from the lower and upper corners [3] of the scene's bounds."""
     extent = high - low
     width = float(extent[:2].max())
     size = f"{extent[0]:.4g} x {extent[1]:.4g} x {extent[2]:.4g}"
@@ -214,7 +219,7 @@ def scale_findings(low: NDArray[np.float64], high: NDArray[np.float64]) -> Itera
 
 
 def _overlap_findings(root: ElementTree.Element, path: Path) -> Iterator[Finding]:
-    """Faces in the open that another face covers, with the first pair of objects."""
+    """Exposed faces that another face covers, with the first such pair of objects."""
     shapes = root.findall("shape")
     meshes = [read_surface(shape, path) for shape in shapes]
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
@@ -229,21 +234,23 @@ def _overlap_findings(root: ElementTree.Element, path: Path) -> Iterator[Finding
     differs = np.array([names[one] != names[other] for one, other in pairs.tolist()])
     one, other = (shapes[number].get("id") for number in pairs[np.argmax(differs)].tolist())
     material = (
-        f", {differs.sum()} of them of another material, of which rays meet either" if differs.any() else ""
+        f", {differs.sum()} of them to one of another material, and a ray may hit either"
+        if differs.any()
+        else ""
     )
     problem = (
-        f"{len(covered)} faces are closer than {CLOSE:g} m to a parallel one (such as {one!r} at {other!r}){material}: "
-        "reflections may count twice, and paths through them may be lost"
+        f"{len(covered)} faces are closer than {CLOSE:g} m to a parallel face (such as {one!r} and {other!r}){material}"
+        ": reflections may count twice, and paths through the faces may be lost"
     )
     severity: Severity = "warning" if differs.any() else "note"
     yield Finding(severity, "", problem, "remove one of the faces, or move them apart by 0.1 m")
 
 
 def find_covers(corners: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Index of a face [F] that is parallel to each face and closer than `CLOSE` to its centroid; -1 without any.
+    """For each face, the index of a parallel face that is closer than `CLOSE` to its centroid [F]; -1 if none.
 
-    Faces are [F, 3, 3], [m]. Faces that rays do not reach from outside do not count: walls between touching buildings,
-    and floors of buildings on the ground. From a point in the open, a straight line crosses an even number of faces.
+    Faces are [F, 3, 3], [m]. Faces that rays cannot reach from outside get -1: walls between touching buildings, and
+    floors of buildings on the ground. A straight line from a point in the open crosses an even number of faces.
     """
     cover = np.full(len(corners), -1)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -251,7 +258,7 @@ def find_covers(corners: NDArray[np.float64]) -> NDArray[np.int64]:
     normal = normal / np.where(length > 2 * _FLAT, length, np.inf)
     steepest = np.abs(normal).argmax(axis=1)
     for axis in range(3):
-        # Faces are projected along the axis nearest to their normal, where they are widest.
+        # Faces are projected along the axis closest to their normal, which gives the largest projected area.
         turn = [(axis + 1) % 3, (axis + 2) % 3, axis]
         members = np.flatnonzero(steepest == axis)
         centroid = corners[members].mean(axis=1)[:, turn]
@@ -263,20 +270,20 @@ def find_covers(corners: NDArray[np.float64]) -> NDArray[np.int64]:
             gap = height - centroid[point, 2]
             own = members[point]
             cosine = np.abs((normal[face] * normal[own]).sum(axis=1))
-            # The gap along the axis times the normal's part along it is the distance across the faces.
+            # The gap along the axis times the component of the normal along it is the distance between the faces.
             near = (cosine > _PARALLEL) & (np.abs(gap * normal[own, axis]) < CLOSE) & (face != own)
             found[point[near]] = face[near]
             np.add.at(above, point, gap > CLOSE)
             np.add.at(below, point, gap < -CLOSE)
-        # A side with an even number of surfaces beyond it is outside of all closed bodies.
-        # Nothing is in the open below the ground.
+        # A side with an even number of surfaces beyond it is outside all closed bodies.
+        # Nothing below the ground is in the open.
         is_open = (above % 2 == 0) | ((below % 2 == 0) & (axis != 2))
         cover[members[is_open]] = found[is_open]
     return cover
 
 
 def count_faults(item: MeshObject) -> MeshFaults:
-    """Count the faults of a mesh."""
+    """Count the faults in a mesh."""
     mesh = item.mesh
     _, position = np.unique(np.rint(mesh.vertices / MILLIMETRE).astype(np.int64), axis=0, return_inverse=True)
     by_position = position.reshape(-1)[mesh.faces]
@@ -303,7 +310,7 @@ def count_faults(item: MeshObject) -> MeshFaults:
 
 
 def _edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """The directed sides of all faces [3 F, 2], the undirected edge of each [3 F], and the sides of each edge [E]."""
+    """The directed sides of all faces [3 F, 2], the edge index of each side [3 F], and the sides per edge [E]."""
     sides = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     _, edge, uses = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
     return sides, edge.reshape(-1), uses
@@ -312,11 +319,11 @@ def _edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int6
 def _count_flipped(
     vertices: NDArray[np.float64], faces: NDArray[np.int64], by_position: NDArray[np.int64]
 ) -> int:
-    """Count the faces with a wrong normal.
+    """Count the faces with wrong normals.
 
-    Faces of a connected piece are first given the same orientation. The right orientation of a piece is known if it is
-    closed, or open only at its bottom (its volume is positive), or a level sheet (its normal points up). For any other
-    piece, such as a wall, either side may be outside, and the faces that differ from the majority are counted.
+    The faces of each connected piece are first given a consistent orientation. The correct orientation is known if the
+    piece is closed or open only at its bottom (its volume is positive), or a level sheet (its normal points up). For
+    any other piece, such as a wall, either side may be outside, and the faces that differ from the majority count.
     """
     if not len(faces):
         return 0
@@ -325,11 +332,11 @@ def _count_flipped(
     base = np.full((piece.max() + 1, 3), np.inf)
     np.minimum.at(base, piece, np.minimum(np.minimum(a, b), c))
     normal = np.cross(b - a, c - a) * orientation[:, None]
-    # Divergence theorem: positive if the normals of a closed body point outwards. From a corner of the piece, so that
-    # large coordinates do not cancel.
+    # Divergence theorem: positive if the normals of a closed body point outwards. Positions are relative to the lower
+    # bounds of the piece, which avoids cancellation of large coordinates.
     volume = np.bincount(piece, (normal * (a - base[piece])).sum(axis=1) / 6)
     area = np.bincount(piece, np.linalg.norm(normal, axis=1) / 2)
-    # Twice the signed area in plan; a level sheet has more than half of its area there.
+    # Twice the signed area in plan; for a level sheet, more than its total area.
     upward = np.bincount(piece, normal[:, 2])
     is_sheet = np.abs(volume) < 1e-3 * area**1.5
     is_level = np.abs(upward) > area
@@ -338,7 +345,7 @@ def _count_flipped(
         is_sheet & is_level, np.sign(upward), np.where(is_closed & ~is_sheet, np.sign(volume), 0.0)
     )
     wrong = orientation * right[piece] < 0
-    # Without a right side, the fewer faces count as flipped against their neighbours.
+    # If neither side is known to be outside, the minority of faces counts as flipped.
     minority = np.minimum(np.bincount(piece, orientation > 0), np.bincount(piece, orientation < 0))
     return int(wrong.sum() + minority[np.unique(piece[right[piece] == 0])].sum())
 
@@ -349,7 +356,7 @@ def _open_above(
     by_position: NDArray[np.int64],
     lowest: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Number of open edges of each face above the bottom of its piece, whose height is `lowest` [F]."""
+    """Number of open edges of each face above the bottom of its connected piece, at height `lowest` [F]."""
     _, edge, uses = _edges(by_position)
     is_open = (uses == 1)[edge].reshape(-1, 3)
     height = vertices[faces][:, :, 2]
@@ -358,7 +365,7 @@ def _open_above(
 
 
 def _orient(faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """+1 or -1 for each face so that neighbours have the same orientation [F], and its connected piece [F]."""
+    """Sign for each face, +1 or -1, that gives neighbours the same orientation [F], and its connected piece [F]."""
     count = len(faces)
     sides, edge, uses = _edges(faces)
     order = np.argsort(edge, kind="stable")
