@@ -156,7 +156,7 @@ def write_town(path: Path, *properties: dict, move: tuple[float, float] = (0.0, 
         ),
         (["--height", "1e300"], (0, 0), r"1e\+300 = 1e\+300, must be finite|at most 1000"),
         (["--height", "nan"], (0, 0), "at most 1000|must"),
-        (["--wall", "brick:1e20"], (0, 0), r"thickness = 1e\+20 must be greater than 0 and at most 100 m"),
+        (["--wall", "brick:1e20"], (0, 0), r"thickness = 1e\+20: must be greater than 0 and at most 100 m"),
     ],
     ids=str,
 )
@@ -178,7 +178,7 @@ def test_a_column_whose_name_is_a_number_is_taken_with_a_warning(tmp_path, caplo
     status, out, _ = scene_command("footprints", town, "-o", tmp_path / "out", "--height", "2020")
     assert status == 0
     assert "0.0 m to 12.0 m high" in out
-    assert "2020 is interpreted as the column of that name" in caplog.text
+    assert "2020 is interpreted as the name of a column" in caplog.text
 
 
 def test_footprints_become_a_scene(tmp_path):
@@ -190,7 +190,7 @@ def test_footprints_become_a_scene(tmp_path):
     write_town(town, {"levels": 4})
     assert "0.0 m to 12.0 m high" in scene_command(*storeys)[1]
     status, _, err = scene_command(*storeys[:4])
-    assert (status, "there are: levels" in err) == (2, True)
+    assert (status, "columns: levels" in err) == (2, True)
 
 
 @pytest.mark.parametrize(

@@ -261,7 +261,7 @@ def test_a_mesh_per_building_has_the_name_of_the_building_made_safe(tmp_path):
 @pytest.mark.parametrize(
     ("material", "message"),
     [
-        (("concrete", "concrete", 0.1), "is a name of ITU-R P.2040"),
+        (("concrete", "concrete", 0.1), "is an ITU-R P.2040 name"),
         (("itu_brick", "brick", 0.1), "name it 'brick_wall'"),
         (("a b", "brick", 0.1), "letters, digits"),
         (("walls", "bricks", 0.1), "did you mean 'brick'"),

@@ -1,4 +1,4 @@
-"""Floor plans: walls drawn as lines, polylines or outlines, with doors and windows, converted to upright rectangles."""
+"""Floor plans: walls, doors and windows drawn as lines, polylines or outlines, converted to vertical rectangles."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ OPENINGS: Final = frozenset({"door", "window"})
 """Types that replace the wall on which they are drawn."""
 
 THICKNESS: Final = (0.0005, 3.0)
-"""Smallest and largest thickness of a wall [m]; beyond it, the column and the coordinates have different units."""
+"""Smallest and largest thickness of a wall [m]; other values suggest that thickness and coordinates differ in unit."""
 
 USUAL_EXTENT: Final = (2.0, 300.0)
-"""Extent of a plan [m] beyond which a warning asks for its unit; large halls are 300 m long."""
+"""Range of usual plan extents [m], outside which a warning asks for the unit; large halls are 300 m long."""
 
 VECTOR_SUFFIXES: Final = (".dxf", ".geojson", ".json", ".gpkg", ".shp", ".fgb", ".gdb")
 """Extensions of vector files; any other file is read as CSV."""
 
 Lines = list[list[NDArray[np.float64]]]
-"""For each row the points [n, 2] of its lines."""
+"""The points [n, 2] of each line, for each row."""
 
 _ENDS: Final = ("x0", "y0", "x1", "y1")
 _OTHER_ENDS: Final = (
@@ -58,15 +58,15 @@ _OTHER_NAMES: Final = {
 
 @dataclass(frozen=True)
 class Segment:
-    """An upright rectangle over a line of a plan.
+    """A vertical rectangle over a line of a plan.
 
     Attributes:
         start: x and y of one end [m].
         end: x and y of the other end [m].
-        kind: Its type, such as `brick` or `door`.
-        bottom: Height at which it begins [m].
-        top: Height at which it ends [m].
-        thickness: Its thickness [m]; None if unknown.
+        kind: Type of the segment, such as `brick` or `door`.
+        bottom: Height of the bottom [m].
+        top: Height of the top [m].
+        thickness: Thickness [m]; None if unknown.
     """
 
     start: tuple[float, float]
@@ -78,7 +78,7 @@ class Segment:
 
     @property
     def length(self) -> float:
-        """Its length [m]."""
+        """Length of the segment in plan [m]."""
         return float(np.hypot(self.end[0] - self.start[0], self.end[1] - self.start[1]))
 
     @property
@@ -92,26 +92,24 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
     """Read a floor plan.
 
     Args:
-        path: A table as text with the columns x0, y0, x1, y1 and type, or, instead of the coordinates, a column wkt
-            with lines, polylines or outlines; thickness, bottom and height are optional. Similar names are understood,
-            and a unit of length in a name, as in `width_cm`, applies to its column. The file can also be a DXF, GeoJSON
-            or other vector file with attributes of exactly these names, with or without a unit, whose coordinates are
-            those of the plan; without an attribute type, the layer of DXF is the type. Points and texts of such files
-            are left out.
+        path: A text table with the columns x0, y0, x1, y1 and type. Instead of the coordinates, a column wkt may give
+            lines, polylines or outlines; thickness, bottom and height are optional. Similar names are recognized, and a
+            unit of length in a name, as in `width_cm`, applies to its column. The file can also be a DXF, GeoJSON or
+            other vector file in the plan's coordinates, with attributes of exactly these names, with or without a unit.
+            Without an attribute type, the DXF layer is the type. Points and texts in vector files are ignored.
         height: Height of the top of segments without a height [m].
-        unit: The plan's unit of length [m]: 0.001 for millimetres. If None, that of a DXF file, or metres.
+        unit: The plan's unit of length [m], such as 0.001 for millimetres; if None, the unit stated in a DXF file, or
+            metres.
 
     Returns:
-        The segments in the plan's order; a polyline or outline becomes one for each of its sides.
+        The segments in file order; a polyline or outline gives one segment per side.
 
     Raises:
         InputError: The file or a column is missing or malformed, or a segment has no length, height or thickness.
     """
     for name, value in (("height", height), ("unit", 1.0 if unit is None else unit)):
         if not 0 < value <= HIGHEST:
-            raise InputError(
-                f"{name} = {value!r}: must be a number of metres greater than 0, at most {HIGHEST:g}"
-            )
+            raise InputError(f"{name} = {value!r}: must be greater than 0 and at most {HIGHEST:g} m")
     path = Path(path)
     is_vector = path.suffix.lower() in VECTOR_SUFFIXES
     if unit is None:
@@ -126,11 +124,11 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
         row = f"floor plan {path}, {frame.index[index]}"
         points = np.concatenate(parts) * unit if parts else np.empty((0, 2))
         if pd.isna(kind) or not len(points) or not np.isfinite(points).all():
-            raise InputError(f"{row}: lacks its type or a coordinate; complete or remove it")
+            raise InputError(f"{row}: has no type or lacks a coordinate; complete or remove it")
         bottom = 0.0 if np.isnan(bottom) else bottom
         extent = height - bottom if np.isnan(extent) else extent
         sides = [(tuple(a), tuple(b)) for part in parts for a, b in pairwise((part * unit).tolist())]
-        # The last point of an outline may stand there twice.
+        # The last point of an outline may be repeated.
         sides = [(a, b) for a, b in sides if np.hypot(b[0] - a[0], b[1] - a[1]) >= MILLIMETRE]
         if not sides or extent <= 0 or thickness <= 0:
             raise InputError(
@@ -139,8 +137,8 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
         size = float(np.abs(points).max())
         if size > WIDEST or max(abs(bottom), extent, thickness) > HIGHEST:
             raise InputError(
-                f"{row}: {size:g} m from the origin, {extent:g} m high and {thickness:g} m thick; coordinates may be "
-                f"{WIDEST:g} m, heights and thicknesses {HIGHEST:g} m at most; correct it or its unit"
+                f"{row}: {size:g} m from the origin, {extent:g} m high and {thickness:g} m thick; must be at most "
+                f"{WIDEST:g} m from the origin, {HIGHEST:g} m high and thick; correct the row or its unit"
             )
         if not (np.isnan(thickness) or THICKNESS[0] <= thickness <= THICKNESS[1]):
             raise InputError(
@@ -165,7 +163,7 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
 
 
 def _read_table(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
-    """The columns of a table, see `_with_known_names`, by the lines of its rows."""
+    """The columns of a table, as from `_with_known_names`, and the lines of each row."""
     if not exists(path):
         raise InputError(f"floor plan {path}: is not a file; check the path")
     table = parse_text(path, read_text(path))
@@ -184,7 +182,7 @@ def _read_table(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
     lines = []
     for row, text in frame["wkt"].items():
         try:
-            with np.errstate(invalid="ignore"):  # values that are not numbers are refused below
+            with np.errstate(invalid="ignore"):  # NaN is refused by the caller
                 lines.append(_parts(shapely.from_wkt(text)))
         except (shapely.GEOSException, TypeError) as error:
             raise InputError(
@@ -195,7 +193,7 @@ def _read_table(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
 
 
 def _read_vector(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
-    """The attributes of a vector file, see `_with_known_names`, by the lines of its features."""
+    """The attributes of a vector file, as from `_with_known_names`, and the lines of each feature."""
     features = read_features(path, None)
     lines = [_parts(geometry) for geometry in features.outline]
     has_lines = [bool(parts) for parts in lines]
@@ -212,13 +210,13 @@ def _read_vector(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
 def _with_known_names(
     path: Path, frame: pd.DataFrame, unit: float, others: Mapping[str, Sequence[str]]
 ) -> pd.DataFrame:
-    """The columns under the names of this module or, if unknown, their own; lengths in the plan's unit [m]."""
+    """Rename known columns to the names in this module, and convert lengths with a unit to the plan's unit [m]."""
     known = _known_names(map(str, frame), others)
     frame = frame.rename(columns=known)
     for column, name in known.items():
         if (frame.columns == name).sum() > 1:
             raise InputError(
-                f"floor plan {path}: column {column!r} and another one both state {name}; keep one"
+                f"floor plan {path}: column {column!r} and another column both state {name}; keep one"
             )
         if words(column) & {*LENGTH_UNITS, "m"}:
             frame[name] = _numbers(path, frame, name) * find_length_unit([column]) / unit
@@ -226,7 +224,7 @@ def _with_known_names(
 
 
 def _known_names(columns: Iterable[str], other_names: Mapping[str, Sequence[str]]) -> dict[str, str]:
-    """Maps the name of a column, without case and unit, to the name that this module uses.
+    """Map column names to the names that this module uses, ignoring case and unit.
 
     Example:
         >>> _known_names(["X1 [cm]", "Y1 [cm]", "X2 [cm]", "Y2 [cm]", "width_cm"], _OTHER_NAMES)["X2 [cm]"]
@@ -249,7 +247,7 @@ def _known_names(columns: Iterable[str], other_names: Mapping[str, Sequence[str]
 
 
 def _parts(geometry: Any) -> list[NDArray[np.float64]]:
-    """The points [n, 2] of each line of a geometry; outlines of areas are lines."""
+    """The points [n, 2] of each line of a geometry; the outlines of areas count as lines."""
     shapely = library("shapely", "scenes")
     parts = shapely.get_parts(geometry)
     is_area = shapely.get_dimensions(parts) == 2
@@ -264,7 +262,7 @@ def _numbers(path: str | Path, frame: pd.DataFrame, name: str) -> NDArray[np.flo
         return np.full(len(frame), np.nan)
     column = frame[name]
     if column.dtype == object:
-        # Integers of any length, which pandas keeps as Python's, overflow a float; as text they are infinite.
+        # pandas keeps long integers as Python integers, which overflow a float; parsed from text, they become infinite.
         column = column.astype("string")
     values = pd.Series(pd.to_numeric(column, errors="coerce")).to_numpy(dtype=np.float64, na_value=np.nan)
     if (bad := np.flatnonzero((np.isnan(values) & frame[name].notna().to_numpy()) | np.isinf(values))).size:

@@ -1,4 +1,4 @@
-"""Scenes of rooms, made of floor plans: one upright sheet for each wall, door and window."""
+"""Scenes of rooms, made from floor plans: one vertical sheet for each wall, door and window."""
 
 from __future__ import annotations
 
@@ -44,24 +44,24 @@ TYPES: Final = {
     "floor": SurfaceMaterial("floor", "concrete", 0.2),
     "ceiling": SurfaceMaterial("ceiling", "concrete", 0.2),
 }
-"""Materials of the types that are not materials of ITU-R P.2040 themselves."""
+"""Materials for types whose names are not ITU-R P.2040 materials."""
 
 LIDS: Final = ("floor", "ceiling")
-"""Level sheets over the whole area."""
+"""Level sheets over the whole area of a plan."""
 
 WALL_THICKNESS: Final = 0.12
 """Thickness of a wall of an ITU material if the plan does not state it [m]."""
 
 STOREY: Final = 1.8
-"""Smallest height of a storey [m]; lower parts of walls, such as parapets, are no storeys."""
+"""Smallest height of a storey [m]; lower parts of walls, such as parapets, do not count as storeys."""
 
 ROUNDING: Final = 2.0
-"""Distance of a corner from its line that rounding explains [mm]: walls of a plan are cut where they cross."""
+"""Distance between a corner and its line that rounding can cause [mm]; walls of a plan are cut where they cross."""
 
-_REACH: Final = 0.03  # distance beyond a wall's face at which the end of another wall still meets it [m]
+_REACH: Final = 0.03  # largest distance from a wall's face at which the end of another wall meets it [m]
 
 Pieces = dict[tuple[Point, Point], list[tuple[int, int, str]]]
-"""For each piece of a line between two crossings: bottom [mm], top [mm] and material of the sheets over it."""
+"""Bottom [mm], top [mm] and material of the sheets over each piece of a line between two crossings."""
 
 
 def make_plan_scene(
@@ -72,26 +72,27 @@ def make_plan_scene(
     merge: bool = True,
     overwrite: bool = False,
 ) -> MadeScene:
-    """Make a scene of a floor plan.
+    """Make a scene from a floor plan.
 
-    Walls that cross or meet share their corners, and ends at the face of another wall are extended to its centre line.
-    A door or window replaces the wall on which it is drawn, between its own bottom and top; the wall continues above
-    and below. The same applies to any shorter line on a longer one, such as a door of another name.
+    Walls that cross or meet share corners, and the end of a wall at the face of another wall is extended to the other
+    wall's centre line. Between its own bottom and top, a door or window replaces the wall on which it is drawn; the
+    wall continues above and below. The same applies to any shorter line on a longer one, such as a door of a type with
+    a different name.
 
     Args:
         segments: Lines of the plan.
         folder: Folder for `scene.xml`, `scene.json` and the meshes.
-        types: Materials by type, in addition to `TYPES` or replacing them. A type that is a material of ITU-R P.2040,
-            such as `brick`, becomes the material `brick_wall`. Several thicknesses of one type that the
-            plan states become several materials.
+        types: Materials by type, which extend or replace those in `TYPES`. A type that is an ITU-R P.2040 material,
+            such as `brick`, becomes the material `brick_wall`. If the plan states several thicknesses for one type,
+            each becomes a separate material.
         lids: Which of `LIDS` to make: sheets over the whole area that walls enclose, the floor at the lowest bottom
             and the ceiling at the highest top.
         merge: Whether two parallel lines are merged into one wall (`merge_faces`).
-        overwrite: Replace files that Calibray did not write.
+        overwrite: Whether to replace files that Calibray did not write.
 
     Raises:
-        InputError: A type has no material, there is no segment, storeys above each other would have no floor between
-            them, the folder cannot be written, or a file there must not be replaced.
+        InputError: A type has no material, there is no segment, the plan has several storeys but no floor between
+            them, the folder cannot be written to, or a file in it must not be replaced.
     """
     folder = check_outputs(folder, SCENE_FILES, overwrite=overwrite)
     types = {**TYPES, **(types or {})}
@@ -110,7 +111,7 @@ def make_plan_scene(
     outline = _enclosed(pieces)
     if lids and outline.area == 0:
         raise InputError(
-            "the floor plan encloses no area, so it has no floor or ceiling; draw walls around the room, or omit both "
+            "the floor plan encloses no area for a floor or ceiling; draw walls around the room, or omit both "
             "(--no-floor --no-ceiling)"
         )
     heights = {"floor": min(sheet.bottom for sheet in sheets), "ceiling": max(sheet.top for sheet in sheets)}
@@ -135,8 +136,8 @@ def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) 
         listed = list(unknown)[:10]
         options = " ".join(f"--material {shlex.quote(kind)}=concrete" for kind in listed)
         raise InputError(
-            f"floor plan: no material for {', '.join(map(repr, listed))}; give each the material of ITU-R P.2040 that "
-            f"comes closest, as in {options}; or correct it, {did_you_mean(listed[0], sorted({*types, *ITU_NAMES}))}"
+            f"floor plan: no material for {', '.join(map(repr, listed))}; assign the closest ITU-R P.2040 material to "
+            f"each, as in {options}; or correct it, {did_you_mean(listed[0], sorted({*types, *ITU_NAMES}))}"
         )
     materials = []
     for sheet in sheets:
@@ -144,7 +145,7 @@ def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) 
             base = types[sheet.kind]
         else:
             base = SurfaceMaterial(f"{sheet.kind}_wall", sheet.kind, WALL_THICKNESS)
-        # To a thousandth of a millimetre: two rounding errors are no two materials.
+        # Rounded to a thousandth of a millimetre, so that rounding errors do not give separate materials.
         stated = base.thickness if sheet.thickness is None else round(sheet.thickness, 6)
         materials.append(replace(base, thickness=stated))
     thicknesses: dict[str, set[float]] = defaultdict(set)
@@ -159,7 +160,7 @@ def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) 
 
 
 def _separation(sheets: Sequence[Segment]) -> float | None:
-    """Height at which one storey ends and all sheets above begin [m]; None if there is one storey."""
+    """Height at which one storey ends and the next begins [m]; None if there is only one storey."""
     lowest, highest = min(sheet.bottom for sheet in sheets), max(sheet.top for sheet in sheets)
     for level in sorted({sheet.bottom for sheet in sheets}):
         passed = any(sheet.bottom < level - MILLIMETRE and sheet.top > level + MILLIMETRE for sheet in sheets)
@@ -169,7 +170,7 @@ def _separation(sheets: Sequence[Segment]) -> float | None:
 
 
 def _extend_to_walls(sheets: Sequence[Segment]) -> list[Segment]:
-    """Move the ends of sheets to the centre line of a wall at which they end."""
+    """Move the ends of sheets to the centre line of the wall that they meet."""
     extended = list(sheets)
     for index, sheet in enumerate(extended):
         start, end = np.array(sheet.start), np.array(sheet.end)
@@ -191,9 +192,9 @@ def _extend(
     for other in others:
         along = np.subtract(other.end, other.start)
         offset = end - other.start
-        sine = outward[0] * along[1] - outward[1] * along[0]  # times the other's length
+        sine = outward[0] * along[1] - outward[1] * along[0]  # times the length of the other wall
         reach = (other.thickness or WALL_THICKNESS) / 2 + _REACH
-        # The crossing of nearly parallel walls is not where they meet.
+        # Nearly parallel walls are skipped, because their lines may cross far from where the walls meet.
         if abs(sine) < 0.1 * np.hypot(*along):
             continue
         step = (along[0] * offset[1] - along[1] * offset[0]) / sine
@@ -205,7 +206,7 @@ def _extend(
 
 
 def _pieces(sheets: Sequence[Segment], materials: Sequence[str]) -> Pieces:
-    """The lines cut where they cross, and the sheets over each piece; doors, windows and shorter lines come first."""
+    """Cut lines where they cross; doors, windows and shorter lines take precedence for the sheets over a piece."""
 
     def priority(number: int) -> tuple[bool, float, int]:
         return sheets[number].kind not in OPENINGS, round(sheets[number].length, 3), number
@@ -233,7 +234,7 @@ def _pieces(sheets: Sequence[Segment], materials: Sequence[str]) -> Pieces:
 
 
 def _wall_objects(pieces: Pieces) -> list[MeshObject]:
-    """One mesh per material; sheets that meet share their corners."""
+    """One mesh per material; sheets of one material that meet share their corners."""
     levels: dict[Point, set[int]] = defaultdict(set)
     for edge, stands in pieces.items():
         for point in edge:

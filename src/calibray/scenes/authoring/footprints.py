@@ -1,8 +1,8 @@
-"""Footprints: the outlines of buildings in the scene's frame, with their lower and upper heights, read from files.
+"""Footprints: the outlines of buildings in the scene's frame, with bottom and top heights, read from files.
 
 OpenStreetMap extracts are read with pyosmium, OpenStreetMap's own library. It assembles multipolygon relations with
-their holes by the map's rules, reads .osm and .pbf, and gives all tags; GDAL's driver hides `building:levels` in a text
-of other tags. Nothing is downloaded.
+holes by OpenStreetMap's rules, reads .osm and .pbf files, and returns all tags, whereas GDAL's driver puts
+`building:levels` into a text with other tags. Nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _FEET_AND_INCHES: Final = re.compile(r"\s*(\d+)'\s*(\d+(?:\.\d+)?)\"\s*")
 
 @dataclass(frozen=True)
 class HeightRule:
-    """Assumptions for the height of a building whose height is not given.
+    """Assumptions for buildings whose height is not given.
 
     Attributes:
         storey: Height of one storey [m].
@@ -64,15 +64,13 @@ class HeightRule:
     def __post_init__(self) -> None:
         for name in ("storey", "default"):
             if not 0 < (value := getattr(self, name)) <= HIGHEST:
-                raise InputError(
-                    f"{name} = {value!r}: must be a number of metres greater than 0, at most {HIGHEST:g}"
-                )
+                raise InputError(f"{name} = {value!r}: must be greater than 0 and at most {HIGHEST:g} m")
 
     def heights(self, tags: Mapping[str, str]) -> tuple[float, float, HeightSource]:
-        """Find bottom [m], top [m] and the source of the top of a building from its OpenStreetMap tags.
+        """Derive a building's bottom [m], top [m] and the source of its top from OpenStreetMap tags.
 
         `height` and `min_height` have priority, then `building:levels` and `building:min_level` times `storey`, then
-        `default`. All heights are above the ground; those above `HIGHEST` are ignored, as is a stated top that is not
+        `default`. All heights are above the ground. Heights above `HIGHEST` are ignored, as is a stated top that is not
         above the bottom. Roof shapes are ignored: the roof is flat at `height`.
 
         Example:
@@ -93,7 +91,7 @@ class HeightRule:
 
 
 def parse_length(text: str | None) -> float | None:
-    r"""Parse a length as written on maps, with or without a unit [m]; None if it cannot be read.
+    r"""Parse a length [m] as written in map data, with or without a unit; None if it cannot be parsed.
 
     Example:
         >>> parse_length("12,5 m"), parse_length("10'6\""), parse_length("tall")
@@ -115,11 +113,11 @@ class Footprints:
 
     Attributes:
         polygon: Outline of each building, a shapely Polygon or MultiPolygon in the scene's frame [n], [m].
-        bottom: Height above the ground at which it begins [n], [m].
-        top: Height above the ground at which it ends [n], [m].
-        name: Its name [n].
-        height_from: Source of its top [n].
-        part: Whether it is a part of a building, which takes precedence over the building's outline [n].
+        bottom: Height of the bottom of each building above the ground [n], [m].
+        top: Height of the top of each building above the ground [n], [m].
+        name: Name of each building [n].
+        height_from: Source of each top [n].
+        part: Whether each is a part of a building, which takes precedence over the building's outline [n].
         repairs: Number of outlines that were changed or left out, by reason.
     """
 
@@ -136,7 +134,7 @@ class Footprints:
 
     @property
     def bounds(self) -> NDArray[np.float64]:
-        """West, south, east and north [4], [m]."""
+        """West, south, east and north bounds [4], [m]."""
         return library("shapely", "scenes").total_bounds(self.polygon)
 
     def guessed(self) -> dict[HeightSource, list[str]]:
@@ -149,9 +147,9 @@ class Footprints:
 
 
 def clean_footprints(raw: Footprints) -> Footprints:
-    """Repair outlines so that buildings can be raised on them: on a grid, without self-crossings, not too small.
+    """Repair outlines so that they can be extruded: on a grid, without self-intersections, and not too small.
 
-    Corners are rounded to multiples of `GRID`; outlines of less area than `SMALLEST` are left out. Repairs
+    Corners are rounded to multiples of `GRID`; outlines with less area than `SMALLEST` are left out. Repairs
     are counted. Repeated names are made unique.
 
     Raises:
@@ -187,13 +185,13 @@ def _check_heights(raw: Footprints, keep: NDArray[np.int64]) -> None:
         wrong = keep[~((heights[keep] >= 0) & (heights[keep] <= HIGHEST))]
         if len(wrong):
             raise InputError(
-                f"building {raw.name[wrong[0]]!r}: its {which} is {heights[wrong[0]]:g} m above the ground, must be "
-                f"0 to {HIGHEST:g} m; correct the height or its unit"
+                f"building {raw.name[wrong[0]]!r}: its {which} is {heights[wrong[0]]:g} m above the ground, but must "
+                f"be 0 to {HIGHEST:g} m; correct the height or its unit"
             )
 
 
 def _check_extent(polygons: NDArray[Any], names: Sequence[str]) -> None:
-    """Refuse buildings far from the others, such as one at 0, 0, and maps across 180 degrees of longitude."""
+    """Refuse a building far from the others, such as one at 0, 0, and maps across 180 degrees of longitude."""
     if not len(polygons):
         return
     bounds = library("shapely", "scenes").bounds(polygons)
@@ -207,16 +205,16 @@ def _check_extent(polygons: NDArray[Any], names: Sequence[str]) -> None:
     if size[furthest] > WIDEST:
         problem = f"is {size[furthest] / 1000:,.0f} km wide"
     raise InputError(
-        f"building {names[furthest]!r} {problem}, scenes may be {WIDEST / 1000:g} km wide; remove it, or cut out the "
-        "area that you need (a map that crosses 180 degrees of longitude: on one side of it)"
+        f"building {names[furthest]!r} {problem}, but scenes may be at most {WIDEST / 1000:g} km wide; remove it, or "
+        "cut out the area that you need (if the map crosses 180 degrees of longitude, an area on one side)"
     )
 
 
 def project(polygons: NDArray[Any], frame: Frame, crs: str) -> NDArray[Any]:
-    """Project outlines [n] from a reference system to the scene's frame [m]; their heights are ignored.
+    """Project outlines [n] from a coordinate reference system to the scene's frame [m]; their heights are ignored.
 
     Raises:
-        InputError: A corner lies outside the area of the frame's projection.
+        InputError: A corner is outside the area of the frame's projection.
     """
     shapely = library("shapely", "scenes")
     return shapely.transform(
@@ -235,8 +233,8 @@ def read_openstreetmap(
 ) -> tuple[Footprints, Frame]:
     """Read the buildings of an extract: closed ways and multipolygon relations tagged `building` or `building:part`.
 
-    Returns the footprints and their frame, by default a local one centred on the buildings. `rule` states the heights
-    that the map does not.
+    Returns the footprints and their frame, by default a local one centred on the buildings. `rule` gives the heights
+    that the map does not state.
 
     Raises:
         InputError: The file does not exist, is not an extract or contains no building, or pyosmium is not installed.
@@ -251,7 +249,7 @@ def read_openstreetmap(
     announced = 0  # ways and relations that should become areas
     try:
         for item in osmium.FileProcessor(path).with_areas(is_building).with_filter(is_building):
-            # "no" denies a tag: an outline with building:part=no is no part that takes precedence.
+            # "no" negates a tag: an outline with building:part=no is not a part that takes precedence.
             stated = any(item.tags.get(key, "no") != "no" for key in _KEYS)
             if not stated or item.tags.get("location") == "underground":
                 continue
@@ -264,7 +262,9 @@ def read_openstreetmap(
     except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:
         raise InputError(f"extract {path}: cannot be read ({error}); give an .osm or .osm.pbf file") from None
     if not outlines:
-        raise InputError(f"extract {path}: contains no complete building; choose an extract that covers some")
+        raise InputError(
+            f"extract {path}: contains no complete building; choose an extract that covers buildings"
+        )
     degrees = np.array(outlines, dtype=object)
     frame = frame or _local_frame(degrees, WGS84)
     bottoms, tops, sources = zip(*(rule.heights(building) for building in tags), strict=True)
@@ -283,11 +283,11 @@ def read_openstreetmap(
 
 @dataclass(frozen=True)
 class FootprintColumns:
-    """Columns of a vector file besides the heights of buildings.
+    """Columns of a vector file, other than the heights of buildings.
 
     Attributes:
-        bottom: Column with the heights at which the buildings begin [m], or one height for all.
-        name: Column with their names; by default, and where a name is missing, they are numbered.
+        bottom: Column with the heights of the bottoms of buildings [m], or one height for all.
+        name: Column with the names of buildings; without it, or where a name is missing, buildings are numbered.
         levels: Column with the numbers of storeys, for buildings without a height.
     """
 
@@ -304,22 +304,22 @@ def read_footprints(
     frame: Frame | None = None,
     rule: HeightRule | None = None,
 ) -> tuple[Footprints, Frame]:
-    """Read footprints with their heights from a vector file.
+    """Read footprints and their heights from a vector file.
 
     Args:
-        path: A GeoJSON file, Shapefile, GeoPackage, FlatGeobuf file or Esri geodatabase that states its reference
-            system.
+        path: A GeoJSON file, Shapefile, GeoPackage, FlatGeobuf file or Esri geodatabase that states its coordinate
+            reference system.
         height: Column with the heights of the buildings above the ground, in metres or the unit in its name
-            (`height_ft`), or one height for all [m]; a text that is both a number and the name of a column means the
-            column. None if `columns` has the numbers of storeys.
-        columns: Further columns.
-        layer: Layer of the file, if it has several.
+            (`height_ft`), or one height for all [m]. Text that is both a number and the name of a column is read as the
+            name. None if `columns` gives the numbers of storeys.
+        columns: Additional columns.
+        layer: Layer of the file, if it has more than one.
         frame: The scene's frame; by default a local frame centred on the footprints.
         rule: Assumptions for heights that are not given.
 
     Raises:
-        InputError: The file does not exist, cannot be read, states no reference system, lacks a column or contains no
-            polygon; or a height is not given, negative or not a number.
+        InputError: The file does not exist, cannot be read, states no coordinate reference system, lacks a column or
+            contains no polygon; or a height is missing, negative or not a number.
     """
     path, rule, named = Path(path), rule or HeightRule(), columns or FootprintColumns()
     outlines, table, crs = _read(path, layer)
@@ -327,8 +327,8 @@ def read_footprints(
     count = len(outlines)
     if height is None and named.levels is None:
         raise InputError(
-            f"footprints {path}: the heights of the buildings are not given; name their column in --height, or that of "
-            f"the numbers of storeys in --levels (there are: {', '.join(map(str, table)) or 'none'}), or give one "
+            f"footprints {path}: the heights of the buildings are not given; give their column in --height or a column "
+            f"with numbers of storeys in --levels (columns: {', '.join(map(str, table)) or 'none'}), or give one "
             "height for all in --height"
         )
     bottoms = _numbers(path, table, named.bottom, count)
@@ -342,7 +342,7 @@ def read_footprints(
         polygon=project(outlines, frame, crs),
         bottom=bottoms,
         top=np.select([has_height, has_levels], [tops, storeys * rule.storey], bottoms + rule.default),
-        # None and NaN are missing names, as is an empty text.
+        # None, NaN and an empty text count as missing names.
         name=tuple(
             f"building-{number}" if label in (None, "") or label != label else str(label)
             for number, label in enumerate(labels, start=1)
@@ -364,7 +364,7 @@ def _local_frame(outlines: NDArray[Any], crs: str) -> Frame:
 
 
 def _read(path: Path, layer: str | None) -> tuple[NDArray[Any], dict[str, NDArray[Any]], str]:
-    """Polygons [n], the columns of their table, and the reference system."""
+    """Read the polygons [n], the columns of their table, and the coordinate reference system."""
     shapely = library("shapely", "scenes")
     features = read_features(path, layer)
     outlines = features.outline
@@ -372,7 +372,7 @@ def _read(path: Path, layer: str | None) -> tuple[NDArray[Any], dict[str, NDArra
         raise InputError(
             f"footprints {path}: has no reference system; add its .prj file, or convert it to GeoJSON"
         )
-    # Polygons, of one or several parts.
+    # Polygons with one or more parts.
     is_polygon = np.isin(shapely.get_type_id(outlines), (3, 6))
     if not is_polygon.any():
         raise InputError(
@@ -399,18 +399,18 @@ def _is_number(text: str) -> bool:
 def _numbers(
     path: Path, columns: dict[str, NDArray[Any]], source: str | float, count: int
 ) -> NDArray[np.float64]:
-    """Numbers from a column or a constant [count]; NaN if the column has none; texts are parsed as lengths.
+    """Read numbers [count] from a column, or repeat a constant; NaN where the column has no value.
 
-    Numbers are in metres, or in the unit that the column's name states.
+    Numbers are in metres, or in the unit that the column's name states. Texts are parsed as lengths.
 
     Raises:
-        InputError: There is no such column, or one of its values is not a height.
+        InputError: There is no such column, or a value in it is not a height.
     """
     if isinstance(source, str) and source not in columns:
         with suppress(ValueError):
             source = float(source)
     elif isinstance(source, str) and _is_number(source):
-        _LOG.warning("%s: %s is interpreted as the column of that name, not as a number", path, source)
+        _LOG.warning("%s: %s is interpreted as the name of a column, not as a number", path, source)
     values = _column(path, columns, source) if isinstance(source, str) else np.full(count, float(source))
     unit = find_length_unit([source]) if isinstance(source, str) else 1.0
     if values.dtype == object:

@@ -1,8 +1,8 @@
 """Vector files and height models, opened with a closed list of drivers.
 
-GDAL has drivers that fetch network addresses, open other files or run pipelines that a file names (VRT, WMS, WFS,
-GDALG), and it chooses the driver by the file's content. Only formats without references to other files are opened here.
-They are recognised by their first bytes, and the sizes that they declare are checked before anything is read.
+GDAL has drivers that fetch URLs, open other files or run pipelines named in a file (VRT, WMS, WFS, GDALG), and it
+chooses the driver by the file's content. This module opens only formats without references to other files. They are
+recognized by their first bytes, and the sizes that they declare are checked before the data are read.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from calibray.support.messages import first_line, shortened
 from calibray.support.output_files import exists
 
 RASTER_DRIVER: Final = "GTiff"
-"""The driver of rasters: GeoTIFF, including cloud-optimized files."""
+"""GDAL's driver for rasters: GeoTIFF, including cloud-optimized files."""
 
 VECTOR_FORMATS: Final = "GeoJSON, a Shapefile, a GeoPackage, a FlatGeobuf file or an Esri geodatabase"
-"""Formats of vector files, for messages."""
+"""Supported formats of vector files, for messages."""
 
 MOST_CELLS: Final = 25_000_000
-"""Largest number of cells of a height model that are read; filling gaps needs about 40 bytes for each."""
+"""Largest number of cells that are read from a height model; filling gaps needs about 40 bytes per cell."""
 
 LARGEST_BLOCK: Final = 2**28
-"""Largest block of a raster [bytes]; GDAL decompresses a block as a whole."""
+"""Largest block of a raster [bytes]; GDAL decompresses whole blocks."""
 
 TEXT_GROWTH: Final = 15
-"""Memory of parsed GeoJSON or DXF as a multiple of the file's size."""
+"""Memory needed to parse GeoJSON or DXF, as a multiple of the file size [1]."""
 
 HEIGHTS: Final = (-1000.0, 10_000.0)
 """Range of heights on land [m]; -32768 and -9999 mark gaps that the file does not declare."""
@@ -53,10 +53,10 @@ _MAGIC: Final = (
 
 _LOG: Final = logging.getLogger(__name__)
 _DXF: Final = re.compile(rb"\s*(?:999\s*\n[^\n]*\n\s*)*0\s*\n\s*SECTION\s*\n[^<{]*", re.DOTALL)
-"""Start of a DXF file, without `<` and `{`, which start files of other drivers."""
+"""Start of a DXF file, without `<` and `{`, which mark the formats of other drivers."""
 
 _INSUNITS: Final = {1: 0.0254, 2: 0.3048, 4: 0.001, 5: 0.01, 6: 1.0, 14: 0.1}
-"""Units of length of DXF in metres: inches, feet, millimetres, centimetres, metres, decimetres."""
+"""DXF units of length [m]: inches, feet, millimetres, centimetres, metres, decimetres."""
 
 _METRES: Final = {
     **dict.fromkeys(("", "m", "metre", "meter", "metres", "meters"), 1.0),
@@ -67,7 +67,7 @@ _METRES: Final = {
     **dict.fromkeys(("cm", "centimetre", "centimeter"), 0.01),
     **dict.fromkeys(("dm", "decimetre", "decimeter"), 0.1),
 }
-"""Units of heights in metres."""
+"""Units of height [m] by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +76,8 @@ class Features:
 
     Attributes:
         outline: Geometries [n].
-        columns: Attributes by name [n] each.
-        crs: Reference system of the geometries; None if the file states none.
+        columns: Attributes by name, each [n].
+        crs: Coordinate reference system of the geometries; None if the file states none.
     """
 
     outline: NDArray[Any]
@@ -86,7 +86,7 @@ class Features:
 
 
 def read_features(path: Path, layer: str | None) -> Features:
-    """Read the features of a vector file in one of `VECTOR_FORMATS`, or of one of its layers.
+    """Read the features of a vector file in one of the `VECTOR_FORMATS`, or those in one of its layers.
 
     Raises:
         InputError: The file does not exist, has another format, is damaged, or does not fit into memory.
@@ -107,7 +107,7 @@ def read_features(path: Path, layer: str | None) -> Features:
             _check_text_size(path, "DXF")
             driver = "DXF"
         if driver is None:
-            raise InputError(f"{path}: is none of the formats that are read; give {VECTOR_FORMATS}")
+            raise InputError(f"{path}: is not in a supported format; give {VECTOR_FORMATS}")
         return _read_with_gdal(path, layer, driver)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from None
@@ -121,7 +121,7 @@ def _head(path: Path, size: int = 100) -> bytes:
 
 
 def stated_unit(path: Path) -> float | None:
-    """The unit of length [m] that the header of a DXF file states ($INSUNITS); None without one, or for other files."""
+    """The unit of length [m] in the header of a DXF file ($INSUNITS); None if it is missing or the file is not DXF."""
     code = (
         re.search(rb"\$INSUNITS\s+70\s+(\d+)\s", _head(path, 65536))
         if path.suffix.lower() == ".dxf"
@@ -141,9 +141,9 @@ def _check_text_size(path: Path, what: str) -> None:
 
 def _read_with_gdal(path: Path, layer: str | None, driver: str) -> Features:
     pyogrio, shapely = library("pyogrio", "scenes"), library("shapely", "scenes")
-    # Absolute, so that no part of the name is taken for a prefix of GDAL's, such as /vsicurl or WFS:.
+    # An absolute path, so that no part of the name is interpreted as a GDAL prefix, such as /vsicurl or WFS:.
     file = str(path.resolve())
-    # Blocks of a DXF file may contain blocks, so that some kilobytes of it become gigabytes.
+    # DXF blocks can be nested, so that a few kilobytes would expand to gigabytes.
     pyogrio.set_gdal_config_options({"DXF_INLINE_BLOCKS": False})
     try:
         if layer is None:
@@ -155,7 +155,7 @@ def _read_with_gdal(path: Path, layer: str | None, driver: str) -> Features:
         count = int(info["features"])
         if info["driver"] != driver:
             raise InputError(f"{path}: is damaged; give {VECTOR_FORMATS}")
-        # A feature with its outline and attributes takes at least 500 bytes.
+        # A feature with its outline and attributes needs at least 500 bytes.
         if count * 500 > available_memory():
             raise InputError(
                 f"{path}: declares {count:,} features, more than fit into memory; cut out the area that you need"
@@ -172,7 +172,7 @@ def _read_with_gdal(path: Path, layer: str | None, driver: str) -> Features:
 
 
 def _read_geojson(path: Path) -> Features:
-    """Read GeoJSON (RFC 7946, and the member `crs` of its predecessor), which GDAL would try with other drivers."""
+    """Read GeoJSON (RFC 7946, with the earlier member `crs`) without GDAL, which would also try other drivers."""
     shapely = library("shapely", "scenes")
     _check_text_size(path, "GeoJSON")
     try:
@@ -199,12 +199,12 @@ def _read_geojson(path: Path) -> Features:
         raise InputError(
             f"{path}: cannot be read ({first_line(error)}); give valid GeoJSON of features, as UTF-8"
         ) from None
-    # CRS84 is WGS 84 with longitude first, which is how all coordinates are taken here.
+    # CRS84 is WGS 84 with longitude first, the order assumed for all coordinates here.
     return Features(outline, columns, WGS84 if crs is not None and crs.endswith("CRS84") else crs)
 
 
 def _column(values: list[Any]) -> NDArray[Any]:
-    """A column: numbers if all of its values are numbers or missing, otherwise objects."""
+    """A column as numbers if all its values are numbers or missing, otherwise as objects."""
     if all(
         value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in values
     ):
@@ -219,10 +219,10 @@ class HeightModel:
     """An open height model.
 
     Attributes:
-        path: Its file.
-        dataset: The raster of rasterio.
-        crs: Its reference system as WKT, without heights.
-        metres: Unit in metres of its numbers, after scale and offset.
+        path: The file.
+        dataset: The raster, as opened by rasterio.
+        crs: Horizontal coordinate reference system as WKT.
+        metres: Unit of the heights after scale and offset [m].
     """
 
     path: Path
@@ -231,16 +231,16 @@ class HeightModel:
     metres: float
 
     def read(self, first: NDArray[np.integer], last: NDArray[np.integer]) -> np.ma.MaskedArray:
-        """Heights [rows, columns], [m], from a first row and column to a last; gaps are masked.
+        """Read heights [rows, columns], [m], from the first to the last row and column, inclusive; gaps are masked.
 
         Raises:
-            InputError: There are too many, they cannot be read, or one is not a height on land.
+            InputError: There are too many heights, they cannot be read, or one is not a height on land.
         """
         rasterio = library("rasterio", "scenes")
         rows, columns = (last - first + 1).tolist()
         if rows * columns > MOST_CELLS:
             raise InputError(
-                f"height model {self.path}: {rows * columns:,} cells lie in the scene, more than {MOST_CELLS:,}; give "
+                f"height model {self.path}: {rows * columns:,} cells are in the scene, more than {MOST_CELLS:,}; give "
                 "a coarser model, or lower the margin"
             )
         window = rasterio.windows.Window(first[1], first[0], columns, rows)
@@ -257,8 +257,9 @@ class HeightModel:
         if np.ma.filled(wrong, False).any():
             value = stored[np.ma.filled(wrong, False)][0]
             raise InputError(
-                f"height model {self.path}: {int(wrong.sum())} of {rows * columns} cells have no height on land, such "
-                f"as {value:g}; declare the number of missing heights (gdal_edit.py -a_nodata {value:g}), or the unit"
+                f"height model {self.path}: {int(wrong.sum())} of {rows * columns} cells have values that are not "
+                f"heights on land, such as {value:g}; declare this as nodata (gdal_edit.py -a_nodata {value:g}), or "
+                "correct the unit"
             )
         return heights
 
@@ -268,14 +269,14 @@ def open_height_model(path: Path) -> Iterator[HeightModel]:
     """Open a height model, a GeoTIFF.
 
     Raises:
-        InputError: The file does not exist, is not a GeoTIFF or cannot be used: it states no reference system or unit
-            that is known, no regular grid, or another scale in a file next to it.
+        InputError: The file does not exist or is not a GeoTIFF; its coordinate reference system or unit is unknown; it
+            has no regular grid; or a file next to it changes its heights.
     """
     rasterio = library("rasterio", "scenes")
     if not path.is_file():
         raise InputError(f"height model {path}: does not exist; check the path")
     _check_sidecars(path)
-    # No file next to the model is opened: a mask or overview may be any format, a VRT included.
+    # No file next to the model is opened, because a mask or overview may have any format, including VRT.
     environment = rasterio.Env(
         GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR", GDAL_PAM_ENABLED="NO", GDAL_CACHEMAX=256
     )
@@ -295,7 +296,7 @@ def open_height_model(path: Path) -> Iterator[HeightModel]:
 
 
 def _check_sidecars(path: Path) -> None:
-    """Refuse files next to a model that change its heights, because they are not read."""
+    """Refuse a model if a file next to it, which is not read, changes its heights."""
     mask, auxiliary = Path(f"{path}.msk"), Path(f"{path}.aux.xml")
     if mask.exists():
         raise InputError(f"height model {path}: its mask {mask.name} is not read; write it into the GeoTIFF")
@@ -319,7 +320,7 @@ def _check_layout(path: Path, dataset: Any) -> None:
     if not np.isfinite([*affine]).all() or not np.isfinite(determinant) or determinant == 0:
         raise InputError(
             f"height model {path}: its geotransform {shortened(str(tuple(affine)[:6]), 200)} is not a grid; "
-            "give one with cells of finite size"
+            "give a model with cells of finite size"
         )
     height, width = dataset.block_shapes[0]
     bands = dataset.count if dataset.interleaving is not None and dataset.interleaving.name == "pixel" else 1
@@ -332,14 +333,14 @@ def _check_layout(path: Path, dataset: Any) -> None:
 
 
 def _systems(path: Path, dataset: Any) -> tuple[str, float]:
-    """The horizontal reference system as WKT, and the unit of heights [m]."""
+    """The horizontal coordinate reference system as WKT, and the unit of heights [m]."""
     crs = parse_crs(dataset.crs.to_wkt())
     parts = crs.sub_crs_list if crs.is_compound else [crs]
     horizontal = next((part for part in parts if part.is_projected or part.is_geographic), None)
     if horizontal is None:
         raise InputError(
             f"height model {path}: its reference system {shortened(crs.name, 100)!r} has no position on the globe; "
-            f"give one with a projection, or longitude and latitude"
+            f"give a model with a map projection, or with longitude and latitude"
         )
     axes = [axis for part in parts for axis in part.axis_info if axis.direction in ("up", "down")]
     if any(axis.direction == "down" for axis in axes):
@@ -357,6 +358,6 @@ def _systems(path: Path, dataset: Any) -> tuple[str, float]:
     if len(declared) > 1 and not np.allclose(list(declared), min(declared), rtol=1e-4):
         raise InputError(
             f"height model {path}: its band states heights in {unit!r}, its reference system in another unit; "
-            "correct one"
+            "correct one of them"
         )
     return horizontal.to_wkt(), max(declared, default=1.0)

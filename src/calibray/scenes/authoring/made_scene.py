@@ -1,7 +1,7 @@
-"""Scenes that Calibray makes: their materials, their files with the assumptions, and the scene of footprints.
+"""Making scenes: materials, scene files with a record of assumptions, and scenes from footprints.
 
-By default roofs and walls have separate materials. Sionna RT finds wedges within one mesh only, so eaves diffract only
-if roofs and walls share a material (`Palette(roof=None)`). The upright edges of walls always diffract.
+By default, roofs and walls have separate materials. Sionna RT finds wedges only within one mesh, so eaves diffract only
+if roofs and walls share a material (`Palette(roof=None)`). The vertical edges of walls always diffract.
 """
 
 from __future__ import annotations
@@ -41,26 +41,26 @@ from calibray.support.messages import did_you_mean
 from calibray.support.output_files import check_outputs, write_text
 
 SCENE_FILES: Final = ("scene.xml", "scene.json")
-"""What is written next to the meshes."""
+"""Files written next to the folder of meshes."""
 
 THICKEST: Final = 100.0
-"""Largest thickness of a material of a new scene [m]."""
+"""Largest thickness of a material in a new scene [m]."""
 
 _NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
 
 @dataclass(frozen=True)
 class SurfaceMaterial:
-    """A material of a new scene, with the constants of ITU-R P.2040.
+    """A material of a new scene, with constants from ITU-R P.2040.
 
     Attributes:
-        name: Name of the material; not a name of ITU-R P.2040, because Sionna RT reserves these.
-        itu: Material of ITU-R P.2040 that gives the constants.
+        name: Name of the material; ITU-R P.2040 names are not allowed, because Sionna RT reserves them.
+        itu: ITU-R P.2040 material that gives the constants.
         thickness: Thickness of the slab [m].
 
     Raises:
-        InputError: The name is an ITU name or has characters other than letters, digits, `_` and `-`; there is no such
-            ITU material; or the thickness is not greater than 0 and at most `THICKEST`.
+        InputError: The name is an ITU name or contains characters other than letters, digits, `_` and `-`; there is no
+            such ITU material; or the thickness is not greater than 0 and at most `THICKEST`.
     """
 
     name: str
@@ -69,11 +69,13 @@ class SurfaceMaterial:
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
-            raise InputError(f"material {self.name!r}: must be letters, digits, '_' and '-', a letter first")
+            raise InputError(
+                f"material {self.name!r}: must consist of letters, digits, '_' and '-', a letter first"
+            )
         if is_itu_name(self.name):
             suggestion = f"{self.name.removeprefix('itu_').removeprefix('itu-')}_wall"
             raise InputError(
-                f"material {self.name!r}: is a name of ITU-R P.2040, which Sionna RT reserves; name it "
+                f"material {self.name!r}: is an ITU-R P.2040 name, which Sionna RT reserves; name it "
                 f"{suggestion!r}, for example"
             )
         if self.itu not in ITU_NAMES:
@@ -82,17 +84,17 @@ class SurfaceMaterial:
             )
         if not 0 < self.thickness <= THICKEST:
             raise InputError(
-                f"material {self.name}: thickness = {self.thickness!r} must be greater than 0 and at most "
+                f"material {self.name}: thickness = {self.thickness!r}: must be greater than 0 and at most "
                 f"{THICKEST:g} m"
             )
 
     def constants(self) -> dict[str, float | str]:
-        """The constants in the form of a scene file."""
+        """The constants as written in a scene file."""
         return {"type": self.itu, "thickness": self.thickness}
 
 
 def material_name(kind: str) -> str:
-    """The name of a material for a type of wall, whose name may have any characters.
+    """Make a material name from a type of wall, which may contain any characters.
 
     Example:
         >>> material_name("tür 2"), material_name("brick"), material_name("2 x drywall")
@@ -108,10 +110,10 @@ class Palette:
     """The materials of buildings and ground.
 
     Attributes:
-        wall: Walls.
-        window: Windows.
-        roof: Roofs and undersides; None for the walls' material, which makes eaves diffract.
-        ground: The ground.
+        wall: Material of walls.
+        window: Material of windows.
+        roof: Material of roofs and undersides; None for the walls' material, which makes eaves diffract.
+        ground: Material of the ground.
     """
 
     wall: SurfaceMaterial = SurfaceMaterial("walls", "concrete", 0.3)
@@ -125,13 +127,13 @@ class MadeScene:
     """A scene that Calibray made.
 
     Attributes:
-        path: Its XML file.
-        frame: Position on the globe; None if unknown.
+        path: The XML file.
+        frame: Geographic frame of the scene; None if unknown.
         bounds: West, south, bottom, east, north and top [6], [m].
         triangles: Number of triangles by material.
         counts: Number of objects used, repaired or left out, by kind.
-        guessed: The buildings whose height is assumed, by the source of the assumption.
-        walls: How the lines of a floor plan were used.
+        guessed: Buildings whose height is assumed, by the source of the assumption.
+        walls: Sentences that state how the lines of a floor plan were used.
     """
 
     path: Path
@@ -169,9 +171,9 @@ def write_made_scene(
     materials: Sequence[SurfaceMaterial],
     overwrite: bool = False,
 ) -> None:
-    """Write a scene and the assumptions made; with `overwrite`, replace files that Calibray did not write.
+    """Write a scene and its assumptions; with `overwrite`, replace files that Calibray did not write.
 
-    Other materials and repeated ones are ignored.
+    Materials that no object uses and repeated materials are ignored.
 
     Raises:
         InputError: Two different materials, or a material and a mesh, have the same name; or a file must not be
@@ -211,26 +213,27 @@ def make_scene(
     overwrite: bool = False,
     trees: Trees | None = None,
 ) -> MadeScene:
-    """Make a scene of buildings and ground.
+    """Make a scene with buildings and ground.
 
     Args:
         footprints: The buildings.
         folder: Folder for `scene.xml`, `scene.json` and the meshes.
-        frame: Position of the scene on the globe, which the files store.
-        terrain: The ground; by default it is level, z = 0, and extends `margin` beyond the buildings. On a terrain, the
-            heights of a building and of its parts are measured from the lowest ground under its walls.
+        frame: Geographic frame of the scene, which is stored in the files.
+        terrain: The ground; by default, it is level at z = 0 and extends `margin` beyond the buildings. With terrain,
+            the heights of a building and of its parts are measured from the lowest ground under its walls.
         palette: The materials.
-        windows: How walls are divided into wall and window; None for walls without windows.
+        windows: Division of walls into wall and window; None for walls without windows.
         margin: Distance by which level ground extends beyond the buildings [m].
         ground: Whether to make ground; without it, buildings are closed at the bottom.
-        per_building: One mesh per building and material, named `BUILDING-MATERIAL`, instead of one per material.
-            Calibray can then give some buildings a separate material. Tracing many meshes takes longer.
-        overwrite: Replace files that Calibray did not write.
-        trees: Trees; those over the ground are written next to the scene as `TREES_FILE`, which needs a frame.
+        per_building: Whether to make one mesh per building and material, named `BUILDING-MATERIAL`, instead of one per
+            material. A study can then give individual buildings a separate material. Tracing many meshes takes longer.
+        overwrite: Whether to replace files that Calibray did not write.
+        trees: Trees; those within `margin` of the buildings are written next to the scene, as `TREES_FILE`; needs
+            `frame`.
 
     Raises:
-        InputError: There is no building, the margin is out of range, the folder cannot be written, or a file there must
-            not be replaced.
+        InputError: There is no building, the margin is out of range, the folder cannot be written to, or a file in it
+            must not be replaced.
     """
     folder = check_outputs(folder, (*SCENE_FILES, TREES_FILE), overwrite=overwrite)
     palette = palette or Palette()
@@ -258,7 +261,7 @@ def make_scene(
     materials = [palette.wall, palette.window, palette.roof or palette.wall, palette.ground]
     scene = MadeScene(folder / SCENE_FILES[0], frame, *extent(objects), counts, guessed)
     write_made_scene(scene, objects, materials, overwrite)
-    # The trees of a scene that this one replaces are no longer here.
+    # Removes the trees of a scene that this scene replaces.
     (folder / TREES_FILE).unlink(missing_ok=True)
     if trees is not None and frame is not None and len(trees):
         trees.write(folder, frame)
@@ -266,7 +269,7 @@ def make_scene(
 
 
 def _base_heights(footprints: Footprints, terrain: Terrain | None) -> NDArray[np.float64]:
-    """Height from which each building rises [n], [m]: below the lowest ground under its walls."""
+    """Base height of each building [n], [m]: the lowest ground under its walls, less `SINK`; 0 without terrain."""
     if terrain is None:
         return np.zeros(len(footprints))
     shapely = library("shapely", "scenes")
@@ -276,7 +279,7 @@ def _base_heights(footprints: Footprints, terrain: Terrain | None) -> NDArray[np
     )
     lowest = np.full(len(footprints), np.inf)
     np.minimum.at(lowest, building, terrain.heights(*corners.T))
-    # The heights of parts are measured from the ground of the whole building, so that they stand on each other.
+    # The heights of parts are measured from the base of the whole building, so that parts stand on each other.
     parts, wholes = np.flatnonzero(footprints.part), np.flatnonzero(~footprints.part)
     inside = shapely.point_on_surface(footprints.polygon[parts])
     part, whole = shapely.STRtree(footprints.polygon[wholes]).query(inside, predicate="within")

@@ -17,16 +17,16 @@ from calibray.scenes.authoring.geodata import open_height_model
 from calibray.scenes.meshes import Mesh
 
 MAX_POINTS: Final = 4_000_000
-"""Largest number of points of a ground sheet, which limits memory."""
+"""Largest number of points in a ground sheet, which limits memory use."""
 
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Heights of the ground over a grid; each cell is two triangles, divided from south-west to north-east.
+    """Heights of the ground on a grid; each cell is two triangles, divided from south-west to north-east.
 
     Attributes:
         x: Eastings of the grid, ascending [nx], [m].
-        y: Northings, ascending [ny], [m].
+        y: Northings of the grid, ascending [ny], [m].
         z: Heights [ny, nx], [m].
         repairs: Number of heights that were filled in, by reason.
     """
@@ -37,7 +37,7 @@ class Terrain:
     repairs: dict[str, int] = field(default_factory=dict)
 
     def heights(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Interpolate heights [n], [m], on the triangles; outside the grid, use the height at its border."""
+        """Interpolate heights [n], [m], on the triangles; outside the grid, use the height at the nearest border."""
         x = np.clip(np.asarray(x, dtype=float), self.x[0], self.x[-1])
         y = np.clip(np.asarray(y, dtype=float), self.y[0], self.y[-1])
         column = np.clip(np.searchsorted(self.x, x, side="right") - 1, 0, len(self.x) - 2)
@@ -64,7 +64,7 @@ class Terrain:
 
 
 def make_level_ground(bounds: ArrayLike) -> Terrain:
-    """Make a level rectangle of two triangles at z = 0 within west, south, east and north [4], [m]."""
+    """Make a level rectangle of two triangles at z = 0; the bounds are west, south, east and north [4], [m]."""
     west, south, east, north = np.asarray(bounds, dtype=float)
     return Terrain(np.array([west, east]), np.array([south, north]), np.zeros((2, 2)))
 
@@ -82,15 +82,15 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
         path: A GeoTIFF that states its reference system; its scale, offset, unit and missing heights are respected.
         frame: The scene's frame.
         bounds: The area to cover in the frame: west, south, east and north [4], [m].
-        spacing: Width of the grid's cells [m]; by default that of the model, but at least 1 m.
+        spacing: Width of the grid's cells [m]; by default, the cell width of the model, but at least 1 m.
 
     Returns:
-        The terrain, interpolated linearly between the centres of the model's cells. Where the model has no height, as
-        on water, the nearest height is used and counted.
+        The terrain, interpolated linearly between the centres of the model's cells. Where the model has no height, such
+        as on water, the height of the nearest cell is used; such cells are counted.
 
     Raises:
         InputError: The file does not exist, cannot be read or used (see `open_height_model`), does not cover the bounds
-            or has no height in them, or the grid would be too fine.
+            or has no heights within them, or the grid would be too fine.
     """
     path = Path(path)
     west, south, east, north = np.asarray(bounds, dtype=float)
@@ -104,9 +104,9 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
             centre = frame.to_geographic([(west + east) / 2, (south + north) / 2, 0])[:2]
             raise InputError(
                 f"height model {path}: does not cover the scene, {east - west:.0f} m x {north - south:.0f} m "
-                f"around {centre.round(5).tolist()}; give a larger one, or lower the margin"
+                f"around {centre.round(5).tolist()}; give a larger model, or lower the margin"
             )
-        # One cell more on each side, for the interpolation.
+        # One additional cell on each side, for interpolation.
         first = np.maximum(np.floor([row.min() - 1, column.min() - 1]).astype(int), 0)
         last = np.ceil([row.max() + 1, column.max() + 1]).astype(int)
         last = np.minimum(last, [dataset.height - 1, dataset.width - 1])
@@ -119,8 +119,8 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
     columns, rows = (max(2, int(np.ceil(length / spacing)) + 1) for length in (east - west, north - south))
     if columns * rows > MAX_POINTS:
         raise InputError(
-            f"spacing = {spacing:g} m: makes {columns * rows} points of ground, more than {MAX_POINTS}; "
-            "give a wider one"
+            f"spacing = {spacing:g} m: gives {columns * rows} points of ground, more than {MAX_POINTS}; "
+            "give a wider spacing"
         )
     x, y = np.linspace(west, east, columns), np.linspace(south, north, rows)
     grid_x, grid_y = np.meshgrid(x, y)
@@ -135,12 +135,12 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
 def pixels(
     x: NDArray[np.float64], y: NDArray[np.float64], frame: Frame, crs: str, affine: object
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Column and row of a raster at positions in the frame; integers at the centres of cells."""
+    """Column and row of a raster at positions in the frame; cell centres have integer values."""
     east, north = transformer(frame.crs, crs).transform(x + frame.easting, y + frame.northing)
     inverse = ~affine  # type: ignore[operator]
     column = inverse.a * east + inverse.b * north + inverse.c
     row = inverse.d * east + inverse.e * north + inverse.f
-    # The affine transform counts from the corner of the first cell, not from its centre.
+    # The affine transform is measured from the corner of the first cell, not from its centre.
     return column - 0.5, row - 0.5
 
 
@@ -149,7 +149,7 @@ def _fill(path: Path, heights: np.ma.MaskedArray) -> tuple[NDArray[np.float64], 
     values = heights.filled(np.nan)
     missing = np.ma.getmaskarray(heights) | ~np.isfinite(values)
     if missing.all():
-        raise InputError(f"height model {path}: has no height within the scene; give one that covers it")
+        raise InputError(f"height model {path}: has no height within the scene; give a model that covers it")
     if not missing.any():
         return values, {}
     nearest = np.asarray(distance_transform_edt(missing, return_distances=False, return_indices=True))

@@ -1,4 +1,4 @@
-"""Trees of an OpenStreetMap extract: single trees, tree rows, woods and forests as polygons with heights."""
+"""Trees in an OpenStreetMap extract: single trees, tree rows, woods and forests as polygons with heights."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ KINDS: Final = {
     ("natural", "wood"): "wood",
     ("landuse", "forest"): "forest",
 }
-"""Kinds of trees by the tag of OpenStreetMap."""
+"""Kinds of trees by OpenStreetMap tag."""
 
 HEIGHTS: Final = {"tree": 10.0, "tree row": 10.0, "wood": 15.0, "forest": 15.0}
-"""Assumed heights [m]: 15 m is the mean of the wood in which ITU-R P.833's largest loss was measured; few maps state
-heights."""
+"""Assumed heights [m], because few maps state heights. The mean height was 15 m in the wood where the largest loss in
+ITU-R P.833 was measured."""
 
 CROWN: Final = 6.0
 """Assumed diameter of a crown [m]."""
 
 CLEARANCE: Final = 2.5
-"""Height at which crowns of single trees and rows begin [m], high enough for people to pass; woods begin at the
+"""Height of the bottom of the crowns of single trees and rows [m], high enough for people to pass; woods begin at the
 ground."""
 
 TALLEST: Final = 120.0
@@ -51,14 +51,14 @@ WIDEST_CROWN: Final = 60.0
 
 @dataclass(frozen=True, eq=False)
 class Trees:
-    """Trees as upright prisms.
+    """Trees as vertical prisms.
 
     Attributes:
         outline: Shapely polygons in the scene's frame [n], [m].
         kind: A value of `KINDS` [n].
-        bottom: Height above the ground at which each begins [n], [m].
-        top: Height at which it ends [n], [m].
-        assumed: Whether its height is an assumption [n].
+        bottom: Height of the bottom of each prism above the ground [n], [m].
+        top: Height of the top of each prism above the ground [n], [m].
+        assumed: Whether each height is an assumption [n].
     """
 
     outline: NDArray[Any]
@@ -72,18 +72,18 @@ class Trees:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of polygons by kind, and of those with an assumed height."""
+        """Number of polygons by kind, and number of polygons with an assumed height."""
         assumed = {"of them with an assumed height": int(self.assumed.sum())} if self.assumed.any() else {}
         return dict(Counter(f"{name}s" for name in self.kind.tolist())) | assumed
 
     def within(self, bounds: NDArray[np.float64]) -> Trees:
-        """The trees that reach into west, south, east and north [4], [m]."""
+        """The trees wholly or partly within the bounds west, south, east and north [4], [m]."""
         shapely = library("shapely", "scenes")
         here = shapely.intersects(self.outline, shapely.box(*bounds)) if len(self) else slice(None)
         return replace(self, **{item.name: getattr(self, item.name)[here] for item in fields(self)})
 
     def write(self, folder: Path, frame: Frame) -> None:
-        """Write `TREES_FILE`: longitude and latitude, with the kind and both heights of each polygon."""
+        """Write `TREES_FILE`, with the outline (longitude, latitude), kind and both heights of each polygon."""
         shapely = library("shapely", "scenes")
 
         def degrees(corner: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -109,9 +109,9 @@ class Trees:
 
 
 def read_trees(path: str | Path, frame: Frame) -> Trees:
-    """Read the trees of an extract: nodes, ways and areas with a tag of `KINDS`.
+    """Read the trees in an extract: nodes, ways and areas with a tag in `KINDS`.
 
-    The tags `height` and `diameter_crown` are used if they are stated, otherwise `HEIGHTS` and `CROWN`.
+    The tags `height` and `diameter_crown` are used if they are present, otherwise `HEIGHTS` and `CROWN`.
 
     Raises:
         InputError: The file cannot be read, or pyosmium is not installed.
@@ -142,28 +142,28 @@ def read_trees(path: str | Path, frame: Frame) -> Trees:
         [height or HEIGHTS[kind] for height, kind in zip(heights, kinds, strict=True)], dtype=float
     )
     kind, narrow = np.array(kinds, dtype=str), np.isin(kinds, ("tree", "tree row"))
-    # Points and lines become discs and strips of a crown's width; areas keep their outline.
+    # Points become discs and lines become strips, as wide as a crown; areas keep their outline.
     radius = np.where(narrow, [0.5 * (crown or CROWN) for crown in crowns], 0.0)
     outline = np.array(shapes, dtype=object)
     if len(outline):
         outline = shapely.make_valid(project(outline, frame, WGS84))
         outline = np.where(narrow, shapely.buffer(outline, radius), outline)
-    # A low tree keeps half of its height as a crown.
+    # The crown of a low tree is half as high as the tree.
     bottom = np.where(narrow, np.minimum(CLEARANCE, top / 2), 0.0)
     return Trees(outline, kind, bottom, top, np.array([height is None for height in heights], dtype=bool))
 
 
 def _stated(tags: Mapping[str, str], key: str, largest: float) -> float | None:
-    """A length of a map [m]; None if it is not stated, cannot be read or is impossible."""
+    """The length in a tag [m]; None if it is not stated, cannot be parsed or is out of bounds."""
     length = parse_length(tags.get(key))
     return length if length is not None and 0 < length <= largest else None
 
 
 LEAST: Final = 2.0
-"""Height from which vegetation counts as trees [m], as in canopy models from laser scans."""
+"""Smallest height of vegetation that counts as trees [m], as in canopy models from laser scans."""
 
 STEP: Final = 1.0
-"""Step to which heights are rounded, so that cells form polygons [m]; canopy models err by metres."""
+"""Step to which heights are rounded so that adjacent cells form polygons [m]; canopy models have errors of metres."""
 
 
 def read_canopy(
@@ -172,13 +172,13 @@ def read_canopy(
     """Read the trees within bounds from a raster of canopy heights.
 
     Args:
-        path: A GeoTIFF of heights above the ground, opened and bounded like a height model (`open_height_model`);
-            a gap has no trees.
+        path: A GeoTIFF of heights above the ground, with the same requirements and limits as a height model
+            (`open_height_model`); gaps have no trees.
         frame: The scene's frame.
-        bounds: West, south, east and north in it [4], [m].
+        bounds: West, south, east and north in the frame [4], [m].
 
     Returns:
-        Shapely polygons in the frame [n], [m], and the height of the trees on each [n], [m].
+        Shapely polygons in the frame [n], [m], and the height of the trees in each [n], [m].
 
     Raises:
         InputError: The file cannot be used, or has no trees within the bounds.
@@ -198,7 +198,7 @@ def read_canopy(
     classes = np.round(heights / STEP).astype(np.int32)
     a, b, c, d, e, f = (float(value) for value in tuple(affine)[:6])
     row, column = (int(value) for value in first)
-    # The transform of the part that was read, with its origin at its own first cell.
+    # The transform of the part that was read, with the origin at the first cell of this part.
     window = type(affine)(a, b, c + a * column + b * row, d, e, f + d * column + e * row)
     polygons = [
         (shapely.from_geojson(json.dumps(shape)), value * STEP)
@@ -212,6 +212,6 @@ def read_canopy(
     inside = shapely.intersects(outline, shapely.box(*bounds)) if polygons else np.zeros(0, dtype=bool)
     if not inside.any():
         raise InputError(
-            f"canopy {path}: has no trees of {LEAST:g} m or more within the scene; give one that covers it"
+            f"canopy {path}: has no trees of {LEAST:g} m or more within the scene; give a canopy model that covers it"
         )
     return outline[inside], np.array([top for _, top in polygons])[inside]

@@ -1,10 +1,10 @@
-"""Wall alignment: walls that lie in one plane except for the rounding of a map are moved into one plane.
+"""Wall alignment: walls that would lie in one plane but for the rounding of coordinates are moved into one plane.
 
-Maps round corners: OpenStreetMap to a centimetre, and Calibray to a millimetre. The front of a row of houses, or a wall
-cut where another one meets it, then consists of several planes that almost coincide. Sionna RT accepts images within 1
-cm of each other but distinguishes planes by much smaller differences, so it finds one reflection several times.
-Edges that continue each other therefore get one straight line by least squares, and corners move onto the lines of
-their walls. Input is in whole millimetres, output in metres.
+Coordinates are rounded: in OpenStreetMap to a centimetre, and in Calibray to a millimetre. The front of a row of
+houses, or a wall cut where another wall meets it, then consists of several planes that almost coincide. Sionna RT
+accepts images within 1 cm of each other but distinguishes planes by much smaller differences, so it finds the same
+reflection several times. Therefore, one straight line is fitted to collinear edges by least squares, and corners are
+moved onto the lines of their walls. Input is in whole millimetres, output in metres.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 TOLERANCE: Final = 25.0
-"""Distance from a straight line that rounding explains, for walls that continue each other over some metres [mm]."""
+"""Distance from a straight line that rounding can cause, for collinear walls a few metres long [mm]."""
 
 REACH: Final = 30_000.0
-"""Largest gap between two walls in line, such as the width of a street [mm]."""
+"""Largest gap between two collinear walls, such as the width of a street [mm]."""
 
 TURN: Final = 0.05
-"""Sine of the largest angle between two walls in line; rounding turns short walls by that much."""
+"""Sine of the largest angle between two collinear walls; rounding can turn short walls by this much."""
 
 CROSSING: Final = 0.2
 """Sine of the smallest angle at which the crossing of two lines defines a corner."""
@@ -48,7 +48,7 @@ class Alignment:
 
 
 def align(triangles: NDArray[np.int64], tolerance: float = TOLERANCE) -> Alignment:
-    """Align walls that continue each other, of triangles [F, 3, 3], [mm], upright or level.
+    """Align collinear walls; the triangles [F, 3, 3], [mm], are vertical or level.
 
     Corners within `tolerance` [mm] of a straight line are moved onto it, unless that would reverse an edge or a level
     triangle.
@@ -58,7 +58,7 @@ def align(triangles: NDArray[np.int64], tolerance: float = TOLERANCE) -> Alignme
     sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     original = points.astype(float)
     area = _area(original[faces])
-    # An upright triangle has no area in plan; its sides in plan are edges of walls.
+    # A vertical triangle has no area in plan; its sides in plan are edges of walls.
     is_wall = np.repeat(area == 0, 3)
     edges = np.unique(sides[is_wall & (sides[:, 0] != sides[:, 1])], axis=0)
     moved = _move_onto_lines(original, edges, tolerance)
@@ -66,7 +66,7 @@ def align(triangles: NDArray[np.int64], tolerance: float = TOLERANCE) -> Alignme
 
 
 def _area(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Twice the signed area of triangles in plan [F, 3, 2] -> [F]."""
+    """Twice the signed area [F] of triangles in plan [F, 3, 2]."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
@@ -74,7 +74,7 @@ def _area(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 def _move_onto_lines(
     points: NDArray[np.float64], edges: NDArray[np.int64], tolerance: float
 ) -> NDArray[np.float64]:
-    """Move points onto the line of the edges that end in them, or to the crossing of their two longest lines."""
+    """Move each point onto the line of the edges that end at it, or to the crossing of the two longest such lines."""
     moved = points.copy()
     line = _lines(points[edges], edges, tolerance)
     if not (line >= 0).any():
@@ -89,11 +89,11 @@ def _move_onto_lines(
         step = along * ((points[point] - middle[first]) @ along)
         crossing = next((other for other in others if abs(_cross(along, direction[other])) > CROSSING), None)
         if crossing is not None:
-            # Crossing of both lines, by Cramer's rule.
+            # Crossing of the two lines, by Cramer's rule.
             reach = _cross(middle[crossing] - middle[first], direction[crossing])
             step = along * reach / _cross(along, direction[crossing])
         target = middle[first] + step
-        # At a small angle, a crossing can be far from the corner.
+        # If the angle is small, the crossing can be far from the corner.
         if np.hypot(*(target - points[point])) <= 2 * tolerance:
             moved[point] = target
     return moved
@@ -104,15 +104,15 @@ def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 def _lines(segments: NDArray[np.float64], edges: NDArray[np.int64], tolerance: float) -> NDArray[np.int64]:
-    """Number of the line of each edge, from 0; -1 for edges that continue no other [E].
+    """Number of the line of each edge, from 0; -1 for edges that are not collinear with any other [E].
 
-    Edges that share a corner are joined to runs first, then runs near each other to lines.
+    Edges that share a corner are first joined into runs; then, nearby runs are joined into lines.
     """
     if not len(segments):
         return np.zeros(0, dtype=np.int64)
     run = _group(segments, _parallel(segments, _touching(edges)), tolerance)
     single = run < 0
-    # Each edge that continues no other is a run of its own.
+    # Each remaining edge is a run of its own.
     run[single] = run.max() + 1 + np.arange(single.sum())
     middle, direction, _ = _fit_lines(segments, run)
     ends = ((segments - middle[run][:, None]) @ direction[run][..., None])[..., 0]
@@ -123,7 +123,7 @@ def _lines(segments: NDArray[np.float64], edges: NDArray[np.int64], tolerance: f
     # Pairs of runs with ends within reach of each other.
     near = KDTree(runs.reshape(-1, 2)).query_pairs(REACH, output_type="ndarray").reshape(-1, 2) // 2
     line = _group(runs, _parallel(runs, near), tolerance)
-    # A run of several edges is a line even if no other run continues it.
+    # A run of several edges is a line even if no other run is collinear with it.
     alone = (line < 0) & (np.bincount(run) > 1)
     line[alone] = line.max() + 1 + np.arange(alone.sum())
     return line[run]
@@ -141,7 +141,7 @@ def _touching(edges: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _parallel(segments: NDArray[np.float64], pairs: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The pairs of different segments with nearly the same direction, each once [P, 2]."""
+    """The pairs of different segments that are nearly parallel, each pair once [P, 2]."""
     direction = segments[:, 1] - segments[:, 0]
     direction /= np.hypot(*direction.T)[:, None]
     one, other = direction[pairs[:, 0]], direction[pairs[:, 1]]
@@ -151,10 +151,10 @@ def _parallel(segments: NDArray[np.float64], pairs: NDArray[np.int64]) -> NDArra
 
 
 def _group(segments: NDArray[np.float64], pairs: NDArray[np.int64], tolerance: float) -> NDArray[np.int64]:
-    """Number of the line that each segment shares with others, from 0; -1 for none [S]."""
+    """Number of the line that each segment shares with others, from 0; -1 if it shares none [S]."""
     line = np.full(len(segments), -1)
     closeness, count = tolerance, 0
-    # Short segments of a bow link into a chain that leaves every line. Such a chain is retried with a smaller distance.
+    # Short segments of an arc can form a chain that no line fits. Such a chain is retried with a smaller distance.
     while len(pairs) and closeness > 1:
         pairs = pairs[_continues(segments, pairs, closeness)]
         graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(segments), len(segments)))
@@ -199,7 +199,7 @@ def _across(
 def _fit_lines(
     segments: NDArray[np.float64], line: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """A point and the direction of each line by total least squares of its segments' ends, and its length."""
+    """A point on each line and its direction, fitted to the segments' ends by total least squares, and total length."""
     used = line >= 0
     ends, number = segments[used], np.repeat(line[used], 2)
     length = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
@@ -208,7 +208,7 @@ def _fit_lines(
     middle = np.column_stack([np.bincount(number, weight * axis) for axis in points.T]) / total[:, None]
     x, y = (points - middle[number]).T
     xx, xy, yy = (np.bincount(number, weight * product) for product in (x * x, x * y, y * y))
-    # The principal axis of the weighted second moments.
+    # Angle of the principal axis of the weighted second moments.
     angle = np.arctan2(2 * xy, xx - yy) / 2
     return middle, np.column_stack([np.cos(angle), np.sin(angle)]), total
 

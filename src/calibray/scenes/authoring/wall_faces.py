@@ -1,7 +1,7 @@
-"""Wall faces: plans that draw both faces of a wall contain every wall twice.
+"""Merging of wall faces: a plan that shows both faces of each wall contains every wall twice.
 
-Sionna RT models a wall as one sheet whose material has a thickness. `merge_faces` replaces two parallel lines of one
-type, a wall's thickness apart, by one sheet midway between them.
+Sionna RT models a wall as one sheet whose material has a thickness. `merge_faces` replaces two parallel lines of the
+same type, one wall thickness apart, with one sheet midway between them.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ THICKEST: Final = 0.6
 """Largest thickness of a wall whose faces are merged [m]."""
 
 _PARALLEL: Final = np.cos(np.radians(2.0))
-_TOUCHING: Final = 0.02  # distance of ends that meet [m]
-_SAME: Final = ("kind", "bottom", "top", "thickness")  # what sheets of one wall have in common
+_TOUCHING: Final = 0.02  # distance below which ends meet [m]
+_SAME: Final = ("kind", "bottom", "top", "thickness")  # attributes that sheets of one wall have in common
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class MergedPlan:
     """The sheets of a plan, and how its lines were used.
 
     Attributes:
-        sheets: One for each wall, door and window.
+        sheets: One sheet for each wall, door and window.
         lines: Number of lines that were merged as faces.
-        report: What was merged, kept and left out, in one sentence each.
+        report: Sentences that state what was merged, kept and left out.
     """
 
     sheets: Sequence[Segment]
@@ -43,20 +43,20 @@ class MergedPlan:
 def merge_faces(segments: Sequence[Segment]) -> MergedPlan:
     """Merge the two faces of each wall into one sheet.
 
-    Two lines are faces of one wall if they have the same type, bottom and top, are parallel, and are adjacent at the
-    distance of a wall's thickness over more than that distance. In addition, no line nearer to one of them may be its
-    other face. The distance is at most `THICKEST`, and within a fifth or 2 cm of the thickness if that is given. Where
-    one long face is opposite several short ones, as between the rooms along a corridor, each pair makes a sheet, and
-    gaps between the sheets up to `THICKEST` are closed. Ends lie midway between the faces' ends, so that corners meet.
+    Two lines are faces of one wall if they have the same type, bottom and top, are parallel, and overlap over a length
+    that exceeds the distance between them and half of the shorter line. No closer line may be the opposite face of
+    either. The distance is at most `THICKEST`, and within a fifth or 2 cm of the thickness if that is given. Where one
+    long face is opposite several short ones, as between a corridor and its rooms, each pair gives a sheet, and gaps of
+    up to `THICKEST` between the sheets are closed. Ends are midway between the faces' ends, so that corners meet.
 
-    The remaining part of a face that is longer than the other one is kept as a sheet in the same plane. The short lines
-    that close the outline of a wall are left out. All walls of a type without a given thickness get the median of the
-    distances of their faces, weighted with their lengths.
+    Where one face is longer than the opposite face, the remaining part is kept as a sheet in the same plane. The short
+    lines that close the outline of a wall are left out. All walls of a type without a given thickness get the median
+    distance between their faces, weighted by length.
 
-    If less than half the length of a type's lines has another face, that type is drawn as single lines: two of them
-    that are close together are two walls, and are kept.
+    If less than half of the total length of a type's lines has an opposite face, the type is drawn as single lines: two
+    lines that are close together are separate walls, and both are kept.
 
-    Returns the sheets, followed by the lines without another face.
+    Returns the sheets, followed by the lines without an opposite face.
     """
     pairs = _face_pairs(segments)
     faced = _types_drawn_as_faces(segments, pairs)
@@ -105,28 +105,28 @@ def _face_pairs(segments: Sequence[Segment]) -> list[tuple[int, int]]:
         if distance is not None:
             distances[other, one] = distance
             nearest[[one, other]] = np.minimum(nearest[[one, other]], distance)
-    # A wall has one other face, but that may be drawn in pieces at nearly the same distance.
+    # A face has one opposite face, which may be drawn in pieces at nearly the same distance.
     return [
         pair for pair, distance in sorted(distances.items()) if (distance <= nearest[list(pair)] + 0.01).all()
     ]
 
 
 def _types_drawn_as_faces(segments: Sequence[Segment], pairs: Sequence[tuple[int, int]]) -> set[str]:
-    """The types whose lines have another face along at least half of their length."""
+    """The types whose lines have an opposite face along at least half of their total length."""
     length: dict[str, float] = defaultdict(float)
     faced: dict[str, float] = defaultdict(float)
     for segment in segments:
         length[segment.kind] += segment.length
     for one, other in pairs:
-        # Each pair covers this length of both of its lines.
+        # Each pair covers this length on both of its lines.
         low, high = _span(segments[one], segments[other])
         faced[segments[one].kind] += 2 * (high - low)
-    # A plan of faces pairs nearly all its length, a plan of single lines only the odd two walls.
+    # If a plan shows faces, nearly all of its length is paired; if it shows single lines, only a few walls are.
     return {kind for kind in length if faced[kind] >= 0.5 * length[kind]}
 
 
 def _face_distance(one: Segment, other: Segment) -> float | None:
-    """Distance of two lines that may be faces of one wall [m]; None if they cannot be."""
+    """Distance between two lines that may be faces of one wall [m]; None if they cannot be."""
     if (one.kind, one.bottom, one.top) != (other.kind, other.bottom, other.top):
         return None
     if abs(one.direction @ other.direction) < _PARALLEL:
@@ -142,25 +142,25 @@ def _face_distance(one: Segment, other: Segment) -> float | None:
 
 
 def _relative(one: Segment, other: Segment) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The ends of a segment along and across another one, from that one's start [2], [m]."""
+    """Coordinates of the ends of `other` along and across `one`, from the start of `one`, each [2], [m]."""
     direction = one.direction
     offset = np.array([other.start, other.end]) - np.array(one.start)
     return offset @ direction, offset @ [-direction[1], direction[0]]
 
 
 def _span(one: Segment, other: Segment) -> tuple[float, float]:
-    """Where a segment has another one opposite, from and to, along it [m]."""
+    """The range along `one` that is opposite `other`, measured from the start of `one` [m]."""
     low, high = sorted(_relative(one, other)[0].tolist())
     return max(low, 0.0), min(high, one.length)
 
 
 def _offset(one: Segment, other: Segment) -> float:
-    """Distance of another segment to the left of one [m]."""
+    """Mean distance of `other` to the left of `one` [m]."""
     return float(np.mean(_relative(one, other)[1]))
 
 
 def _part(segment: Segment, start: float, end: float, offset: float) -> Segment:
-    """The part of a segment between two distances from its start [m], moved to its left [m]."""
+    """The part of a segment between two distances from its start [m], moved to the left by `offset` [m]."""
     direction = segment.direction
     base = np.array(segment.start) + np.array([-direction[1], direction[0]]) * offset
     first, last = ((base + direction * distance).tolist() for distance in (start, end))
@@ -168,10 +168,10 @@ def _part(segment: Segment, start: float, end: float, offset: float) -> Segment:
 
 
 def _merge_pair(one: Segment, other: Segment) -> Segment:
-    """The sheet between two faces: over their overlap, with its ends midway where both faces end near each other."""
+    """The sheet between two faces, over their overlap; where both faces end near each other, it ends midway."""
     low, high = sorted(_relative(one, other)[0].tolist())
-    # At a corner, one face ends a wall's thickness before the other: midway is the centre line of the wall that
-    # crosses.
+    # At a corner, one face ends a wall's thickness before the other; midway is the centre line of the wall that it
+    # meets.
     start = low / 2 if abs(low) <= THICKEST else max(low, 0.0)
     end = (high + one.length) / 2 if abs(high - one.length) <= THICKEST else min(high, one.length)
     sheet = _part(one, start, end, _offset(one, other) / 2)
@@ -179,7 +179,7 @@ def _merge_pair(one: Segment, other: Segment) -> Segment:
 
 
 def _left_over(index: int, pairs: Sequence[tuple[int, int]], segments: Sequence[Segment]) -> list[Segment]:
-    """The parts of a face without another face, longer than `THICKEST`, moved into the plane of the nearest sheet."""
+    """The parts of a face, longer than `THICKEST`, without an opposite face, moved into the plane of the sheet."""
     face = segments[index]
     opposite = [segments[sum(pair) - index] for pair in pairs if index in pair]
     spans = sorted((*_span(face, other), _offset(face, other)) for other in opposite)
@@ -192,7 +192,7 @@ def _left_over(index: int, pairs: Sequence[tuple[int, int]], segments: Sequence[
 
 
 def _closes_wall(segment: Segment, pairs: Sequence[tuple[int, int]], segments: Sequence[Segment]) -> bool:
-    """Whether a line joins ends of the two faces of a wall."""
+    """Whether a line connects the ends of the two faces of a wall."""
     if segment.length > THICKEST:
         return False
     for one, other in pairs:
@@ -208,7 +208,7 @@ def _closes_wall(segment: Segment, pairs: Sequence[tuple[int, int]], segments: S
 
 
 def _close_gaps(sheets: Sequence[Segment]) -> list[Segment]:
-    """Join sheets of one wall that only a crossing wall separates."""
+    """Join sheets of one wall that are separated only by a crossing wall."""
     joined: list[Segment] = []
     for sheet in sorted(sheets, key=lambda sheet: min(sheet.start, sheet.end)):
         for index, before in enumerate(joined):
@@ -229,7 +229,7 @@ def _close_gaps(sheets: Sequence[Segment]) -> list[Segment]:
 
 
 def _thicknesses(sheets: Sequence[Segment], distances: Sequence[float]) -> dict[str, float]:
-    """The thickness of the walls of each type without one [m]: the median distance of their faces, by length."""
+    """Thickness of the walls of each type without a given one [m]: the median distance of faces, weighted by length."""
     thickness = {}
     for kind in sorted({sheet.kind for sheet in sheets if sheet.thickness is None} - OPENINGS):
         walls = sorted(
@@ -243,7 +243,7 @@ def _thicknesses(sheets: Sequence[Segment], distances: Sequence[float]) -> dict[
 
 
 def _described(what: str, sheets: Sequence[Segment], distances: Sequence[float] = ()) -> list[str]:
-    """Number and length of sheets by type and, if given, the distance of their faces to a centimetre."""
+    """Number and total length of sheets by type and, if given, by distance between faces, rounded to centimetres."""
     groups: dict[tuple[str, str], list[float]] = defaultdict(list)
     for index, sheet in enumerate(sheets):
         apart = f", {distances[index]:.2f} m apart" if distances else ""
