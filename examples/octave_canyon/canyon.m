@@ -1,6 +1,6 @@
 function canyon(request_file, response_file, walls)
   % Path loss in a straight street canyon by the image method: the direct path and one reflection each off the ground
-  % and both walls. The code runs in MATLAB and GNU Octave 7 or later. docs/reference/program-files.md describes its files.
+  % and both walls. The code runs in MATLAB and GNU Octave 7 or later. Its files: docs/reference/program-files.md.
   % With 'half-space' as the third argument, surfaces are half-spaces: nothing is reflected from their rear face.
   request = jsondecode(fileread(request_file));
   if ~strcmp(request.schema, 'calibray.request') || request.version ~= 1
