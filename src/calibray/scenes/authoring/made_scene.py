@@ -241,8 +241,10 @@ def make_scene(
         raise InputError("there is no building to make a scene from; check the file and its columns")
     if not 0 <= margin <= WIDEST:
         raise InputError(f"margin = {margin!r}: must be 0 to {WIDEST:g} m")
-    base = _base_heights(footprints, terrain)
-    cells, overlapping = split_overlaps(footprints, base + footprints.bottom, base + footprints.top)
+    level = _ground_heights(footprints, terrain)
+    base = level if terrain is None else level - SINK
+    bottom = np.where(footprints.bottom > 0, level + footprints.bottom, base)
+    cells, overlapping = split_overlaps(footprints, bottom, level + footprints.top)
     shell = extrude(cells, windows, base if ground else None)
     objects = _objects(shell, palette, footprints.name if per_building else None)
     if ground:
@@ -268,8 +270,8 @@ def make_scene(
     return scene
 
 
-def _base_heights(footprints: Footprints, terrain: Terrain | None) -> NDArray[np.float64]:
-    """Base height of each building [n], [m]: the lowest ground under its walls, less `SINK`; 0 without terrain."""
+def _ground_heights(footprints: Footprints, terrain: Terrain | None) -> NDArray[np.float64]:
+    """Height of the lowest ground under the walls of each building [n], [m], from which its heights are measured."""
     if terrain is None:
         return np.zeros(len(footprints))
     shapely = library("shapely", "scenes")
@@ -284,7 +286,7 @@ def _base_heights(footprints: Footprints, terrain: Terrain | None) -> NDArray[np
     inside = shapely.point_on_surface(footprints.polygon[parts])
     part, whole = shapely.STRtree(footprints.polygon[wholes]).query(inside, predicate="within")
     np.minimum.at(lowest, parts[part], lowest[wholes[whole]])
-    return np.floor((lowest - SINK) * 100) / 100
+    return np.floor(lowest * 100) / 100
 
 
 def _objects(shell: Shell, palette: Palette, buildings: Sequence[str] | None) -> list[MeshObject]:
