@@ -12,6 +12,7 @@ from calibray.engines import Replay
 from calibray.engines.compression import MIN_PATHS, compress, sparse_weights, strongest
 from calibray.engines.replay import Computation
 from calibray.errors import InputError
+from calibray.materials import Material
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Kind, Paths, take
 
@@ -99,6 +100,18 @@ def test_a_link_that_scatters_nothing_at_some_candidate_has_no_path_there(parame
     loss = Replay(few, parameters).path_loss(np.array([[4.0, 4.0, 0.0], [4.0, 4.0, 0.5]]))
     assert np.isposinf(loss[0, 0])
     assert np.isfinite(loss[1, 0])
+
+
+def test_a_link_behind_metal_has_no_path_before_and_after(parameters) -> None:
+    """No power passes a metal sheet, whatever the candidate."""
+    metal = Material(1.0, 1e7, 0.1)
+    shut = synthetic.program([(Kind.REFRACTION,)] * 200, seed=3, links=1, materials=synthetic.LAMBERTIAN)
+    material = np.full(200, list(shut.materials).index("ground"), dtype=np.int32)
+    shut = replace(shut, material=material, materials={**shut.materials, "ground": metal})
+    only = replace(parameters, items=parameters.items[:2])
+    few = compress(shut, only, TOLERANCE_DB).paths
+    for some in (shut, few):
+        assert np.isposinf(Replay(some, only).path_loss(np.array([[4.0, 4.0]]))).all()
 
 
 def test_weights_that_cannot_exist_are_not_made_up() -> None:

@@ -264,7 +264,7 @@ def sparse_weights(
         gain = residual @ unit
         gain[chosen] = 0.0
         best = np.argmax(gain)
-        if np.abs(residual).max() <= bound or gain[best] <= 0:
+        if np.abs(residual).max(initial=0.0) <= bound or gain[best] <= 0:
             break
         chosen = np.append(chosen, best)
     weight = nnls(unit[:, chosen], one)[0] if len(weight) < len(chosen) else weight
