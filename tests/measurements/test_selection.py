@@ -27,7 +27,7 @@ def test_a_wide_table_becomes_one_row_per_link():
     [
         ({"ap3": "x"}, "rss", "no column 'ap3'"),
         ({"ap1": "x", "ap2": "x"}, "rss", "two columns have the same transmitter"),
-        ({"ap1": "x"}, "room", "column 'room' exists already"),
+        ({"ap1": "x"}, "room", "column 'room' already exists"),
         ({"room": "x"}, "rss", "row 1, column 'room': 'a' is not a number"),
         ({"empty": "x"}, "rss", "the columns empty contain no value"),
     ],
@@ -141,7 +141,7 @@ def test_a_filter_sees_the_columns_of_a_track(tmp_path):
         (gpx('<trkpt lat="x" lon="1"/>'), None, "a point is malformed"),
         (gpx('<trkpt lat="1" lon="1"><time>noon</time></trkpt>'), None, "not ISO 8601"),
         ("<gpx", None, "not well-formed"),
-        (gpx(point(1, 1, 0) + point(1, 1, 9)), "2026-05-01T12:00:05", "none of 1 times .* lies on the track"),
+        (gpx(point(1, 1, 0) + point(1, 1, 9)), "2026-05-01T12:00:05", "none of 1 times .* is on the track"),
         (gpx(point(1, 1, 0)), "noon", "log.csv, column 'time': a time cannot be read"),
         (gpx(point(1, 1, 0) + point(1, 1, 9)), "2026-05-01", "column 'time': contains dates without times"),
     ],

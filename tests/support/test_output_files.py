@@ -80,8 +80,8 @@ def test_inputs_links_and_devices_are_never_replaced(tmp_path, overwrite):
     os.mkfifo(tmp_path / "fifo.csv")
     (tmp_path / "null.csv").symlink_to("/dev/null")
     for name, message in {
-        "links.csv": "is an input; name another",
-        "hard.csv": "is an input; name another",
+        "links.csv": "is an input; name another file",
+        "hard.csv": "is an input; name another file",
         "soft.csv": "is a link",
         "dangling.csv": "is a link",
         "null.csv": "is a link",

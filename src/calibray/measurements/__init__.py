@@ -1,4 +1,4 @@
-"""Measured links: positions, path losses, weights and groups, read from tables and checked.
+"""Measured links: reading positions, path losses, weights and groups from tables, and checking them.
 
 `reading.measured_links` is the pipeline that converts the rows of a table to `Measurements`.
 """

@@ -81,7 +81,7 @@ LENGTH_UNITS: Final = {
 """Units of length other than the metre that column names may state [m]."""
 
 WATTS: Final = frozenset({"w", "watt", "watts", "kw", "mw", "dbw"})
-"""Words in a column's name which show that its powers are not in dBm."""
+"""Words in a column's name that show that its powers are not in dBm."""
 
 FREQUENCY_UNITS: Final = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
 """Units of carrier frequency that column names may state [Hz]."""
@@ -146,7 +146,7 @@ def words(name: object) -> frozenset[str]:
     # A time of flight must not be mistaken for a time of day.
     text = re.sub(r"(?i)time[ _-]*of[ _-]*flight", "tof", without_accents(name).replace("\u03bc", "u"))
     text = re.sub(r"(?i)round[ _-]*trip[ _-]*time", "rtt", text)
-    # Units keep their capitals together: "dBm" is one word.
+    # Units with several capitals stay one word, such as "dBm".
     text = re.sub(r"[dD][bB][mM]|dB|[kMG]?Hz", lambda unit: f" {unit[0].lower()} ", text)
     parts = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", text)
     split = (re.split(r"[^a-z0-9]+", spelling.lower()) for spelling in (text, parts))
@@ -212,18 +212,18 @@ def text_instead(frame: pd.DataFrame, *rows: str) -> str:
 
 
 def no_degrees(frame: pd.DataFrame) -> str:
-    """Hint at a column named like longitudes or latitudes whose numbers are not degrees; empty without such a column.
+    """Hint at a column named like longitudes or latitudes whose values are not degrees; empty without such a column.
 
     Example:
         >>> no_degrees(pd.DataFrame({"lat": [4734.12], "lon": [1041.84]}))
-        "; column 'lat' has values of about 4734, not degrees: write 47.5687 for 4734.12 (NMEA), and name metres x, y"
+        "; column 'lat' has values of about 4734, not degrees: write 47.5687 for 4734.12 (NMEA), or name metres x, y"
     """
     for name in numeric_columns(frame):
         largest = 90 if matches(name, "latitude") else 180
         if matches(name, "latitude", "longitude") and (median := abs(frame[name].median())) > largest:
             return (
                 f"; column {shortened(name)!r} has values of about {median:.0f}, not degrees: write 47.5687 for "
-                "4734.12 (NMEA), and name metres x, y"
+                "4734.12 (NMEA), or name metres x, y"
             )
     return ""
 
@@ -231,7 +231,7 @@ def no_degrees(frame: pd.DataFrame) -> str:
 def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) -> PositionColumns | None:
     """Find the columns that give the position of one end; metres are preferred to degrees.
 
-    With `unnamed`, columns whose names state neither end may belong to this end.
+    With `unnamed`, columns whose names do not state an end may belong to this end.
 
     Example:
         >>> find_position(pd.DataFrame({"time": [0], "lat": [50.0], "lon": [10.0]}), "rx", unnamed=True)
@@ -306,9 +306,9 @@ def find_value(table: SourceTable) -> ValueColumn:
     median = float(np.nanmedian(without_codes(table.frame[name])))
     reason = f"its name, and values of about {median:.0f}"
     if quantity == "path_loss" and median < 0:
-        quantity, reason = "path_gain", f"named a loss, but values are negative, about {median:.0f}: a gain"
+        quantity, reason = "path_gain", f"named a loss, but values of about {median:.0f} mean a gain"
     elif quantity == "path_gain" and median > 0:
-        quantity, reason = "path_loss", f"named a gain, but values are positive, about {median:.0f}: a loss"
+        quantity, reason = "path_loss", f"named a gain, but values of about {median:.0f} mean a loss"
     others = [candidate[3] for candidate in candidates[1:]]
     return ValueColumn(name, quantity, reason + (f"; not {', '.join(others)}" if others else ""))
 
@@ -357,7 +357,7 @@ def find_frequency_unit(name: str, default: str = "hz") -> float:
 
 
 def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
-    """Find the column of carrier frequencies, and the carrier of every row [Hz]; None without such a column.
+    """Find the column of carrier frequencies, and the frequency of each row [Hz]; None without such a column.
 
     The name contains a word for frequency, or else a unit of frequency. The unit is taken from the name, or else
     inferred from the magnitude of the values.
@@ -375,7 +375,7 @@ def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
         if np.isnan(values).all():
             continue
         median = float(np.nanmedian(values))
-        # Carriers are below 300 GHz, so larger numbers are in a smaller unit.
+        # Carrier frequencies are below 300 GHz, so larger numbers must be in a smaller unit.
         likely_unit = "ghz" if median < 300 else "mhz" if median < 3e5 else "hz"
         carriers = values * find_frequency_unit(name, likely_unit)
         if FREQUENCIES[0] <= np.nanmin(carriers) and np.nanmax(carriers) <= FREQUENCIES[1]:
@@ -384,7 +384,7 @@ def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
 
 
 def find_time(frame: pd.DataFrame) -> str | None:
-    """Name of the first column that is named like times, or None."""
+    """Name of the first column whose name suggests times, or None."""
     return _first([str(name) for name in frame], "time")
 
 
@@ -394,7 +394,7 @@ def find_distance(frame: pd.DataFrame) -> str | None:
 
 
 def _are_degrees(longitude: pd.Series, latitude: pd.Series) -> bool:
-    """Whether coordinates can be degrees; in some tables, columns named like degrees contain projected metres."""
+    """Whether coordinates can be degrees; some tables have projected coordinates in columns named like degrees."""
     return bool(longitude.abs().median() <= 180 and latitude.abs().median() <= 90)
 
 
@@ -410,5 +410,5 @@ def _first(names: Iterable[str], row: str) -> str | None:
 def _is_plausible(values: pd.Series, quantity: Quantity) -> bool:
     """Whether values are plausible for a quantity; the sign of a loss or gain is ignored."""
     median = float(np.nanmedian(values)) if values.notna().any() else 0.0
-    # The median is used because single values may be logging errors.
+    # The median is used because individual values may be logging errors.
     return -200 < median < -10 if quantity == "rsrp" else 20 < abs(median) < 250

@@ -41,9 +41,9 @@ class _Layout:
     """The layout of a table in a text.
 
     Attributes:
-        separator: Column separator; a space represents any white space.
+        separator: Column separator; a space stands for any white space.
         skipped: Number of lines above the header.
-        units: Unit of every column, from a row of units below the header; empty without such a row.
+        units: Unit of each column, from a row of units below the header; empty without such a row.
         unit_lines: First line of the row of units, and the line after its end, relative to the header's first line.
     """
 
@@ -139,7 +139,7 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
 
 
 def _layout(text: str, separator: str | None) -> _Layout:
-    """The layout from the first line after which all lines have equally many cells, with the widest separator."""
+    """Find the first line that can be the header of rows of equal width, and the separator with the most columns."""
     first_lines = list(islice(io.StringIO(text, newline=""), 30 + 4 * _HEAD))
     for above in range(31):  # number of lines above the header
         layouts: list[tuple[int, _Layout]] = []
@@ -233,7 +233,7 @@ def _plain_numbers(column: pd.Series, decimal: str) -> pd.Series:
 
 
 def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
-    """The decimal mark of the numbers of a CSV text.
+    """The decimal mark of the numbers in a CSV text.
 
     Raises:
         InputError: The decimal mark is not the same in all numbers.
@@ -257,7 +257,7 @@ def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
 def _checked_layout(path: Path, text: str, layout: _Layout) -> tuple[list[str], list[int], bool]:
     """Header and first line of each row of a CSV text; faults that pandas would silently repair are refused.
 
-    The last result states whether every row ends with an additional empty cell.
+    The third result states whether every row ends with an additional empty cell.
 
     Raises:
         InputError: A column appears twice, or a row has more or fewer cells than the header.

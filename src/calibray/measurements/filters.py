@@ -2,7 +2,7 @@
 
 Python's parser reads a filter, and this module interprets the syntax tree on whole columns; nothing is passed to
 `eval`. Only the operators, functions and methods listed below exist: no attributes, no subscripts, no other calls.
-Precedence is as in pandas queries: ``&`` and ``|`` mean ``and`` and ``or``, and bind as loosely.
+Precedence is as in pandas queries: ``&`` and ``|`` mean ``and`` and ``or``, with the same low precedence.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from calibray.errors import InputError
 from calibray.support.messages import did_you_mean, shortened
 
 MAX_LENGTH: Final = 10_000
-"""Largest number of characters of a filter."""
+"""Largest number of characters in a filter."""
 
 MAX_PARTS: Final = 2_000
-"""Largest number of names, values and operators of a filter."""
+"""Largest number of names, values and operators in a filter."""
 
 MAX_DEPTH: Final = 50
 """Largest nesting depth of a filter."""
 
 MAX_PATTERN_LENGTH: Final = 200
-"""Largest number of characters of a regular expression."""
+"""Largest number of characters in a regular expression."""
 
 MAX_SEARCH_STEPS: Final = 1e9
-"""Largest sum of squared text lengths in a column that is searched with a repetition; the search takes 2 to 5 s."""
+"""Largest sum of squared text lengths in a column for patterns with a repetition; the search takes 2 to 5 s."""
 
 _MAX_INTEGER: Final = int(np.iinfo(np.int64).max)
 
@@ -170,7 +170,7 @@ def _check_pattern(pattern: str, column: pd.Series) -> None:
     if _REPETITION.match(pattern):
         steps = float((column.dropna().astype(str).str.len().astype(float) ** 2).sum())
         if steps > MAX_SEARCH_STEPS:
-            raise InputError("the texts are too long to search for a repetition; set regex=False")
+            raise InputError("the texts are too long for a pattern with a repetition; set regex=False")
 
 
 def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
@@ -178,7 +178,7 @@ def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
 
     Raises:
         InputError: The filter is malformed or too large, uses an unknown column or a construct that is not allowed, or
-            does not give one truth value per row. The message quotes the part of the filter, not the filter's source.
+            does not give one truth value per row. The message quotes the faulty part, but not the filter's origin.
 
     Example:
         >>> frame = pd.DataFrame({"x": [1, 2, 3], "my set": ["A", "B", "A"]})
@@ -411,7 +411,7 @@ class _Interpreter:
     def _call(self, node: ast.Call) -> _Value:
         name = getattr(node.func, "attr", getattr(node.func, "id", ""))
         if not (ast.get_source_segment(self._code, node.func) or "").endswith(name):
-            # The name is written with letters that Python normalizes.
+            # The name contains letters that Python normalizes.
             raise self._refusal(node.func, f"write the method in plain letters, {name!r}")
         match node.func:
             case ast.Name():

@@ -1,4 +1,4 @@
-"""The links and their measured values."""
+"""Links and their measured values."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from calibray.support.messages import first_line, shortened
 from calibray.tables import Column, Table, hertz, named, short_html, short_text
 
 MIN_DISTANCE: Final = 1e-3
-"""Distance [m] between transmitter and receiver below which they count as coincident, without a path loss."""
+"""Distance between transmitter and receiver below which they count as coincident and have no path loss [m]."""
 
 FEW: Final = 8
 """Number of links below which no trend, noise model or prediction error is estimated from their errors."""
 
 MAX_CARRIERS: Final = 32
-"""Largest number of carriers; a column with more values probably contains another quantity."""
+"""Largest number of carrier frequencies; a column with more values probably contains another quantity."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -35,15 +35,15 @@ class Measurements:
         path_loss_db: Measured path loss [links], [dB]; all NaN for links without measured values.
         weight: Relative weights [links], [1], greater than 0; 1 unless given.
         group: Label [links] of each link's group, or None.
-        frequency: Carrier of each link [links], [Hz]; None if all have the study's carrier.
+        frequency: Carrier frequency of each link [links], [Hz]; None if all have that of the study.
         limit_db: Largest measurable path loss [links], [dB]; None if unknown.
         censored: Mask [links] of the links below the noise floor, whose path loss is at least `path_loss_db`; None if
             no link is censored.
-        table: The rows of the source table, for filters and messages; one empty row per link if not given.
+        table: The rows of the source table, used by filters and messages; one empty row per link if not given.
 
     Raises:
         InputError: Shapes disagree, a position is not finite, a transmitter and its receiver coincide, a weight is not
-            positive, a carrier or the number of carriers is implausible, or only some path losses are finite.
+            positive, a carrier frequency or the number of them is implausible, or only some path losses are finite.
 
     Example:
         >>> links = Measurements(tx=[[0, 0, 10]], rx=[[30, 40, 10]], path_loss_db=[85.0])
@@ -131,7 +131,7 @@ class Measurements:
 
     @property
     def distance(self) -> NDArray[np.float64]:
-        """The straight-line distance [links], [m] from transmitter to receiver."""
+        """Straight-line distance from transmitter to receiver [links], [m]."""
         return np.linalg.norm(self.rx - self.tx, axis=1)
 
     @property
@@ -149,7 +149,7 @@ class Measurements:
 
     @property
     def carriers(self) -> tuple[tuple[float, NDArray[np.int64]], ...]:
-        """The carriers [Hz] in ascending order, each with the indices of its links; empty if all have the study's."""
+        """Carrier frequencies [Hz], ascending, each with the indices of its links; empty if all have the study's."""
         if self.frequency is None:
             return ()
         return tuple(
@@ -158,7 +158,7 @@ class Measurements:
         )
 
     def select(self, mask: ArrayLike) -> Measurements:
-        """The links where a mask [links] is true.
+        """Select the links where a mask [links] is true.
 
         Raises:
             InputError: The mask does not have one truth value per link, or selects no link.
@@ -183,7 +183,7 @@ class Measurements:
         )
 
     def where(self, expression: str) -> NDArray[np.bool_]:
-        """The mask [links] of the links that pass a filter on the source table's columns.
+        """Mask [links] of the links that pass a filter on the source table's columns.
 
         Raises:
             InputError: The filter is not valid (see `SourceTable.where`).
@@ -191,7 +191,7 @@ class Measurements:
         return self.table.where(expression)
 
     def held_out(self, holdout: str) -> NDArray[np.bool_]:
-        """The mask [links] of the links that a filter holds out; neither part is empty.
+        """Mask [links] of the links that a filter holds out; neither part is empty.
 
         Raises:
             InputError: The filter is not valid, or one of the two parts would be empty.

@@ -1,8 +1,8 @@
-"""Observables of links from measured multipath components: the delay, power and angles of every path of every link.
+"""Observables of links from measured multipath components: the delay, power and angles of each path of each link.
 
-Each observable is the same statistic that the model computes, with a hard limit at the receiver's dynamic range. If a
-link was measured several times, for example with rotations of the receiving array, snapshots are averaged.
-Impulse responses are converted to components: the samples above a stated threshold.
+Each observable is the same statistic as the model computes, with a hard limit at the receiver's dynamic range. If a
+link was measured several times, for example with rotations of the receiving array, the snapshots are averaged.
+Impulse responses are converted to components, which are the samples above a given threshold.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ ANGLES: Final = (*(kind for kind, unit in kinds.KINDS.items() if unit == "rad"),
 SECONDS: Final = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 
 RADIANS: Final = frozenset({"rad", "radian", "radians"})
-"""Words in a column's name which show that its angles are not in degrees."""
+"""Words in a column's name that show that its angles are not in degrees."""
 
 LONGEST: Final = 0.01
-"""Largest plausible delay [s]: light travels 3,000 km in this time."""
+"""Largest plausible delay [s], in which light travels 3,000 km."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +71,9 @@ class Multipath:
 def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multipath:
     """Read a table with one row per multipath component.
 
-    The columns are recognised by their names: a delay (`delay_ns`), a path loss, path gain or power [dB]
-    (`path_loss_db`), and if present an azimuth, an elevation, and the number of the rotation or snapshot. An angle
-    counts for both ends unless its name states one (`aoa_deg`, `azimuth_tx`).
+    The columns are recognized by their names: a delay (`delay_ns`), a path loss, path gain or power [dB]
+    (`path_loss_db`), and, if present, an azimuth, an elevation, and the number of the rotation or snapshot. An angle
+    is used for both ends unless its name states one (`aoa_deg`, `azimuth_tx`).
 
     Args:
         path: The table.
@@ -113,7 +113,7 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
         )
     level_db, is_loss = table.numbers(power), re.search(r"loss|(^|_)pl(_|$)", names[power]) is not None
     median, is_level = float(np.median(level_db)), matches(power, "decibel") and "gain" not in power.lower()
-    # The received power in decibels of an uncalibrated receiver can be positive.
+    # Received power in decibels can be positive if the receiver is not calibrated.
     if (median < 0) if is_loss else (median > 0 and not is_level):
         raise InputError(
             f"{path}: column {power!r} has values of about {median:g} dB; losses must be positive, gains and "
@@ -149,7 +149,7 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
 
 
 def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:
-    """A statistic of every link in SI units, averaged over the link's snapshots, by the link's label.
+    """Compute a statistic of each link in SI units, averaged over the link's snapshots, by the link's label.
 
     Snapshots with a single component have no K-factor and are excluded from its mean. Links with no component that the
     receiver detects are left out. The components already reflect the bandwidth of the receiver.

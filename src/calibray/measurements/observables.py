@@ -38,17 +38,17 @@ KINDS: Final = {
 """Kinds of observables, each with the unit of its values."""
 
 FLIGHTS: Final = (TIME_OF_FLIGHT, ROUND_TRIP)
-"""Kinds that are times, in which a device may have a bias."""
+"""Kinds that are times, which may contain a bias of the device."""
 
 SECTORS: Final = (DEPARTURE_SECTOR, ARRIVAL_SECTOR)
 PROFILES: Final = (DELAY_BIN, *SECTORS)
-"""Kinds that are shares of a link's power in bins; each bin is a separate observable."""
+"""Kinds that are fractions of a link's power in bins; each bin is a separate observable."""
 
 SIGNED: Final = (K_FACTOR, *FLIGHTS, *PROFILES)
 """Kinds whose measured values can be negative: values in decibels, and times from a clock with a bias."""
 
 SHARE_RANGE_DB: Final = 30.0
-"""Dynamic range of the share of power in a bin, unless a study states one [dB]."""
+"""Dynamic range of the fraction of power in a bin, unless a study states one [dB]."""
 
 ROUNDING: Final = 1e-12
 """Distance within which delays [s] and azimuths [rad] count as on a limit, as for samples at multiples of 1 /
@@ -80,7 +80,7 @@ class Statistic:
 
     @property
     def bin(self) -> tuple[float, float]:
-        """Edges of the bin, both reduced by `ROUNDING`: a value at the lower edge is inside, one at the upper is not.
+        """Edges of the bin, both reduced by `ROUNDING`; a value at the lower edge is inside, one at the upper is not.
 
         Raises:
             ValueError: The statistic has no bin.
@@ -91,9 +91,9 @@ class Statistic:
         return low - ROUNDING, high - ROUNDING
 
     def limited(self, share_db: ArrayLike) -> NDArray[np.float64]:
-        """Shares of power in the bin of one of `PROFILES` [dB], limited from below by the dynamic range.
+        """Fractions of power in the bin of one of `PROFILES` [dB], limited from below by the dynamic range.
 
-        An empty bin has a finite value, in the model and in measurements.
+        An empty bin therefore has a finite value, both in the model and in measurements.
 
         Example:
             >>> Statistic(DELAY_BIN).limited([-np.inf, -30.0, 0.0]).round(2).tolist()

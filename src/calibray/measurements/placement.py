@@ -1,4 +1,4 @@
-"""Place both ends of every row in the scene's frame, from columns or a track, and move receivers out of buildings."""
+"""Place both ends of each row in the scene's frame, from columns or a track, and move receivers out of buildings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from calibray.measurements.source_table import Coordinates, SourceTable
 from calibray.support.messages import first_line
 
 TRACK_COLUMNS: Final = ("track_longitude", "track_latitude")
-"""The columns of a row's position on a track [deg]."""
+"""The columns with a row's position on a track [deg]."""
 
 NOT_ON_TRACK: Final = "rows without a position on the track, left out"
 """The entry in `changes` for rows outside the times of a track; extended if another time zone fits clearly better."""
@@ -46,7 +46,7 @@ def join_track(table: SourceTable, track: Track) -> SourceTable:
             f"with {clock} they do; check the time zone" if shift else "check the time zone and the clock"
         )
         raise InputError(
-            f"{table.source} with {track.file}: none of {len(table)} times in column {track.time!r} lies on the track, "
+            f"{table.source} with {track.file}: none of {len(table)} times in column {track.time!r} is on the track, "
             f"{first} to {last}; {remedy}"
         )
     table = table.keep(covered, NOT_ON_TRACK + (f", which {clock} would keep" if shift else ""))
@@ -103,9 +103,9 @@ def _covered(
 
 
 def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], longest_gap: float) -> float:
-    """Offset of the time zone that fits better, ahead of the track's clock [s]; 0 if none fits better.
+    """Offset of a time zone, ahead of the track's clock, that fits better [s]; 0 if none fits better.
 
-    Shifts are tried if more than a tenth of the rows are off the track, and must reduce their number by more than half.
+    Shifts are tried if more than a tenth of the rows are off the track, and must reduce this number by more than half.
     """
     seconds = seconds[np.isfinite(seconds)]
     seconds = seconds[:: 1 + len(seconds) // 10_000]
@@ -233,7 +233,7 @@ def _positions(
             ground = steps.ground(positions[:, 0], positions[:, 1])
         except InputError as error:
             raise InputError(f"{table.source}: {end}: {error}") from None
-        # The given heights are above the ground, not above the origin or the sea.
+        # The given heights are above the ground, not above the origin or sea level.
         positions[:, 2] = ground + height
     return positions
 

@@ -44,7 +44,7 @@ class LinkColumns:
         weight: Column of relative weights [1], greater than 0.
         std: Standard deviation [dB] of the values, a number or a column; the weights become 1 / std^2.
         tx_power_dbm: Transmitted power [dBm], a number or a column; only for "received_power".
-        frequency: Column of carrier frequencies, in Hz or the unit in its name.
+        frequency: Column of carrier frequencies, in hertz or the unit in its name.
 
     Raises:
         InputError: The quantity is unknown or does not match `tx_power_dbm`, or both `weight` and `std` are given.
@@ -84,7 +84,7 @@ class Averaging:
             grid, in a stretch of "distance" travelled in the order of the rows, or in a window of "time".
         size: Width or length [m], or duration [s]; not used for "place".
         time: Column of times, for "time".
-        unbiased: Whether to correct the bias in the logarithm of a mean of few samples.
+        unbiased: Whether to correct the bias in the logarithm of a mean over few samples.
         minimum_count: Smallest number of samples in an average; averages of fewer samples are left out.
     """
 
@@ -132,10 +132,10 @@ class Preparation:
         averaging: How samples are averaged.
         keep: Columns whose groups are averaged separately, in addition to the transmitter column.
         held_out: Labels of the parts that are held out separately; samples are not averaged or merged across parts.
-        observables: Columns of further measured values, which are averaged over rows that repeat a link.
+        observables: Columns of additional measured values, which are averaged over rows that repeat a link.
         flights: Observables that are times of flight, in which certain numbers can stand for a missing value.
-        computed: Functions that compute further columns, by name, after the transmitters' columns are added. A function
-            returns None if an optional column that it needs is missing.
+        computed: Functions that compute additional columns, by name, after the transmitters' columns are added. A
+            function returns None if an optional column that it needs is missing.
         inside: What to do with receivers inside buildings; nothing if None.
         outside: Function that moves positions out of buildings; required with `inside`.
     """
@@ -163,7 +163,7 @@ class Preparation:
 
     @property
     def is_filter_only(self) -> bool:
-        """Whether a filter is the only step, so that the remaining rows already are links."""
+        """Whether a filter is the only step, so that the remaining rows are already links."""
         steps = (
             *(self.track, self.transmitters, self.noise_floor_dbm, self.frame, self.ground),
             *(self.averaging, self.inside),

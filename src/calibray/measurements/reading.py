@@ -1,7 +1,7 @@
 """From a table to links: read the file, select rows, place them, average or merge, clear buildings, check.
 
-Samples are averaged to one row per area or place, in linear power. Along a street, the power fades by several dB within
-a wavelength. Ray tracing from one point does not predict this fading; it predicts the mean power over a few tens of
+Samples are averaged in linear power, to one row per area or place. Along a street, the power fades by several dB within
+a wavelength. Ray tracing to one point does not predict this fading; it predicts the mean power over a few tens of
 wavelengths (W. C. Y. Lee, "Estimate of local average power of a mobile radio signal", IEEE Trans. Veh. Technol. 34(1),
 1985: 40 wavelengths, 36 to 50 samples). Linear powers are averaged, not decibels: for Rayleigh fading, the mean of the
 decibel values is 2.5 dB too low.
@@ -62,7 +62,7 @@ def read_measurements(
         std: Standard deviation [dB] of the values, a number or a column; the weights become 1 / std^2.
         tx_power_dbm: Transmitted power [dBm], a number or a column, only for "received_power": the path loss is this
             power minus the received power, including antenna gains and cable losses.
-        frequency: Column of carrier frequencies, in Hz or the unit in its name, for links measured at several carriers.
+        frequency: Column of carrier frequencies, in hertz or the unit in its name, for links at several frequencies.
 
     Returns:
         The links that pass, in the order of the file.
@@ -103,10 +103,10 @@ def links_from_table(
     tx: Coordinates = TX_COLUMNS,
     rx: Coordinates = RX_COLUMNS,
 ) -> Measurements:
-    """Links without measured values, with NaN as path loss, from the rows of a table.
+    """Make links without measured values, with NaN as path loss, from the rows of a table.
 
-    If `group` names several columns, their labels are joined. If `frequency`, a column of carriers [Hz], is None or
-    missing in the table, all links have the study's carrier. No step may leave out rows.
+    If `group` names several columns, their labels are joined. `frequency` is a column of carrier frequencies; if it is
+    None or missing in the table, all links have the study's carrier frequency. No step may leave out rows.
 
     Raises:
         InputError: There are no rows, a column is missing or malformed, or a position is not finite.
@@ -133,7 +133,7 @@ PLAUSIBLE_POWER_DBM: Final = (-200.0, 30.0)
 
 
 LINEAR: Final = 0.1
-"""Magnitude; if all received powers of a table are below it, they are not in dBm but in another unit, such as watts."""
+"""If all received powers in a table are below this in magnitude, their unit is not dBm but, for example, watts."""
 
 
 def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> Measurements:
@@ -162,7 +162,7 @@ def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> 
 
 
 def _carriers(table: SourceTable, column: str | None) -> NDArray[np.float64] | None:
-    """Carrier of every row [rows], [Hz], from a column in the unit of its name; None without a column."""
+    """Carrier frequency of each row [rows], [Hz], from a column in the unit of its name; None without a column."""
     if column is None:
         return None
     return table.numbers(column) * column_names.find_frequency_unit(column)
@@ -181,7 +181,7 @@ def _path_loss_db(table: SourceTable, columns: LinkColumns) -> NDArray[np.float6
             _check_range(table, columns, measured, PLAUSIBLE_POWER_DBM, "check the sign and the unit")
             return -measured
         case "path_loss":
-            loss, remedy = measured, "set quantity = 'path_gain' or 'received_power' if it is one"
+            loss, remedy = measured, "set quantity = 'path_gain' or 'received_power' if it is one of these"
         case "path_gain":
             loss, remedy = -measured, "set quantity = 'path_loss' if it is one"
         case "received_power":
@@ -235,13 +235,13 @@ _PART: Final = "calibray part"
 
 
 def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
-    """Average the samples of each area, transmitter, carrier and group; without averaging, return the table unchanged.
+    """Average the samples of each area, transmitter, frequency and group; without averaging, the table is unchanged.
 
     A sample below the noise floor has a power between zero and the floor, and counts as half the floor. Averages whose
-    uncertainty then exceeds `MAX_UNCERTAINTY_DB` are left out, because the samples above the floor are only the strong
-    ones. The steps `averaging`, `keep`, `held_out`, `transmitter` and `noise_floor_dbm` are used. Returns the row of
+    uncertainty then exceeds `MAX_UNCERTAINTY_DB` are left out, because only their strongest samples are above the
+    floor. The steps `averaging`, `keep`, `held_out`, `transmitter` and `noise_floor_dbm` are used. Returns the row of
     the first sample of each average, with the mean receiver position, the mean value, and the columns `std_db`
-    (standard deviation of the samples [dB], NaN for one sample) and `count`; weights and further observables are means.
+    (standard deviation of the samples [dB], NaN for one sample) and `count`. Weights and other observables are means.
 
     Raises:
         InputError: A column is missing or not numeric, a time cannot be read, or no average remains.
@@ -269,7 +269,7 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     group = np.asarray(labels.groupby(list(labels), sort=False, dropna=False).ngroup(), dtype=np.int64)
 
     samples = pd.DataFrame({name: table.numbers(name) for name in rx})
-    # Powers are relative to the strongest sample, so that weak ones do not underflow.
+    # Powers are relative to the strongest sample, so that weak samples do not underflow.
     samples["power"] = 10 ** ((level - level.max()) / 10)
     samples["level"] = level
     samples["below"] = 0.0
@@ -312,7 +312,7 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
 
 
 def _areas(table: SourceTable, averaging: Averaging, rx: Sequence[str]) -> NDArray[np.int64]:
-    """Index of the place, cell, stretch or window of every row [rows]; `rx` names the columns of x, y and z [m]."""
+    """Index of the place, cell, stretch or window of each row [rows]; `rx` names the columns of x, y and z [m]."""
     if averaging.by == "place":
         positions = np.stack([table.numbers(name) for name in rx], axis=1)
         return join_positions(positions)
@@ -356,12 +356,12 @@ best, and coordinate conversions differ by micrometres."""
 
 
 def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
-    """Merge the rows of each link into its first row, with the means of linear power, weights and further observables.
+    """Merge the rows of each link into its first row, with the means of linear power, weights and other observables.
 
-    Rows belong to one link if their positions agree within `SAME_POSITION`, and transmitter, kept columns, carrier,
-    transmitted power and times are equal. Rows at different times remain separate links. A link below the noise floor
-    is not merged with one above it, nor a held-out row with other rows. Receivers inside buildings are moved only after
-    merging, because two positions may be moved to the same corner. The steps `keep`, `held_out`, `observables`,
+    Rows belong to one link if their positions agree within `SAME_POSITION`, and transmitter, kept columns, carrier
+    frequency, transmitted power and times are equal. Rows at different times remain separate links. A link below the
+    noise floor is not merged with one above it, nor a held-out row with others. Receivers inside buildings are moved
+    only after merging, because two positions may move to the same corner. The steps `keep`, `held_out`, `observables`,
     `transmitter`, `noise_floor_dbm` and `averaging` are used; after averaging, no repeats remain to be merged.
 
     Raises:
@@ -411,13 +411,13 @@ def _means(table: SourceTable, name: str, group: NDArray[np.int64]) -> NDArray[n
 
 
 LEAST_STEP_DB: Final = 1.0
-"""Smallest power difference between labels of a column that is noted if rows with different labels become one link."""
+"""Smallest effect of a column's labels on the power that is noted if rows with different labels become one link."""
 
 LEAST_RATIO: Final = 5.0
-"""Smallest ratio of this difference to its standard error; by chance, one in two million labels exceeds it."""
+"""Smallest ratio of this effect to its standard error; by chance, one in two million labels exceeds it."""
 
 MOST_LABELS: Final = 50
-"""Largest number of labels in such a column; a column with more probably names links or positions."""
+"""Largest number of labels in such a column; a column with more labels probably names links or positions."""
 
 
 def _note_steps(
@@ -429,14 +429,14 @@ def _note_steps(
 ) -> SourceTable:
     """Note text columns, such as days, whose labels affect the power of a link although rows are averaged over them.
 
-    Every link counts as one observation of this effect, because its rows can share errors.
+    Each link counts as one observation of this effect, because its rows can share errors.
 
     Args:
         table: The rows.
         link: The link or average to which each row belongs [rows].
         level: Power or gain [rows], [dB].
         usable: Mask of the rows whose level is above the noise floor [rows].
-        apart: Columns over whose labels rows are not averaged.
+        apart: Columns whose labels are kept apart in averaging.
     """
     rows = pd.DataFrame({"link": link, "level": level})[usable]
     for name in [str(name) for name in table.frame if name not in apart]:

@@ -78,7 +78,7 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
 def melt(
     table: SourceTable, columns: Mapping[str, str], value: str, transmitter: str, *, keep_empty: bool = False
 ) -> SourceTable:
-    """Convert a table with one column per transmitter to one row per link; links of one row stay together.
+    """Convert a table with one column per transmitter to one row per link; links from one row stay together.
 
     `value` and `transmitter` name the new columns. With `keep_empty`, cells without a value also become links, as
     needed for prediction.
@@ -88,14 +88,14 @@ def melt(
     """
     if len(set(columns.values())) != len(columns):
         raise InputError(
-            f"wide = {dict(columns)}: two columns have the same transmitter; name each differently"
+            f"wide = {dict(columns)}: two columns have the same transmitter; give each a different name"
         )
     others = [name for name in table.frame if name not in columns]
     for name in (value, transmitter):
         if name in others:
-            raise InputError(f"{table.source}: column {name!r} exists already; choose another name")
+            raise InputError(f"{table.source}: column {name!r} already exists; choose another name")
     values = np.column_stack([table.numbers(name, gaps=True) for name in columns])
-    # In row-major order: the links of one row stay together.
+    # In row-major order, the links of one row stay together.
     row, column = np.nonzero(~np.isnan(values) | keep_empty)
     if not len(row):
         raise InputError(f"{table.source}: the columns {', '.join(columns)} contain no value")
@@ -108,7 +108,7 @@ def melt(
 
 
 def plain_labels(column: Iterable[object]) -> list[str]:
-    """Normalized labels: lower case, no white space at the ends, 5 instead of 5.0, and colons instead of hyphens.
+    """Normalize labels: lower case, no leading or trailing white space, 5 for 5.0, and colons for hyphens.
 
     Tools write the same address as `AA-BB` or as `aa:bb`, and whole numbers as floats if a column has gaps.
 
@@ -131,7 +131,7 @@ def comparison(names: Iterable[object]) -> Callable[[Iterable[object]], list[str
 
 
 def naming_column(transmitters: pd.DataFrame, labels: Iterable[object]) -> str | None:
-    """The column that names the transmitters in their table: it has no repeated value and at least half the labels.
+    """The column that names the transmitters in their table: no value is repeated, and it has at least half the labels.
 
     Returns None if no column or more than one column qualifies.
 
@@ -237,8 +237,8 @@ def mask_codes(
 ) -> tuple[SourceTable, NDArray[np.bool_]]:
     """Set the codes in columns of measured values to missing, and record their number.
 
-    Codes are detected over all columns together, which contain one quantity; `stated` codes always apply. Returns the
-    table, and a mask of the rows that contained a code [rows].
+    Codes are detected in all columns together, which must contain the same quantity; `stated` codes always apply.
+    Returns the table, and a mask of the rows that contained a code [rows].
 
     Raises:
         InputError: A column does not exist.

@@ -45,11 +45,11 @@ class SourceTable:
         return len(self.frame)
 
     def assign(self, **columns: Any) -> SourceTable:
-        """The same rows with columns [rows] added or replaced."""
+        """Return the same rows with columns [rows] added or replaced."""
         return replace(self, frame=self.frame.assign(**columns))
 
     def note(self, change: str, number: int) -> SourceTable:
-        """The same rows with one more entry in `changes`."""
+        """Return the same rows with an additional entry in `changes`."""
         return replace(self, changes={**self.changes, change: int(number)})
 
     def select(self, mask: NDArray[np.bool_]) -> SourceTable:
@@ -91,7 +91,7 @@ class SourceTable:
         return self.frame[name]
 
     def numbers(self, source: str | float, gaps: bool = False) -> NDArray[np.float64]:
-        """One column as finite numbers [rows], or one number for all rows; with `gaps`, missing values are NaN.
+        """A column as finite numbers [rows], or one number repeated for all rows; with `gaps`, missing values are NaN.
 
         Raises:
             InputError: There is no such column, or a value is missing, infinite or not a number.
@@ -129,7 +129,7 @@ class SourceTable:
         return numbers
 
     def labels(self, names: str | Sequence[str]) -> NDArray[np.str_]:
-        """One column as labels [rows], or the labels of several columns joined by a space.
+        """A column as labels [rows], or the labels of several columns joined by spaces.
 
         Raises:
             InputError: There is no such column, or a label is missing.
@@ -141,10 +141,10 @@ class SourceTable:
         if (missing := column.isna().to_numpy()).any():
             first = int(np.flatnonzero(missing)[0])
             raise InputError(
-                f"{self.cell(first, names)}: the label is missing ({missing.sum()} in all); give one"
+                f"{self.cell(first, names)}: the label is missing ({missing.sum()} in all); give a label"
             )
         if pd.api.types.is_float_dtype(column):
-            # A label must not depend on other rows: in a column with gaps or 0.9, pandas stores the integer 26 as 26.0.
+            # A label must not depend on other rows; in a column with gaps or 0.9, pandas stores the integer 26 as 26.0.
             return column.astype(str).str.removesuffix(".0").to_numpy(dtype=np.str_)
         return column.astype(str).to_numpy(dtype=np.str_)
 

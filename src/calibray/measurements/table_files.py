@@ -1,7 +1,7 @@
 """Read tables from CSV, Parquet and Excel files.
 
 The first sheet of a workbook is converted to CSV text, so that one parser reads both formats. Sheets are read row by
-row, so a sheet whose only value is in its last row and column needs no more memory than others.
+row, so a sheet whose only value is in the last row and column needs no more memory than other sheets.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MAX_UNPACKED: Final = 2**28
 """Largest unpacked size of a workbook [bytes]."""
 
 MAX_CELLS: Final = 10_000_000
-"""Largest number of cells of a sheet."""
+"""Largest number of cells in a sheet."""
 
 _Cells = tuple[Any, ...]
 _ROW: Final = re.compile(rb"""<(?:\w+:)?row\s(?:[^>]*?\s)?r=["']([^"']*)["']""")
@@ -43,8 +43,8 @@ def sheet_text(path: Path) -> tuple[list[int], str]:
     """Read the first sheet of a workbook as CSV text, and the row number of each row that is not blank.
 
     A formula is replaced by its last computed value; without one, it remains text, which is refused in a column of
-    numbers. Of merged cells, the first contains the value and the others are empty. The header, which is the first row,
-    determines the columns.
+    numbers. The first of several merged cells contains the value, and the others are empty. The header, which is the
+    first row, determines the columns.
 
     Raises:
         InputError: The file is not a workbook, contains no worksheet, is too large, or has a value in a column
@@ -100,7 +100,7 @@ def _check_row_order(path: Path, sheet: bytes) -> None:
 
 
 def _rows(path: Path, computed: bool) -> Iterator[tuple[int, _Cells]]:
-    """Number and cells of every row that is not blank, up to its last value, as computed values or as formulas."""
+    """Number and cells of each row that is not blank, up to its last value, as computed values or as formulas."""
     import openpyxl
 
     # The file is opened here because openpyxl does not close files that it cannot read.
@@ -123,7 +123,7 @@ def _rows(path: Path, computed: bool) -> Iterator[tuple[int, _Cells]]:
 
 
 def _with_formulas(values: _Cells, formulas: _Cells) -> _Cells:
-    """A row of computed values, with the formula as text where there is no computed value."""
+    """A row of computed values, or formulas as text where there is no computed value."""
     padded = (*values, *[None] * (len(formulas) - len(values)))
     return tuple(
         formula if value is None and str(formula).startswith("=") else value
@@ -198,7 +198,7 @@ except Exception as error:
 """
 
 _decoded: Final[set[tuple[str | int, ...]]] = set()
-"""Files that were already decoded, with the states in which they were decoded."""
+"""Files that have already been decoded, each with its state at that time."""
 
 
 def read_table(path: str | Path) -> SourceTable:
@@ -222,7 +222,7 @@ def read_table(path: str | Path) -> SourceTable:
         case ".xlsx":
             numbers, text = sheet_text(path)
             table = parse_text(path, text, ",")
-            # Line numbers of the text also count line breaks within cells, and row numbers of the sheet blank rows.
+            # Line numbers in the text also count line breaks within cells; row numbers in the sheet count blank rows.
             # The header, units and lines above it come first, so the rows of the table are the last rows of the sheet.
             table = replace(table, row=np.array(numbers[len(numbers) - len(table) :], dtype=np.int64))
         case suffix:
@@ -271,7 +271,7 @@ class PiecedTable:
         return cls(str(path), rows, None)
 
     def pieces(self, size: int) -> Iterator[SourceTable]:
-        """The rows in the order of the file, in pieces of at most `size` rows; a column has one type in all pieces.
+        """Yield the rows in file order, in pieces of at most `size` rows; a column has the same type in all pieces.
 
         Raises:
             InputError: The file is damaged.
@@ -313,7 +313,7 @@ def _read_parquet(path: Path) -> SourceTable:
 
 
 def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> int:
-    """The declared size of row groups [bytes]; too large a size is refused, as kilobytes may decompress to gigabytes.
+    """The declared size of row groups [bytes]; it is checked because kilobytes may decompress to gigabytes.
 
     Raises:
         InputError: The size exceeds the limit or the memory.
@@ -326,17 +326,17 @@ def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> int
     )
     if size > min(limit, available_memory()):
         raise InputError(
-            f"{path}: {what} takes {size / 2**30:,.1f} GiB decompressed, at most {limit / 2**30:g} GiB and the free "
-            "memory can be read; keep only the columns and rows that you need, or write smaller row groups"
+            f"{path}: {what} takes {size / 2**30:,.1f} GiB decompressed, must take at most {limit / 2**30:g} GiB and "
+            "fit into the free memory; keep only the columns and rows that you need, or write smaller row groups"
         )
     return size
 
 
 def _decode_elsewhere(path: Path, size: int, limit: int, whole: bool) -> None:
-    """Decode a Parquet file in a process with limits: pages may be larger than declared, and rows may share one text.
+    """Decode a Parquet file in a limited process: pages may be larger than declared, and rows may share one text.
 
-    `size` is the declared size, and `limit` the largest size of the rows in memory, both in bytes. The limit applies to
-    the whole table or to a row group.
+    `size` is the declared size, and `limit` is the largest size of the rows in memory, both in bytes. The limit applies
+    to the table if `whole`, and otherwise to each piece.
 
     Raises:
         InputError: The file needs more memory or time, or is damaged.
@@ -362,14 +362,14 @@ def _run_elsewhere(path: Path, code: str, size: int) -> None:
     except TimeoutError as error:
         raise InputError(f"{path}: cannot be decompressed {error}; export it again") from None
     if not is_read:
-        raise InputError(f"{path}: its library fails while reading it; export it again")
+        raise InputError(f"{path}: the library that reads this file fails on it; export it again")
     _decoded.add(key)
 
 
 def _open_parquet(path: Path) -> Any:
     from pyarrow import parquet
 
-    # The library terminates the process if damaged metadata is contradictory.
+    # The library terminates the process if damaged metadata are contradictory.
     _run_elsewhere(path, _METADATA.format(path=str(path.resolve())), path.stat().st_size)
     try:
         # With pre_buffer, pyarrow reads ahead and keeps every row group in memory.

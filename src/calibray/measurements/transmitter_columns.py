@@ -1,6 +1,6 @@
 """Find the columns that describe transmitters.
 
-These columns join a table of links with a table of transmitters, contain the values of one transmitter each, or
+These columns join a table of links with a table of transmitters, each contain the values of one transmitter, or
 describe transmit antennas. Planning tools and operators use different names for them.
 """
 
@@ -24,8 +24,8 @@ location."""
 def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[str, str]:
     """Find the columns of a wide table, and the transmitter of each column.
 
-    The names of these columns differ only in the name of the transmitter, between separators. If there are several
-    quantities, received power or path loss is chosen. The result is empty if there are fewer than two such columns.
+    The names of these columns differ only in the transmitter's name, which is delimited by separators. If there are
+    several quantities, received power or path loss is chosen. The result is empty for fewer than two such columns.
 
     Example:
         >>> find_wide_columns(pd.DataFrame({"x": [1.0], "rss_a": [-50.0], "rss_b": [-60.0]}), ["a", "b"])
@@ -33,7 +33,7 @@ def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[
         >>> list(find_wide_columns(pd.DataFrame(columns=["A RTT(mm)", "B RTT(mm)", "A RSS", "B RSS"]), ["A", "B"]))
         ['A RSS', 'B RSS']
     """
-    # Columns by the rest of their name, such as " RSS(dBm)" of "AP1 RSS(dBm)".
+    # Columns by the remainder of their name, such as " RSS(dBm)" in "AP1 RSS(dBm)".
     families: dict[tuple[str, str], dict[str, str]] = {}
     for name in transmitters:
         pattern = re.compile(rf"(|.*[^a-z0-9]){re.escape(name.lower())}(|[^a-z0-9].*)")
@@ -84,10 +84,10 @@ def name_melted_values(columns: Iterable[str]) -> str:
 
 
 def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | None:
-    """Find the column by which two tables name the transmitter, if any.
+    """Find the common column that names the transmitter in both tables, if any.
 
-    It is the first common column whose every value in the links appears exactly once among the transmitters, or else
-    the first one that is named like transmitters, names each of them once and shares at least one value.
+    It is the first common column of which each value in the links appears exactly once among the transmitters, or else
+    the first that is named like transmitters, names each of them once and has at least one value in both tables.
     """
     partial = None
     for name in transmitters:
@@ -219,7 +219,7 @@ def find_angles(frame: pd.DataFrame, of_transmitters: bool) -> dict[str, str]:
 
 
 def unusable(frame: pd.DataFrame, key: str, column: str) -> str:
-    """The reason why a column cannot be the angle of every transmitter; empty if it can."""
+    """The reason why a column cannot contain the angle of each transmitter; empty if it can."""
     values = pd.to_numeric(frame[column], errors="coerce")
     missing = int(values.isna().sum())
     if missing or column not in numeric_columns(frame):
@@ -230,7 +230,7 @@ def unusable(frame: pd.DataFrame, key: str, column: str) -> str:
 
 
 def find_antenna_names(frame: pd.DataFrame, known: Iterable[str] = ()) -> str | None:
-    """Column with the name of each antenna's model or file; if there are several, the one with most `known` names."""
+    """Column with the name of each antenna's model or file; if several exist, the one with the most `known` names."""
     texts = [str(name) for name in frame if not pd.api.types.is_bool_dtype(frame[name])]
     names = [name for name in texts if matches(name, "antenna") and name not in numeric_columns(frame)]
     stems = {plain_name(name) for name in known}

@@ -1,13 +1,13 @@
-"""The demo: a coastal high-rise district like that of the paper, and a simulated measurement campaign.
+"""The demo: a coastal high-rise district like the one in the paper, and a simulated measurement campaign.
 
-`coastal_district/` contains its files. In the repository, `python benchmarks/demo_campaign.py FOLDER` makes them again.
+`coastal_district/` contains its files, which `python benchmarks/demo_campaign.py FOLDER` regenerates in the repository.
 """
 
 from pathlib import Path
 
 
 def demo_study_path() -> Path:
-    """The `study.toml` of the demo district, in the folder of its scene, its links and the truth.
+    """The path of the demo's `study.toml`; the folder also contains the scene, the links and the true parameters.
 
     Example:
         >>> sorted(path.name for path in demo_study_path().parent.iterdir())

@@ -25,8 +25,8 @@ _NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | g
 _DIGEST_BYTES: Final = hashlib.sha256().digest_size
 """Length of the SHA-256 digest at the start of each entry [bytes]."""
 _PRUNED_AT: Final = 16
-"""The total size is checked once per this number of written entries. With 7,000 entries, a check takes 0.08 s, as long
-as compiling a small program."""
+"""On average, the total size is checked once per this number of written entries. With 7,000 entries, a check takes
+0.08 s, as long as compiling a small program."""
 
 
 def cache_folder() -> Path | None:
@@ -90,7 +90,7 @@ class Store:
                 with suppress(OSError):
                     os.unlink(partial, dir_fd=folder)
                 raise
-            # The digest of the name determines whether to check, so that about one new entry in `_PRUNED_AT` does.
+            # The digest of the name decides whether to check, so that about one in `_PRUNED_AT` new entries does.
             if hashlib.sha256(name.encode()).digest()[0] % _PRUNED_AT == 0:
                 self._remove_oldest()
 
@@ -127,7 +127,7 @@ class Store:
         ages = []
         with suppress(OSError):
             for path in self.path.glob(f"*{self.suffix}"):
-                with suppress(OSError):  # another process may remove it meanwhile
+                with suppress(OSError):  # another process may remove it in the meantime
                     status = path.lstat()
                     if stat.S_ISREG(status.st_mode):
                         ages.append((status.st_mtime, path))

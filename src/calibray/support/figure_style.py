@@ -1,6 +1,6 @@
-"""The common style of all figures: colours that colour-blind people can distinguish, few lines, units on axes.
+"""The common style of all figures: colours for colour-blind readers, no unnecessary lines, and units on the axes.
 
-Most line colours are those of Okabe and Ito (2008). A figure in an HTML page takes the colours of its lines and text
+Most line colours are those of Okabe and Ito (2008). A figure in an HTML page takes the colours of its axes and text
 from the page, so that it is readable on light and dark backgrounds.
 """
 
@@ -30,7 +30,7 @@ BLUE: Final = "#0072b2"
 ORANGE: Final = "#d55e00"
 GREEN: Final = "#009e73"
 PALETTE: Final = ("#cc79a7", "#e69f00", "#56b4e9", "#8c5a3c", "#882255", "#6f7f2e", "#5c6bc0", "#777777")
-"""Colours for further lines, in addition to the named colours."""
+"""Additional line colours, after the named colours."""
 
 COLORS: Final = {"gwo": GREEN, "sgwo-im": BLUE, "space-mapping": FAINT, "auto": ORANGE}
 """Colour of each optimizer: the paper's methods, and Calibray's own."""
@@ -110,7 +110,7 @@ def write(figure: Figure, path: Path) -> Path:
 
 
 def inline(figure: Figure, name: str) -> str:
-    """Make an SVG element of a figure that takes its colours and font from the surrounding page.
+    """Make an SVG element from a figure; it takes its colours and font from the surrounding page.
 
     Its ids begin with `name`, and it has no external references.
     """

@@ -1,4 +1,4 @@
-"""Handling of Ctrl-C during compiled code, in which libraries convert it to their own error or drop it."""
+"""Handling of Ctrl-C in compiled code, where a library may convert it to another error or drop it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ INTERRUPTED: Final = 128 + signal.SIGINT
 """Exit status after Ctrl-C: 128 plus the number of the signal, as in shells."""
 
 GRACE: Final = 1.0
-"""Time that an interruption is given to reach the code that saves results, before it is raised again [s]."""
+"""Time for an interruption to reach the code that saves results, before it is raised again [s]."""
 
 
 @contextmanager

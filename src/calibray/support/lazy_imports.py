@@ -1,4 +1,4 @@
-"""Imports on first use: of the names in a package, so that importing it is fast, and of optional libraries."""
+"""Imports on first use: the names in a package, so that importing the package is fast, and optional libraries."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from calibray.support.messages import first_line
 def lazy_attributes(
     package: str, modules: Mapping[str, str]
 ) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
-    """Make `__all__`, `__getattr__` and `__dir__` of a package (PEP 562) from the names that its modules define.
+    """Make `__all__`, `__getattr__` and `__dir__` for a package (PEP 562) from the names that its modules define.
 
     `modules` maps each module to its names, separated by spaces; an empty text stands for the module itself.
     """

@@ -63,7 +63,7 @@ def available_memory() -> int:
 
 
 def single_blas_thread(wanted: bool = True) -> AbstractContextManager[object]:
-    """Make a context in which linear algebra uses a single thread; without effect if `wanted` is False."""
+    """Make a context in which linear algebra uses a single thread; it has no effect if `wanted` is False."""
     return _libraries().limit(limits=1, user_api="blas") if wanted else nullcontext()
 
 
@@ -101,7 +101,7 @@ def run_limited(code: str, memory: int, size: int) -> bool:
     """Run code in a separate process, which can import the same modules as this process.
 
     Args:
-        code: The code, which may call `refuse(reason)`.
+        code: Python code, which may call `refuse(reason)`.
         memory: Limit on the address space [bytes].
         size: Size of the file that the code reads [bytes], which determines the time limit.
 
@@ -113,7 +113,7 @@ def run_limited(code: str, memory: int, size: int) -> bool:
         TimeoutError: The code did not finish in time; the message states the time limit.
     """
     if not sys.executable:
-        return True  # an embedded interpreter cannot start another one
+        return True  # an embedded interpreter cannot start another interpreter
     # Large files are read at 20 MB/s or faster.
     limit = SECONDS + size / 20e6  # [s]
     program = _LIMITS.format(path=sys.path, memory=memory, refused=REFUSED) + code

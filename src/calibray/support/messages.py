@@ -36,7 +36,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def shortened(text: str, longest: int = MAX_LENGTH) -> str:
-    """Shorten a text to its start and its end if it has more than `longest` characters.
+    """Shorten a text to its beginning and end if it has more than `longest` characters.
 
     Example:
         >>> shortened("abcdefghijkl", longest=9)
@@ -51,7 +51,7 @@ def shortened(text: str, longest: int = MAX_LENGTH) -> str:
 def printable(text: str, keep: str = "") -> str:
     r"""Escape the characters of a text that a terminal or an editor would interpret, because names come from files.
 
-    Characters in `keep`, for instance line breaks, are kept; the others become Python escape sequences.
+    Characters in `keep`, for instance line breaks, are kept; others become Python escape sequences.
 
     Example:
         >>> printable("RSS\x1b[2J\n[engine]")

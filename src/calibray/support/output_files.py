@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Final, NoReturn
 from calibray.errors import InputError
 from calibray.support.messages import shortened, type_name
 
-PARTIAL: Final = ".part"  # ending of the name of an unfinished file
+PARTIAL: Final = ".part"  # suffix of unfinished files
 SIGNATURES: Final = ".calibray"  # one line per written file: SHA-256 and name; lines are only appended
 SIGNATURES_LIMIT: Final = 2**26  # size limit of a signature file [bytes]; a line takes about 80
 PATH_SEAL: Final = b"calibray/paths sha256 "  # start of a path file
@@ -32,7 +32,7 @@ STALE_SECONDS: Final = 60.0  # age at which an unfinished file is removed if its
 
 _UNFINISHED: Final = re.compile(r"\.([0-9]{1,10})-[0-9a-f]{32}" + re.escape(PARTIAL))  # with the process id
 _SIGNATURE_LINE: Final = re.compile(rb"[0-9a-f]{64}  ")  # start of each line of a signature file
-# Windows has neither of the first two flags: links need special rights there, and folders contain no FIFOs.
+# Windows has neither of the first two flags: links require special privileges there, and folders contain no FIFOs.
 NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
 
 
@@ -129,11 +129,11 @@ def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool =
         raise InputError(f"output file {file}: is a folder, a device or a FIFO; give a file")
     for source in inputs:
         if source.exists() and file.samefile(source):
-            raise InputError(f"output file {file}: is an input; name another")
+            raise InputError(f"output file {file}: is an input; name another file")
     if status.st_size and not overwrite and not is_unchanged_output(file):
         raise InputError(
-            f"output file {file}: was not written by Calibray, or has changed since; name another, move it away, or "
-            "give --overwrite"
+            f"output file {file}: was not written by Calibray, or has changed since; name another file, move this one "
+            "away, or give --overwrite"
         )
 
 
@@ -176,7 +176,7 @@ def _status(path: Path, role: str) -> os.stat_result | None:
     except OSError as error:
         raise InputError(f"{name}: cannot be accessed ({error.strerror}); choose another name") from None
     except ValueError as error:
-        raise InputError(f"{name}: is not a valid name ({error}); choose another") from None
+        raise InputError(f"{name}: is not a valid name ({error}); choose another name") from None
 
 
 def _signatures(folder: Path) -> list[str]:
@@ -190,7 +190,7 @@ def _signatures(folder: Path) -> list[str]:
 
 def _check_signature_file(folder: Path) -> None:
     """Refuse a folder whose signature file is not Calibray's, because files there could not be signed."""
-    # If it may not be read, writing fails later with the same message as for any other file.
+    # If it cannot be read, writing fails later with the same message as for any other file.
     with suppress(OSError), _open_signatures(folder, os.O_RDONLY):
         pass
 
@@ -387,7 +387,7 @@ def csv_text(table: pd.DataFrame, float_format: str | None = None, header: bool 
 
 
 def formula_free(cell: Any) -> Any:
-    """Put an apostrophe before text that a spreadsheet would read as a formula; all else is unchanged.
+    """Put an apostrophe before text that a spreadsheet would read as a formula; other values are unchanged.
 
     Example:
         >>> formula_free("=HYPERLINK(1)"), formula_free("-80.5"), formula_free("- east")

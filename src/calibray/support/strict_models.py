@@ -59,8 +59,8 @@ def explain(
 ) -> InputError:
     """Combine all errors in one message, with one line per error: file, dotted key, value, bound.
 
-    The message suggests valid keys for misspelled ones. `tagged` lists the tables that have several kinds,
-    distinguished by their key `name`.
+    The message suggests valid keys for misspelled ones. `tagged` lists the tables that exist in several kinds, which
+    are distinguished by the key `name`.
     """
     lines: dict[str, str] = {}
     for fault in error.errors():
@@ -90,7 +90,7 @@ def explain(
 
 
 def describe_fault(fault: Mapping[str, Any]) -> str:
-    """The message for an error reported by Pydantic, without the value."""
+    """The message, without the value, for an error reported by Pydantic."""
     context = fault.get("ctx") or {}
     if isinstance(cause := context.get("error"), InputError):
         return str(cause)

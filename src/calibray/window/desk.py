@@ -1,6 +1,6 @@
 """State that the steps of the window share: the study's folder, its commands, selections, and the scene in 2-D and 3-D.
 
-In the folder, only files that the command line reads and writes are used.
+The window uses only the files in the folder that the command line reads and writes.
 
 In 3-D, lengths are scaled so that the scene fits into a sphere of `RADIUS` around the origin, because the page's camera
 covers distances of 0.1 to 1000 units.
@@ -52,7 +52,7 @@ PREDICTED: Final = "-predicted.csv"
 """Suffix of the names of predicted tables."""
 
 LARGEST: Final = 2**30
-"""Largest size of an uploaded file [bytes]; put larger files into the folder."""
+"""Largest size of an uploaded file [bytes]; larger files must be put into the folder."""
 
 Control = TypeVar("Control", bound=ValueElement)
 
@@ -89,7 +89,7 @@ class StudyFolder:
         return sorted(name for name in names if not name.startswith("."))
 
     def results(self) -> list[str]:
-        """Names of the folders that contain results, the latest last."""
+        """Names of the folders that contain results, the most recent last."""
         written = {
             file.parent.name: file.stat().st_mtime_ns
             for file in self.path.glob("*/result.json")
@@ -117,7 +117,7 @@ class StudyFolder:
         Raises:
             InputError: The name is not a plain file name, Calibray does not read this kind of file, or the file exists.
         """
-        # Some systems encode an umlaut as a letter and a combining mark; in other scripts, only the marks exist.
+        # Some systems encode an umlaut as a letter and a combining mark; some scripts have only combining marks.
         name = unicodedata.normalize("NFC", name)
         letters = "".join(letter for letter in name if not unicodedata.category(letter).startswith("M"))
         shown = shortened(repr(name))
@@ -145,7 +145,7 @@ class StudyFolder:
             return {}
 
     def valid_content(self) -> dict[str, Any]:
-        """The sections of the study file, with values of the types required in a study; empty if it is not valid."""
+        """The sections of the study file, with values of the types that a study requires; empty if it is not valid."""
         content = self.content()
         try:
             Study.from_content(content, self.study_file)
@@ -292,7 +292,7 @@ class Desk:
         ui.run_javascript(f"plan.mark({json.dumps(self.point)}, {json.dumps(area)})")
 
     def keep(self, control: Control) -> Control:
-        """The control, with the value that the user entered before its step was redrawn, if it is still an option."""
+        """Restore in a control the value entered before its step was redrawn, if it is still an option."""
         name = control.text if isinstance(control, ui.switch) else str(control.props["label"])
         if name in self.entered and self.entered[name] in getattr(control, "options", [self.entered[name]]):
             control.set_value(self.entered[name])
@@ -358,7 +358,7 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
 
 
 def sites(study: Study, links: Measurements) -> list[dict[str, Any]]:
-    """The transmitters of the links, listed once for each group and carrier, because a mast may carry several sectors.
+    """The transmitters of the links, once for each group and carrier frequency, as a mast may carry several sectors.
 
     Each has a `name`, a position `tx` [m], and the values of the `columns` that a prediction needs, such as azimuth.
     """
@@ -366,7 +366,7 @@ def sites(study: Study, links: Measurements) -> list[dict[str, Any]]:
     key = list(dict.fromkeys(name for name in names if name is not None and name in links.frame))
     columns = links.frame[list(dict.fromkeys([*key, *mounting_columns(study)]))]
     tx = pd.DataFrame(links.tx.round(2), columns=["x", "y", "z"])
-    # The first link of every mast, group and carrier represents the others.
+    # The first link of each mast, group and carrier frequency represents the others.
     first = ~pd.concat([tx, columns[key].reset_index(drop=True)], axis=1).duplicated().to_numpy()
     # Converted via JSON, because NumPy numbers and NaN cannot be sent to the page. Without columns, there are no rows.
     rows = json.loads(columns[first].to_json(orient="records")) or [{}] * int(first.sum())

@@ -1,11 +1,11 @@
-"""Commands that the window started in a study's folder, and commands that were started there from a terminal.
+"""Commands that were started in a study's folder by the window or from a terminal.
 
 Each command of the window is a separate process with three files in `.calibray-window`: `0001.json` describes it,
 `0001.log` contains its output, and `0001.exit` its exit status. A command with neither an exit status nor a process has
 died; starting it again resumes its work.
 
-`python -m calibray.window.jobs` runs one command in a session of its own, so that it outlives the server, and records
-its exit status. Ctrl-C is passed to the command, which keeps finished work.
+`python -m calibray.window.jobs` runs one command in its own session, so that it outlives the server, and records its
+exit status. Ctrl-C is passed to the command, which keeps finished work.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ WIDTH: Final = "80"
 """Number of characters per line in a command's tables."""
 
 TAIL: Final = 16_384
-"""Number of bytes shown from the end of a log: a few screenfuls."""
+"""Number of bytes shown from the end of a log, which fill a few screens."""
 
 
 _LINE: Final = re.compile(
@@ -88,7 +88,7 @@ class Jobs:
             raise InputError(f"{self._folder}: is a link; remove it")
         try:
             self._folder.mkdir(exist_ok=True)
-            # All files count, because a command that was never recorded may have left its log.
+            # All files are considered, because a command that was never recorded may have left its log.
             used = (int(file.stem) for file in self._folder.glob("[0-9]*.*") if file.stem.isdecimal())
             number = max(used, default=0) + 1
             stem = self._folder / f"{number:04d}"
@@ -101,7 +101,7 @@ class Jobs:
                     start_new_session=True, env={**os.environ, "COLUMNS": WIDTH},
                 )  # fmt: skip
             created = psutil.Process(child.pid).create_time()
-            # Without a wait, the ended process would stay in the process table; the look-up above needs it there.
+            # Without a wait, the ended process would stay in the process table, where the look-up above still needs it.
             Thread(target=child.wait, daemon=True).start()
             record = {"words": list(words), "pid": child.pid, "created": created}
             write_text(Path(f"{stem}.json"), json.dumps(record) + "\n")
@@ -110,7 +110,7 @@ class Jobs:
         return Job(number, tuple(words), "running", child.pid)
 
     def list(self) -> list[Job]:
-        """The commands started in the folder, the latest first."""
+        """The commands started in the folder, the most recent first."""
         files = sorted(self._folder.glob("[0-9]*.json"), reverse=True)
         return [job for job in map(_read, files) if job is not None]
 
@@ -138,7 +138,7 @@ class Jobs:
                 os.killpg(job.pid, signal.SIGINT)
 
     def wait(self, job: Job, seconds: float) -> Job:
-        """Wait until a command ends, at most for a number of seconds, and return its latest state."""
+        """Wait until a command ends, for at most the given number of seconds, and return its current state."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             now = next(other for other in self.list() if other.number == job.number)
@@ -173,12 +173,12 @@ def _read(file: Path) -> Job | None:
 
 
 def _state(exit_file: Path, pid: int, created: float) -> str:
-    # After Ctrl-C, a command exits with 130, or with -2 if the signal killed it or came before it started.
+    # After Ctrl-C, a command exits with 130, or with -2 if the signal killed it or arrived before it started.
     with suppress(OSError, ValueError):
         return {0: "done", 130: "stopped", -2: "stopped"}.get(int(exit_file.read_text()[:20]), "failed")
     with suppress(psutil.Error, OverflowError, ValueError):
         process = psutil.Process(pid)
-        # Another process may have received this ID since; it must not be mistaken for the command or stopped.
+        # Another process may have received this ID since; it must not be mistaken for the command, or be stopped.
         if abs(process.create_time() - created) < 1 and process.status() != psutil.STATUS_ZOMBIE:
             return "running"
     return "died"
@@ -199,10 +199,10 @@ class Stage:
 
     Attributes:
         name: Name of the stage.
-        share: Completed share, 0 to 1; None if unknown.
+        share: Completed fraction, 0 to 1; None if unknown.
         seconds: Elapsed time [s].
         left: Remaining time [s]; None if unknown.
-        best: The best value so far, such as "best RMSE 3.10 dB"; empty if the log states none.
+        best: Best value so far, such as "best RMSE 3.10 dB"; empty if the log states none.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The page: the map, the steps from a map to a prediction, and a dialog that shows the scene in 3-D."""
+"""The page: the map, the steps from a map to a prediction, and a dialog with the scene in 3-D."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ UPLOADS: Final = {
     "Map or plan": "Add maps, plans, scenes, height models",
     "Measurements": "Add tables, tracks",
 }
-"""The steps that accept files, with the labels of their buttons."""
+"""The steps that accept files, with the labels of their upload buttons."""
 
 HEAD: Final = '<link rel="stylesheet" href="/window/window.css"><script src="/window/plan.js" defer></script>'
 
 
 def build(desk: Desk) -> None:
     """Build the page for one browser tab."""
-    # Each tab has its own: if one tab redraws its command, the others keep their buttons and the keyboard focus.
+    # Separate for each tab: if one tab redraws its command, the others keep their buttons and the keyboard focus.
     progress = ui.refreshable(_progress)
 
     @ui.refreshable
@@ -126,7 +126,7 @@ def _follow_changes(
     """Redraw steps when the files in the folder or the running command have changed."""
 
     def contents() -> dict[str, object]:
-        """What the steps with text fields show; they are redrawn only if it changes."""
+        """The content of the steps with text fields, which are redrawn only if it changes."""
         text, files = desk.folder.text(), desk.folder.files((*MAPS, ".tif", ".tiff"))
         return {
             "Map or plan": (text, files, desk.folder.scenes(), desk.scene),
@@ -158,7 +158,7 @@ def _follow_changes(
 
     def watch() -> None:
         before, job = watched["job"], desk.jobs.running()
-        # Only changed parts are redrawn: a redrawn button loses the keyboard focus, and a click.
+        # Only changed parts are redrawn, because a redrawn button loses the keyboard focus and may lose a click.
         if job is None or before is None or job.number != before.number:
             if job != before:
                 activity.refresh()
@@ -181,7 +181,7 @@ def heading(text: str, level: int) -> None:
 
 
 def _activity(desk: Desk, progress: Callable[[Job], None]) -> None:
-    """Draw the command that is running or ran last, with the end of its output."""
+    """Draw the running or most recent command, with the end of its output."""
     jobs = desk.jobs.list()
     if not jobs:
         return
@@ -234,7 +234,7 @@ class Camera:
     distance: float = 1.9 * RADIUS
 
     def move(self, turn: float = 0.0, rise: float = 0.0, factor: float = 1.0) -> None:
-        """Turn and raise the camera and scale its distance; straight down is excluded, as up would be undefined."""
+        """Turn and raise the camera and scale its distance; it never looks straight down, where up is undefined."""
         self.azimuth += turn
         self.elevation = float(np.clip(self.elevation + rise, 0.05, 1.5))
         self.distance = float(np.clip(self.distance * factor, 0.1 * RADIUS, 10 * RADIUS))

@@ -1,4 +1,4 @@
-"""The steps of the page from a study to its use: the runs, their results, and predictions.
+"""The steps of the page from a study to its use: runs, results and predictions.
 
 Steps are redrawn after each command.
 """
@@ -40,7 +40,7 @@ from calibray.window.study_steps import safe
 
 @ui.refreshable
 def show_run(desk: Desk) -> None:
-    """Draw the step of the runs: calibrate, validate, and all commands that have run or are running in the folder."""
+    """Draw the step for runs: calibration, validation, and all commands that have run or are running in the folder."""
     if desk.folder.study_file.is_file():
         with ui.row():
             out = desk.keep(ui.input("Name of the result", value="result"))
@@ -94,7 +94,7 @@ NONE = "-"
 
 @ui.refreshable
 def show_result(desk: Desk) -> None:
-    """Draw the step of the results: a table of key figures, and the report."""
+    """Draw the step for results: a table of key figures, and the report."""
     names = desk.folder.results()
     if not names:
         ui.label("No result yet.").classes("quiet")
@@ -160,8 +160,8 @@ def _facts(desk: Desk, name: str) -> dict[str, str]:
     model = str(_inside(record, "prediction", "model", "name") or NONE)
     if model != Model.CALIBRATED and _inside(record, "accuracy", "holdout_rmse_db") is not None:
         residual_db = _shown(record, "prediction", "model", "residual_db")
-        facts["RMSE of held-out links, model of predictions [dB]"] = residual_db
-    facts["Model of predictions"] = model
+        facts["RMSE of held-out links, prediction model [dB]"] = residual_db
+    facts["Prediction model"] = model
     for parameter, value in (_inside(record, "fit", "parameters") or {}).items():
         interval = _inside(record, "uncertainty", "intervals", parameter) or {}
         ends = f" ({_number(interval.get('lower'))} to {_number(interval.get('upper'))})" if interval else ""
@@ -214,7 +214,7 @@ def _number(value: Any) -> str:
 
 
 def settings(study: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """The settings of a study by their dotted names.
+    """The settings of a study by dotted name.
 
     Example:
         >>> settings({"scene": {"frequency": 3.5e9}, "offset": {}})
@@ -267,7 +267,7 @@ def better(first: str, second: str, folder: Path) -> str:
     errors = {first: one.errors[model][judged], second: other.errors[other_model][judged]}
     best, worst = sorted(errors, key=lambda name: float(np.mean(errors[name] ** 2)))
     judgement = compare(errors[best], {worst: errors[worst]}, one.position[judged])
-    # The blocks are those of the first result; the second may have different ones.
+    # The blocks are those of the first result; the second result may have different blocks.
     lower = sum(
         np.mean(errors[best][rows] ** 2) < np.mean(errors[worst][rows] ** 2)
         for rows in (one.block[judged] == block for block in np.unique(one.block[judged]))
@@ -288,7 +288,7 @@ MOST_CANDIDATES: Final = 2000
 
 @ui.refreshable
 def show_prediction(desk: Desk) -> None:
-    """Draw the step of the predictions: at a place, over an area, suggested places to measure, and export."""
+    """Draw the step for predictions: at a place, over an area, suggested places to measure, and export."""
     names = desk.folder.results()
     if not names:
         ui.label("Calibrate first.").classes("quiet")
@@ -374,7 +374,7 @@ def show_prediction(desk: Desk) -> None:
 def write_links(
     desk: Desk, file: str, site: dict[str, Any], x: NDArray[np.float64], y: NDArray[np.float64], height: float
 ) -> None:
-    """Write a table of links from a transmitter to a grid of places x, y at a height above the ground, all in [m].
+    """Write a table of links from a transmitter to a grid of places x, y at a height above the ground, all [m].
 
     The links have the transmitter's groups, carrier and antenna direction.
 

@@ -1,4 +1,4 @@
-"""The server of the window: reachable from this machine only, behind the guard."""
+"""The server of the window, which only this machine can reach and a guard protects."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SHOWN = ("report.html", "map.png")
 
 
 def serve(folder: Path, port: int, opened: Callable[[str], None]) -> None:
-    """Serve the page for a study's folder until Ctrl-C; port 0 selects a free one. `opened` is called with the address.
+    """Serve the page for a study's folder until Ctrl-C; port 0 selects a free port. `opened` receives the address.
 
     Raises:
         InputError: The port is in use.
@@ -43,7 +43,7 @@ def serve(folder: Path, port: int, opened: Callable[[str], None]) -> None:
 
 
 def application(desk: Desk) -> FastAPI:
-    """The page with its data and assets, without a guard."""
+    """Make the application that serves the page with its data and assets, without a guard."""
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
     @app.get("/data/plan.json")
@@ -75,7 +75,7 @@ def application(desk: Desk) -> FastAPI:
         path = desk.folder.path / name / file
         if not path.is_file():
             return Response("not written yet", 404)
-        # A report may come from elsewhere, so its scripts run in an origin of their own and cannot send requests.
+        # A report may come from elsewhere, so its scripts run in a separate origin and cannot send requests.
         policy = "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
         return FileResponse(
             path, headers={"Content-Security-Policy": policy + "img-src data:; font-src data:"}
@@ -103,7 +103,7 @@ def _listen(port: int) -> socket.socket:
     except (OSError, OverflowError) as error:
         listening.close()
         raise InputError(
-            f"--port {port}: cannot be opened ({error}); give another port, or 0 for a free one"
+            f"--port {port}: cannot be opened ({error}); give another port, or 0 for a free port"
         ) from None
     return listening
 
@@ -123,7 +123,7 @@ HEADERS: Final = (
 
 @final
 class Guard:
-    """An ASGI application that refuses unauthorized requests to the server's port before they reach the wrapped one."""
+    """An ASGI application that refuses unauthorized requests before they reach the application that it wraps."""
 
     def __init__(self, app: Any, token: str, port: int) -> None:
         self._app, self._token, self._port = app, token.encode(), port
@@ -144,7 +144,7 @@ class Guard:
             cookie = f"{self._cookie}={self._token.decode()}; HttpOnly; SameSite=Strict; Path=/".encode()
             await _answer(send, 303, b"", ((b"location", b"/"), (b"set-cookie", cookie)))
         elif fault is not None or not self._known(headers):
-            text = fault or "open the address that `calibray open` printed: this one has no valid token"
+            text = fault or "open the address that `calibray open` printed: this address has no valid token"
             await _refuse(scope, receive, send, 400 if fault else 403, text)
         else:
             await self._app(scope, receive, _with_headers(send))
@@ -159,7 +159,7 @@ class Guard:
         origins = {b"http://" + host for host in self._hosts}
         if b"origin" in headers and headers[b"origin"] not in origins:
             return "the request comes from another origin"
-        # Another port on this machine is the same site, so SameSite=Strict alone would let its requests pass.
+        # A page from another port on this machine is same-site, so SameSite=Strict alone would not stop its requests.
         if headers.get(b"sec-fetch-site", b"none") not in {b"none", b"same-origin"}:
             return "the request comes from another site"
         return None

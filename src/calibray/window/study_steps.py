@@ -1,4 +1,4 @@
-"""The steps of the page from a map to a study: the scene, the measurements, and the parameters."""
+"""The steps of the page from a map to a study: scene, measurements and parameters."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from calibray.window.desk import LARGEST, MAPS, STUDY, Desk, StudyFolder, filled
 
 ITU: Final = [name for name in ITU_MATERIALS[DEFAULT_REVISION] if name != "vacuum"]
 COMMANDS: Final = {".osm": "osm", ".pbf": "osm", ".csv": "plan", ".dxf": "plan"}
-"""The command that converts a file to a scene, by extension; files with other extensions may be footprints or plans."""
+"""The command that converts a file to a scene, by file extension; other files may be footprints or plans."""
 
 
 def upload(desk: Desk, label: str) -> None:
@@ -52,10 +52,10 @@ def upload(desk: Desk, label: str) -> None:
 
 @ui.refreshable
 def show_scene(desk: Desk) -> None:
-    """Draw the step of the scene: convert a map, footprints or a floor plan, or choose a scene."""
+    """Draw the step for the scene: convert a map, footprints or a floor plan, or choose a scene."""
     sources, terrain = desk.folder.files(MAPS), desk.folder.files((".tif", ".tiff"))
     if sources:
-        # Tables are rarely plans.
+        # A table is rarely a plan.
         likely = min(sources, key=lambda name: (name.endswith(".csv"), "plan" not in name.lower()))
         with ui.row():
             source = desk.keep(
@@ -140,12 +140,12 @@ def _is_number(text: str | None) -> bool:
 
 
 SECTIONS = ("scene", "links", "antennas", "trace", "offset")
-"""Sections whose assumptions the step of the measurements shows; parameters have their own step."""
+"""Sections whose assumptions the step for measurements shows; parameters have their own step."""
 
 
 @ui.refreshable
 def show_measurements(desk: Desk) -> None:
-    """Draw the step of the measurements: draft a study from tables of links, and change its assumptions."""
+    """Draw the step for measurements: draft a study from tables of links, and change its assumptions."""
     if desk.folder.study_file.is_file():
         _assumptions(desk)
         findings(desk)
@@ -176,7 +176,7 @@ def show_measurements(desk: Desk) -> None:
         options = {
             "--transmitters": sites.value, "--track": track.value, "--frequency": frequency.value, "--tx": tx.value
         }  # fmt: skip
-        # Each option and its value are one word, so that a negative x is not mistaken for an option.
+        # Each option and its value form one word, so that a negative x is not mistaken for an option.
         words += [f"{option}={value}" for option, value in options.items() if value]
         desk.start(words)
 
@@ -227,7 +227,7 @@ def _assumptions(desk: Desk) -> None:
 
 
 def _control(key: str, value: Any, columns: list[str]) -> Callable[[], Any]:
-    """A control for a value of the study, and a function that reads it."""
+    """Draw a control for a value of the study, and return a function that reads it."""
     if isinstance(value, bool):
         switch = ui.switch(key, value=value)
         return lambda: switch.value
@@ -291,7 +291,7 @@ SITES: Final = ("cell", "site", "mast", "access", "transmitter", "station")
 
 @lru_cache(maxsize=100)
 def _content(file: Path, changed: int) -> str:
-    """What a table contains, judged by its columns: "links" or "transmitters"; empty if neither is recognized.
+    """The content of a table, judged by its columns: "links" or "transmitters"; empty if neither is recognized.
 
     `changed` is the file's modification time, so that a modified file is read again.
     """
@@ -311,7 +311,7 @@ def _content(file: Path, changed: int) -> str:
 
 @ui.refreshable
 def show_parameters(desk: Desk) -> None:
-    """Draw the step of the parameters: which are calibrated, with which bounds and which prior."""
+    """Draw the step for parameters: which parameters are calibrated, and their bounds and priors."""
     parameters = desk.folder.valid_content().get("parameters")
     if not isinstance(parameters, dict):
         ui.label("Draft the study first.").classes("quiet")
@@ -327,7 +327,7 @@ def show_parameters(desk: Desk) -> None:
 
 
 def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | None]:
-    """Draw the controls of a parameter; return a function that reads its entry, None if it is not calibrated."""
+    """Draw the controls of a parameter; return a function that reads its entry, or None if it is not calibrated."""
     low, high = map(float, entry["bounds"])
     prior = entry.get("prior", {})
     stated = prior.get("itu", "")
@@ -375,5 +375,5 @@ def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | No
 
 
 def safe(name: str) -> str:
-    """A name without the quotes that would end a property string."""
+    """A name without quotes, which would end a property string."""
     return "".join(letter for letter in name if letter.isalnum() or letter in " ._-")
