@@ -5,13 +5,14 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Callable
+from copy import copy
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import sionna.rt as rt
-from scipy.io import savemat
+from scipy.io import loadmat, savemat
 
 import calibray as cb
 from calibray.engines.rays.compile import powers
@@ -75,6 +76,16 @@ def test_paths_of_sionna_have_its_powers(paths: rt.Paths) -> None:
             ]
         )
         np.testing.assert_allclose(mine, np.sort(power[rx][power[rx] > 0]), rtol=1e-6)
+
+
+def test_a_gain_of_sionna_that_is_not_a_number_is_refused(paths: rt.Paths) -> None:
+    """Otherwise, the link would silently lose the path."""
+    real, imaginary = (np.array(part) for part in paths.a)
+    real[np.unravel_index(np.argmax(np.abs(real)), real.shape)] = np.nan
+    spoilt = copy(paths)
+    spoilt._a_real, spoilt._a_imag = real, imaginary
+    with pytest.raises(InputError, match=r"the power of path .* is NaN"):
+        read(spoilt)
 
 
 def test_arrays_of_several_places_are_refused() -> None:
@@ -236,7 +247,22 @@ def test_aodt_s_gains_are_those_of_the_paths_time(lines: list[Polyline], tmp_pat
     np.testing.assert_allclose(path_loss(read(folder)), path_loss(expected))
 
 
+def without_a_gain(folder: Path) -> None:
+    gains = pd.read_parquet(folder / "cirs.parquet")
+    gains.at[0, "cir_re"] = np.array([np.nan, *gains.cir_re[0][1:]])
+    gains.to_parquet(folder / "cirs.parquet")
+
+
+def without_a_power(folder: Path) -> None:
+    file = folder / "power_t001_tx000_r002.mat"
+    power = loadmat(file)["power"]
+    power[0, 0] = np.nan
+    savemat(file, {"power": power})
+
+
 REFUSED = {
+    "a gain that is not a number": (write_aodt, without_a_gain, {}, "the power of path .* is NaN"),
+    "a power that is not a number": (write_deepmimo, without_a_power, {}, "the power of path 0, from .* is NaN"),
     "no transmitted power": (write_insite, lambda file: None, {}, "give tx_power_dbm"),
     "a text as transmitted power": (write_insite, lambda file: None, {"tx_power_dbm": "13"}, "'13': must be a finite"),
     "no number as transmitted power": (write_insite, lambda file: None, {"tx_power_dbm": np.nan}, "must be a finite"),

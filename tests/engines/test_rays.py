@@ -291,6 +291,54 @@ def test_a_path_of_power_zero_is_absent(yard: Tracer, rows: pd.DataFrame, form: 
         read(silence, yard)
 
 
+@pytest.mark.parametrize("in_study", [False, True])
+def test_a_link_whose_paths_have_no_power_remains(yard: Tracer, in_study: bool) -> None:
+    rows = direct_paths([f"rx{number}" for number in (1, 2, 3)])
+    silent = rows.assign(power_db=rows.power_db.where(rows.link != "rx2", -np.inf))
+    ends = [rows[rows.type == end][["x", "y", "z"]].to_numpy() for end in ("transmitter", "receiver")]
+    links = SimpleNamespace(tx=ends[0], rx=ends[1]) if in_study else None
+    paths = compile_rays(RayTable.of(SourceTable(silent)), RaySetting(yard.scene, FREQUENCY, links=links))
+    loss = -rows.power_db.to_numpy()[::2]
+    np.testing.assert_allclose(path_loss(paths), [loss[0], np.inf, loss[2]], rtol=1e-12)
+
+
+def direct_paths(labels: list[str]) -> pd.DataFrame:
+    """Direct paths of 1, 2, 3, ... m, one for each link, with their power in free space."""
+    number = np.repeat(np.arange(1, len(labels) + 1), 2)
+    point = np.tile([0, 1], len(labels))
+    return pd.DataFrame(
+        {
+            "path": number, "point": point, "type": np.array(["transmitter", "receiver"])[point], "x": -30.0,
+            "y": 1.0 * number * point, "z": 20.0, "link": np.repeat(labels, 2),
+            "power_db": -20 * np.log10(4 * np.pi * number * FREQUENCY / 299_792_458),
+        }
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("form", ["1-{}", "rx{}", "rx0{}"])
+def test_numbers_within_names_order_the_links(yard: Tracer, form: str) -> None:
+    """The names of `rays_to_table.m` are such as 1-2 and 1-10, and the tenth receiver is not the second link."""
+    labels = [form.format(number) for number in range(1, 13)]
+    paths = read(direct_paths(labels), yard, antennas=None)
+    np.testing.assert_allclose(paths.rx_position[:, 1], np.arange(1, 13))
+
+
+def test_long_numbers_of_paths_remain_distinct(yard: Tracer) -> None:
+    """In double precision, the first two would be the same number."""
+    rows = direct_paths(["a", "b", "c"])
+    for first in (2**53, 2**63):
+        number = np.repeat(np.arange(first, first + 3, dtype=np.uint64), 2)
+        assert read(rows.assign(path=number, link=number), yard, antennas=None).num_links == 3
+
+
+@pytest.mark.parametrize("level_db", [-1000.0, -450.0])
+def test_paths_of_any_power_can_be_loaded_again(yard: Tracer, tmp_path: Path, level_db: float) -> None:
+    rows = direct_paths(["a", "b"])
+    paths = read(rows.assign(power_db=rows.power_db.where(rows.link == "a", level_db)), yard, antennas=None)
+    paths.save(tmp_path / "paths.h5")
+    np.testing.assert_allclose(path_loss(Paths.load(tmp_path / "paths.h5"))[1], -level_db)
+
+
 def test_a_correction_is_stored_and_follows_its_path(
     yard: Tracer, rows: pd.DataFrame, tmp_path: Path
 ) -> None:

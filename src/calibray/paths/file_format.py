@@ -118,9 +118,9 @@ DATASETS: Final[Mapping[str, Dataset]] = MappingProxyType(
     }
 )
 
-# Zero would remove a path; the upper limit is far above the values of any antenna and power.
+# Zero would remove a path. Each wall on a path can contribute hundreds of decibels, in the engine or in the replay.
 OPTIONAL: Final[Mapping[str, Dataset]] = MappingProxyType(
-    {"paths/correction": Dataset(("P",), "f", 1e-30, 1e30)}
+    {"paths/correction": Dataset(("P",), "f", 1e-300, 1e300)}
 )
 """Datasets that a file may omit."""
 

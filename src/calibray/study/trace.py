@@ -154,7 +154,7 @@ def read_rays(
 
     Returns:
         The path program. With a study, it has the study's links; without a study, it has the table's links, identified
-        by label or position.
+        by label or position; labels are in order, `rx2` before `rx10`.
 
     Raises:
         InputError: The table, the scene or an antenna cannot be used, or they are inconsistent.
@@ -167,7 +167,9 @@ def read_rays(
     if frequency is not None:
         check_frequency(frequency)
     if antennas is not None and not (
-        len(antennas) == 2 and all(isinstance(each, Antenna) for each in antennas)
+        isinstance(antennas, tuple | list)
+        and len(antennas) == 2
+        and all(isinstance(each, Antenna) for each in antennas)
     ):
         raise InputError(
             f"read_rays: antennas = {antennas!r}: must be two Antenna, for transmitter and receiver"

@@ -7,6 +7,7 @@ the engine knows, such as its antennas. Replay at other constants multiplies the
 from __future__ import annotations
 
 import logging
+import re
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -69,20 +70,18 @@ class RaySetting:
 
 
 def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
-    """Compile the paths of a table; paths of power 0 are left out.
+    """Compile the paths of a table; paths of power 0 are left out, but not their links.
 
     Raises:
         InputError: The table does not agree with the scene, the links or itself, or has neither links nor power.
     """
     scene = setting.scene
-    if table.power is not None:
-        table = table.take(np.flatnonzero(table.power > 0))
-        if not len(table.path) and setting.links is None:
-            raise InputError(
-                f"{table.source}: no path has a power above 0; export the rays of at least one link"
-            )
+    absent = np.zeros(len(table.path), dtype=bool) if table.power is None else table.power == 0
+    if absent.all() and setting.links is None:
+        raise InputError(f"{table.source}: no path has a power above 0; export the rays of at least one link")
     ends, link, chosen = _assign_links(table, setting.links)
-    # Paths that belong to no link have the number -1; they come first and are left out.
+    link = np.where(absent, -1, link)
+    # Paths that belong to no link, or have no power, have the number -1; they come first and are left out.
     order = np.argsort(link, kind="stable")[(link < 0).sum() :]
     table, link = table.take(order), link[order]
     _check_repeats(table, link)
@@ -255,7 +254,7 @@ def _assign_links(
     """
     own = np.hstack([table.tx, table.rx])
     # Without labels, nearly equal positions count as the same; rounding would separate a few of them.
-    label = join_positions(own) if table.link is None else table.link
+    label = join_positions(own) if table.link is None else _ranks(table.link)
     _, first, link = np.unique(label, return_index=True, return_inverse=True)
     link = link.reshape(-1)
     apart = np.abs(own - own[first][link]).max(axis=1)
@@ -280,6 +279,15 @@ def _assign_links(
             )
         _LOG.warning("%s; they are left out", fault)
     return LinkPositions(ends[:, :3], ends[:, 3:]), np.where(lost, -1, link), chosen.reshape(-1)
+
+
+def _ranks(label: NDArray) -> NDArray[np.int64]:
+    """Numbers of labels in their order [P]; digits in names compare as numbers, so that `rx2` precedes `rx10`."""
+    names = np.unique(label).tolist()
+    if label.dtype.kind not in "iu":
+        names.sort(key=lambda name: re.sub(r"\d+", lambda digits: digits[0].zfill(20), name))
+    rank = {name: number for number, name in enumerate(names)}
+    return np.array([rank[name] for name in label.tolist()], dtype=np.int64)
 
 
 def _check_repeats(table: RayTable, link: NDArray[np.int64]) -> None:

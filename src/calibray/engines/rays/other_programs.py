@@ -41,7 +41,8 @@ def rows_of(paths: Iterable[Polyline], source: str) -> SourceTable:
     """The ray table of paths, in their order.
 
     Raises:
-        InputError: The list is empty, or the numbers of points, interactions and ends of a path do not match.
+        InputError: The list is empty, a power is NaN, or the numbers of points, interactions and ends of a path do not
+            match.
     """
     paths = list(paths)
     if not paths:
@@ -51,6 +52,12 @@ def rows_of(paths: Iterable[Polyline], source: str) -> SourceTable:
             raise InputError(
                 f"{source}: path {number} has {len(path.points)} points and {len(path.types)} interactions; it needs "
                 "two more points than interactions, for its transmitter and its receiver"
+            )
+        if np.isnan(path.power_db):
+            ends = " to ".join(np.array2string(path.points[end], precision=3) for end in (0, -1))
+            raise InputError(
+                f"{source}: the power of path {number}, from {ends} m, is NaN; check the constants of its materials, "
+                "and compute it again"
             )
     count = [len(path.points) for path in paths]
     per_path = {
@@ -221,7 +228,7 @@ def read_aodt(folder: Path) -> SourceTable:
             )
         power, delay = _aodt_response(gains.source, pair, responses[pair], len(rows))
         for number, (points, types) in enumerate(zip(rows["points"], rows["interaction_types"], strict=True)):
-            if power[number] > 0:
+            if power[number] != 0:
                 level = 10 * np.log10(power[number])
                 paths.append(
                     Polyline(AODT_UNIT * _aodt_points(points), _aodt_types(rays, types), level, delay[number])
@@ -310,7 +317,7 @@ def read_deepmimo(folder: Path) -> SourceTable:
 
     For each transmitter and set of N receivers: `power` [N, P], path gain [dB]; `delay` [N, P], [s]; `inter` [N, P],
     one digit for each interaction; `inter_pos` [N, P, I, 3], `tx_pos` [3] and `rx_pos` [N, 3], [m]. Missing paths are
-    NaN.
+    NaN in all matrices.
 
     Raises:
         InputError: A matrix is missing, malformed or too large, or its shape does not match the others.
@@ -346,7 +353,9 @@ def _deepmimo_paths(file: Path) -> Iterator[Polyline]:
             f"{tx.shape} and {rx.shape}; power, delay and inter must be [N, P], inter_pos [N, P, I, 3], tx_pos [1, 3] "
             "and rx_pos [N, 3]"
         )
-    for receiver, path in np.argwhere(np.isfinite(power) & np.isfinite(inter) & (inter >= 0)).tolist():
+    # A path with a delay and interactions exists, so that a power of NaN is refused later.
+    exists = np.isfinite(inter) & (inter >= 0) & (np.isfinite(power) | np.isnan(power) & np.isfinite(delay))
+    for receiver, path in np.argwhere(exists).tolist():
         codes = str(int(inter[receiver, path])) if inter[receiver, path] else ""
         if unknown := set(codes) - set(DEEPMIMO_TYPES):
             raise InputError(
@@ -441,7 +450,7 @@ def _sionna_polylines(paths: Any) -> Iterator[Polyline]:
         for ends, count in ((paths.sources, shape[1]), (paths.targets, shape[0]))
     )
     names = {int(kind): name for name, kind in TYPES.items()}
-    for rx, tx, path in np.argwhere((power > 0) & (delay >= 0)).tolist():
+    for rx, tx, path in np.argwhere((power != 0) & (delay >= 0)).tolist():
         kind = [int(code) for code in kinds[:, rx, tx, path] if code]
         inner = vertices[: len(kind), rx, tx, path]
         points = np.vstack([sources[tx], inner, targets[rx]])

@@ -244,7 +244,7 @@ def _kinds(
 
 
 def _positions(table: SourceTable, axes: str) -> NDArray[np.float64]:
-    words = axes.split()
+    words = axes.split() if isinstance(axes, str) else []
     if sorted(word.lstrip("-") for word in words) != ["x", "y", "z"] or not re.fullmatch("[-xyz ]*", axes):
         raise InputError(
             f"axes = {axes!r}: must name the table's axes that are x, y and z of the scene, such as 'x y z' or 'x -z y'"
@@ -272,9 +272,10 @@ def _link(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray | None:
 def _names(table: SourceTable, name: str) -> NDArray:
     """Whole numbers of a column, which sort as numbers, or otherwise its labels [rows]."""
     column = table.column(name)
+    if pd.api.types.is_integer_dtype(column) and not column.isna().any():
+        return column.to_numpy()
     # Whole numbers are floats in MATLAB, and in pandas if any row is empty.
-    whole = pd.api.types.is_float_dtype(column) and (column % 1 == 0).all()
-    if whole or pd.api.types.is_integer_dtype(column):
+    if pd.api.types.is_float_dtype(column) and ((column % 1 == 0) & (column.abs() < 2**53)).all():
         return table.numbers(name).astype(np.int64)
     return table.labels(name)
 
