@@ -1,15 +1,15 @@
-"""Planted sectors whose stated directions are wrong: does calibration find them, and the materials as well?
+"""Planted sectors whose stated directions are wrong: does calibration recover them and the materials?
 
     python benchmarks/antenna_pose.py --first 100 --districts 20 --repetitions 5
 
 Every district has buildings, two masts and three 65-degree sectors: panels of eight rows 0.8 wavelengths apart, whose
 beam is 65 degrees wide in azimuth and 8 degrees in elevation, with 6 degrees of electrical downtilt. A repetition draws
-two permittivities, azimuths off by up to 20 degrees and downtilts by up to 5, computes the path loss of 200 links, adds
-3 dB of noise, and calibrates all but a block of 50 with the stated directions, once with the directions as parameters
-and once without.
-The table says how often the 90 % intervals of the draws hold the truth, and the RMSE on the held-out block: against
-the measured path loss, and against the true one, which has no noise. The last lines say how many sectors the remark on
-directions names, by the error of their azimuth, and how often it names one if all directions are right.
+two permittivities, azimuths off by up to 20 degrees and downtilts by up to 5, computes the path loss of 200 links, and
+adds 3 dB of noise. It then calibrates all links except a block of 50, starting from the stated directions, once with
+the directions as parameters and once without. The table shows how often the 90 % intervals of the draws contain the
+truth, and the RMSE on the held-out block, relative to the measured path loss and to the true one without noise. The
+last lines show how many sectors the remark on directions names, by azimuth error, and how often it names one although
+all directions are right.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from calibray.scenes import Mesh, MeshObject, join_meshes, write_scene
 from calibray.study import Setup, Study
 
 Repetition = Callable[[Path, pd.DataFrame, list[int]], list[dict[str, Any]]]
-"""From the folder of a district, its links and a seed to rows of a table."""
+"""Function that takes the folder of a district, its links and a seed, and returns rows of a table."""
 
 FREQUENCY: Final = 3.5e9
 NOISE_DB: Final = 3.0
@@ -47,7 +47,7 @@ POSITION: Final = ["tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z"]
 
 
 def district(folder: Path, seed: int) -> pd.DataFrame:
-    """Write a scene, and draw masts, sectors and receivers; the columns are those of the true directions."""
+    """Write a scene, and draw masts, sectors and receivers; the columns contain the true directions."""
     random = np.random.default_rng([seed, 27])
     boxes, centres = [], [(x, y) for x in (-70.0, 0.0, 70.0) for y in (-70.0, 0.0, 70.0)]
     footprints = []
@@ -81,14 +81,14 @@ def district(folder: Path, seed: int) -> pd.DataFrame:
         table = pd.DataFrame(np.hstack([np.tile(tx, (count, 1)), rx]), columns=POSITION)
         parts.append(table.assign(sector=sector, azimuth=azimuth[sector], downtilt=random.uniform(0, 4)))
     links = pd.concat(parts, ignore_index=True)
-    # The held-out block is the fifty receivers nearest to a point.
+    # The held-out block consists of the fifty receivers nearest to a point.
     centre = random.uniform(-60, 60, 2)
     distance = np.linalg.norm(links[["rx_x", "rx_y"]] - centre, axis=1)
     return links.assign(held_out=distance.argsort().argsort() < 50, loss_db=100.0)
 
 
 def _box(low: np.ndarray, high: np.ndarray, height: float) -> Mesh:
-    """A box without a floor; of height 0, a rectangle."""
+    """A box without a floor; a rectangle if the height is 0."""
     corners = np.array([[*low], [high[0], low[1]], [*high], [low[0], high[1]]])
     roof = np.column_stack([corners, np.full(4, height)])
     faces = [[0, 1, 2], [0, 2, 3]]
@@ -126,7 +126,7 @@ def study(folder: Path, table: pd.DataFrame, posed: bool, rays: int = RAYS) -> S
 def planted(
     folder: Path, links: pd.DataFrame, random: np.random.Generator, rays: int = RAYS
 ) -> tuple[dict[str, float], np.ndarray, pd.DataFrame]:
-    """A draw of the materials, a mask of the links that paths reach, and the links with their noisy path loss."""
+    """A draw of the materials, a mask of the links with a path, and the links with their noisy path loss."""
     setup = Setup.open(study(folder, links, posed=False, rays=rays))
     truth = {name: random.uniform(bounds[0] + 0.5, bounds[1] - 2.0) for name, bounds in MATERIALS.items()}
     values = np.array([truth[name] for name in setup.parameters.names])
@@ -137,7 +137,7 @@ def planted(
 
 
 def repetition(folder: Path, links: pd.DataFrame, seed: list[int]) -> list[dict[str, Any]]:
-    """Calibrate one draw of the truth with and without directions as parameters: rows of parameters and of errors."""
+    """Calibrate one draw of the truth with and without directions as parameters; return rows of both tables."""
     random = np.random.default_rng(seed)
     truth, reached, stated = planted(folder, links, random)
     alarms = named(cb.calibrate(study(folder, stated[reached], posed=False)))
@@ -191,7 +191,7 @@ def named(result: cb.Result) -> set[str]:
 
 
 def arguments(description: str | None) -> argparse.ArgumentParser:
-    """The options that benchmarks on these districts share."""
+    """The options that all benchmarks on these districts share."""
     parser = argparse.ArgumentParser(description=(description or "").partition("\n")[0])
     parser.add_argument("--first", type=int, default=0, help="seed of the first district")
     parser.add_argument("--districts", type=int, default=20)
@@ -201,7 +201,7 @@ def arguments(description: str | None) -> argparse.ArgumentParser:
 
 
 def repeated(options: argparse.Namespace, repetition: Repetition, stream: int) -> pd.DataFrame:
-    """The rows of all repetitions in all districts, which are printed as each ends; `stream` seeds them."""
+    """The rows of all repetitions in all districts, printed as each repetition ends; `stream` is part of their seed."""
     started, tables = time.perf_counter(), []
     with tempfile.TemporaryDirectory() as root:
         seeds = range(options.first, options.first + options.districts)

@@ -1,9 +1,9 @@
-"""Inputs that request more than a machine has: the memory of each, and how soon it ends or announces its cost.
+"""Inputs that request more resources than a machine has: their memory, and the time until they end or state their cost.
 
 Run with: python benchmarks/bombs.py [--only WORD]
 
-Each is a small study with one huge item, passed to the command line in a separate process, which is stopped once it has
-announced its cost. Memory is the largest of any process that the command started.
+Each input is a small study with one huge item, passed to the command line in a separate process. This process is
+stopped once it has stated its cost. Memory is that of the largest process that the command started.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ from fuzzing.mutations import toml
 from fuzzing.outcome import MEMORY
 
 SAYING, GIVEN_UP = 10.0, 120.0
-"""Time within which a bomb must end or announce its cost, and after which it is stopped [s]."""
+"""Time limit for a bomb to end or to state its cost, after which it is stopped [s]."""
 COST = re.compile(r"[\d.,]+ (GiB|MiB|GB|minutes|hours|days|seconds|RT calls|launches|runs|s left)\b")
 
 
 @dataclass(frozen=True)
 class Bomb:
-    """One input, and the command that is given it.
+    """One input, and the command that reads it.
 
     Attributes:
         name: What is huge.
-        sections: Sections of the study in place of the harmless ones.
-        prepare: Changes the folder's files.
-        words: The command.
+        sections: Sections of the study that replace the harmless ones.
+        prepare: Function that changes the folder's files.
+        words: Arguments of the command line.
     """
 
     name: str
@@ -62,12 +62,12 @@ def changed(section: str, **keys: Any) -> dict[str, Any]:
 
 
 def method(name: str, **options: Any) -> dict[str, Any]:
-    """A method with its options."""
+    """The section of a method with its options."""
     return {"method": {"name": name, "seed": 0, "options": options}}
 
 
 def named(file: str, text: str) -> Callable[[Path], object]:
-    """Write a file of the folder anew."""
+    """Replace a file in the folder."""
     return lambda folder: (folder / file).write_text(text)
 
 
@@ -78,13 +78,13 @@ def many_links(folder: Path) -> None:
 
 
 def entities(levels: int) -> str:
-    """A scene whose entities hold one another."""
+    """A scene with nested entities."""
     inner = "".join(f'<!ENTITY e{k + 1} "{f"&e{k};" * 10}">' for k in range(levels))
     return f'<!DOCTYPE s [<!ENTITY e0 "ha">{inner}]><scene version="2.1.0"><bsdf id="&e{levels};"/></scene>'
 
 
 def parameters(count: int) -> dict[str, Any]:
-    """A study of many parameters of materials that the scene lacks."""
+    """A study with many parameters, whose materials the scene lacks."""
     return {"parameters": {f"wall-{k}.conductivity": {"bounds": [0.001, 1.0]} for k in range(count)}}
 
 
@@ -94,12 +94,12 @@ def program(line: str) -> tuple[dict[str, Any], Callable[[Path], object]]:
 
 
 def rays(write: Callable[[Path], object], ending: str) -> tuple[dict[str, Any], Callable[[Path], object]]:
-    """A study on a ray table of this ending, which `write` makes."""
+    """A study on a ray table with this file extension, which `write` creates."""
     return changed("engine", rays=f"rays.{ending}"), lambda folder: write(folder / f"rays.{ending}")
 
 
 def parquet_bomb(file: Path) -> None:
-    """A Parquet file of some kilobytes whose rows share one text of 16 MB: 16 TB of text."""
+    """A Parquet file of a few kilobytes whose rows share one text of 16 MB: 16 TB of text."""
     text = pa.DictionaryArray.from_arrays(pa.array(np.zeros(2**20, dtype=np.int32)), pa.array(["x" * 2**24]))
     columns = {name: text for name in ("x", "y", "loss", "half", "w", "path", "point", "type", "z")}
     parquet.write_table(
@@ -108,14 +108,14 @@ def parquet_bomb(file: Path) -> None:
 
 
 def hdf5_bomb(file: Path) -> None:
-    """An HDF5 file of some kilobytes with columns of 80 TB."""
+    """An HDF5 file of a few kilobytes with columns of 80 TB."""
     with h5py.File(file, "w") as content:
         for name in ("path", "point", "type", "x", "y", "z"):
             content.create_dataset(name, (10**13,), chunks=(2**20,), dtype="f8", compression="gzip")
 
 
 def raster_bomb(folder: Path) -> None:
-    """A sparse GeoTIFF of a megabyte with 120,000 million cells, under the footprint of a house."""
+    """A sparse GeoTIFF of one megabyte with 120 billion cells, under the footprint of a house."""
     profile = {"driver": "GTiff", "width": 400_000, "height": 300_000, "count": 1, "dtype": "uint8"}
     options = {"tiled": True, "compress": "deflate", "sparse_ok": True, "BIGTIFF": "YES"}
     grid = rasterio.Affine(5e-7, 0, 11.4, 0, -5e-7, 48.2)
@@ -175,7 +175,7 @@ BOMBS = (
 
 
 def tree(root: int) -> list[int]:
-    """A process and all that it started."""
+    """A process and all its descendants."""
     parents: dict[int, list[int]] = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
@@ -191,7 +191,7 @@ def tree(root: int) -> list[int]:
 
 
 def memory(process: int) -> int:
-    """The most memory that a process has had [bytes]."""
+    """Peak memory of a process [bytes]."""
     try:
         peak = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{process}/status").read_text())
     except OSError:
@@ -200,7 +200,7 @@ def memory(process: int) -> int:
 
 
 def explode(bomb: Bomb, folder: Path) -> tuple[str, float, int, str]:
-    """Give a bomb to the command line: the outcome, its time [s], the memory [bytes], and the last message."""
+    """Pass a bomb to the command line; return the outcome, its time [s], the memory [bytes], and the last message."""
     world.write(folder)
     (folder / "study.toml").write_text(toml(world.content(**bomb.sections)))
     bomb.prepare(folder)
@@ -224,7 +224,7 @@ def explode(bomb: Bomb, folder: Path) -> tuple[str, float, int, str]:
         after = time.monotonic() - started
         if process.poll() is None:
             came = came or "HANGS"
-            # The peak goes on for a while: what was announced is not yet what it takes.
+            # Memory may still grow after the cost is stated, so the measurement continues for a while.
             until = time.monotonic() + (SAYING if came == "announced" else 0.0)
             while process.poll() is None and time.monotonic() < until:
                 most = max(most, *map(memory, tree(process.pid)))
@@ -251,9 +251,9 @@ def explode(bomb: Bomb, folder: Path) -> tuple[str, float, int, str]:
 
 
 def main() -> int:
-    """Print a line for each; 0 if all ended or said their cost in time, within the memory."""
+    """Print a line for each input; return 0 if all ended or stated their cost within the limits of time and memory."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", default="", help="only those whose name holds this")
+    parser.add_argument("--only", default="", help="only inputs whose name contains this text")
     only = parser.parse_args().only
     well = True
     print(f"{'':40}{'':>10}{'s':>7}{'MiB':>7}  said")

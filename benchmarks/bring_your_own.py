@@ -1,14 +1,14 @@
-"""How often the planted values lie in their 95 % intervals, over seeds of the logs of the three example walks.
+"""How often the planted values lie in their 95 % intervals, over seeds of the three example walks.
 
     python benchmarks/bring_your_own.py [--walks town flat hill] [--seeds 30] [--first 1000] [--keep-faint] [--biased]
         [--out intervals.jsonl]
 
-Every seed is another walk through the places of `examples/bring_your_own`: other errors of position, other fading. The
-study is the one that `calibray init` writes for the example, the scene is the one that `calibray scene` makes, and the
-calibration is that of `calibray run`. Positions are drawn from a few for each stop of the town, and the track of the
-hill is one of a few, so that everything is traced and compiled only once. --keep-faint fits all averages above the
-noise floor, --biased leaves the logarithm of their means as it is; both concern the town, where there is a noise floor.
-Seeds that --out already contains are not run again.
+Every seed is a new walk through the places of `examples/bring_your_own`, with new position errors and new fading.
+`calibray init` drafts the study, `calibray scene` makes the scene, and the calibration is that of `calibray run`. For
+each stop in the town, the position is one of a few, and so is the track on the hill, so that all links are traced and
+compiled only once. --keep-faint fits all averages above the noise floor; --biased does not correct the bias of the
+logarithm of a mean. Both options apply to the town, which has a noise floor. Seeds that --out already contains are not
+run again.
 """
 
 from __future__ import annotations
@@ -60,16 +60,16 @@ from finished_runs import append_run, read_runs  # noqa: E402
 
 CHOICES = 4  # recorded positions to draw from for each stop of the town
 TRACKS = 3  # tracks along the hill
-MARGIN = 50.0  # [m], of ground about the houses, as `calibray scene` makes it
+MARGIN = 50.0  # [m], width of the ground around the houses, as in `calibray scene`
 
 
 @dataclass(frozen=True)
 class Walk:
-    """A place whose truth is known.
+    """A place with a known truth.
 
     Attributes:
-        planted: The constants that its intervals are to hold, by parameter.
-        problem: The problem of the walk of a seed.
+        planted: The true constants by parameter.
+        problem: Function that returns the problem of the walk of a seed.
     """
 
     planted: dict[str, float]
@@ -77,18 +77,19 @@ class Walk:
 
 
 def constants(materials: dict[str, dict[str, float]]) -> dict[str, float]:
-    """Constants of materials by parameter."""
+    """Constants of the materials by parameter name."""
     return {f"{name}.{key}": value for name, values in materials.items() for key, value in values.items()}
 
 
-# The town: positions that may be recorded are links of one problem, of which a walk weighs those drawn and received.
+# The town: all positions that may be recorded are links of one problem. A walk gives weight to those drawn and
+# received.
 
 
 def town_walk(folder: Path, biased: bool) -> Walk:
     """The town, its phones and its noise floor."""
     found, frame = read_openstreetmap(EXAMPLES / "town.osm", town.FRAME)
     places, gains = town.stopped(make_scene(found, folder / "planted", frame).path)
-    # The user's scene is made without the truth's frame.
+    # The user's scene is made without knowledge of the true frame.
     found, frame = read_openstreetmap(EXAMPLES / "town.osm")
     scene = make_scene(found, folder, frame).path
 
@@ -130,7 +131,7 @@ def town_walk(folder: Path, biased: bool) -> Walk:
 def _received_in_town(
     problem: Problem, gains: list[list[np.ndarray]], recorded: np.ndarray, seed: int, averaging: Averaging
 ) -> Problem:
-    """The problem of one walk: only the positions drawn and received count."""
+    """The problem of one walk, in which only the positions drawn and received have weight."""
     rng = np.random.default_rng(seed)
     number = np.arange(len(problem.setup.links)).reshape(len(town.MASTS), *recorded.shape[:3])
     rows = []
@@ -153,19 +154,19 @@ def _received_in_town(
     return replace(problem, objective=replace(problem.objective, measured=measured, weight=weight))
 
 
-# The flat and the hill: the same positions with other values, read from files as the user's are.
+# The flat and the hill: the same positions with new values, read from files like those of a user.
 
 
 def _again(study: Study, problem: Problem) -> Problem:
-    """The problem with the values that the study's table holds now."""
+    """The problem with the values that the study's table now contains."""
     links = study.measurements()
     if not np.array_equal(links.rx, problem.setup.links.rx):
-        raise RuntimeError("the links are others than those that were traced")
+        raise RuntimeError("the links differ from those that were traced")
     return replace(problem, objective=replace(problem.objective, measured=links.path_loss_db))
 
 
 def flat_walk(folder: Path) -> Walk:
-    """The flat, its laptop and three access points; floor and ceiling are planted as the scene makes them."""
+    """The flat, its laptop and three access points; floor and ceiling have the constants of `calibray scene`."""
     gains = flat.received()
     scene = make_plan_scene(read_plan(flat.FOLDER / "plan.csv", 2.6), folder).path
     table = folder / "rss.csv"
@@ -223,7 +224,7 @@ def hill_walk(folder: Path) -> Walk:
 
 
 def judged(walk: Walk, seed: int, keep_faint: bool) -> dict[str, object]:
-    """What comes of the walk of a seed."""
+    """The outcome of the walk of a seed."""
     problem = walk.problem(seed)
     problem = problem if keep_faint else leave_out_near_floor(problem)
     trail = search(problem, choose(problem))
@@ -242,12 +243,12 @@ def judged(walk: Walk, seed: int, keep_faint: bool) -> dict[str, object]:
 
 
 def holds(record: dict[str, object]) -> bool:
-    """Whether an interval holds what was planted."""
+    """Whether an interval contains the planted value."""
     return any(low <= record["planted"] <= high for low, high in record["pieces"])
 
 
 def summary(entries: list[dict[str, object]]) -> Iterator[str]:
-    """How many intervals hold what was planted, a line for each walk and parameter."""
+    """How many intervals contain the planted value, one line for each walk and parameter."""
     for walk in dict.fromkeys(entry["walk"] for entry in entries):
         mine = [entry["parameters"] for entry in entries if entry["walk"] == walk]
         for name in mine[0]:
@@ -266,7 +267,7 @@ def summary(entries: list[dict[str, object]]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Run the seeds that are missing, and print how many intervals hold what was planted."""
+    """Run the missing seeds, and print how many intervals contain the planted value."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -277,7 +278,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=1000)
     parser.add_argument("--keep-faint", action="store_true")
     parser.add_argument("--biased", action="store_true")
-    parser.add_argument("--out", type=Path, help="keep what comes of each seed, and go on from there")
+    parser.add_argument("--out", type=Path, help="file of the outcomes; an interrupted run continues from it")
     arguments = parser.parse_args()
     how = {"keep_faint": arguments.keep_faint, "biased": arguments.biased}
     known = {(entry["walk"], entry["seed"]): entry for entry in read_runs(arguments.out, {"how": how})}

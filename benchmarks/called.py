@@ -1,13 +1,13 @@
-"""Intervals for engines that can only be called, compared with intervals from their derivatives.
+"""Intervals for black-box engines, compared with intervals from derivatives of the same engines.
 
     python benchmarks/called.py --repetitions 30 --districts demo,development --out called.jsonl
 
-The engine is the replay of a district whose fixed constants (thickness, conductivity) are off by random factors and
-whose every link is off by 0.5 dB, so that the study's own replay is a cheap model with wrong constants. Truths are
-drawn evenly from their ranges, and errors have 1 and 3 dB. Two methods only call the engine: space mapping with the
+The engine is the replay of a district whose fixed constants (thickness, conductivity) have random factors and whose
+links have random errors of 0.5 dB. The study's own replay is therefore a cheap model with wrong constants. Truths are
+drawn uniformly from their ranges, and the noise is 1 or 3 dB. Two methods only call the engine: space mapping with the
 study's replay, with 10 calls per parameter, and the vector surrogate without it, with 20 calls per parameter. The third
-method uses derivatives. A row says how often 90 % and 95 % intervals cover the truth, and how wide they are relative to
-those from derivatives on the same data.
+method uses derivatives. A row shows how often 90 % and 95 % intervals cover the truth, and how wide they are relative
+to those from derivatives on the same data.
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ from finished_runs import append_run, read_runs
 LEVELS = (0.9, 0.95)
 NOISES_DB = (1.0, 3.0)
 OWN_DB = 0.5
-"""What every link of the engine is off by against the study's replay, standard deviation [dB]."""
+"""Standard deviation of the links' differences between the engine and the study's replay [dB]."""
 OFF = 0.5
-"""How far its constants are off, of the spread that space mapping allows for."""
+"""Spread of the errors of its constants, relative to the spread that space mapping allows."""
 
 
 @dataclass
 class Engine:
-    """A district with constants of its own.
+    """A district with its own constants.
 
     Attributes:
-        stored: Its paths, over the parameters and then the constants.
+        stored: Replay of its paths as a function of the parameters, followed by the constants.
         constants: The constants, in the fields' units.
-        own: What every link is off by [L], [dB].
-        parameters: What a candidate's components stand for.
+        own: Error of every link [L], [dB].
+        parameters: The parameters, in the order of a candidate's components.
         calls: Candidates evaluated so far.
     """
 
@@ -78,13 +78,13 @@ class Engine:
 
 @dataclass
 class WithDerivatives(Engine):
-    """The same with derivatives."""
+    """The same engine with derivatives."""
 
     large: bool = False
 
     @property
     def interactions(self) -> int:
-        """Interactions that a candidate is evaluated at."""
+        """Number of interactions evaluated per candidate."""
         return self.stored.interactions
 
     def path_loss_and_jacobian(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -96,7 +96,7 @@ class WithDerivatives(Engine):
 
 @cache
 def _opened(name: str, folder: Path) -> tuple[Problem, Replay]:
-    """A district's problem, and its paths over the parameters and the constants."""
+    """A district's problem, and the replay of its paths as a function of the parameters and the constants."""
     district = districts.make(name, folder)
     problem, paths = district.problem, district.paths
     setup = problem.setup
@@ -108,14 +108,14 @@ def _opened(name: str, folder: Path) -> tuple[Problem, Replay]:
 
 
 def repetition(name: str, noise_db: float, turn: int, folder: Path) -> dict[str, Any]:
-    """One planted truth, by three ways to it."""
+    """One planted truth, estimated in three ways."""
     problem, stored = _opened(name, folder)
     parameters, started = problem.parameters, time.process_time()
     random = np.random.default_rng([zlib.crc32(name.encode()), turn, 12])
     bounds, count = parameters.search_bounds, len(parameters)
     point = random.uniform(*bounds)
     low, high = (each[count:] for each in stored.parameters.search_bounds)
-    # Bounds lie three spreads out.
+    # The bounds are three spreads away.
     moved = (low + high) / 2 + OFF * (high - low) / 6 * random.standard_normal(len(low))
     constants = stored.parameters.from_search(np.append(point, np.clip(moved, low, high)))[count:]
     own = OWN_DB * random.standard_normal(len(problem.before))
@@ -212,7 +212,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repetitions", type=int, default=30)
     parser.add_argument("--districts", default="demo,development")
-    parser.add_argument("--out", type=Path, help="file of lines, one a repetition; goes on where it stands")
+    parser.add_argument("--out", type=Path, help="file with one line per repetition, to continue from")
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "calibray-districts")
     given = parser.parse_args()
     names, lines = districts.named(given.districts), read_runs(given.out, {})

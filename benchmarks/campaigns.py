@@ -67,7 +67,7 @@ def auckland(folder: Path) -> dict[str, bool]:
 
 
 def main() -> None:
-    """Compare, print, and end with what was found."""
+    """Print the comparisons, and exit with a status of 1 if one fails."""
     data = Path(os.environ.get("CALIBRAY_DATA", Path(__file__).parents[2] / "shared" / "data"))
     found = [
         (name, shown, right)

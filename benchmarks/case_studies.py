@@ -1,12 +1,12 @@
-"""Downtown Boulder: what path loss and delay spread show about the walls' scattering coefficient.
+"""Downtown Boulder: what path loss and delay spread reveal about the walls' scattering coefficient.
 
     CALIBRAY_DATA=FOLDER python benchmarks/case_studies.py --samples 60000
 
 The links are traced once with diffuse reflection, and the paths are replayed for each scattering coefficient S of the
-walls. The table has the RMSE of path loss, with an offset for links in sight and one for those out of sight, and the
-RMS delay spread in sight next to the measured one (delay.csv). Delay spreads come from power delay profiles in bins of
-1 ns. Bins above 132 dB of path loss or 30 dB below the strongest are left out, as the sounder left them out. The script
-needs the data of the campaign.
+walls. The table has the RMSE of path loss, with one offset for links in sight and one for links out of sight, and the
+modelled and the measured (delay.csv) RMS delay spread in sight. Delay spreads are computed from power delay profiles
+with bins of 1 ns. As in the sounder, bins with a path loss above 132 dB or more than 30 dB below the strongest bin are
+left out. The script needs the data of the campaign.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from calibray.tables import Table, numbers, render
 
 STUDY = Path(__file__).parents[1] / "examples" / "nist_boulder.toml"
 WALLS, TRACED = "walls", 0.4
-"""The material that scatters, and its coefficient while paths are sampled."""
+"""The scattering material, and its scattering coefficient during the trace."""
 COEFFICIENTS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9)
 FLOOR_DB, DYNAMIC_DB, BIN_S = 132.0, 30.0, 1e-9
 
 
 def delay_spread(power: np.ndarray, delay: np.ndarray) -> np.ndarray:
-    """RMS delay spread of profiles as the sounder kept them [L], [s]."""
+    """RMS delay spread of the profiles after the sounder's thresholds [L], [s]."""
     level = -10 * np.log10(np.maximum(power, 1e-40))
     kept = (level <= FLOOR_DB) & (level <= level.min(axis=1, keepdims=True) + DYNAMIC_DB)
     share = np.where(kept, power, 0.0)
@@ -42,7 +42,7 @@ def delay_spread(power: np.ndarray, delay: np.ndarray) -> np.ndarray:
 
 
 def offset_rmse(error: np.ndarray, group: np.ndarray) -> float:
-    """RMSE with the mean of every group taken off [dB]."""
+    """RMSE after the mean of every group is subtracted [dB]."""
     for label in np.unique(group):
         error = np.where(group == label, error - error[group == label].mean(), error)
     return float(np.sqrt(np.mean(error**2)))
@@ -51,7 +51,7 @@ def offset_rmse(error: np.ndarray, group: np.ndarray) -> float:
 def main() -> None:
     """Print the table."""
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options.add_argument("--samples", type=int, default=60_000, help="rays sent out by the transmitter")
+    options.add_argument("--samples", type=int, default=60_000, help="rays launched from the transmitter")
     samples = options.parse_args().samples
     data = Path(os.environ.get("CALIBRAY_DATA", STUDY.parent / "../../shared/data")) / "nist_boulder"
     if not data.is_dir():

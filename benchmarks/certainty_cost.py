@@ -1,15 +1,15 @@
-"""Time of posterior draws, validation and choice, as a ratio to that of the calibration itself, in one run.
+"""Time taken by posterior draws, validation and choice, relative to that of the calibration itself, in one run.
 
     python benchmarks/certainty_cost.py
     python benchmarks/certainty_cost.py STUDY ...
     python benchmarks/certainty_cost.py --seeds 3 STUDY ...
 
-With `--seeds`, only the draws, from several seeds: their time, the widths of the 90 % sets, and how many independent
-draws they are worth. Members of a population are counted by how much the mean over a member's kept states scatters.
+With `--seeds`, only posterior draws from several seeds are made: their time, the widths of the 90 % sets, and their
+number of effective draws, which follows from the scatter of the means over each member's kept states.
 
-Processor seconds of this process, seconds by the clock, and replays, on the study's own paths, compiled before anything
-is timed. The script fails where all of it together costs more than ten times the calibration, and takes more than a
-minute.
+The table has the processor time of this process, the wall time, and the number of replays on the study's own paths,
+which are compiled before timing starts. The script fails if all parts together cost more than ten times the calibration
+and take more than a minute.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ LEVEL = 0.9
 
 
 def costs(problem: Problem) -> dict[str, tuple[float, float, int]]:
-    """Processor seconds, seconds by the clock and replays of each part."""
+    """Processor time [s], wall time [s] and replays of each part."""
     found: dict[str, tuple[float, float, int]] = {}
 
     def timed(name: str, work: Callable, *given):
@@ -64,7 +64,7 @@ def costs(problem: Problem) -> dict[str, tuple[float, float, int]]:
 
 
 def seeds(problem: Problem, count: int) -> Table:
-    """Draws from several seeds: time, replays, effective draws, widths of the 90 % sets as shares of the range."""
+    """Draws from several seeds: time, replays, effective draws, and widths of the 90 % sets relative to the range."""
     trail, study = search(problem, choose(problem)), problem.setup.study
     lower, upper = problem.parameters.search_bounds
     rows, widths = [], []
@@ -96,7 +96,7 @@ def seeds(problem: Problem, count: int) -> Table:
 
 
 def effective(posterior: Posterior) -> float:
-    """Independent draws that the draws are worth, for the parameter for which they are worth least."""
+    """Effective draws, for the parameter for which they are fewest."""
     populations, states, size = posterior.shape
     point = posterior.means.point.reshape(populations, states, size, -1)
     scatter = point.mean(axis=1).var(axis=(0, 1)) / point.var(axis=(0, 1, 2))

@@ -1,4 +1,4 @@
-"""Constants of a cheap model that an input mapping finds (docs/measurements/expensive-engines.md).
+"""Constants of a cheap model, found by an input mapping (docs/measurements/expensive-engines.md).
 
     python benchmarks/cheap_model_constants.py --seeds 1000 1004 1009 1013 1018
 
@@ -28,7 +28,7 @@ from problem_families.problems import cheap_model
 
 POINTS = (10, 20)
 NEAR, JUDGED, APART = 4, 40, 0.2
-"""Points near the optimum that are fitted, those that are predicted, and their largest distance in the unit cube."""
+"""Numbers of fitted and of predicted points near the optimum, and their largest distance from it in the unit cube."""
 
 COLUMNS = (
     "problem", "parameters", "constants", "answers", "density: believed", "found", "true", "error [dB]: believed",
@@ -37,7 +37,7 @@ COLUMNS = (
 
 
 def true_constants(planted: PlantedProblem, model: UnitModel) -> NDArray[np.float64]:
-    """The engine's values of the cheap model's constants [q]."""
+    """The engine's values for the constants of the cheap model [q]."""
     parameters, count = cheap_model(planted).engine.parameters, len(planted.parameters)
     materials = planted.engine.paths.materials
     values = [getattr(materials[item.material], item.constant) for item in parameters][count:]

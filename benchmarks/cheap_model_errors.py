@@ -2,9 +2,10 @@
 
     python benchmarks/cheap_model_errors.py --seeds 1001 1003 1006 1014 1018
 
-runs space mapping once on each problem. After some calls, the corrected model predicts the residuals of every link at
-the optimum, where it was never evaluated. Links with a path in the cheap model, and links without one, are listed
-separately. "Expected" is the root mean square of the errors over the standard deviations that the model states.
+runs space mapping once on each problem. After given numbers of calls, the corrected model predicts the residuals of
+every link at the optimum, where it was never evaluated. Links with and without a path in the cheap model are listed
+separately. "Over expected" is the root mean square of the errors divided by the standard deviations that the model
+states.
 """
 
 # ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)
@@ -33,7 +34,7 @@ COLUMNS = (
 
 
 def optimum(planted: PlantedProblem) -> NDArray[np.float64]:
-    """The point of the lowest RMSE found by 16 local searches and one from the planted values [d]."""
+    """The point with the lowest RMSE in 16 local searches and one from the planted values [d]."""
     start = planted.parameters.to_search(planted.truth)
     search = LeastSquares(planted.lower, planted.upper, starts=16, x0=start)
     while not search.done:

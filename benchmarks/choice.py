@@ -1,4 +1,4 @@
-"""Whether the model chosen by held-out blocks is the right one on links that were not used for fitting or choice.
+"""Whether the model chosen on held-out blocks is also the best one on links that were not used for fitting or choice.
 
     CALIBRAY_DATA=FOLDER python benchmarks/choice.py examples/nist_boulder.toml examples/auckland_tower.toml
     CALIBRAY_DATA=FOLDER python benchmarks/choice.py examples/nist_boulder.toml --blocks 5 --uneven 22
@@ -7,20 +7,20 @@
     python benchmarks/choice.py --chance 100 --workers 2 --out chance.jsonl
 
 The validation is nested: each block is held out in turn, and all models are validated on blocks of the remaining links.
-The best model there is fitted to the remaining links and judged on the block. The output has its pooled RMSE, that of
-the model with the lowest RMSE on the inner blocks, those of all models, and how often the block's links lie in the 90 %
-interval from the chosen model's errors on the inner blocks. Blocks are even, or with `--uneven` clusters of receivers
-(k-means from that seed).
+The chosen model is fitted to the remaining links and judged on the block. The output has its pooled RMSE, that of the
+model with the lowest RMSE on the inner blocks, and those of all models. It also shows how often the block's links lie
+in the 90 % interval, which follows from the chosen model's errors on the inner blocks. The blocks have equal size; with
+`--uneven`, they are clusters of receivers (k-means from that seed).
 
-With `--rule`, the same over planted truths in districts: at the study's start, near it, and anywhere, with an offset of
-3 dB and 3 dB of noise, one of four blocks left out each time.
+With `--rule`, the same for planted truths in districts: at the study's start values, near them, and anywhere, with an
+offset of 3 dB and 3 dB of noise. One of four blocks is left out each time.
 
-With `--planted`, the output is how often the links of a block of the demo district lie in the interval of a prediction
-from the other blocks: planted truths, 3 dB of noise.
+With `--planted`, the output shows how often the links of a block of the demo district lie in the interval predicted
+from the other blocks, for planted truths and 3 dB of noise.
 
 With `--chance`, the scene contains no information: measurements follow a log-distance law with noise, in the demo
-district. The result must state that calibration did not help; the script fails if it does so in fewer than 95 of 100
-repetitions. Each repetition is a line of the file `--out`; an interrupted run continues where it stopped.
+district. The result must state that calibration did not help; the script fails if the result does so in fewer than 95
+of 100 repetitions. Each repetition is a line of the file `--out`; an interrupted run continues where it stopped.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ CHOSEN = "chosen without the block"
 
 
 def opened(file: str) -> Problem:
-    """A study's problem over all its links, those that it holds out included."""
+    """A study's problem over all its links, including those that the study holds out."""
     setup = Study.load(file).opened()
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
     return estimate_noise(Problem.of(setup, engines.make(setup)))
@@ -71,22 +71,22 @@ LEAST = "least RMSE on the others"
 """The choice without margins."""
 
 APART = (0.0, 0.3, 1.0)
-"""Distances of truths from the study's start, as shares of that of a random point."""
+"""Distances of truths from the study's start values, relative to that of a random point."""
 
 
 def left_out(
     problem: Problem, here: np.ndarray, inner_blocks: int | None = None
 ) -> tuple[str, dict[str, np.ndarray], list[bool]]:
-    """Choose and fit without some links, and judge by them.
+    """Choose and fit a model without some links, and judge it on these links.
 
     Args:
         problem: The problem.
         here: Which links are left out [L].
-        inner_blocks: Number of blocks of the others that choose the model; the study's number if None.
+        inner_blocks: Number of blocks of the other links for choosing the model; the study's number if None.
 
     Returns:
-        The model that the other links choose; the errors of every model, and of the one with the lowest RMSE on the
-        other links, at the links left out; and which of these with a path lie in the interval of the chosen one.
+        The model chosen on the other links; the errors of every model, and of the one with the lowest RMSE on the other
+        links, at the links left out; and which of these links that have a path lie in the chosen model's interval.
     """
     objective = problem.objective
     part = replace(problem, objective=replace(objective, weight=np.where(here, 0.0, objective.weight)))
@@ -106,14 +106,14 @@ def left_out(
 
 
 def half_widths(levels: BlockErrors, links: int) -> tuple[float, float]:
-    """Half the 90 % interval of the errors within and of those between blocks [dB]."""
+    """Half the width of the 90 % interval for errors within and between blocks [dB]."""
     freedom = (links - levels.blocks, levels.blocks)
     within, between = (float(stdtrit(each, (1 + LEVEL) / 2)) for each in freedom)
     return within * levels.within_db, between * levels.between_db
 
 
 def nested(problem: Problem, count: int, uneven: int | None, inner_blocks: int | None) -> tuple[Table, str]:
-    """Leave one block out, and choose without it."""
+    """Choose a model without one block."""
     links, objective = problem.setup.links, problem.objective
     block = blocks_of(problem, count, uneven)
     errors, inside, chosen = {}, [], []
@@ -139,7 +139,7 @@ def nested(problem: Problem, count: int, uneven: int | None, inner_blocks: int |
 
 
 def blocks_of(problem: Problem, count: int, uneven: int | None = None) -> np.ndarray:
-    """Block of every link, -1 where it does not count [L]; even ones, or clusters from a seed."""
+    """Block of every link, -1 for links without weight [L]: blocks of equal size, or clusters from a seed."""
     links, counted = problem.setup.links, np.flatnonzero(problem.objective.weight > 0)
     block, place = np.full(len(links), -1), links.rx[counted, :2]
     block[counted] = (
@@ -149,7 +149,7 @@ def blocks_of(problem: Problem, count: int, uneven: int | None = None) -> np.nda
 
 
 def ruled(name: str, count: int, folder: Path) -> dict[float, list[dict[str, np.ndarray]]]:
-    """Errors at blocks left out of planted truths in a district, by how far these lie from the study's start."""
+    """Errors at left-out blocks, for planted truths in a district, by distance of the truths from the start values."""
     problem, found = districts.make(name, folder).problem, {apart: [] for apart in APART}
     parameters, objective = problem.parameters, problem.objective
     start = parameters.to_search(parameters.start)
@@ -168,7 +168,7 @@ def ruled(name: str, count: int, folder: Path) -> dict[float, list[dict[str, np.
 
 
 def rules(names: list[str], count: int) -> Table:
-    """Errors of the chosen model over planted truths, compared with models that are always taken."""
+    """Errors of the chosen model over planted truths, compared with always using the same model."""
     every: dict[float, list[dict[str, np.ndarray]]] = {apart: [] for apart in APART}
     with TemporaryDirectory() as folder:
         for name in names:
@@ -185,7 +185,7 @@ def rules(names: list[str], count: int) -> Table:
 
 
 def planted(seed: int) -> tuple[str, list[bool]]:
-    """A truth and noise planted in the demo district, one block left out: what was chosen, and which links held."""
+    """The model chosen without one block of the demo district, and which links of the block lie in its interval."""
     problem, random = _demo(), np.random.default_rng([seed, 6])
     parameters, objective = problem.parameters, problem.objective
     truth = parameters.from_search(random.uniform(*parameters.search_bounds))
@@ -203,7 +203,7 @@ def _demo() -> Problem:
 
 
 def without_a_chance(seed: int) -> tuple[int, str]:
-    """The seed, and what is said of a twin whose measurements follow distance alone."""
+    """The seed, and the verdict on a twin of the demo whose measurements depend on distance alone."""
     problem = _demo()
     links, random = problem.setup.links, np.random.default_rng([seed, 5])
     law = INTERCEPT_DB + SLOPE_DB * np.log10(links.distance)
@@ -214,7 +214,7 @@ def without_a_chance(seed: int) -> tuple[int, str]:
 
 
 def said_without_a_chance(count: int, workers: int, out: Path | None) -> list[str]:
-    """What is said in so many repetitions; those that the file holds already are read from it."""
+    """The verdicts of all repetitions; those already in the file are read from it."""
     said = {run["seed"]: run["sentence"] for run in read_runs(out, {})}
     left = [seed for seed in range(count) if seed not in said]
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
@@ -230,12 +230,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("studies", nargs="*", help="study files")
     parser.add_argument("--blocks", type=int, default=4)
-    parser.add_argument("--inner", type=int, help="number of blocks that choose the model; 4 if not given")
-    parser.add_argument("--uneven", type=int, help="seed of clusters of receivers in place of even blocks")
+    parser.add_argument("--inner", type=int, help="number of blocks for choosing the model; 4 if not given")
+    parser.add_argument(
+        "--uneven", type=int, help="seed of clusters of receivers, instead of blocks of equal size"
+    )
     parser.add_argument("--rule", type=int, default=0, help="planted truths in each district")
     parser.add_argument("--districts", default="demo,district-101,district-103,district-105,district-107")
     parser.add_argument("--planted", type=int, default=0, help="repetitions in the demo district")
-    parser.add_argument("--chance", type=int, default=0, help="repetitions of the twin without a chance")
+    parser.add_argument("--chance", type=int, default=0, help="repetitions of the twin without information")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, help="file of the repetitions")
     given = parser.parse_args()

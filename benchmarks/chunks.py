@@ -1,13 +1,13 @@
-"""Links in chunks: speed-up by a second worker, bytes returned, and memory and time over the number of links.
+"""Links in chunks: speed-up by a second worker, bytes returned, and memory and time versus the number of links.
 
     python benchmarks/chunks.py speed-up            # tracing and search in Munich, 2 workers of one thread against 1
-    python benchmarks/chunks.py validate            # the same of a validation by two blocks held out
-    python benchmarks/chunks.py bytes               # what a candidate moves, by number of links
-    python benchmarks/chunks.py links               # memory and time of a step, chunks repeated up to a million links
+    python benchmarks/chunks.py validate            # the same for a validation with two blocks
+    python benchmarks/chunks.py bytes               # bytes returned per candidate, by number of links
+    python benchmarks/chunks.py links               # memory and time per step, one chunk repeated to a million links
     python benchmarks/chunks.py city --links 100000 # a campaign in Munich end to end, in one process
-    python benchmarks/chunks.py draws               # the uncertainty in ten chunks against all links at once
+    python benchmarks/chunks.py draws               # the uncertainty from ten chunks and from all links at once
 
-Each mode has its own processes and cache. Measured values follow a law of distance with noise of 6 dB, because the fit
+Each mode has its own processes and cache. Measured values follow a log-distance law with 6 dB of noise, because the fit
 does not matter here.
 """
 
@@ -47,11 +47,11 @@ STEPS, CANDIDATES = 3, 32  # of a search over repeated chunks
 PARAMETERS = ("concrete", "marble", "brick")
 
 Work = Callable[[Setup, "Workers | None"], tuple[float, float]]
-"""From an opened study and its workers to the seconds of tracing and of the rest."""
+"""Function that takes an opened study and its workers, and returns the seconds for tracing and for the rest."""
 
 
 def study(engine: dict, starts: int, samples: int | str) -> Study:
-    """A study of links in Munich, which are not in a file."""
+    """A study of links in Munich that are in no file."""
     return Study.from_content(
         {
             "version": 1,
@@ -69,7 +69,7 @@ def study(engine: dict, starts: int, samples: int | str) -> Study:
 def campaign(
     count: int, engine: dict, starts: int = 16, seed: int = 0, samples: int | str = 100_000
 ) -> Setup:
-    """Links from two masts to places drawn from a seed; those in buildings have no path, and are left out."""
+    """Links from two masts to places drawn from a seed; receivers inside buildings have no path and are left out."""
     random = np.random.default_rng(seed)
     mast = random.integers(0, len(MASTS), count)
     rx = np.c_[random.uniform(-300, 300, (count, 2)), np.full(count, 1.5)]
@@ -80,12 +80,12 @@ def campaign(
 
 
 def resident() -> float:
-    """Largest memory that this process has had so far [GiB]."""
+    """Peak memory of this process so far [GiB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
 
 
 def searched(setup: Setup, workers: Workers | None) -> tuple[float, float]:
-    """Seconds of tracing and of search."""
+    """Seconds for tracing and for the search."""
     started = time.perf_counter()
     problem = Problem.of(setup, engines.make(setup, workers=workers))
     traced = time.perf_counter()
@@ -94,7 +94,7 @@ def searched(setup: Setup, workers: Workers | None) -> tuple[float, float]:
 
 
 def validated(setup: Setup, workers: Workers | None) -> tuple[float, float]:
-    """Seconds of tracing and of judging by two blocks."""
+    """Seconds for tracing and for validation with two blocks."""
     started, times = time.perf_counter(), []
     cb.validate(setup, blocks=2, workers=workers, progress=lambda *_: times.append(time.perf_counter()))
     traced = times[-3]
@@ -102,7 +102,7 @@ def validated(setup: Setup, workers: Workers | None) -> tuple[float, float]:
 
 
 def on_core(core: int) -> None:
-    """Keep all threads of this process, and those that they start, on one core, where the system can."""
+    """Pin all threads of this process, and those that they start, to one core if the system supports it."""
     if sys.platform == "linux":
         for thread in Path("/proc/self/task").iterdir():
             os.sched_setaffinity(int(thread.name), {core})
@@ -111,8 +111,8 @@ def on_core(core: int) -> None:
 def speed_up(links: int, work: Work) -> None:
     """Trace and search, or validate, with one worker of one core and with two.
 
-    Told by the clock, and by the processor time of the busiest process: what the clock would tell where nothing else
-    runs and every process has a core.
+    The speed-up is given in wall time and in the processor time of the busiest process. The latter would be the wall
+    time on an idle machine with a core for every process.
     """
     alone: tuple[float, float] | None = None
     for workers in (1, 2):
@@ -128,7 +128,7 @@ def speed_up(links: int, work: Work) -> None:
             ) as cluster,
             Client(cluster) as client,
         ):
-            # Dr.Jit and XLA would take every core for a single worker.
+            # Dr.Jit and XLA would otherwise use every core for a single worker.
             for core, worker in enumerate(client.scheduler_info()["workers"]):
                 client.run(on_core, core % (os.cpu_count() or 1), workers=[worker])
             opened = DaskWorkers(lambda: client, client.get_executor)
@@ -149,7 +149,7 @@ def speed_up(links: int, work: Work) -> None:
 
 
 class pinned:
-    """Variables of the environment, set and put back; None leaves one out."""
+    """Set environment variables, and restore them afterwards; None removes a variable."""
 
     def __init__(self, **values: str | None) -> None:
         self.values, self.before = values, {name: os.environ.get(name) for name in values}
@@ -168,7 +168,7 @@ class pinned:
 
 
 def moved(links: int) -> None:
-    """What the answers to a batch of candidates weigh, as they are sent."""
+    """Size of the answers to a batch of candidates, as they are sent."""
     import pickle
 
     for count in (links // 4, links):
@@ -186,7 +186,7 @@ def moved(links: int) -> None:
 
 
 def repeated(chunks: int, links: int) -> None:
-    """One chunk's links again and again, two chunks open at once; steps of a search over all."""
+    """Repeat one chunk's links, with two chunks open at once, and time steps of a search over all links."""
     one = campaign(links, {"chunk_links": links})
     tx, rx = (np.tile(end, (chunks, 1)) for end in (one.links.tx, one.links.rx))
     loss, mast = (np.tile(each, chunks) for each in (one.links.path_loss_db, one.links.group_index))
@@ -225,7 +225,7 @@ def city(links: int, samples: int | str) -> None:
 
 
 def draws(links: int) -> None:
-    """Assess the uncertainty of links with planted path loss in one process, at once and in ten chunks."""
+    """Assess the uncertainty from links with planted path loss in one process, at once and in ten chunks."""
     base = campaign(links, {})
     loss = engines.make(base).path_loss(np.array([[5.0, 6.0, 4.0]]))[0]
     reached = np.isfinite(loss)
@@ -248,10 +248,12 @@ def draws(links: int) -> None:
 
 
 def main() -> None:
-    """Run what was asked for, each size in a process of its own."""
+    """Run the requested mode, with a separate process for each size."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("what", choices=("speed-up", "validate", "bytes", "links", "city", "draws"))
-    parser.add_argument("--links", type=int, default=None, help="number of links, of a chunk with `links`")
+    parser.add_argument(
+        "--links", type=int, default=None, help="number of links; in the mode `links`, of one chunk"
+    )
     parser.add_argument("--chunks", type=int, nargs="+", default=[1, 10, 100])
     parser.add_argument(
         "--samples",
