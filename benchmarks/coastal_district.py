@@ -1,9 +1,8 @@
 """The coastal high-rise district: streets, buildings and ground like those of the paper's measurement area.
 
-The real district (Golden Beach, Huangdao, Qingdao; section III of the paper) covers 2.1 km x 1.7 km; its
-buildings are 60 m to 70 m high, of concrete with glass windows, on soil and asphalt. Its map is not
-published. This district has the same extent, heights and materials; a seeded generator draws the rest. The
-sea is in the south.
+The real district (Golden Beach, Huangdao, Qingdao; section III of the paper) covers 2.1 km x 1.7 km. Its buildings are
+60 m to 70 m high, made of concrete with glass windows, and stand on soil and asphalt. Its map is not published. This
+district has the same extent, heights and materials; a seeded generator draws the rest. The sea is to the south.
 
 All coordinates are multiples of 1/64 m. These coordinates are exact in 32-bit floats, so all panels of a wall lie in
 exactly one plane, as the image method of the ray tracer requires.
@@ -48,9 +47,9 @@ class Layout:
     Attributes:
         avenues: x coordinates of the centre lines of north-south streets, ascending [m].
         streets: y coordinates of the centre lines of east-west streets, ascending [m].
-        extent: East-west and north-south [m].
+        extent: Extent from west to east and from south to north [m].
         parks: Blocks without buildings, column and row.
-        heights: Lowest and highest building [m].
+        heights: Heights of the lowest and the highest building [m].
         beach: Whether the southernmost row of blocks has no buildings.
     """
 
@@ -114,8 +113,8 @@ def scene_objects(
 ) -> list[MeshObject]:
     """The district as objects of a scene, one per material.
 
-    Structures, windows, ground (of soil) and streets (of asphalt); structures and windows of several materials are
-    numbered. The names of a building's concrete and glass are given.
+    The objects are structures, windows, ground (soil) and streets (asphalt); structures and windows of several
+    materials are numbered. The arguments give the names of each building's concrete and glass.
     """
     structures: dict[str, list[Mesh]] = {}
     windows: dict[str, list[Mesh]] = {}
@@ -153,7 +152,7 @@ def building_meshes(building: Building) -> tuple[Mesh, Mesh]:
 
 
 def lamp_positions() -> NDArray[np.float64]:
-    """Positions [n, 2], [m], of the lamp posts: along the kerbs, on alternating sides, none on a crossing."""
+    """Positions of the lamp posts [n, 2], [m]: along the kerbs, on alternating sides, none at a crossing."""
     kerb = ROADWAY_HALF_WIDTH + 0.5
     positions = []
     for lines, across, length in ((AVENUES, STREETS, EXTENT[1]), (STREETS, AVENUES, EXTENT[0])):
@@ -185,7 +184,7 @@ def inside(building: Building, points: NDArray[np.float64]) -> NDArray[np.bool_]
 
 
 def _between(lines: Sequence[float], length: float) -> list[tuple[float, float]]:
-    """The ranges between streets, from one border of the district to the other [m]."""
+    """The ranges between streets, from one border of the district to the opposite border [m]."""
     return list(pairwise(_edges(lines, STREET_HALF_WIDTH, length)))[::2]
 
 

@@ -1,23 +1,22 @@
-"""How often intervals cover the truth: planted values, replayed paths of several districts, several worlds of errors.
+"""How often intervals cover the truth: planted values on replayed paths of several districts, in worlds of errors.
 
     python benchmarks/coverage.py --repetitions 200 --workers 2 --out coverage.jsonl
     python benchmarks/coverage.py --districts demo --worlds random,offset --repetitions 20
     python benchmarks/coverage.py --districts judging --repetitions 200 --workers 2 --out judging.jsonl
     python benchmarks/coverage.py --districts district-233:10138 --worlds random --repetitions 10   # as many links
 
-Every repetition draws a truth for each parameter evenly from its search range, makes path losses of it, adds the errors
-of its world, and calibrates as `calibray run` does, from fewer starting points. The study does not state the world:
-all settings are defaults. A row says how often the interval covered the truth, over all repetitions and where the
-verdict was "identified" or "weakly identified", and how often the verdict was "not identifiable". For comparison,
-there are two posteriors that know the noise and that buildings are equal. One has the study's prior of the constants
-that the scene fixes; the other knows these constants, and no posterior is narrower. If buildings differ, neither
-exists.
+Every repetition draws a truth for each parameter uniformly from its search range, computes the path losses, adds the
+errors of its world, and calibrates as `calibray run` does, but from fewer starting points. The study does not state the
+world: all settings are defaults. A row shows how often the interval covered the truth, over all repetitions and where
+the verdict was "identified" or "weakly identified", and how often the verdict was "not identifiable". Two reference
+posteriors know the noise and that buildings are equal. One has the study's prior for the constants that the scene
+fixes; the other knows these constants, and no posterior is narrower. If buildings differ, neither exists.
 
 Each repetition is a line of the file `--out`; an interrupted run continues where it stopped, and `--repetitions 0`
-prints the tables of the stored repetitions. The last rows are the negative control, the same posterior with the noise
-understated by two, which must cover too seldom: the script fails if it does not. It fails as well if more than a tenth
-of the values that the posterior with the noise known determines to a tenth of the range are not called identified or
-weakly identified.
+prints the tables of the stored repetitions. The last rows are the negative control: the same posterior with the noise
+understated by a factor of two, whose coverage must be too low, or the script fails. It also fails if more than a tenth
+of the values that the posterior with known noise determines to a tenth of the range are not called identified or weakly
+identified.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ UNDERSTATED = 4.0
 """Square of the factor by which the negative control understates the noise."""
 
 World = Callable[[District, np.ndarray, np.random.Generator], np.ndarray]
-"""District, truth [d] and random numbers to measured path loss [L], [dB]."""
+"""Function of a district, a truth [d] and random numbers that returns measured path loss [L], [dB]."""
 
 
 def _plain(district: District, truth: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -139,13 +138,13 @@ KNOWN: dict[str, Callable[[District, np.ndarray], np.ndarray]] = {
     "outliers": _mixed,
     "student-t": _tailed,
 }
-"""Logarithm of the density of measured less modelled path loss [n, L] as the world makes it, but for a constant."""
+"""Log density, up to a constant, of measured minus modelled path loss [n, L] in the world."""
 
 DETERMINED: Final = 0.1
-"""Width of the posterior with the noise known, of the range, below which a parameter is well determined."""
+"""Width of the posterior with known noise, relative to the range, below which a parameter is well determined."""
 
 DENIED: Final = 0.1
-"""Largest share of well-determined values that may have another verdict than these."""
+"""Largest share of well-determined values that may have a different verdict."""
 
 IDENTIFIED: Final = ("identified", "weakly identified")
 
@@ -156,14 +155,14 @@ def _district(name: str, folder: Path) -> District:
 
 
 def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder: Path) -> dict[str, Any]:
-    """One planted truth, calibrated.
+    """Calibrate one planted truth.
 
     Args:
         name: The district.
         world: The world of errors.
         turn: Number of the repetition.
-        seed: Seed of all of them.
-        starts: Local searches of the calibration.
+        seed: Seed of all repetitions.
+        starts: Number of local searches of the calibration.
         folder: Folder of the districts.
 
     Returns:
@@ -221,9 +220,9 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
 
 @dataclass(frozen=True)
 class KnownNoise:
-    """The density of the errors as a world makes them, in place of the noise models.
+    """The density of a world's errors, used in place of the noise models.
 
-    With `censored` links, the sampler asks for the densities themselves.
+    With `censored` links, the sampler requests the densities themselves.
     """
 
     district: District
@@ -234,7 +233,7 @@ class KnownNoise:
     column: np.ndarray = field(default_factory=lambda: np.ones(1))
 
     def densities(self, gap: np.ndarray) -> np.ndarray:
-        """Log density of gaps [n, L]: [n, 1]."""
+        """Log density of the gaps [n, L], shape [n, 1]."""
         density = np.where(np.isfinite(gap).all(axis=1), KNOWN[self.world](self.district, gap), -np.inf)
         return density[:, None]
 
@@ -242,7 +241,7 @@ class KnownNoise:
 def _known(
     district: District, world: str, problem: Problem, trail: Trail, seed: int, exact_constants: bool
 ) -> Draws:
-    """Draws where the noise is known and buildings are equal; the constants that the scene fixes may be known too."""
+    """Draws with known noise and equal buildings; the constants that the scene fixes may be known too."""
     study = problem.setup.study
     spread = 0.0 if exact_constants else study.noise.constants_spread
     noise = study.noise.model_copy(update={"constants_spread": spread, "heterogeneity": 0.0})
@@ -279,10 +278,10 @@ def main() -> None:
         "--districts", default="demo,development", help="names, or demo, development, judging, all"
     )
     parser.add_argument("--worlds", default=",".join(WORLDS))
-    parser.add_argument("--starts", type=int, default=64, help="local searches of each calibration")
+    parser.add_argument("--starts", type=int, default=64, help="number of local searches per calibration")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="file of lines, one a repetition; goes on where it stands")
+    parser.add_argument("--out", type=Path, help="file with one line per repetition, to continue from")
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "calibray-districts")
     parser.add_argument("--markdown", action="store_true", help="print tables for the documentation")
     given = parser.parse_args()
@@ -292,7 +291,7 @@ def main() -> None:
     for name in names:
         if given.repetitions:
             _district(name, given.folder)  # traced once, by this process
-    # Turn by turn, so that a run that is stopped holds as many of every district and world.
+    # Repetition by repetition, so that an interrupted run has equally many from every district and world.
     tasks = [
         (name, world, turn, given.seed, given.starts, given.folder)
         for turn in range(given.repetitions)
@@ -365,19 +364,19 @@ def _table(title: str, lines: list[dict[str, Any]], by_name: bool) -> Table:
 
 
 def _lucky(entries: list[dict[str, Any]]) -> str:
-    """How often the posterior held the truth whose noise is known."""
+    """How often the posterior with known noise contains the truth."""
     known = [entry["known"]["held"] for entry in entries if entry.get("known")]
     return f"{np.mean(known):.2f}" if known else "-"
 
 
 def _wider(entries: list[dict[str, Any]], reference: str) -> str:
-    """Median of the widths by those of a reference."""
+    """Median of the widths relative to those of a reference."""
     ratio = [entry["width"] / entry[reference]["width"] for entry in entries if entry.get(reference)]
     return f"{np.median(ratio):.2f}" if ratio else "-"
 
 
 def _error(entries: list[dict[str, Any]], level: str) -> str:
-    """Standard error of a share, as of so many independent draws: at least that of one more that fell otherwise."""
+    """Standard error of a share of independent draws, at least that with one more draw of the opposite outcome."""
     if not entries:
         return ""
     share = (sum(entry["held"][level] for entry in entries) + 1) / (len(entries) + 2)

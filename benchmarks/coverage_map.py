@@ -2,10 +2,10 @@
 
     python benchmarks/coverage_map.py [--cells 64 | --whole] [--samples auto] [--solver]
 
-The map has cells of 5 m around one transmitter of the demo district, with the values planted in its world. The map is
-timed against the same trace alone, both without the cache and each after a first run that compiles. With --solver,
-Sionna's radio map of the same cells is compared with the map: it counts the rays that cross a cell, so it averages over
-the cell and is noisy, where the map is a sum of paths to the cell's middle.
+The map has cells of 5 m around one transmitter of the demo district, with the values planted in its world. The time of
+the map is compared with that of the same trace alone, both without the cache and after a first run that compiles. With
+--solver, Sionna's radio map of the same cells is compared with the map. The radio map counts the rays that cross a
+cell, so it averages over the cell and is noisy; the map is a sum of paths to the centre of the cell.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def main() -> None:
         default=50_000,
         help='rays, or "auto"',
     )
-    parser.add_argument("--whole", action="store_true", help="all cells of the district")
+    parser.add_argument("--whole", action="store_true", help="map all cells of the district")
     parser.add_argument("--solver", action="store_true")
     given = parser.parse_args()
     os.environ["CALIBRAY_CACHE"] = ""
@@ -63,12 +63,12 @@ def main() -> None:
 
 
 def _result(samples: int | str) -> cb.Result:
-    """A calibration of the district as `auto` finds it, quickly."""
+    """A quick calibration of the district, as `auto` finds it."""
     from calibray.scenarios import demo_study_path
 
     content = cb.Study.load(demo_study_path()).content()
     content["trace"]["samples"] = samples
-    # A radio map knows of no receive antenna.
+    # A radio map has no receive antenna.
     content["antennas"]["rx"] = {"pattern": "iso", "polarization": "V"}
     content["method"] = {"name": "auto", "seed": 0, "options": {"starts": 16}}
     return cb.calibrate(cb.Study.from_content(content, demo_study_path()))

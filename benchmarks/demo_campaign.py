@@ -1,11 +1,11 @@
-"""The demo's simulated measurement campaign: trace and sound the true world, and write the files of a study.
+"""The demo's simulated measurement campaign: trace the true world, simulate the sounder, and write a study's files.
 
     python benchmarks/demo_campaign.py FOLDER
 
 The channel sounder turns paths into a path loss averaged over noisy snapshots. The paper's sounder sends a PN9 sequence
 of 511 chips over 200 MHz and records 100 impulse responses at every position (section III). Here a snapshot is a power
 delay profile of 511 taps of 5 ns. Between snapshots, traffic and swaying masts change the phases of the paths, so that
-paths within a tap fade. The receiver adds noise.
+the taps fade. The receiver adds noise.
 
 The true world is more detailed than the calibrated model. Every building has its own concrete and glass, surfaces
 scatter diffusely, lamp posts stand along the streets, and the recorded positions have errors of about a metre. A
@@ -75,7 +75,7 @@ class Planted:
     scattering_coefficient: float
 
     def constants(self, relative_permittivity: float) -> dict[str, float]:
-        """The constants by name for a scene file; a building may have another permittivity than the mean [1]."""
+        """The constants by name for a scene file; a building's permittivity may differ from the mean [1]."""
         return {
             "relative_permittivity": relative_permittivity,
             "conductivity": self.conductivity,
@@ -189,9 +189,9 @@ def sounded_path_loss(
     is_diffuse: NDArray[np.bool_],
     rng: np.random.Generator,
 ) -> tuple[float, float]:
-    """Sound one link: path loss [dB] of the mean power of the snapshots, and their standard deviation [dB].
+    """Simulate the sounder on one link: path loss [dB] of the snapshots' mean power, and their standard deviation [dB].
 
-    Specular paths keep their amplitude and change their phase between snapshots. The many diffuse paths of a tap make
+    Between snapshots, specular paths keep their amplitude and change their phase. The many diffuse paths of a tap make
     its field complex Gaussian. The noise is subtracted; the standard deviation is (10 / ln 10) std / mean.
 
     Raises:
@@ -235,11 +235,11 @@ MODEL_MATERIALS: Final = {
     "soil": {"relative_permittivity": 2.25, "conductivity": 0.05, "thickness": 2.0},
     "asphalt": {"relative_permittivity": 4.83, "conductivity": 0.075, "thickness": 0.5},
 }
-"""The materials of the scene that is calibrated: four for the whole district, without scattering."""
+"""The materials of the calibrated scene: four for the whole district, without scattering."""
 
 
 def generate(folder: Path, seed: int = SEED) -> None:
-    """Write the scene to calibrate, the study file, the measured links and the truth."""
+    """Write the scene for the calibration, the study file, the measured links and the truth."""
     truth = world(seed)
     write_model(folder, truth)
     table = links_csv(truth, measure(truth, seed))
@@ -247,7 +247,7 @@ def generate(folder: Path, seed: int = SEED) -> None:
 
 
 def write_model(folder: Path, truth: World) -> None:
-    """Write the scene to calibrate, the study file and the truth, which need no tracing."""
+    """Write the scene for the calibration, the study file and the truth, which need no tracing."""
     study = demo_study_path().read_bytes()
     write_scene(folder / "scene", scene_objects(truth.buildings), MODEL_MATERIALS)
     write_bytes(folder / "study.toml", study)
@@ -258,7 +258,7 @@ def measure(truth: World, seed: int = SEED, links: slice = EVERY) -> NDArray[np.
     """Path loss of every link and standard deviation of its snapshots [L, 2], [dB], in the true world.
 
     Specular paths and paths with a diffuse reflection are traced separately: all of the few specular paths are needed,
-    but only a sample of the diffuse ones. Fewer `links` have the same values as among all.
+    but only a sample of the diffuse ones. A subset of `links` has the same values as in the whole campaign.
     """
     ends = replace(truth, tx=truth.tx[links], rx=truth.rx[links])
     with TemporaryDirectory() as folder:

@@ -1,10 +1,10 @@
-"""Downtown Boulder with diffuse reflection: replay and compressed replay against tracing again.
+"""Downtown Boulder with diffuse reflection: replay and compressed replay compared with a new trace.
 
     CALIBRAY_DATA=../shared/data python benchmarks/diffuse.py
 
-The script needs the measured campaign (examples/README.md). One run times the rival (Sionna RT finding the paths and
-evaluating the fields anew), replay of all paths, and replay of the compressed program, with the agreement next to the
-times.
+The script needs the measured campaign (examples/README.md). One run times Sionna RT (finding the paths and evaluating
+the fields again), replay of all paths, and replay of the compressed program, and shows how well their path losses
+agree.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ NAMES = ("walls", "ground")
 def main() -> None:
     """Measure and print the table."""
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options.add_argument("--samples", type=float, default=7e5, help="rays sent out by the transmitter")
+    options.add_argument("--samples", type=float, default=7e5, help="rays launched from the transmitter")
     samples = int(options.parse_args().samples)
     data = Path(os.environ.get("CALIBRAY_DATA", STUDY.parent / "../../shared/data"))
     if not (data / "nist_boulder").is_dir():

@@ -1,14 +1,14 @@
-"""Planted heights of masts and a shifted track: do intervals contain them, and those of materials the truth?
+"""Planted errors of mast heights and a shifted track: do the intervals of these and of the materials cover the truth?
 
     python benchmarks/displaced_antennas.py one --first 100 --districts 20 --repetitions 1
     python benchmarks/displaced_antennas.py all --first 100 --districts 20 --repetitions 1
 
-Districts are those of antenna_pose.py, with directions that are right. One: the stated height of one of the three
+The districts are those of antenna_pose.py, with correct directions. One: the stated height of one of the three
 transmitters is off by 5 m, up or down; the heights of all three are parameters. All: the stated heights of all three
-transmitters are off by 5 m, and the whole track by up to 5 m along x and along y; all five are parameters. The noise
-is 3 dB. Every draw is calibrated with these parameters, and with `--blind` also without. The table says how often the
-90 % intervals of the draws hold the truth; the RMSE on the held-out block is that against path loss without noise. The
-tracer sends 20,000 rays, which give the same path loss as the 100,000 of antenna_pose.py.
+transmitters are off by 5 m, and the whole track by up to 5 m along x and along y; all five are parameters. The noise is
+3 dB. Every draw is calibrated with these parameters and, with `--blind`, also without them. The table shows how often
+the 90 % intervals of the draws contain the truth; the RMSE on the held-out block is relative to path loss without
+noise. The tracer launches 20,000 rays, which give the same path loss as the 100,000 of antenna_pose.py.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ RAYS: Final = 20_000
 def repetition(
     folder: Path, links: pd.DataFrame, seed: list[int], every: bool, blind: bool
 ) -> list[dict[str, Any]]:
-    """Calibrate one draw of the truth: a row for every parameter."""
+    """Calibrate one draw of the truth; return a row for every parameter."""
     random = np.random.default_rng(seed)
     truth, reached, stated = planted(folder, links, random, RAYS)
     wrong = SECTORS if every else [random.choice(SECTORS)]
@@ -82,7 +82,7 @@ def main() -> None:
     parser = arguments(__doc__)
     parser.set_defaults(repetitions=1)
     parser.add_argument("case", choices=["one", "all"])
-    parser.add_argument("--blind", action="store_true", help="calibrate without heights and shifts as well")
+    parser.add_argument("--blind", action="store_true", help="also calibrate without heights and shifts")
     options = parser.parse_args()
     table = repeated(options, partial(repetition, every=options.case == "all", blind=options.blind), 272)
     summary = table.groupby(["known", "parameter"]).agg(

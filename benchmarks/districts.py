@@ -1,7 +1,7 @@
-"""Districts made from seeds: streets, buildings, materials, carriers and links that no part of the package contains.
+"""Districts drawn from seeds: streets, buildings, materials, carriers and links that are not in the package.
 
-Seeds 100 to 109 are for development (the odd ones were used for judging earlier). Buildings are boxes with windows, so
-that the building an interaction belongs to follows from where it happens.
+Seeds 100 to 109 are for development (the odd ones were previously used for judging). Buildings are boxes with windows,
+so that the position of an interaction determines its building.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from calibray.study import Setup, Study
 from coastal_district import Building, building_meshes, district
 
 DEVELOPMENT = tuple(f"district-{seed}" for seed in (100, 101, 102, 103, 104, 105, 106, 107, 108, 109))
-"""Districts to develop on."""
+"""Districts for development."""
 
 JUDGING = tuple(f"district-{seed}" for seed in (153, 155, 159, 161, 163))
-"""Districts that judged earlier versions, and on which the default of `noise.constants_spread` was chosen: a new
-version needs other seeds. (151 and 157 draw a carrier that P.2040 gives no constants for.)"""
+"""Districts for judging, on which the default of `noise.constants_spread` was also chosen: a new version needs other
+seeds. (151 and 157 draw a carrier for which P.2040 gives no constants.)"""
 
 DEMO = "demo"
 NEAR_M = 0.1
-"""Distance from a footprint within which an interaction happens on its building [m]."""
+"""Largest distance of an interaction from the footprint of its building [m]."""
 
 
 @dataclass(frozen=True)
 class District:
-    """A district whose paths are traced.
+    """A traced district.
 
     Attributes:
         name: Its name.
-        problem: The problem over its links.
+        problem: The problem of its links.
         footprints: Corners of every building, counter-clockwise [n, 2], [m].
     """
 
@@ -55,16 +55,16 @@ class District:
         return cast(engines.Replay, self.problem.engine).paths
 
     def path_loss(self, truth: np.ndarray) -> np.ndarray:
-        """Path loss of every link with one candidate everywhere [L], [dB]."""
+        """Path loss of every link with the same materials everywhere [L], [dB]."""
         return self.problem.engine.path_loss(truth[None])[0]
 
     def path_loss_apart(self, truth: np.ndarray, spread: float, random: np.random.Generator) -> np.ndarray:
-        """Path loss of every link where every building has walls of its own [L], [dB].
+        """Path loss of every link if every building has its own wall constants [L], [dB].
 
         Args:
-            truth: The materials' means.
+            truth: The means over the buildings.
             spread: Standard deviation of a building's factor.
-            random: Random numbers.
+            random: Generator of random numbers.
         """
         paths = self.paths
         buildings, parameters = len(self.footprints), self.problem.parameters
@@ -118,7 +118,7 @@ class Streets:
 
     @property
     def extent(self) -> np.ndarray:
-        """Size of it all along x and y [2], [m]."""
+        """Total size along x and y [2], [m]."""
         return self.blocks * self.pitch + self.width
 
 
@@ -134,13 +134,13 @@ def make(name: str, folder: Path, missing: float = 0.0) -> District:
     Args:
         name: "demo", "district-SEED" with 20 to 200 links, or "district-SEED:LINKS".
         folder: Folder for the scene and its links.
-        missing: Share of the buildings that the scene lacks; the links are those of the complete district.
+        missing: Share of the buildings that are missing in the scene; the links are those of the complete district.
     """
     if name == DEMO:
         setup = Study.load(demo_study_path()).opened()
         footprints = tuple(building.footprint for building in district())
     else:
-        # A folder for each process: another one may be writing the same district.
+        # Each process has its own folder, because another process may be writing the same district.
         seed, _, links = name.removeprefix("district-").partition(":")
         setup, footprints = _drawn(
             int(seed),
@@ -194,7 +194,7 @@ def _drawn(seed: int, folder: Path, missing: float, links: int) -> tuple[Setup, 
         "parameters": bounds,
     }  # fmt: skip
     setup = Study.from_content(content, folder / "study.toml").opened()
-    # Of the receivers planned, the first that some path leads to.
+    # The first of the planned receivers that have a path.
     reached = np.setdiff1d(np.arange(len(table)), setup.trace().links_without_path)[:count]
     table.iloc[reached].to_csv(folder / "links.csv", index=False)
     if missing:
@@ -220,7 +220,7 @@ def _objects(buildings: list[Building], streets: Streets) -> list[MeshObject]:
 
 
 def _block(corner: np.ndarray, size: np.ndarray, random: np.random.Generator, first: int) -> list[Building]:
-    """The buildings of a block, a lot each."""
+    """The buildings of a block, one per lot."""
     lots = random.integers(1, 3, 2)
     found = []
     for column in range(lots[0]):

@@ -1,12 +1,12 @@
 """Every method on families of planted problems at equal budgets of RT calls (docs/measurements/methods-on-families.md).
 
     python benchmarks/family.py --workers 2                      # development: seeds 0 to 19
-    python benchmarks/family.py --seeds 5000:5020 --workers 2    # judging: run once, reported whatever it says
+    python benchmarks/family.py --seeds 5000:5020 --workers 2    # judging: run once, reported whatever the result
 
-needs `pip install "calibray[optimizers,scenes]"` and a tracer. Every finished run is kept under out/family at once; a
+needs `pip install "calibray[optimizers,scenes]"` and a tracer. Every finished run is stored under out/family at once; a
 killed benchmark continues where it stopped, and one with more seeds, methods or `--repeats` runs only what is missing.
-Problems that cannot be made and runs that fail are named below the tables. Excesses can be compared between machines;
-seconds cannot.
+Problems that cannot be made and failed runs are listed below the tables. Excess RMSE can be compared between machines,
+but times cannot.
 """
 
 # ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)
@@ -20,7 +20,7 @@ for library in (
     "OMP",
     "OPENBLAS",
     "MKL",
-):  # read when NumPy is loaded; one core a run, here and in the workers
+):  # read when NumPy is loaded; one core per run, here and in the workers
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 from calibray.cli.console import log, progress_bars
@@ -36,8 +36,8 @@ METHODS = (
     "differential-evolution", "dfo-ls", "random", "latin-hypercube", "sobol",
 )  # fmt: skip
 
-AUTO = "vector-surrogate"  # what `auto` is without a cheap model
-DIGIT_DB = 1e-4  # the last digit of the tables, within which medians are taken for equal
+AUTO = "vector-surrogate"  # what `auto` uses without a cheap model
+DIGIT_DB = 1e-4  # the last digit of the tables; medians this close count as equal
 
 
 def main() -> None:
@@ -54,7 +54,7 @@ def main() -> None:
         "--constants", choices=("right", "wrong"), help="only problems whose cheap model has such constants"
     )
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--runs", type=Path, default=ROOT / "out/family", help="folder that keeps the runs")
+    parser.add_argument("--runs", type=Path, default=ROOT / "out/family", help="folder of the finished runs")
     chosen = parser.parse_args()
     wrong_constants = None if chosen.constants is None else chosen.constants == "wrong"
     finished = []
@@ -84,7 +84,7 @@ def main() -> None:
 
 
 def shown(comparison: FamilyComparison) -> Table:
-    """The targets of the methods that were run, and what was measured."""
+    """The targets of the methods that were run, with the measured values."""
     by_method = {budgeted.method: budgeted for budgeted in comparison.methods}
     rows: list[tuple[str, str, str, str]] = []
 

@@ -1,20 +1,20 @@
-"""Coverage of prediction intervals on clusters of links that were kept apart.
+"""Coverage of prediction intervals on clusters of links that the calibration does not use.
 
     CALIBRAY_DATA=FOLDER python benchmarks/far_predictions.py examples/auckland_tower.toml examples/nist_boulder.toml
     python benchmarks/far_predictions.py --districts development --seeds 2
     python benchmarks/far_predictions.py --worlds --districts judging --seeds 1 --out worlds.jsonl
 
-K-means from several seeds divides the receivers into four clusters. Each is kept apart in turn, and so is the quarter
-of the links at either end of the longer axis. The other links are validated on blocks, choose the model and give its
-errors. Four intervals of 90 % are compared at the links kept apart: by the ranks of all errors, in two levels (within
-and between blocks), these also wider out of sight, and these with the error between blocks counted twice. Clusters that
-hold all links of an offset's group are left out. A second table has the RMSE of every model on the links kept apart,
-and of the model that was chosen without them. If this is an average, the RMSE of the chosen model alone is listed too.
+K-means with several seeds divides the receivers into four clusters. Each cluster is kept apart in turn, and so is the
+quarter of the links at each end of the longer axis. Validation on blocks of the other links chooses the model and gives
+its errors. Four 90 % intervals are compared at the links kept apart: by the ranks of all errors; in two levels (within
+and between blocks); these also wider out of sight; and these with the error between blocks counted twice. Clusters that
+contain all links of an offset's group are left out. A second table has the RMSE of every model on the links kept apart,
+and that of the model chosen without them. If the choice is an average, the RMSE without averaging is listed too.
 
 With `--worlds`, the truth differs from each district's study (`misfit_worlds.py`). One of four blocks is kept apart;
-the regret is the RMSE there of the chosen model minus that of the best. "Of few" is the regret against the best of the
-initial materials, the calibrated model and the law of distance; "not averaged" is that of a choice without averages.
-Each run is a line of the file `--out`; an interrupted benchmark continues where it stopped.
+the regret is the RMSE there of the chosen model minus that of the best. "Of few" is the regret relative to the best of
+the initial materials, the calibrated model and the log-distance model; "not averaged" is that of a choice without
+averages. Each run is a line of the file `--out`; an interrupted benchmark continues where it stopped.
 """
 
 from __future__ import annotations
@@ -58,11 +58,11 @@ ALONE = "this, not averaged"
 NOT_AVERAGED = {str(average): name for name, average in AVERAGE_OF.items()}
 FEW = (Model.INITIAL, Model.CALIBRATED, Model.LOG_DISTANCE)
 CLOSE_DB = 0.3
-"""Regret up to which the choice counts as right."""
+"""Largest regret for which the choice counts as right."""
 
 
 def coverage(problem: Problem, apart: np.ndarray) -> tuple[list[float], list[float], dict[str, np.ndarray]]:
-    """Share of the links kept apart [L] in each kind of interval, half the widths, errors of every model [dB]."""
+    """Share of the links kept apart [L] in each kind of interval, half the widths, and errors of every model [dB]."""
     objective, links = problem.objective, problem.setup.links
     part = replace(problem, objective=replace(objective, weight=np.where(apart, 0.0, objective.weight)))
     part = replace(part, setup=part.setup.with_obstruction())
@@ -117,14 +117,14 @@ def judged(
 
 
 def _ends(place: np.ndarray) -> np.ndarray:
-    """The quarter of the links at each end of the longer axis, as clusters 0 and 1; -1 between [n]."""
+    """The quarters of the links at the ends of the longer axis, as clusters 0 and 1; -1 for the links between [n]."""
     centred = place - place.mean(axis=0)
     rank = (centred @ np.linalg.svd(centred, full_matrices=False)[2][0]).argsort().argsort()
     return np.where(rank < len(rank) // 4, 0, np.where(rank >= len(rank) - len(rank) // 4, 1, -1))
 
 
 def rmse_rows(name: str, errors: list[dict[str, np.ndarray]]) -> list[tuple[str, ...]]:
-    """Median and largest RMSE of every model over the clusters, and that over all links."""
+    """Median and largest RMSE of every model over the clusters, and its RMSE over all links."""
     rows = []
     for model in errors[0]:
         by_cluster = [np.sqrt(np.nanmean(error[model] ** 2)) for error in errors if model in error]
@@ -135,7 +135,7 @@ def rmse_rows(name: str, errors: list[dict[str, np.ndarray]]) -> list[tuple[str,
 
 
 def planted(name: str, folder: Path, seed: int) -> Problem:
-    """A district with a truth anywhere, and 3 dB of noise."""
+    """A district with a truth drawn from the whole bounds, and 3 dB of noise."""
     problem = districts.make(name, folder).problem
     random = np.random.default_rng([seed, int(name.rpartition("-")[2])])
     truth = random.uniform(*problem.parameters.search_bounds)
@@ -189,7 +189,7 @@ def in_worlds(names: str, seeds: int, out: Path) -> Table:
 
 
 def regrets(rows: list[dict[str, Any]], name: str, rivals: tuple[str, ...]) -> np.ndarray:
-    """RMSE of a model minus that of the best of some others, by run [dB]."""
+    """RMSE of a model minus that of the best of given models, for every run [dB]."""
     lowest = [np.nanmin([row["rmse"].get(rival, np.inf) for rival in rivals]) for row in rows]
     return np.array([row["rmse"][name] for row in rows]) - lowest
 
@@ -200,7 +200,7 @@ def main() -> None:
     parser.add_argument("studies", nargs="*")
     parser.add_argument("--districts", default="", help="development, judging or names")
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--worlds", action="store_true", help="worlds that differ from the study")
+    parser.add_argument("--worlds", action="store_true", help="use worlds that differ from the study")
     parser.add_argument("--out", type=Path, default=Path("worlds.jsonl"), help="file of the runs in worlds")
     given = parser.parse_args()
     if given.worlds:

@@ -2,9 +2,9 @@
 
     CALIBRAY_DATA=FOLDER python benchmarks/fidelity.py
 
-The scenes and the comparison are those of the tests (tests/fidelity_cases.py), and those of the measured
-campaigns, which lie in the folder that is named; materials are as traced, and then all changed at random twice. Only
-paths within 60 dB of their link's strongest count. The exit status is 1 if an error is over its bound.
+The scenes and the comparison are those of the tests (tests/fidelity_cases.py), and the scenes of the measured campaigns
+in FOLDER. Paths are evaluated with the materials of the trace, and then twice with all materials changed at random.
+Only paths within 60 dB of their link's strongest path count. The exit status is 1 if an error exceeds its bound.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def main() -> None:
             f"| {name} | {sum(errors.counted for errors in found)} | {worst:.1e} | {link:.5f} |", flush=True
         )
     if not within:
-        sys.exit("An error is over its bound")
+        sys.exit("An error exceeds its bound")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
-"""Hostile input of every kind, thousands of cases from a seed; lists the outcomes of each kind, and forbidden ones.
+"""Run thousands of cases of hostile input from a seed; list the outcomes of each kind of input, and forbidden ones.
 
 Run with: python benchmarks/fuzz.py [--cases N] [--seed S] [--workers W] [--kinds NAME ...], or, to see one case again,
 python benchmarks/fuzz.py --seed S --case N
 
-Cases run one after the other in worker processes; one that hangs or crashes is counted and its worker replaced. As root
-on Linux everything but a temporary folder is read-only to them, in a mount namespace of its own.
+Each worker process runs one case at a time. A case that hangs or crashes is counted, and its worker is replaced. As
+root on Linux, the workers run in a separate mount namespace, in which everything except a temporary folder is
+read-only.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 LIMIT = 30.0
-"""Processor time that a case may take [s]; waiting for it counts a quarter, so that a busy machine is no hang."""
+"""Limit of a case's processor time [s]; its wall time may be four times as long, in case the machine is busy."""
 START = 600.0
 """Time that a worker may take to start [s]."""
 INSIDE = "CALIBRAY_FUZZ_PLACE"  # the temporary folder, set within the mount namespace
@@ -48,19 +49,19 @@ PROGRAMS = (
     "rays",
     "section",
 )
-"""Kinds that may start programs: the study's, or Calibray itself to read a file within limits."""
+"""Kinds that may start programs: that of the study, or Calibray itself to read a file within limits."""
 COST = re.compile(r"\d (GiB|MiB|GB|rays|minutes|hours|days|seconds|RT calls|calls)\b")
 
 
 def work(place: Path, seed: int, kinds: list[str]) -> None:
-    """Run the cases whose numbers stand on standard input, and print what came of each."""
+    """Run the cases whose numbers are on standard input, and print their outcomes."""
     from fuzzing.kinds import make
     from fuzzing.outcome import MEMORY, Case, Verdict, Watch, judge, peak, restart_peak
     from fuzzing.world import World
 
     faulthandler.enable()
     answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what libraries print is no answer
+    os.dup2(2, 1)  # output of libraries must not mix with the answers
     found = World.open(place)
     found.warm()
     tempfile.tempdir = str(place)
@@ -77,7 +78,7 @@ def work(place: Path, seed: int, kinds: list[str]) -> None:
             case = make(seed, number, found, folder, kinds)
         except Exception:
             case = Case("broken", traceback.format_exc(), lambda: None, damaged=True)
-        # The case's number is written first, in case the process ends in it.
+        # The case is described first, because the process may end during it.
         print(json.dumps({"number": number, "kind": case.kind, "note": case.note}), file=answers, flush=True)
         started = time.monotonic()
         watch.programs = case.kind in PROGRAMS
@@ -98,7 +99,7 @@ def _remove(folder: Path) -> None:
 
 
 class Worker:
-    """A process that runs cases, and is started again when it is lost."""
+    """A process that runs cases, and is restarted if it is lost."""
 
     def __init__(self, place: Path, name: str, seed: int, kinds: list[str]) -> None:
         self._place, self._errors, self._seed, self._kinds = place, place / f"{name}.err", seed, kinds
@@ -106,7 +107,7 @@ class Worker:
         self._start()
 
     def _start(self) -> None:
-        """Start the process, which is ended again if this one is asked to end meanwhile."""
+        """Start the process; it is ended again if this process is asked to end meanwhile."""
         command = [sys.executable, __file__, "--work", str(self._place), "--seed", str(self._seed)]
         command += ["--kinds", *self._kinds] if self._kinds else []
         self._process = subprocess.Popen(
@@ -136,7 +137,7 @@ class Worker:
             return None
 
     def _spent(self) -> float:
-        """Processor time of the process [s]; 0 where the system does not tell."""
+        """Processor time of the process [s]; 0 if the system does not report it."""
         try:
             words = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
         except OSError:
@@ -144,11 +145,11 @@ class Worker:
         return sum(map(int, words[11:13])) / os.sysconf("SC_CLK_TCK")
 
     def run(self, number: int) -> dict[str, object]:
-        """Run a case, and tell what came of it."""
+        """Run a case, and return its outcome."""
         self._process.stdin.write(f"{number}\n")
         self._process.stdin.flush()
         answer: dict[str, object] = {"number": number, "kind": "unmade", "note": ""}
-        for _ in range(2):  # what it is, and what came of it
+        for _ in range(2):  # its description, and its outcome
             line, before, started = None, self._spent(), time.monotonic()
             while line is None and max(self._spent() - before, (time.monotonic() - started) / 4) < LIMIT:
                 line = self._next(1.0)
@@ -158,7 +159,7 @@ class Worker:
         return answer
 
     def _lost(self, ended: bool) -> dict[str, object]:
-        """What came of a case whose process ended, or goes on without end; another takes its place."""
+        """The outcome of a case whose process ended or hangs; a new process takes its place."""
         from fuzzing.outcome import MEMORY, peak
 
         said, large = self._errors.read_text(errors="replace")[-3000:], peak(self._process.pid) > MEMORY
@@ -170,12 +171,12 @@ class Worker:
         return lost
 
     def close(self) -> None:
-        """End the process for good."""
+        """End the process without starting a new one."""
         self._closed = True
         self.end()
 
     def end(self) -> None:
-        """End the process and what it started."""
+        """End the process and all processes that it started."""
         with suppress(ProcessLookupError):
             os.killpg(self._process.pid, 9)
         self._process.wait()
@@ -205,7 +206,7 @@ def attack(
                     file=sys.stderr,
                 )
 
-    # The first makes the world that the others find.
+    # The first worker makes the world that the others find.
     team = [Worker(place, "worker-0", seed, kinds)]
 
     def join(name: str) -> None:
@@ -237,7 +238,7 @@ def attack(
 
 
 def report(found: list[dict[str, object]]) -> int:
-    """Print counts by kind and by what came of it; 1 if something forbidden did."""
+    """Print counts by kind and outcome; return 1 if an outcome is forbidden."""
     counts = Counter((str(answer["kind"]), str(answer["verdict"])) for answer in found)
     columns = [*ALLOWED, *FORBIDDEN]
     print(f"{'':9}{'cases':>7}{'ms':>7}" + "".join(f"{name:>11}" for name in columns))
@@ -255,7 +256,7 @@ def report(found: list[dict[str, object]]) -> int:
 
 
 def main(place: Path, chosen: argparse.Namespace) -> int:
-    """Run the cases that were chosen."""
+    """Run the chosen cases."""
     numbers = (
         [chosen.case] if chosen.case is not None else list(range(chosen.first, chosen.first + chosen.cases))
     )
@@ -267,7 +268,7 @@ def main(place: Path, chosen: argparse.Namespace) -> int:
 
 
 def _apart(place: str) -> int:
-    """Start again where nothing but the temporary folder can be written; its files lie in memory."""
+    """Restart where only the temporary folder, whose files are in memory, is writable."""
     script = (
         f"mount --make-rprivate / && mount -t tmpfs -o size=2g tmpfs {place} && mount -o remount,bind,ro / && "
         'mount -o remount,bind,ro /dev; mount -t tmpfs -o size=1g tmpfs /dev/shm; exec "$@"'
@@ -277,13 +278,13 @@ def _apart(place: str) -> int:
     try:
         return process.wait()
     finally:
-        # Asked to end, which ends its workers too.
+        # This signal also ends its workers.
         process.terminate()
         process.wait()
 
 
 def _end(number: int, _: object) -> None:
-    """End on a signal as on an error, so that what was started is ended as well."""
+    """End on a signal as on an error, so that child processes are ended as well."""
     sys.exit(128 + number)
 
 
@@ -294,7 +295,7 @@ if __name__ == "__main__":
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kinds", nargs="+", default=[], help="functions of fuzzing.kinds.SHARES, by name")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--case", type=int, help="run this one, and print all of it")
+    parser.add_argument("--case", type=int, help="run this case, and print its full outcome")
     parser.add_argument("--work", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.work is not None:

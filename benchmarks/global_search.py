@@ -2,9 +2,10 @@
 
     python benchmarks/global_search.py --first 3700 --districts 20 --offices 10 --truths 4 --out search.jsonl
 
-Slabs are 60 % thicker than in the scene, so that they resonate often. Truths are drawn evenly within the bounds, errors
-have 3 dB. The lowest known minimum is that of `auto`, of the same searches without basin hopping, of 2,048 starting
-points from another seed, and of a search from the truth. The gap is the RMSE above it.
+Slabs are 60 % thicker than in the scene, so that they resonate often. Truths are drawn uniformly within the bounds, and
+the noise is 3 dB. The lowest known minimum is the lowest one that is found by `auto`, by the same searches without
+basin hopping, from 2,048 starting points of another seed, or by a search from the truth. The gap is the RMSE minus this
+minimum.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def searched(place: Place, engine: Foreign, number: int) -> dict[str, Any]:
 
 
 def summary(lines: list[dict[str, Any]]) -> Table:
-    """One row per method."""
+    """The table's rows, one per method."""
     rows = []
     for name in METHODS:
         gaps, evaluations, seconds = (
@@ -83,7 +84,7 @@ def main() -> None:
     parser.add_argument("--districts", type=int, default=20)
     parser.add_argument("--offices", type=int, default=10)
     parser.add_argument("--truths", type=int, default=4)
-    parser.add_argument("--out", type=Path, default=Path("search.jsonl"), help="lines of finished runs")
+    parser.add_argument("--out", type=Path, default=Path("search.jsonl"), help="file of the finished runs")
     options, lines = parser.parse_args(), []
     for make, count in ((district, options.districts), (office, options.offices)):
         for seed in range(options.first, options.first + count):

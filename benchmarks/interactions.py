@@ -3,12 +3,12 @@
     python benchmarks/interactions.py
     python benchmarks/interactions.py --compiling
 
-Path programs are made up at random (three materials, three interactions a path, three hundred links), in single
-precision as large programs are. The rival in the same run is the slab formula of ITU-R P.2040 evaluated at every
-interaction, which is what replay does without tables; the difference between both is printed next to the times.
+Path programs are drawn at random (three materials, three interactions per path, three hundred links), in single
+precision like all large programs. The rival in the same run is the slab formula of ITU-R P.2040 evaluated at every
+interaction, as in replay without tables; the difference between their path losses is printed next to the times.
 
-With `--compiling`, small programs: the processor time of their compilation and the time of a candidate, in batches of
-32, compiled to run fast and compiled fast.
+With `--compiling`, small programs are measured: the processor time of their compilation and the time per candidate, in
+batches of 32, compiled for fast runs and compiled quickly.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def program(interactions: int, diffuse: bool, seed: int = 0) -> Paths:
     Args:
         interactions: Number of interactions.
         diffuse: Whether the last interaction of every path is a diffuse reflection.
-        seed: Seed.
+        seed: Seed of the random numbers.
 
     Returns:
         The program.
@@ -102,7 +102,9 @@ def main() -> None:
     """Measure and print the table."""
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--largest", type=float, default=1e7, help="largest number of interactions")
-    options.add_argument("--compiling", action="store_true", help="small programs and their compilation")
+    options.add_argument(
+        "--compiling", action="store_true", help="measure small programs and their compilation"
+    )
     chosen = options.parse_args()
     if chosen.compiling:
         return measure_compiling()
@@ -118,7 +120,7 @@ def main() -> None:
 
 
 def measure_compiling() -> None:
-    """Measure and print the table of small programs; what was compiled is not kept."""
+    """Measure and print the table of small programs; compiled programs are not stored."""
     os.environ["CALIBRAY_CACHE"] = ""
     print(
         f"{'interactions':>12} {'compiled':>12} {'compiling [s]':>14} {'path loss [us]':>15} {'Jacobian [us]':>14}"

@@ -1,9 +1,9 @@
-"""Results that must not depend on names, order, place, direction or chunks: the largest change of each quantity.
+"""Results must not depend on names, order, place, direction or chunks: the largest change of each quantity.
 
     python benchmarks/invariance.py
 
-A campaign of two masts, three houses and forty links is traced, calibrated and predicted with, and again after each
-transformation of `tests/invariance_cases.py`. The exit status is 1 if a change exceeds its tolerance.
+A campaign of two masts, three houses and forty links is traced, calibrated and used for predictions, and again after
+each transformation of `tests/invariance_cases.py`. The exit status is 1 if a change exceeds its tolerance.
 """
 
 from __future__ import annotations

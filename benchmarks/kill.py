@@ -1,9 +1,9 @@
-"""Studies that are killed, interrupted, or lose their disk at random moments, and are started again each time.
+"""Studies that are killed, interrupted, or deprived of their disk at random moments, and restarted each time.
 
 Run with: python benchmarks/kill.py [--kills N] [--seed S] [--studies NAMES]
 
-As root on Linux it has a mount namespace of its own, for disks that are full or read-only; elsewhere only signals
-are sent.
+As root on Linux, the script uses its own mount namespace, for disks that are full or read-only; otherwise it only sends
+signals.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ DISK = "size=8m"
 
 @dataclass(frozen=True)
 class Case:
-    """One study to be disturbed.
+    """One study that is disturbed.
 
     Attributes:
         method: Its method.
         options: The method's settings.
-        workers: Programs that run at once.
+        workers: Number of programs that run at once.
         engine: Its engine.
     """
 
@@ -60,7 +60,7 @@ STUDIES = {
 
 
 def prepare(folder: Path, case: Case, mounts: bool) -> None:
-    """A study in a folder of its own, its output on a small disk of its own."""
+    """A study in a separate folder, with its output on a separate small disk."""
     (folder / "out").mkdir(parents=True)
     if mounts:
         subprocess.run(["mount", "-t", "tmpfs", "-o", DISK, "tmpfs", str(folder / "out")], check=True)
@@ -74,9 +74,9 @@ def prepare(folder: Path, case: Case, mounts: bool) -> None:
 
 
 def plan(case: Case, kills: int, calls: int, seconds: float, kinds: tuple[str, ...], seed: int) -> list[Harm]:
-    """Harms of random kinds at random moments."""
+    """Disturbances of random kinds at random moments."""
     rng = random.Random(seed)
-    if case.engine == "replay":  # without a ledger, a disk has no say before the end
+    if case.engine == "replay":  # without a ledger, the disk matters only at the end
         return [Harm(rng.choice(SIGNALS), seconds=rng.uniform(0, 0.9 * seconds)) for _ in range(kills)]
     last = max(2, calls - max(case.workers, 1))
     moments = sorted(rng.randrange(1, last) for _ in range(kills))
@@ -84,7 +84,7 @@ def plan(case: Case, kills: int, calls: int, seconds: float, kinds: tuple[str, .
 
 
 def disturb(runner: subprocess.Popen, place: Path, name: str, kills: int, seed: int, mounts: bool) -> bool:
-    """Run a study undisturbed and with harms, print what came of it, and tell whether all is well."""
+    """Run a study undisturbed and disturbed, print the outcome, and return whether it is as required."""
     case, folders = STUDIES[name], [place / f"{name}-undisturbed", place / f"{name}-disturbed"]
     for folder in folders:
         prepare(folder, case, mounts)
@@ -109,7 +109,7 @@ def disturb(runner: subprocess.Popen, place: Path, name: str, kills: int, seed: 
 
 
 def together(runners: tuple[subprocess.Popen, ...], place: Path, name: str, seed: int) -> bool:
-    """Start a study twice on one ledger; then kill one of the two as well, and start it again."""
+    """Start a study twice on one ledger; in a second round, also kill one of the two and restart it."""
     case, rng, folder = STUDIES[name], random.Random(seed), place / f"{name}-together"
     prepare(folder, case, False)
     well = True
@@ -144,11 +144,11 @@ def release(place: Path) -> None:
 
 
 def main() -> int:
-    """Disturb every study, and run two at once; 0 if nothing was lost, repeated or changed."""
+    """Disturb every study, and run two at once; return 0 if nothing was lost, repeated or changed."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=30, help="in all, over the studies")
+    parser.add_argument("--kills", type=int, default=30, help="total number of kills over the studies")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--studies", default=",".join(STUDIES), help="names with commas between")
+    parser.add_argument("--studies", default=",".join(STUDIES), help="names, separated by commas")
     chosen = parser.parse_args()
     names, mounts = chosen.studies.split(","), INSIDE in os.environ
     with tempfile.TemporaryDirectory() as place, restarts.open_runner() as one, restarts.open_runner() as two:

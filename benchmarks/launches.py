@@ -1,15 +1,15 @@
-"""What tracing costs by launches: rays added in rounds against a number of rays, many receivers, many transmitters.
+"""Cost of tracing by launches: rays added in rounds or in a fixed number, many receivers, many transmitters.
 
-Everything is measured in one run on one machine, in processor seconds, so that other work hardly changes the ratios:
+Everything is measured in one run on one machine, as processor time, so that other work hardly changes the ratios:
 
     python benchmarks/launches.py            # a few minutes
     python benchmarks/launches.py --full     # 4 million rays on the demo district and 10,000 receivers as well
 
-Four comparisons: the demo district, whose paths 1 million rays do not all find; receivers in the streets of Munich on
-one transmitter, traced with a million rays (the default) and with "auto"; a flat-like case, many transmitters and
-few receivers, and its mirror image; and traces to numbers of receivers that occur for the first time, with a number of
-rays for which no kernel was compiled. Each other trace is run once before, so that no compiling is measured, but for
-the demo district, where the first run is printed too.
+There are four comparisons: the demo district, where 1 million rays do not find all paths; receivers in the streets of
+Munich with one transmitter, traced with a million rays (the default) and with "auto"; many transmitters and few
+receivers, as in a flat, and the mirror image; and traces to new numbers of receivers, with a number of rays for which
+no kernel was compiled. In the first three, each trace is run once beforehand, so that compilation is not measured; for
+the demo district, the first run is printed too.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MILLION = 1_000_000
 
 
 def timed(call: Callable[[], Paths]) -> tuple[Paths, float]:
-    """What a call answers, and its processor time [s]."""
+    """The return value of a call, and its processor time [s]."""
     start = time.process_time()
     return call(), time.process_time() - start
 
@@ -54,7 +54,7 @@ def row(name: str, *cells: object) -> None:
 
 
 def demo(counts: tuple[int, ...]) -> None:
-    """Rays in rounds against numbers of rays, on the demo district."""
+    """Rays added in rounds compared with fixed numbers of rays, in the demo district."""
     setup = Setup.open(Study.load(demo_study_path()))
     print(f"Demo district, {len(setup.links)} links\n")
     row("samples", "processor [s]", "paths", "missed [dB]")
@@ -68,7 +68,7 @@ def demo(counts: tuple[int, ...]) -> None:
 
 
 def streets(receivers: int, compared: int) -> None:
-    """Links a second with many receivers on one transmitter."""
+    """Links per second with one transmitter and many receivers."""
     at = Tracer(
         read_scene("sionna:munich", FREQUENCY), FREQUENCY, TraceSettings(samples="auto"), Antenna(), Antenna()
     )
@@ -82,7 +82,7 @@ def streets(receivers: int, compared: int) -> None:
     at.trace(links(MAST[None], rx[:20]))
     auto, seconds = timed(lambda: at.trace(links(MAST[None], rx)))
     row(f"auto ({auto.settings['rays']:,} rays)", receivers, f"{seconds:.2f}", f"{receivers / seconds:.1f}")
-    # Those that are reached count double: most receivers see neither the mast nor a wall that does.
+    # Half of the sample is reached: most receivers see neither the mast nor a wall that the mast sees.
     reached = np.isfinite(path_loss(auto))
     some = np.concatenate([np.flatnonzero(reached == each)[: compared // 2] for each in (True, False)])
     many.trace(links(MAST[None], rx[:6]))
@@ -98,7 +98,7 @@ def streets(receivers: int, compared: int) -> None:
 
 
 def mirrored(many: int, few: int) -> None:
-    """Many transmitters and few receivers, and the mirror image, with a number of rays and with "auto"."""
+    """Many transmitters and few receivers, and the mirror image, with a fixed number of rays and with "auto"."""
     settings = TraceSettings(max_depth=3, samples=100_000, refraction=True)
     scene = read_scene("sionna:simple_street_canyon", FREQUENCY)
     here, there = Antenna("tr38901", "V", (0.3, 0.1, 0.0)), Antenna("dipole", "V")
@@ -138,7 +138,7 @@ def mirrored(many: int, few: int) -> None:
 
 
 def first_launches(numbers: tuple[int, ...]) -> None:
-    """Traces to numbers of receivers, in this order, whose kernels are not on disk because no run had as many rays."""
+    """Traces to the given numbers of receivers in order; their kernels are not on disk, as no run had as many rays."""
     settings = TraceSettings(
         max_depth=2, samples=20_000 + time.time_ns() % 10_000, refraction=True, diffraction=True
     )
