@@ -1,8 +1,8 @@
 """Memory of tracing, and a check that splitting receivers over launches does not change the result.
 
     python benchmarks/memory.py             # 2,000 receivers and 2 transmitters in Munich
-    python benchmarks/memory.py --lanes     # bytes of a lane, for calibray.tracing.trace_plan.LANE_BYTES
-    python benchmarks/memory.py --paths     # bytes of a path, for calibray.tracing.trace_plan.PATH_BYTES
+    python benchmarks/memory.py --lanes     # bytes per lane, for calibray.tracing.trace_plan.LANE_BYTES
+    python benchmarks/memory.py --paths     # bytes per path, for calibray.tracing.trace_plan.PATH_BYTES
 
 Each run has its own process, whose peak resident memory is printed.
 """
@@ -30,7 +30,7 @@ ROUGH = {name: {"scattering_coefficient": 0.5} for name in ("glass", "wood", "ma
 
 
 def resident() -> float:
-    """Largest memory that this process has had so far [bytes]."""
+    """Peak memory of this process so far [bytes]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
@@ -52,7 +52,7 @@ def outdoors(at: Tracer, count: int, seed: int = 0) -> np.ndarray:
 
 
 def campaign(receivers: int, samples: int, depth: int, compared: int) -> None:
-    """Trace a large campaign, and some of its links one by one."""
+    """Trace a large campaign, and a sample of its links one by one."""
     munich = make_tracer("sionna:munich", samples=samples, max_depth=depth)
     rx = outdoors(munich, receivers)
     links = SimpleNamespace(tx=np.repeat(MASTS, len(rx), axis=0), rx=np.tile(rx, (len(MASTS), 1)))
@@ -69,7 +69,7 @@ def campaign(receivers: int, samples: int, depth: int, compared: int) -> None:
     print(f"launches             {len(planned.launches)} of up to {planned.lanes:,} lanes")
     print(f"tracing, compiling   {traced:.1f} s, {compiled:.1f} s")
     print(f"peak memory          {peak / 2**30:.2f} GiB")
-    # Half of the links compared have a path: most receivers see neither mast, nor a wall that does.
+    # Half of the compared links have a path: most receivers see neither a mast nor a wall that a mast sees.
     random, reached = np.random.default_rng(1), np.isfinite(loss)
     sample = np.concatenate(
         [
@@ -87,7 +87,7 @@ def campaign(receivers: int, samples: int, depth: int, compared: int) -> None:
 
 
 def one(links: SimpleNamespace, link: int) -> SimpleNamespace:
-    """One of some links."""
+    """One of the given links."""
     return SimpleNamespace(tx=links.tx[link : link + 1], rx=links.rx[link : link + 1])
 
 
@@ -108,7 +108,7 @@ def lanes(samples: int, depth: int, receivers: int) -> None:
 
 
 def paths(samples: int, depth: int, receivers: int) -> None:
-    """Trace and compile very many paths."""
+    """Trace and compile a very large number of paths."""
     rough = make_tracer(CANYON, ROUGH, samples=samples, max_depth=depth, diffuse_reflection=True)
     before = resident()
     found = rough.trace(canyon_links(receivers))
@@ -117,14 +117,16 @@ def paths(samples: int, depth: int, receivers: int) -> None:
 
 
 def main() -> None:
-    """Run what was asked for, each in a process of its own."""
+    """Run the requested measurements, each in a separate process."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--lanes", action="store_true", help="measure the bytes of a lane")
-    parser.add_argument("--paths", action="store_true", help="measure the bytes of a path")
+    parser.add_argument("--lanes", action="store_true", help="measure the bytes per lane")
+    parser.add_argument("--paths", action="store_true", help="measure the bytes per path")
     parser.add_argument("--receivers", type=int, default=2000)
     parser.add_argument("--samples", type=int, default=200_000)
     parser.add_argument("--depth", type=int, default=3)
-    parser.add_argument("--compared", type=int, default=50, help="links that are traced one by one as well")
+    parser.add_argument(
+        "--compared", type=int, default=50, help="number of links that are also traced one by one"
+    )
     parser.add_argument("--child", nargs="+", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:

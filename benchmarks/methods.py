@@ -2,9 +2,9 @@
 
     python benchmarks/methods.py --seeds 25 --workers 2
 
-needs `pip install 'calibray[optimizers]'`, and for the two real campaigns their data (see examples/README.md). Finished
-runs are kept under out/methods, so that a killed benchmark continues where it stopped; delete the folder to measure
-again. Excesses can be compared between machines; seconds cannot.
+needs `pip install 'calibray[optimizers]'` and the data of both measured campaigns (see examples/README.md). Finished
+runs are stored under out/methods, so that a killed benchmark continues where it stopped; delete the folder to measure
+again. Excess RMSE can be compared between machines, but times cannot.
 """
 
 # ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)
@@ -20,7 +20,7 @@ for library in (
     "OMP",
     "OPENBLAS",
     "MKL",
-):  # read when NumPy is loaded; one core a run, here and in the workers
+):  # read when NumPy is loaded; one core per run, here and in the workers
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 from calibray.cli.console import log, progress_bars
@@ -59,9 +59,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=25)
     parser.add_argument("--budget", type=int, default=225)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--runs", type=Path, default=ROOT / "out/methods", help="folder that keeps the runs")
+    parser.add_argument("--runs", type=Path, default=ROOT / "out/methods", help="folder of the finished runs")
     parser.add_argument(
-        "--out", type=Path, default=ROOT / "docs/measurements/methods", help="folder of tables and figures"
+        "--out", type=Path, default=ROOT / "docs/measurements/methods", help="folder for tables and figures"
     )
     chosen = parser.parse_args()
     chosen.out.mkdir(parents=True, exist_ok=True)

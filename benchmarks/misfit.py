@@ -1,18 +1,19 @@
-"""Intervals, warnings and choice where the truth has what the study's scene lacks: seven worlds, on drawn districts.
+"""Intervals, warnings and choice if the study's scene lacks part of the truth: seven worlds, on drawn districts.
 
     python benchmarks/misfit.py --repetitions 5 --districts judging
     python benchmarks/misfit.py --worlds "nothing,thickness" --no-choice --constants-spread 0 --out exact.jsonl
     python benchmarks/misfit.py --repetitions 2 --districts judging --no-draws
 
 A repetition draws a truth from the bounds, computes path loss in its world, adds 3 dB of noise, keeps one of four
-clusters of receivers apart, and calibrates the others as `calibray run` does. The true paths of a world are traced once
-for each district.
+clusters of receivers apart, and calibrates on the others as `calibray run` does. The true paths of a world are traced
+once for each district.
 
-Reported are how often 90 % sets contain the truth by verdict, and how often a run with a wrong verdict (any but not
-identifiable, and the 95 % interval misses) has a warning, or a value at a bound, which the report explains as a
-possible defect of the model. The regret is what the model that held-out blocks choose loses at the cluster kept apart,
-compared with the best of the initial materials, the calibrated ones and the log-distance model there. The same is
-reported for the choice without averaging, and for the calibrated models without and with a prior.
+The table shows, by verdict, how often 90 % sets contain the truth. It also shows how often a run with a wrong verdict
+has a warning, or a value at a bound, which the report explains as a possible defect of the model. A verdict is wrong if
+it is not "not identifiable" and the 95 % interval misses the truth. The regret is the RMSE at the cluster kept apart of
+the model that held-out blocks choose, minus that of the best of the initial materials, the calibrated ones and the
+log-distance model. The same is shown for the choice without averaging, and for the calibrated models without and with a
+prior.
 """
 
 from __future__ import annotations
@@ -47,9 +48,9 @@ LEVEL = 0.9
 APART = 4
 """Clusters of receivers, one of which is kept apart."""
 FEWEST = 8
-"""Links of each cluster below which none is kept apart."""
+"""Mean number of links per cluster below which no cluster is kept apart."""
 NEARLY_DB = 0.3
-"""Loss compared with the best model up to which a choice is right."""
+"""Largest regret for which a choice is right."""
 IDENTIFIED = ("identified", "weakly identified")
 PARTLY = ("ambiguous", "at bound")
 OWN_PATHS = "own paths"
@@ -57,7 +58,7 @@ NOT_AVERAGED = {str(average): name for name, average in AVERAGE_OF.items()}
 
 
 def repetition(world: World, seed: int, spread: float | None, *, draws: bool, choice: bool) -> dict[str, Any]:
-    """Calibrate one truth: with draws, verdicts and whether their sets contain it; with a choice, errors far away."""
+    """Calibrate one truth; judge verdicts and sets from draws, and the chosen model at the cluster kept apart."""
     started, drawn = time.process_time(), world.planted(seed)
     problem, loss, random = drawn.problem, drawn.loss_db, np.random.default_rng([seed, 4])
     weight, far = problem.objective.weight.copy(), np.zeros(len(loss), dtype=bool)
@@ -91,7 +92,7 @@ def repetition(world: World, seed: int, spread: float | None, *, draws: bool, ch
 def intervals(planted: Problem, trail: Trail, point: np.ndarray) -> dict[str, Any]:
     """Verdicts and remarks of a calibration, and whether its sets and intervals contain the truth [d].
 
-    If the measurements favour paths that the study leaves out, those on its own paths are under `OWN_PATHS`.
+    If the measurements favour paths that the study leaves out, the values for its own paths are under `OWN_PATHS`.
     """
     own_paths = certainty(planted, trail)
     assessed = assess_richer_paths(planted, trail, own_paths)
@@ -163,7 +164,7 @@ def table(lines: list[dict[str, Any]]) -> Table:
 
 
 def _regret(line: dict[str, Any], name: str) -> float:
-    """RMSE of a model at the cluster kept apart, minus that of the best simple one [dB]."""
+    """RMSE of a model at the cluster kept apart, minus that of the best simple model [dB]."""
     simple = (Model.INITIAL, Model.CALIBRATED, Model.LOG_DISTANCE)
     return line["far_db"][name] - min(line["far_db"].get(name, np.inf) for name in simple)
 
@@ -175,17 +176,19 @@ def _share(values: list[bool]) -> str:
 def main() -> None:
     """Run what is missing and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--repetitions", type=int, default=5, help="of every world in every district")
+    parser.add_argument(
+        "--repetitions", type=int, default=5, help="repetitions of every world in every district"
+    )
     parser.add_argument("--districts", default="development", help="names, or development or judging")
     parser.add_argument("--worlds", default=",".join(WORLDS))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
-        "--constants-spread", type=float, help="how well constants are known; the default if absent"
+        "--constants-spread", type=float, help="noise.constants_spread; the default if absent"
     )
     parser.add_argument("--own-paths", action="store_true", help="show intervals on the study's own paths")
-    parser.add_argument("--no-choice", action="store_true", help="leave validation out")
-    parser.add_argument("--no-draws", action="store_true", help="leave verdicts and intervals out")
-    parser.add_argument("--out", type=Path, help="file of lines, one a repetition; goes on where it stands")
+    parser.add_argument("--no-choice", action="store_true", help="omit validation and choice")
+    parser.add_argument("--no-draws", action="store_true", help="omit verdicts and intervals")
+    parser.add_argument("--out", type=Path, help="file with one line per repetition, to continue from")
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "calibray-districts")
     given = parser.parse_args()
     worlds = tuple(name for name in WORLDS if any(name.startswith(word) for word in given.worlds.split(",")))

@@ -1,7 +1,7 @@
 """Worlds in which a district's study differs from the truth in one respect.
 
-The study of a world is calibrated as it is. Its measurements are path loss along the paths of the true world, with the
-true materials and noise. Both are traced once per district; a truth takes one replay.
+The study of a world is calibrated unchanged. Its measurements are the path loss of the paths of the true world, with
+the true materials, plus noise. The study and the true world are traced once per district; each truth takes one replay.
 
     python benchmarks/misfit_worlds.py --districts district-100     # the size of each world
 """
@@ -48,7 +48,7 @@ FACTOR = 1.5
 DIFFUSE_TRACE = {"max_depth": 2, "samples": 30_000, "diffuse_reflection": True}
 
 JUDGING = tuple(f"district-{seed}" for seed in range(200, 224) if seed not in (201, 206, 208, 209))
-"""Twenty districts that no method was developed on. (The others draw a carrier that P.2040 gives no constants for.)"""
+"""Twenty districts not used for development. (The others draw a carrier for which P.2040 has no constants.)"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class World:
         name: What differs; one of `WORLDS`.
         district: The district as the study describes it.
         truth: The paths of the true world.
-        further_db: Further true loss [L], [dB].
+        further_db: Additional loss in the true world [L], [dB].
     """
 
     name: str
@@ -96,7 +96,7 @@ class Planted:
     """A calibration problem with a known truth.
 
     Attributes:
-        problem: The problem; links that the study or the truth has no path for have weight 0.
+        problem: The problem; links without a path in the study or in the true world have weight 0.
         truth: The true parameters in the search space [d].
         loss_db: True path loss without noise [L], [dB].
     """
@@ -187,14 +187,14 @@ def _inside(point: np.ndarray, corners: np.ndarray) -> bool:
 
 
 def _in_groves(place: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """The quarter of the receivers nearest to a few random ones, the groves [L]."""
+    """Mask of the quarter of the receivers nearest to a few random receivers, the groves [L]."""
     centre = place[random.choice(len(place), GROVES, replace=False)]
     distance = np.linalg.norm(place[:, None] - centre, axis=2).min(axis=1)
     return distance.argsort().argsort() < round(TREES_SHARE * len(place))
 
 
 def _sectors(district: District, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Stated and true azimuth of every link's transmitter [L], [deg]: towards its receivers, and off to one side."""
+    """Stated and true azimuth of every link's transmitter [L], [deg]: towards its receivers, and turned to one side."""
     links = district.problem.setup.links
     stated, error = np.zeros(len(links)), np.zeros(len(links))
     for tx in np.unique(links.tx, axis=0):
@@ -214,7 +214,7 @@ def _sector_study(azimuth: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Print the size of every world, and how far its true path loss is from that of the study's paths."""
+    """Print the size of every world, and the difference of its path loss from that of the study's paths."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--districts", default="district-100")
     given = parser.parse_args()

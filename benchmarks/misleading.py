@@ -1,13 +1,14 @@
-"""The calls that a misleading cheap model costs space mapping, on planted problems.
+"""Additional calls of space mapping with a misleading cheap model, on planted problems.
 
     python benchmarks/misleading.py --seeds 0:5
 
 runs space mapping on each problem of the families with its own cheap model, with none (the vector surrogate), and with
-three that know nothing of the problem: *scrambled*, the problem's own with its links shuffled and its box mirrored,
-*tones*, smooth random functions of the same size for every link, and *noise*, random numbers without any smoothness,
-the same at the same point. It prints the median calls to come within a tolerance, and how many more these are than
-without a cheap model. It also prints the median difference between the i-th fastest run with it and the i-th fastest
-without, over as many as were solved by both. Finished runs are kept under out/misleading; a killed benchmark continues.
+three models without information on the problem: *scrambled*, the problem's own model with its links shuffled and its
+box mirrored; *tones*, smooth random functions of the same size for every link; and *noise*, random numbers without any
+smoothness, repeatable at each point. It prints the median calls to come within a tolerance, and the difference from
+those without a cheap model. It also prints the median difference between the i-th fastest run with the model and the
+i-th fastest without it, over the number of runs that both solve. Finished runs are stored under out/misleading; a
+killed benchmark continues where it stopped.
 """
 
 # ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)
@@ -59,12 +60,12 @@ class Scrambled:
 
     @property
     def constants(self) -> Constants:
-        """Those of the model."""
+        """The value of the original model."""
         return self.model.constants
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Rows that it says something about [m]."""
+        """Mask of the rows for which it has an answer [m]."""
         return self.model.known[self.order]
 
     def residuals(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -87,8 +88,8 @@ class Tones:
 
     Attributes:
         size: Root mean square of each link's residuals [dB].
-        wave: Wave numbers of the tones by the parameters [t, d].
-        phase: Their phases [t].
+        wave: Wave numbers of the tones with respect to the parameters [t, d].
+        phase: Phases of the tones [t].
         weight: Weight of every tone in every link [t, m].
     """
 
@@ -122,10 +123,10 @@ class Tones:
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Normal random numbers, the same at the same point, with derivatives that are as random.
+    """Normal random numbers, repeatable at each point, with random derivatives.
 
     Attributes:
-        size: Their standard deviation [dB].
+        size: Standard deviation of the numbers [dB].
         width: Range of each parameter [d].
         links: Number of rows m.
     """
@@ -155,7 +156,7 @@ class Noise:
         return CheapAnswer(drawn[:, 0], slope, np.zeros((len(points), self.links, 0)))
 
     def _drawn(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Numbers from generators that are seeded by the bits of each point [n, 1 + d, m]."""
+        """Numbers from generators seeded with the bits of each point [n, 1 + d, m]."""
         shape = (1 + len(self.width), self.links)
         bits = np.ascontiguousarray(points).view(np.uint64)
         return self.size * np.array([np.random.default_rng(row).standard_normal(shape) for row in bits])
@@ -169,7 +170,7 @@ def scrambled(problem: ComparisonProblem) -> CheapModel:
 
 
 def tones(problem: ComparisonProblem, count: int = 20) -> CheapModel:
-    """Tones of about one period over the box, as large as the residuals in its middle."""
+    """Tones with about one period over the box, as large as the residuals at its centre."""
     rng, (size, links) = np.random.default_rng(0), in_the_middle(problem)
     wave = rng.normal(0.0, np.pi, (count, len(problem.lower))) / (problem.upper - problem.lower)
     weight = rng.standard_normal((count, links)) * np.sqrt(2.0 / count)
@@ -177,13 +178,13 @@ def tones(problem: ComparisonProblem, count: int = 20) -> CheapModel:
 
 
 def noise(problem: ComparisonProblem) -> CheapModel:
-    """Noise as large as the residuals in the middle of the box."""
+    """Noise as large as the residuals at the centre of the box."""
     size, links = in_the_middle(problem)
     return Noise(size, problem.upper - problem.lower, links)
 
 
 def in_the_middle(problem: ComparisonProblem) -> tuple[float, int]:
-    """Root mean square of the residuals in the middle of the box [dB], and their number."""
+    """Root mean square of the residuals at the centre of the box [dB], and their number."""
     answer = problem.evaluate(0.5 * (problem.lower + problem.upper)[None], False)
     return float(answer.value[0]), answer.residuals.shape[1]
 
@@ -201,7 +202,7 @@ MODELS: dict[str, Callable[[ComparisonProblem], CheapModel] | None] = {
 
 
 def with_model(problem: ComparisonProblem, name: str) -> ComparisonProblem:
-    """The problem with another cheap model."""
+    """The problem with a different cheap model."""
     make = MODELS[name]
     return replace(problem, cheap_model=None if make is None else lambda: make(problem))
 
@@ -214,12 +215,12 @@ def main() -> None:
     parser.add_argument("--families", nargs="+", default=["district", "office"])
     parser.add_argument("--seeds", default="0:5")
     parser.add_argument(
-        "--models", nargs="+", choices=MODELS, default=list(MODELS), help="none is always run"
+        "--models", nargs="+", choices=MODELS, default=list(MODELS), help="'none' is always run too"
     )
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--budget", type=int, default=60)
     parser.add_argument(
-        "--runs", type=Path, default=ROOT / "out/misleading", help="folder that keeps the runs"
+        "--runs", type=Path, default=ROOT / "out/misleading", help="folder of the finished runs"
     )
     chosen = parser.parse_args()
     method = BudgetedMethod.parse("space-mapping", chosen.budget)
@@ -250,7 +251,7 @@ def main() -> None:
 
 
 def compared(runs: dict[str, list[MethodRun]], lowest: NDArray[np.float64]) -> Table:
-    """Calls to a tolerance with every cheap model, and beyond those without one."""
+    """Calls to a tolerance with every cheap model, and their excess over those without one."""
     rows = []
     for name, each in runs.items():
         cells = [name]
@@ -279,7 +280,7 @@ def compared(runs: dict[str, list[MethodRun]], lowest: NDArray[np.float64]) -> T
 
 
 def _count(calls: float, sign: str = "") -> str:
-    """A number of calls, none where half of the runs or more were not solved."""
+    """A number of calls; a dash if at least half of the runs did not solve their problem."""
     return f"{calls:{sign}.1f}" if np.isfinite(calls) else "-"
 
 

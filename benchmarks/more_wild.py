@@ -2,9 +2,9 @@
 
     python benchmarks/more_wild.py
 
-A problem is solved to a tolerance t when f <= f_L + t (f_0 - f_L), with the lowest sum of squares f_L that any method
-reached. The data profile is the share of problems solved within a number of simplex gradients, n + 1 evaluations each.
-The box reaches to both sides of the starting point by ten times its largest coordinate, or by 10.
+A problem is solved to a tolerance t if f <= f_L + t (f_0 - f_L), where f_L is the lowest sum of squares that any method
+reached. The data profile is the share of problems solved within a number of simplex gradients, each of n + 1
+evaluations. The box extends to both sides of the starting point by ten times its largest coordinate, or by 10.
 """
 
 # ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)
@@ -24,7 +24,7 @@ from calibray.tables import Column, Table, numbers
 from markdown_tables import render_markdown
 from problem_families.more_wild import MoreWild, problems
 
-RADIUS = 0.005  # of the box, which makes the first trust region a tenth of the starting point, as by default in DFO-LS
+RADIUS = 0.005  # of the box, so that the first trust region is a tenth of the starting point, the default of DFO-LS
 OPTIONS = {
     "pounders": {"radius": RADIUS, "tolerance": 1e-11},
     "dfo-ls": {"radius": RADIUS, "tolerance": 1e-11},

@@ -1,9 +1,9 @@
-"""Derivatives with the nuisance eliminated: one pass over all links against a loop over groups.
+"""Derivatives with the nuisance eliminated: one pass over all links compared with a loop over groups.
 
     python benchmarks/nuisance.py
 
-The baseline is an earlier implementation: a mask over all links for every group and every parameter. Both are timed in
-the same run on the same numbers and must agree; designs that the baseline cannot express are listed below without it.
+The baseline uses a mask over all links for every group and every parameter. Both are timed in the same run on the same
+numbers and must agree; designs that the baseline cannot express are listed without it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from timing import seconds
 def former_jacobian(
     objective: Objective, group: np.ndarray, groups: int, loss: np.ndarray, slope: np.ndarray
 ) -> np.ndarray:
-    """Derivatives less their weighted means over groups, a mask for each; all links counted."""
+    """Derivatives minus their weighted means over groups, with a mask for each group; all links have weight."""
     gap = objective.measured - loss
     weight = np.where(np.isfinite(gap), objective.weight, 0.0)
 
@@ -38,7 +38,7 @@ def former_jacobian(
 
 
 def campaign(count: int, groups: int) -> Measurements:
-    """Links in groups, weights of their own."""
+    """Links in groups, with individual weights."""
     rng = np.random.default_rng(0)
     return Measurements(
         tx=np.zeros((count, 3)),

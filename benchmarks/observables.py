@@ -1,17 +1,17 @@
-"""Planted delay spreads and round-trip times: do they determine what path loss leaves open, with honest intervals?
+"""Planted delay spreads and round-trip times: do they determine what path loss cannot, with intervals that hold?
 
     python benchmarks/observables.py --districts 20 --repetitions 5
     python benchmarks/observables.py --receiver
 
 Every district of antenna_pose.py gets diffuse walls and 40 links in sight along two streets. A repetition draws the
 permittivity and the scattering coefficient S of the walls, computes path loss and RMS delay spread, adds noise of 3 dB
-and 3 ns, and calibrates on path loss alone and on both, with an unknown offset of path loss. The table says how often S
-is identified, and how often the 90 % intervals of the draws cover the truth. A third run uses the delay spreads of the
-next district: how often is a conflict reported there, and how often with the right ones?
+and 3 ns, and calibrates on path loss alone and on both, with an unknown offset of path loss. The table shows how often
+S is identified, and how often the 90 % intervals of the draws cover the truth. A third run uses the delay spreads of
+the next district. The last lines show how often a conflict is reported with these and with the correct ones.
 
-Every office has five access points whose round-trip times have an unknown bias each. A repetition draws two
-permittivities and the biases, and calibrates on path loss and round-trip times (80 MHz, 8 ns of noise). The table says
-how often the 90 % interval of a bias covers it.
+Every office has five access points, each with an unknown bias of its round-trip times. A repetition draws two
+permittivities and the biases, and calibrates on path loss and round-trip times (80 MHz, 8 ns of noise). The table shows
+how often the 90 % interval of a bias covers its true value.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ REPORTED: Final = {RemarkKind.CONFLICT}
 SPREAD: Final = {"kind": "rms_delay_spread", "column": "spread_ns", "unit": "ns"}
 Row = dict[str, Any]
 NOISE_RTT_NS: Final = 8.0
-"""Standard deviation of a round-trip time, 1.2 m of distance."""
+"""Standard deviation of a round-trip time, equivalent to 1.2 m of distance."""
 ROUND_TRIP: Final = Statistic("round_trip_time", "first", dynamic_range_db=20.0, bandwidth=80e6)
 RTT: Final = {
     "kind": "round_trip_time", "column": "rtt_ns", "unit": "ns", "bias": "access_point", "path": "first",
@@ -62,9 +62,9 @@ OFFICE: Final = ("walls.relative_permittivity", "slabs.relative_permittivity")
 LINKS: Final = 40
 """Links of a district, along two of its streets."""
 SAMPLES: Final = 400
-"""Rays of a transmitter; truth and calibration share the paths."""
+"""Rays per transmitter; truth and calibration share the paths."""
 QUICK: Final = {"noise": {"kind": "gaussian", "range_m": 0, "heterogeneity": 0, "constants_spread": 0}}
-"""The noise that is planted: one model instead of all."""
+"""The planted noise: one noise model instead of all."""
 
 
 def streets(folder: Path, seed: int) -> pd.DataFrame:
@@ -98,7 +98,7 @@ def study(folder: Path, table: pd.DataFrame, **sections: Any) -> Study:
 def planted(
     folder: Path, links: pd.DataFrame, random: np.random.Generator
 ) -> tuple[dict[str, float], pd.DataFrame]:
-    """A draw of the truth, and the links that paths reach with their noisy path loss and delay spread."""
+    """A draw of the truth, and the links with a path, with their noisy path loss and delay spread."""
     setup = Setup.open(study(folder, links))
     truth = {name: random.uniform(*limits) for name, limits in DRAWN.items()}
     engine = replay(setup, setup.trace())
@@ -115,13 +115,13 @@ def planted(
 
 
 def district_runs(folder: Path, links: pd.DataFrame, other: pd.DataFrame, seed: list[int]) -> list[Row]:
-    """Calibrate one draw of the truth on path loss, on both, and with the delay spreads of another district."""
+    """Calibrate one draw of the truth on path loss, on both observables, and with another district's delay spreads."""
     random, rows = np.random.default_rng([*seed, 28]), []
     truth, table = planted(folder, links, random)
     _, elsewhere = planted(folder.with_name(f"{folder.name}-next"), other, random)
     foreign = table.assign(spread_ns=np.resize(elsewhere["spread_ns"].to_numpy(), len(table)))
     runs = {"both": {"observables": {"spread": SPREAD}}}
-    # What path loss alone determines hardly depends on the draw: some runs show it.
+    # What path loss alone determines hardly depends on the draw, so a few runs are sufficient.
     runs |= {"path loss": {}} if seed[1] == 0 and seed[0] % 2 == 0 else {}
     for data, sections in runs.items():
         started = time.perf_counter()
@@ -139,7 +139,7 @@ def district_runs(folder: Path, links: pd.DataFrame, other: pd.DataFrame, seed: 
 
 
 def conflict_of(plan: Study) -> tuple[Remark, ...]:
-    """The remarks on a conflict, as a calibration finds them, without its draws."""
+    """The remarks on a conflict as in a calibration, but without posterior draws."""
     setup = Setup.open(plan)
     problem = estimate_noise(Problem.of(setup, engines.make(setup)))
     return conflict(problem, search(problem, choose(problem)).minima)
@@ -166,7 +166,7 @@ def office(folder: Path, seed: int) -> pd.DataFrame:
 
 
 def receiver_checks(folder: Path, links: pd.DataFrame) -> None:
-    """Print the error of the smooth limits against hard ones, and what path loss alone costs next to observables."""
+    """Print the error of smooth limits relative to hard ones, and the time with and without further observables."""
     wanted = tuple(
         Statistic(kind, dynamic_range_db=range_db, bandwidth=bandwidth)
         for kind in ("rms_delay_spread", "mean_excess_delay")
@@ -214,7 +214,7 @@ def receiver_checks(folder: Path, links: pd.DataFrame) -> None:
 
 @contextmanager
 def hard_limits() -> Iterator[None]:
-    """Replace the smooth limits of the receiver by hard ones."""
+    """Replace the smooth limits of the receiver with hard ones."""
     before = receiver.SOFT_DB
     vars(receiver)["SOFT_DB"] = 1e-4
     jax.clear_caches()
@@ -308,7 +308,7 @@ def main() -> None:
     parser.add_argument("--offices", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=np.inf, help="start no repetition after this time")
     parser.add_argument(
-        "--receiver", action="store_true", help="errors of smooth limits and cost, nothing else"
+        "--receiver", action="store_true", help="measure only errors of smooth limits and time"
     )
     options = parser.parse_args()
     started, rows = time.perf_counter(), []

@@ -1,8 +1,8 @@
-"""Speed-up of a batch on a program that sleeps 1 s a call: four threads, and four worker processes of a Dask cluster.
+"""Speed-up of a batch on a program that sleeps 1 s per call: four threads, and four worker processes of a Dask cluster.
 
     python benchmarks/parallel.py
 
-The baseline in the same run is the same batch, one call after the other.
+The baseline in the same run is the same batch, one call at a time.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ CALLS = 12
 
 
 def seconds(folder: Path, workers: int | None, scheduler: str | None) -> float:
-    """Time that a batch takes [s]."""
+    """Time taken by a batch [s]."""
     study = programs.study(folder, "import time; time.sleep(1)")
     candidates = np.random.default_rng(0).uniform(1.5, 12.0, (CALLS, 3))
     with engines.open_workers(workers, scheduler) as opened:
@@ -36,7 +36,7 @@ def seconds(folder: Path, workers: int | None, scheduler: str | None) -> float:
 
 
 def main() -> None:
-    """Time one batch all three ways."""
+    """Time one batch in all three ways."""
     options: dict[str, Any] = {
         "n_workers": 4,
         "threads_per_worker": 1,

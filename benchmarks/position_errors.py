@@ -2,9 +2,9 @@
 
     python benchmarks/position_errors.py --districts 20 --repetitions 5
 
-Districts are those of antenna_pose.py, with correct stated directions. Links are measured at the true positions; the
-study states positions that are off by 5 m (standard deviation along x and along y), with or without
-`links.position_error_m = 5`. The noise is 3 dB. The table says how often the 90 % intervals of the draws cover the
+The districts are those of antenna_pose.py, with correct stated directions. Links are measured at the true positions;
+the study states positions that are off by 5 m (standard deviation along x and along y), with or without
+`links.position_error_m = 5`. The noise is 3 dB. The table shows how often the 90 % intervals of the draws cover the
 truth.
 """
 

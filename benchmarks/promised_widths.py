@@ -5,7 +5,7 @@
 
 A repetition draws a truth within the bounds of a district's study and 3 dB of noise. Half of the links, at most 40, are
 measured; the others are candidates. The table compares, over all parameters, the width of the reported interval before,
-the width that the last of five suggestions promises, and the width that came about, each as a share of the range.
+the width that the last of five suggestions promises, and the resulting width, each relative to the range.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ NOISE_DB, MOST, MORE = 3.0, 40, 5
 
 
 def repetition(district: District, seed: int) -> list[dict[str, object]]:
-    """One truth: a row per parameter."""
+    """Calibrate, measure and calibrate again for one truth; return a row per parameter."""
     problem = district.problem
     parameters, study = problem.parameters, problem.setup.study
     random = np.random.default_rng([seed, len(problem.before), 31])
@@ -52,7 +52,7 @@ def repetition(district: District, seed: int) -> list[dict[str, object]]:
         ends = np.array([[old.lower, old.upper], [new.lower, new.upper], section.bounds], dtype=float)
         width = suggested[f"{name}_width"].iloc[-1]
         if section.scale == "log":
-            # A promised width applies to the middle of the interval on the scale of the search.
+            # A promised width applies at the centre of the interval in search coordinates.
             centre = np.sqrt(old.lower * old.upper)
             width = 2 * np.arcsinh(width / (2 * centre))
             ends = np.log(ends)

@@ -1,13 +1,13 @@
-"""Ray mapping on foreign engines: calls until the engine's own optimum is reached to 0.01 dB.
+"""Ray mapping on foreign engines: calls until the RMSE is within 0.01 dB of the engine's own optimum.
 
     python benchmarks/ray_mapping.py --first 3000 --districts 20 --offices 10 --seeds 3 --out rays.jsonl
     python benchmarks/ray_mapping.py --first 3000 --districts 20 --offices 10 --seeds 3 --in-turn 1   # of eight engines
     python benchmarks/ray_mapping.py --first 3000 --districts 20 --in-turn 1 --engines "$OUTSIDE"   # see below
 
 The engine is the replay of a district or an office with its own antennas, constants and physics, which the study does
-not state; it answers with the power of every path. Truths are drawn evenly within the bounds, errors have 3 dB. The
-excess of a call is the RMSE of its candidate on the engine, minus that of the engine's optimum. A call counts as the
-first one whose excess is at most 0.01 dB.
+not state; it returns the power of every path. Truths are drawn uniformly within the bounds, and the noise is 3 dB. The
+excess of a call is the RMSE of its candidate on the engine minus that of the engine's optimum. The result is the number
+of the first call whose excess is at most 0.01 dB.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ from problem_families.sites import office_site
 
 NOISE_DB: Final = 3.0
 REACHED_DB: Final = 0.01
-FAILED: Final = 99  # calls of a repetition that does not reach it, or fails
+FAILED: Final = 99  # calls of a repetition that does not reach the optimum, or fails
 SEARCHES: Final = 128  # local searches for an engine's optimum
-DIFFUSE: Final = 3  # diffuse paths of a link
-LEAST_POWER: Final = 1e-25  # of a path at the start values; the engines trace no weaker ones
+DIFFUSE: Final = 3  # diffuse paths per link
+LEAST_POWER: Final = 1e-25  # of a path at the start values; the engines have no weaker paths
 
 SAME: Final = (Antenna("dipole", "V"), Antenna("dipole", "V"))
 OTHER: Final = (Antenna("tr38901", "V", (0.7, 0.1, 0.0)), Antenna("iso", "V"))
@@ -76,14 +76,14 @@ ENGINES: Final[dict[str, tuple[Any, Any]]] = {
         lambda m, f: replace(
             m, conductivity=itu_material("concrete", max(f, 1e9)).conductivity, thickness=0.25
         ),
-        # The law starts at 1 GHz.
+        # The law is valid from 1 GHz.
     ),
 }
-"""Antennas, and materials from the study's at a carrier [Hz]; calibrated constants are those of the candidate."""
+"""Antennas, and a function of a material of the study and the carrier [Hz]; the candidate sets calibrated constants."""
 
 
 def _tied(materials: dict[str, Material], start: dict[str, Material]) -> dict[str, Material]:
-    """The loss tangent is that of the start values, so that conductivity changes with permittivity."""
+    """Materials that keep the loss tangent of the start values, so that conductivity changes with permittivity."""
     return {
         key: changed(item, conductivity=item.relative_permittivity / start[key].relative_permittivity)
         for key, item in materials.items()
@@ -91,7 +91,7 @@ def _tied(materials: dict[str, Material], start: dict[str, Material]) -> dict[st
 
 
 def _compressed(materials: dict[str, Material], _: dict[str, Material]) -> dict[str, Material]:
-    """Susceptibilities are 0.7 times those that the engine is asked for."""
+    """Materials whose susceptibilities are 0.7 times those of the candidate."""
     return {
         key: replace(item, relative_permittivity=1 + 0.7 * (item.relative_permittivity - 1))
         for key, item in materials.items()
@@ -99,13 +99,13 @@ def _compressed(materials: dict[str, Material], _: dict[str, Material]) -> dict[
 
 
 MATERIALS: Final = {"loss tangent": _tied, "permittivity law": _compressed}
-"""Materials of a call, from those of the candidate and of the start values."""
+"""Function that returns the materials of a call, from those of the candidate and of the start values."""
 
 OUTSIDE: Final = (*MATERIALS, "first order", "strongest paths", "rounded powers")
 """Engines whose powers the model of rays cannot represent, with other antennas.
 
-With "first order", permittivity changes paths of one interaction only. "Strongest paths" answers with the five
-strongest of each link. "Rounded powers" answers with multiples of 0.1 dB.
+With "first order", permittivity affects only paths with one interaction. "Strongest paths" returns the five strongest
+paths of each link. "Rounded powers" returns multiples of 0.1 dB.
 """
 
 STRONGEST: Final = 5
@@ -117,9 +117,9 @@ class Place:
     """Links whose paths are traced.
 
     Attributes:
-        name: Its name.
+        name: Name of the place.
         setup: The study, which states no antennas.
-        paths: Its paths between short dipoles.
+        paths: Paths of the place between short dipoles.
     """
 
     name: str
@@ -184,7 +184,7 @@ def _without_weak(paths: Paths) -> Paths:
 
 
 def with_diffuse(place: Place) -> Place:
-    """The place with the strongest diffuse paths of every link, and a study that knows that surfaces scatter."""
+    """The place with the strongest diffuse paths of every link, and a study with diffuse reflection."""
     content = place.setup.study.content()
     materials = {name: {"scattering_coefficient": 0.2} for name in place.paths.materials}
     stated = content.get("materials", {})
@@ -210,7 +210,7 @@ def with_diffuse(place: Place) -> Place:
 
 
 class Foreign:
-    """An engine that answers with rays."""
+    """An engine that returns rays."""
 
     def __init__(self, place: Place, name: str) -> None:
         antennas, materials = ENGINES.get(name, (OTHER, lambda m, _: m))
@@ -236,7 +236,7 @@ class Foreign:
         return Export.of_table(replace(self.table, power=power).take(answered), self.setting)
 
     def powers(self, candidate: np.ndarray) -> np.ndarray:
-        """Power of every path for a candidate, 0 if the engine leaves it out."""
+        """Power of every path for a candidate, 0 if the engine omits the path."""
         start = self.parameters.materials(self.parameters.start, self.paths.materials)
         materials = self.parameters.materials(candidate, self.paths.materials)
         if self.name in MATERIALS:
@@ -265,7 +265,7 @@ class Foreign:
 
 
 def planted(place: Place, foreign: Foreign, random: np.random.Generator) -> tuple[Problem, np.ndarray]:
-    """The problem on an engine's replay whose links are measured with noise at a drawn truth [d], and this truth."""
+    """The problem on an engine's replay, with links measured with noise at a drawn truth [d], and this truth."""
     parameters = foreign.parameters
     truth = parameters.from_search(random.uniform(*parameters.search_bounds))
     loss = foreign.path_loss(truth[None])[0]
@@ -325,7 +325,7 @@ def repetition(place: Place, foreign: Foreign, name: str, seed: int) -> dict[str
 
 
 def _attempt(place: Place, name: str, seed: int) -> dict[str, Any] | None:
-    """A repetition; one that fails counts as not solved and states the error. None if the engine has no path at all."""
+    """Run a repetition; a failed one counts as not solved and states the error. None if the engine has no path."""
     started = time.process_time()
     try:
         foreign = Foreign(place, name)
@@ -342,7 +342,7 @@ def _attempt(place: Place, name: str, seed: int) -> dict[str, Any] | None:
 
 
 def main() -> None:
-    """Run the repetitions that the file lacks, and print the quantiles of all of them."""
+    """Run the repetitions that are missing in the file, and print the quantiles of all repetitions."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--first", type=int, default=100)
     parser.add_argument("--districts", type=int, default=2)
@@ -350,9 +350,12 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--engines", default=",".join(ENGINES))
     parser.add_argument(
-        "--in-turn", type=int, default=len(ENGINES), help="engines of a truth, which take turns"
+        "--in-turn",
+        type=int,
+        default=len(ENGINES),
+        help="number of engines per truth, taken in turn from the list",
     )
-    parser.add_argument("--out", type=Path, help="file of the repetitions; a run that was stopped goes on")
+    parser.add_argument("--out", type=Path, help="file of the repetitions; an interrupted run continues")
     parser.add_argument("--minutes", type=float, default=np.inf, help="start no repetition after this time")
     options = parser.parse_args()
     engines, rows = options.engines.split(","), read_runs(options.out, {})
@@ -366,10 +369,10 @@ def main() -> None:
     order = [order[index] for index in np.random.default_rng(30).permutation(len(order))]
     with tempfile.TemporaryDirectory() as folder:
         made = Places(Path(folder))
-        # One visit is one truth per engine: a run that is stopped has seen whole visits, in random order of the places,
-        # and the engines of a visit share what is compiled for the place.
+        # One visit is one truth per engine. An interrupted run has completed whole visits, in random order of the
+        # places, and the engines of a visit share the functions compiled for the place.
         for visit, (seed, (make, number)) in enumerate(product(range(options.seeds), order)):
-            jax.clear_caches()  # the functions of the place before
+            jax.clear_caches()  # functions compiled for the previous place
             turns = range(
                 options.in_turn * visit, options.in_turn * visit + min(options.in_turn, len(engines))
             )
@@ -387,7 +390,7 @@ def main() -> None:
 
 
 def _report(rows: list[dict[str, Any]]) -> None:
-    """Print the figures of all rows, of every kind of place, and of every engine."""
+    """Print the figures for all rows, for every kind of place, and for every engine."""
     groups = {"all": rows}
     for row in rows:
         groups.setdefault(row["place"].split("-")[0], []).append(row)
@@ -404,20 +407,20 @@ class Places:
 
     Attributes:
         folder: Folder of their files.
-        made: Those made; None for one left out.
+        made: Places made so far; None for a place that is left out.
     """
 
     folder: Path
     made: dict[tuple[str, int, bool], Place | None] = field(default_factory=dict)
 
     def get(self, make: Callable[[int, Path], Place], number: int, rough: bool) -> Place | None:
-        """A place, with diffuse paths if it is rough."""
+        """A place, with diffuse paths if `rough`."""
         key = make.__name__, number, rough
         if key not in self.made:
             try:
                 place = self.get(make, number, False) if rough else make(number, self.folder)
                 self.made[key] = with_diffuse(place) if rough and place is not None else place
-            except InputError as error:  # some draw a carrier for which P.2040 has no constants
+            except InputError as error:  # some places draw a carrier for which P.2040 has no constants
                 print(f"{make.__name__} {number} left out: {error}", flush=True)
                 self.made[key] = None
         return self.made[key]

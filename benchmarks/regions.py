@@ -1,4 +1,4 @@
-"""A planted belt of trees: its estimated attenuation, the model that validation prefers, and the hint in the report.
+"""A planted belt of trees: its estimated attenuation, the model that validation prefers, and the report's hint.
 
     python benchmarks/regions.py --districts 20 --repetitions 5
     python benchmarks/regions.py --lines --districts 20 --repetitions 5
@@ -6,15 +6,16 @@
 
 Every district has buildings and two masts (`antenna_pose.district`). A repetition plants a belt of trees in a street,
 10 to 16 m wide, 60 to 110 m long and 7 to 12 m high, with 0.3 to 1.5 dB/m, and two permittivities, computes the path
-loss of 200 links, adds 3 dB of noise, and calibrates three quarters of the links: with the belt, whose attenuation is a
-parameter, and without. Held out are the receivers in a quarter of all squares of 40 m. The table says how often the
-90 % interval of the draws holds the planted attenuation, how often the model with the belt has the lower error on the
-held-out links, and how often the page of the model without the belt points at a region of extra loss that covers a
-third of the belt or more; and how often at one if there are no trees (first repetition in each district).
+loss of 200 links, and adds 3 dB of noise. It calibrates on three quarters of the links, with the belt, whose
+attenuation is a parameter, and without it. The receivers in a quarter of all squares of 40 m are held out. The table
+shows how often the 90 % interval of the draws contains the planted attenuation, and how often the model with the belt
+has the lower error on the held-out links. It also shows how often the report of the model without the belt hints at a
+region of extra loss that covers a third of the belt or more, and how often it hints at a region if there are no trees
+(first repetition in each district).
 
-With `--lines`, only the search for a region is judged, on errors that the belts cause on straight lines, with noise.
-With `--plain`, the time of a replay of a study without regions over that of the bare evaluation of the same program,
-and the largest difference of their path loss, which must be 0.
+With `--lines`, only the search for a region is judged, on errors that the belts cause along straight lines, plus noise.
+With `--plain`, the output is the ratio of the time of a replay of a study without regions to that of the bare
+evaluation of the same program, and the largest difference in path loss, which must be 0.
 """
 
 from __future__ import annotations
@@ -45,14 +46,14 @@ SQUARE: Final = 40.0
 """Width of the squares whose receivers are held out together [m]."""
 ONE_NOISE_MODEL: Final = {"kind": "gaussian", "range_m": 0, "heterogeneity": 0, "constants_spread": 0}
 STREET: Final = 35.0
-"""Distance of the streets from the middle of a district [m]."""
+"""Distance of the streets from the centre of a district [m]."""
 
 
 def study(folder: Path, table: pd.DataFrame, belt: dict[str, Any] | None, known: bool = True) -> Study:
     """The study of links, with or without a belt whose attenuation is a parameter.
 
-    Where the belt is not known, its attenuation has the bounds 0 and 1e-9 dB/m: the same program, which is not compiled
-    again, gives the path loss of a scene without it.
+    If the belt is unknown, its attenuation has the bounds 0 and 1e-9 dB/m. The same program, which is not compiled
+    again, then gives the path loss of a scene without it.
     """
     table.to_csv(folder / "links.csv", index=False)
     parameters: dict[str, Any] = {name: {"bounds": bounds} for name, bounds in MATERIALS.items()}
@@ -67,7 +68,7 @@ def study(folder: Path, table: pd.DataFrame, belt: dict[str, Any] | None, known:
         "holdout": {"where": "held_out == True"},
         "parameters": parameters,
         **({"regions": {"trees": belt}} if belt else {}),
-        # Without the belt only errors are looked at, not intervals, so that one noise model does.
+        # Without the belt, only errors are judged, not intervals, so that one noise model is sufficient.
         **({} if known else {"noise": ONE_NOISE_MODEL}),
     }  # fmt: skip
     return Study.from_content(content, folder / "study.toml")
@@ -85,7 +86,7 @@ def planted_belt(random: np.random.Generator) -> tuple[dict[str, Any], float]:
 
 
 def points_at(result: cb.Result, belt: shapely.Geometry) -> tuple[bool, bool]:
-    """Whether the page of a result points at a region of extra loss, and at one with a third of the belt or more."""
+    """Whether the report of a result hints at a region of extra loss, and at one with a third of the belt or more."""
     found = diagnostics(result).get("missing_region")
     if found is None or not found["significant"].item():
         return False, False
@@ -94,16 +95,16 @@ def points_at(result: cb.Result, belt: shapely.Geometry) -> tuple[bool, bool]:
 
 
 def reached(folder: Path, seed: int) -> pd.DataFrame:
-    """The links of a new district that paths reach."""
+    """The links of a new district that have a path."""
     links = district(folder, seed)
     setup = Setup.open(study(folder, links, None))
     return links[np.isfinite(fields.path_loss(setup.trace()))]
 
 
 def repetition(folder: Path, links: pd.DataFrame, seed: list[int], bare: bool) -> dict[str, Any]:
-    """Calibrate one draw of belt and materials with and without the belt: a row of the table.
+    """Calibrate one draw of belt and materials with and without the belt; return a row of the table.
 
-    With `bare`, the same materials are measured without trees too.
+    With `bare`, the same materials are also measured without trees.
     """
     random, started = np.random.default_rng(seed), time.process_time()
     belt, attenuation = planted_belt(random)
@@ -151,7 +152,7 @@ def repetition(folder: Path, links: pd.DataFrame, seed: list[int], bare: bool) -
 
 
 def on_lines(folder: Path, seed: int, number: int) -> dict[str, Any]:
-    """Search a planted belt in errors that follow from straight lines alone: nothing is traced or calibrated."""
+    """Search for a planted belt in errors that follow from straight lines alone, without a trace or a calibration."""
     random, started = np.random.default_rng([seed, number, 291]), time.process_time()
     links = district(folder, seed)
     belt, attenuation = planted_belt(random)
@@ -176,7 +177,7 @@ def on_lines(folder: Path, seed: int, number: int) -> dict[str, Any]:
 
 
 def plain_study(folder: Path) -> None:
-    """Print the time and the differences of a study without regions against the bare evaluation of its paths."""
+    """Print the time and path loss of a study without regions, compared with the bare evaluation of its paths."""
     links = district(folder, 900)
     engine = engines.make(Setup.open(study(folder, links, None)))
     assert isinstance(engine, engines.Replay)
@@ -239,7 +240,8 @@ def main() -> None:
                 f"{seen['points'].mean():.2f} are reported as a region and {seen['covers'].mean():.2f} at the belt"
             )
             return
-        # One repetition of every district before the second of any, so that a stop leaves all districts.
+        # Every district has its first repetition before any has its second, so that an interrupted run has all
+        # districts.
         for number, seed in run:
             if time.perf_counter() - started < options.seconds:
                 folder = Path(root) / str(seed)

@@ -1,10 +1,10 @@
-"""Rows that were logged several times: do they count as one measurement?
+"""Links that were logged several times: do their rows count as one measurement?
 
     python benchmarks/repeats.py --repetitions 4 --districts development
 
-A repetition plants a truth with 3 dB of noise for each link, and 0.3 dB for each row. It is calibrated once with the
-mean of each link's three rows, and once with the rows, whose receivers lie 2 mm apart, so that they are not merged when
-the table is read. If the rows counted as independent, intervals would be too narrow by the square root of three.
+A repetition plants a truth with 3 dB of noise per link and 0.3 dB per row. It calibrates once with the mean of each
+link's three rows, and once with the rows, whose receivers are 2 mm apart so that they are not merged when the table is
+read. If the rows counted as independent, intervals would be too narrow by a factor of the square root of three.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ LEVEL = 0.9
 
 
 def repeated(problem: Problem) -> Problem:
-    """The problem of a study whose table has three rows of each link."""
+    """The problem of a study whose table has three rows per link."""
     study, frame = problem.setup.study, problem.setup.links.frame
     rows = frame.loc[np.repeat(frame.index, ROWS)].reset_index(drop=True)
     rows["rx_x"] += APART_M * np.tile(np.arange(ROWS), len(frame))

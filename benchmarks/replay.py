@@ -1,11 +1,11 @@
-"""How much faster replay is than running the ray tracer again, with the agreement and the time.
+"""How much faster replay is than a new run of the ray tracer, and how well their path losses agree.
 
 Everything is measured in one run on one machine, so that only ratios matter:
 
     python benchmarks/replay.py
 
-Rivals: Sionna RT traced anew for every candidate (what a loop around a ray tracer pays), and Sionna's own field stage
-on stored paths (what it would pay if its paths were kept).
+Rivals: a new Sionna RT trace for every candidate (the cost of a loop around a ray tracer), and Sionna's own field stage
+on stored paths (the cost if the paths are stored).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def candidates(engine: engines.Replay, count: int) -> np.ndarray:
 
 
 def field_stage(trace: Trace, engine: engines.Replay, points: np.ndarray) -> Callable[[], object]:
-    """A call that evaluates another candidate with Sionna's field stage each time."""
+    """A function that evaluates a different candidate with Sionna's field stage in each call."""
     turn = iter(np.tile(points, (100, 1)))
 
     def call() -> object:

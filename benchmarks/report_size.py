@@ -1,9 +1,9 @@
-"""Size of the report of a large study, and how long a browser takes to open it, against the report of a small one.
+"""Size of the report of a large study, and the time that a browser takes to open it, compared with a small report.
 
     python benchmarks/report_size.py [--links 10000] [--buildings 5000] [--keep FILE]
 
-Links, buildings and paths are made up. The browser is Debian's `chromium`, driven by Playwright; without it only the
-size is measured. A browser without a graphics card draws in software, which is the slow case.
+Links, buildings and paths are synthetic. The browser is Debian's `chromium`, controlled by Playwright; without it, only
+the size is measured. A browser without a graphics card renders in software, which is the slow case.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ LIMIT_MB, LIMIT_S = 15.0, 5.0
 
 
 def opened(file: Path) -> tuple[float, float]:
-    """Time [s] from asking for a page until a link is selected in it and the scene is drawn.
+    """Time [s] from the request of a page until a link is selected and the scene is drawn.
 
-    First the wall's, which other work on the machine makes longer, then the processor's that the browser took.
+    The first value is the wall time, which other work on the machine increases; the second is the processor time.
     """
     from playwright.sync_api import sync_playwright
 
@@ -54,16 +54,16 @@ def opened(file: Path) -> tuple[float, float]:
 
 
 def _processor(counters: CDPSession) -> float:
-    """Processor time [s] that all processes of the browser took so far, the one that draws in software included."""
+    """Processor time [s] of all processes of the browser so far, including the one that renders in software."""
     return sum(each["cpuTime"] for each in counters.send("SystemInfo.getProcessInfo")["processInfo"])
 
 
 def main() -> None:
-    """Make both reports, and print size and time."""
+    """Make both reports, and print their size and time."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--links", type=int, default=10_000)
     parser.add_argument("--buildings", type=int, default=5_000)
-    parser.add_argument("--keep", type=Path, help="where to leave the large report")
+    parser.add_argument("--keep", type=Path, help="file for the large report")
     options = parser.parse_args()
     taken = []
     with tempfile.TemporaryDirectory() as folder:

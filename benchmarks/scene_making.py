@@ -2,8 +2,8 @@
 
     python benchmarks/scene_making.py [--buildings 5000] [--windows 0.3] [--trace]
 
-A town of blocks is planted as an OpenStreetMap extract: rows of houses that share walls, of heights given, from
-storeys or missing. Reading is pyosmium's part alone, the same areas assembled and nothing made of them.
+A town of blocks is written as an OpenStreetMap extract: rows of houses that share walls, with heights stated, given by
+storeys, or missing. Reading is the part of pyosmium alone: the same areas are assembled, but no scene is made.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def plant(path: Path, buildings: int) -> None:
         west, south = 160.0 * (row % columns) + 14.0 * place, 40.0 * (row // columns)
         depth = 12.0 + random.integers(0, 3)
         bay = random.uniform(3.0, 9.0)
-        # A house with a bay at its back: eight corners.
+        # A house with a bay at the back, which has eight corners.
         back = [(bay + 3, depth), (bay + 3, depth + 2), (bay, depth + 2), (bay, depth)]
         ring = [(0, 0), (14, 0), (14, depth), *back, (0, depth)]
         corners += [(west + x, south + y, 0.0) for x, y in ring]
@@ -68,7 +68,7 @@ def plant(path: Path, buildings: int) -> None:
 
 
 def read_alone(path: Path) -> int:
-    """Assemble the areas with pyosmium and their geometry with shapely, and do nothing with them."""
+    """Assemble the areas with pyosmium and their geometry with shapely, without making a scene."""
     wanted, geometry = KeyFilter("building"), WKBFactory()
     areas = osmium.FileProcessor(path).with_areas(wanted).with_filter(wanted)
     return len(
@@ -77,7 +77,7 @@ def read_alone(path: Path) -> int:
 
 
 def resident() -> float:
-    """Largest memory that this process has had so far [MiB]."""
+    """Peak memory of this process so far [MiB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
@@ -85,7 +85,7 @@ R = TypeVar("R")
 
 
 def timed(function: Callable[..., R], *arguments: object) -> tuple[float, R]:
-    """Processor time that a call takes [s], so that other work on the machine hardly counts, and what it returns."""
+    """Processor time of a call [s], which other work on the machine hardly affects, and its return value."""
     start = time.process_time()
     returned = function(*arguments)
     return time.process_time() - start, returned

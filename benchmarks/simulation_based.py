@@ -4,17 +4,19 @@
     python benchmarks/simulation_based.py --runs 20 --reference 1000000 --districts development
 
 Each run draws all unknowns of the joint model from its prior in one district: permittivities, two thicknesses with the
-study's prior, and the constants that the scene fixes. Noise is Gaussian with a standard deviation of 3 dB. If sampler
-and model are right, a 90 % set contains its parameter in 90 % of the runs (S. Talts et al., arXiv 1804.06788).
+study's prior, and the constants that the scene fixes. Noise is Gaussian with a standard deviation of 3 dB. If the
+sampler and the model are correct, a 90 % set contains its parameter in 90 % of the runs (S. Talts et al., arXiv
+1804.06788).
 
-Where the data say little, a set is that of the prior, and contains the truths that happen to lie in the middle of the
-prior. Of 100 independent truths these are 84 to 96 in 19 of 20 cases, whatever the sampler does. The truths of a
-parameter are therefore a Latin hypercube: one in each of as many equally probable parts of its prior as there are runs.
+If the data contain little information, a set is that of the prior, and contains the truths that happen to lie near the
+centre of the prior. For 100 independent truths, 84 to 96 do so in 19 of 20 cases, whatever the sampler does. The truths
+of a parameter are therefore a Latin hypercube: the prior is divided into as many equally probable parts as there are
+runs, and each part has one truth.
 
-With `--reference`, the distribution function of every parameter is compared with that of so many draws from the prior,
-weighted by the likelihood: an independent computation of the same posterior. Path loss of these draws is computed once
-for each district. The distance is the largest one between both functions; it counts where the reference has more than
-1,000 effective draws.
+With `--reference`, the distribution function of every parameter is compared with that of the given number of draws from
+the prior, weighted by the likelihood. This is an independent computation of the same posterior. The path loss of these
+draws is computed once per district. The distance is the largest difference between both functions; it counts if the
+reference has more than 1,000 effective draws.
 """
 
 from __future__ import annotations
@@ -46,11 +48,11 @@ NOISE_DB = 3.0
 LEVEL = 0.9
 BATCH = 4096
 QUANTILES = 100_000
-"""Draws from the prior whose quantiles are truths."""
+"""Number of draws from the prior, whose quantiles are the truths."""
 MOST = 20
-"""Most parameters and constants of a district."""
+"""Largest number of parameters and constants of a district."""
 EFFECTIVE = 1000
-"""Effective draws below which a reference does not count."""
+"""Number of effective draws below which a reference does not count."""
 
 
 def five_parameters(name: str, folder: Path) -> Problem:
@@ -85,13 +87,13 @@ def planted(
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Draws from the prior with their gaps, for any measurements of a district.
+    """Draws from the prior with their gaps, for use with any measurements of a district.
 
     Attributes:
         model: The joint model with all constants that the scene fixes.
-        measured: The measurements that the gaps are of [L], [dB].
+        measured: The measurements from which the gaps are computed [L], [dB].
         point: The study's parameters of the draws, in the unit cube [n, d].
-        gap: Their gaps, in single precision [n, m], [dB].
+        gap: Gaps of the draws, in single precision [n, m], [dB].
     """
 
     model: JointModel
@@ -103,7 +105,7 @@ class Reference:
     def of(cls, problem: Problem, count: int) -> Reference:
         """Draw from the prior of a problem's joint model."""
         parameters, random = problem.parameters, np.random.default_rng(1)
-        # Errors of next to nothing, so that no constant is left out because it has little effect.
+        # The assumed errors are tiny, so that no constant is left out because of a small effect.
         model = joint_model(problem, parameters.to_search(parameters.start), 1e-12, 10)
         points, gaps = [], []
         for _ in range(0, count, BATCH):
@@ -113,7 +115,7 @@ class Reference:
         return cls(model, problem.objective.measured, np.concatenate(points), np.concatenate(gaps))
 
     def weights(self, problem: Problem, model: JointModel) -> np.ndarray:
-        """Weight of every draw for the measurements of a problem with unit weights of the links [n]."""
+        """Weight of every draw [n] for the measurements of a problem whose links have unit weight."""
         used = problem.objective.weight > 0
         change = (problem.objective.measured - self.measured)[used].astype(np.float32)
         logs = [
@@ -127,7 +129,7 @@ class Reference:
 def run(
     problem: Problem, levels: np.ndarray, number: int, seed: int, reference: Reference | None, budget: int
 ) -> dict[str, Any]:
-    """One truth: whether the sets contain it, and the distance from the reference."""
+    """Draw one truth; return whether the sets contain it, and the distance from the reference."""
     random = np.random.default_rng([seed, number])
     parameters, width = problem.parameters, len(problem.parameters)
     start = parameters.to_search(parameters.start)
@@ -159,7 +161,7 @@ def run(
 def _masses(
     unit: np.ndarray, weight: np.ndarray, point: np.ndarray, share: np.ndarray
 ) -> list[tuple[float, int]]:
-    """Share of the reference in the credible set of each parameter, and the number of the set's pieces."""
+    """Share of the reference in the credible set of each parameter, and the number of intervals in the set."""
     masses = []
     for k in range(unit.shape[1]):
         pieces = _set(unit[:, k], weight)
@@ -176,7 +178,7 @@ def _inside(unit: np.ndarray, weight: np.ndarray, truth: np.ndarray) -> list[boo
 
 
 def _set(unit: np.ndarray, weight: np.ndarray) -> tuple[tuple[float, float], ...]:
-    """Pieces of the credible set of a parameter."""
+    """Intervals that form the credible set of a parameter."""
     return credible_sets(unit, weight, 0.0, 1.0, [LEVEL])[0]
 
 
@@ -204,7 +206,7 @@ def main() -> None:
     given = parser.parse_args()
     names, lines = districts.named(given.districts), []
     levels = LatinHypercube(MOST, rng=np.random.default_rng(given.seed)).random(given.runs)
-    # District by district, since the reference of one takes the memory of all.
+    # One district at a time, because a single reference needs much memory.
     order = sorted(range(given.runs), key=lambda number: number % len(names))
     made: tuple[str, Problem, Reference | None] | None = None
     for turn, number in enumerate(order):

@@ -2,7 +2,8 @@
 
     python benchmarks/sizes.py
 
-Five times the parameters should take about five times as long; what is quadratic takes twenty-five times.
+With five times as many parameters, a step should take about five times as long; a quadratic step takes 25 times as
+long.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ FEW, MANY = 2_000, 10_000
 
 
 def content(count: int, entries: dict[str, dict[str, object]]) -> dict[str, object]:
-    """A study of many materials with some parameters each."""
+    """A study of many materials with several parameters each."""
     return {
         "version": 1,
         "scene": {"file": "scene.xml", "frequency": 3.5e9},
@@ -31,7 +32,7 @@ def content(count: int, entries: dict[str, dict[str, object]]) -> dict[str, obje
 
 
 def seconds(work: Callable[[], object]) -> float:
-    """The least of three runs."""
+    """The smallest time of three runs [s]."""
     times = []
     for _ in range(3):
         start = perf_counter()

@@ -1,4 +1,4 @@
-"""How long `calibray --version` and `--help` take, compared with Python that does nothing.
+"""How long `calibray --version` and `--help` take, compared with a Python process that does nothing.
 
     python benchmarks/start_up.py [--repeats 9]
 
@@ -14,7 +14,7 @@ import sys
 
 
 def seconds(words: list[str], repeats: int) -> float:
-    """Least processor time of a command [s]."""
+    """Smallest processor time of a command [s]."""
     times = []
     for _ in range(repeats + 1):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)

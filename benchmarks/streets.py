@@ -3,12 +3,12 @@
     python benchmarks/streets.py --districts development --repetitions 2
     python benchmarks/streets.py --districts judging --repetitions 5 --stated
 
-Links out of sight lose 5 dB more than the district's materials give, and in every street further dB of their own, drawn
-with a standard deviation of 6 dB; the noise is 3 dB. Two streets are kept apart. Two studies of the others are
-calibrated: one that states a random effect of the streets (`prior = "auto"`) and holds out street by street, and one
-that states nothing and holds out four blocks. The table says how many links kept apart lie in the 90 % intervals, how
+Links out of sight have 5 dB more loss than the district's materials cause, plus an extra loss per street, drawn with a
+standard deviation of 6 dB; the noise is 3 dB. Two streets are kept apart. Two studies of the other streets are
+calibrated: one states a random effect of the streets (`prior = "auto"`) and holds out one street at a time; the other
+states no effect and holds out four blocks. The table shows how many links kept apart lie in the 90 % intervals, how
 wide these are, and how the RMSE of the predictions compares with that of the log-distance model with obstruction, which
-knows what blocks the direct line.
+knows what blocks the straight line.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from districts import District
 
 NOISE_DB, LOSS_DB, SPREAD_DB = 3.0, 5.0, 6.0
 APART, LEAST = 2, 3
-"""Streets kept apart, and the least number of other streets."""
+"""Number of streets kept apart, and smallest number of other streets."""
 CHEAP = {"kind": "gaussian", "range_m": 0, "heterogeneity": 0, "constants_spread": 0}
-"""Errors as planted: draws of other errors would only take time, for held-out links give the intervals."""
+"""Noise model of the planted errors. Others would only take time, because held-out links determine the intervals."""
 STUDIES: dict[str, dict[str, Any]] = {
     "random effect, streets held out": {
         "nuisance": {"street": {"by": "out_of_sight", "per": "street", "prior": "auto"}},
@@ -47,7 +47,7 @@ STUDIES: dict[str, dict[str, Any]] = {
 
 
 def repetition(district: District, seed: int, studies: list[str]) -> list[dict[str, Any]]:
-    """Plant one truth, and predict the streets kept apart with each study."""
+    """Plant one truth, and predict path loss in the streets kept apart with each study."""
     problem = district.problem
     links = problem.setup.with_obstruction().links
     street, blocked = links.frame["street"].to_numpy(str), links.table.numbers("out_of_sight")
@@ -84,7 +84,7 @@ def repetition(district: District, seed: int, studies: list[str]) -> list[dict[s
 
 
 def _rival(problem: Problem, loss: np.ndarray, apart: np.ndarray) -> np.ndarray:
-    """Path loss at the links kept apart by the log-distance model with obstruction, fitted to the others [dB]."""
+    """Path loss at the links kept apart [dB], by the log-distance model with obstruction fitted to the others."""
     links = problem.setup.with_obstruction().links
     objective = replace(
         problem.objective, measured=loss, weight=np.where(apart, 0.0, problem.objective.weight)
@@ -97,7 +97,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--districts", default="development", help="names, or development or judging")
     parser.add_argument("--repetitions", type=int, default=2)
-    parser.add_argument("--stated", action="store_true", help="only the study that states a random effect")
+    parser.add_argument(
+        "--stated", action="store_true", help="run only the study that states a random effect"
+    )
     given = parser.parse_args()
     studies = list(STUDIES)[:1] if given.stated else list(STUDIES)
     rows: list[dict[str, Any]] = []

@@ -1,24 +1,25 @@
-"""Whether suggested points narrow intervals more than random ones: planted values, replayed paths, exact profiles.
+"""Whether suggested points narrow intervals more than random points: planted values, replayed paths, exact profiles.
 
     python benchmarks/suggestion.py --repetitions 60
     python benchmarks/suggestion.py --districts demo,11 --repetitions 20
     python benchmarks/suggestion.py --districts 11,12 --repetitions 200 --separate --oracle
 
-Each repetition draws a truth evenly from the ranges of the materials, computes path losses with noise of 3 dB, and
+Each repetition draws a truth uniformly from the ranges of the materials, computes path losses with 3 dB of noise, and
 measures 20 links. Then five of the other links are measured: those that `experiment_design.py` suggests, or random
-ones. Profiles of the parameters and draws from the posterior are exact, on a grid over the whole range. The demo has
-its 40 links. A district with a number is the demo's, built with that seed, with its own carrier, thicknesses and 160
-places in the streets. The demo and 11 to 19 were developed on, others not.
+ones. Profiles of the parameters and posterior draws are exact, on a grid over the whole range. The demo has its 40
+links. A district with a number is that of the demo, built with this seed, with its own carrier, thicknesses and 160
+places in the streets. The demo and districts 11 to 19 were used for development, the others were not.
 
-Random points are drawn ten times. With `--oracle`, five points are also chosen by an oracle that knows the truth, but
-not the noise. It starts with the suggested points or random ones, and exchanges each in turn for the point that most
-often leaves one range in simulated noise. With `--separate`, a repetition counts only if the interval of a material has
+Random points are drawn ten times. With `--oracle`, an oracle that knows the truth, but not the noise, also chooses five
+points. It starts from the suggested or from random points, and replaces each in turn with the point that most often
+leaves a single range in simulated noise. With `--separate`, a repetition counts only if the interval of a material has
 separate ranges.
 
-A row contains, for concrete and for glass: the median width of the 95 % interval after suggested points relative to
-that after random ones, and how often it is narrower (ties count half); how often ranges were separate, how often there
-is one afterwards, and how often the other ranges were then ruled out, so that the values between them do not fit
-either; the expected width and those that resulted, relative to the width before.
+A row contains, for concrete and for glass, the median width of the 95 % interval after suggested points relative to
+that after random points, and how often it is narrower (ties count half). It also contains how often ranges were
+separate, how often a single range is left, and how often the other ranges were then ruled out, so that the values
+between them do not fit either. The last columns are the expected width and the resulting widths, relative to the width
+before.
 """
 
 from __future__ import annotations
@@ -47,20 +48,20 @@ NOISE_DB = 3.0
 MEASURED, MORE = 20, 5
 DRAWS, RIVALS = 96, 24
 GRID = (150, 120, 3)
-"""Values of concrete, glass and soil; soil hardly matters to any link."""
+"""Numbers of grid values for concrete, glass and soil; soil hardly affects any link."""
 JUDGED = ("concrete", "glass")
 KINDS = ("suggested", "random", "oracle")
 AGAIN = 10
-"""Draws of random points that the suggested are compared with."""
+"""Number of draws of random points for the comparison."""
 SIMULATED = 48
-"""Draws of the noise that the oracle goes by."""
+"""Number of noise draws that the oracle uses."""
 LIKELY = 2.2
-"""Sum of squares, by the least, up to which a value may matter to the oracle."""
+"""Ratio of the sum of squares to the smallest one, up to which the oracle considers a value."""
 PLACES = 160
 
 
 def made(seed: int, folder: Path) -> Study:
-    """A district of its own: buildings, carrier, thicknesses, two transmitters, receivers in the streets near them."""
+    """A drawn district: buildings, carrier, thicknesses, two transmitters, and receivers in the streets near them."""
     random = np.random.default_rng([seed, 3])
     frequency = float(random.choice([1.8e9, 2.6e9, 3.5e9, 5.9e9]))
     wall, pane = float(random.uniform(0.12, 0.35)), float(random.uniform(0.006, 0.026))
@@ -106,7 +107,7 @@ class Exact:
     """A district whose path losses are known on a grid of values.
 
     Args:
-        study: Its study.
+        study: The district's study.
     """
 
     def __init__(self, study: Study) -> None:
@@ -123,7 +124,7 @@ class Exact:
         self.loss = np.concatenate([self.engine.path_loss(part)[:, self.reached] for part in parts])
 
     def pieces(self, square: np.ndarray, links: int) -> list[list[tuple[float, float]]]:
-        """The pieces of every parameter's 95 % interval by its profile, in the unit interval; ends interpolated."""
+        """The pieces of every parameter's 95 % profile interval, in the unit interval, with interpolated ends."""
         freedom = links - len(GRID)
         cube = square.reshape(GRID)
         threshold = cube.min() * (1 + fdtri(1, freedom, 0.95) / freedom)
@@ -145,13 +146,13 @@ class Exact:
         return inside + step * (threshold - profile[inside]) / (profile[outside] - profile[inside])
 
     def squares(self, measured: np.ndarray, links: np.ndarray) -> np.ndarray:
-        """Sum of squares at every place of the grid."""
+        """Sum of squares at every grid point."""
         return np.sum((self.loss[:, links] - measured[links]) ** 2, axis=1)
 
     def suggested(
         self, square: np.ndarray, known: np.ndarray, others: np.ndarray, random: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Five of the other links, and the widths to be expected then, of those before."""
+        """Five of the other links, and the expected widths after measuring them, relative to those before."""
         log_density = -0.5 * len(known) * np.log(square)
         share = np.exp(log_density - log_density.max())
         noise = float(np.sqrt(square.min() / (len(known) - len(GRID))))
@@ -178,7 +179,7 @@ class Exact:
     def best(
         self, square: np.ndarray, truth: np.ndarray, others: np.ndarray, axis: int, first: np.ndarray
     ) -> np.ndarray:
-        """Five of the other links by who knows the truth: each is exchanged for what makes one range the likeliest."""
+        """Five of the other links, chosen by the oracle: each one most likely leaves a single range."""
         random = np.random.default_rng(0)
         piece = self._piece(self.pieces(square, MEASURED))[:, axis]
         value = np.round(self.unit[:, axis] * (GRID[axis] - 1)).astype(int)
@@ -194,7 +195,7 @@ class Exact:
         freedom = MEASURED + MORE - len(GRID)
 
         def likely(chosen: list[int]) -> float:
-            """Share of simulated noise that leaves one range; how far the others are from it decides between equals."""
+            """Share of noise draws that leave one range; the distance of the other ranges from it breaks ties."""
             sums = (left + (apart[:, chosen] ** 2).sum(axis=1))[:, None] - 2 * apart[:, chosen] @ noise[
                 chosen
             ]
@@ -223,7 +224,7 @@ class Exact:
         return others[chosen]
 
     def _piece(self, pieces: list[list[tuple[float, float]]]) -> np.ndarray:
-        """Which piece of every parameter's interval each place of the grid lies in, or nearest to."""
+        """Index of the piece of every parameter's interval in which, or nearest to which, each grid point lies."""
         found = np.zeros(self.unit.shape, dtype=np.int64)
         for k, ends in enumerate(np.array(each) for each in pieces):
             apart = np.maximum(ends[:, 0, None] - self.unit[:, k], self.unit[:, k] - ends[:, 1, None])
@@ -232,9 +233,9 @@ class Exact:
 
 
 def repetition(exact: Exact, given: argparse.Namespace, turn: int) -> dict[str, list] | None:
-    """One planted truth: pieces of intervals before and after, and what was expected; None where it does not count.
+    """One planted truth: pieces of intervals before and after, and the expected widths; None if it does not count.
 
-    After points of a kind there is a list of draws of them for each parameter that is judged.
+    The pieces after points of a kind are a list over draws of these points, for each judged parameter.
     """
     random = np.random.default_rng([given.seed, turn])
     order = random.permutation(len(exact.reached))
@@ -263,7 +264,7 @@ def repetition(exact: Exact, given: argparse.Namespace, turn: int) -> dict[str, 
 
 
 def judged(name: str, runs: list[dict[str, list]]) -> list[tuple[str, ...]]:
-    """Rows of the table for a district, or for all."""
+    """Rows of the table for a district, or for all districts."""
     rows, both, ranges, made = [], [], 0, 0.0
     for k, material in enumerate(JUDGED):
         first = np.array([_hull(run["before"][k]) for run in runs])
@@ -287,12 +288,12 @@ def judged(name: str, runs: list[dict[str, list]]) -> list[tuple[str, ...]]:
 
 
 def _listed(counted: NDArray[np.float64]) -> list[str]:
-    """How often ranges are one, and the others ruled out, by the kinds of points."""
+    """How often one range is left, and how often the others are ruled out, by kind of points."""
     return [", ".join(f"{each:.4g}" for each in column) for column in counted.T]
 
 
 def _counted(k: int, kind: str, apart: list[dict[str, list]]) -> NDArray[np.float64]:
-    """How often separate ranges are one after points of a kind, and how often because the others are ruled out."""
+    """How often separate ranges become one after points of a kind, and how often because the others are ruled out."""
     found = np.zeros(2)
     for run in apart:
         for after in run[kind][k]:
@@ -312,9 +313,9 @@ def main() -> None:
     parser.add_argument("--repetitions", type=int, default=60)
     parser.add_argument("--districts", default="demo,11,12,21,22")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--separate", action="store_true", help="only where an interval has separate ranges")
+    parser.add_argument("--separate", action="store_true", help="count only intervals with separate ranges")
     parser.add_argument(
-        "--oracle", action="store_true", help="also the choice of an oracle that knows the truth"
+        "--oracle", action="store_true", help="also measure points chosen by an oracle that knows the truth"
     )
     given, runs = parser.parse_args(), {}
     for name in given.districts.split(","):

@@ -2,11 +2,12 @@
 
     CALIBRAY_DATA=../shared/data python benchmarks/time_to_result.py
 
-Each study runs in processes of its own with a cache folder of its own: `cold` has nothing compiled, `warm` finds what
-the first one compiled. Both trace. "search" and "inference" include compilation; "compile" is its time in both by JAX's
-own events. "trace" goes from the launches to the path program, with the scene in memory. The ratio is (search +
-inference) / trace. Times are those of the clock on an otherwise idle machine, processor times are in brackets.
-The last table repeats the search from other seeds, and with all 512 starts: the optimum found, and the evaluations.
+Each study runs in separate processes with a separate cache folder: `cold` starts without compiled functions, `warm`
+finds those that `cold` compiled. Both trace. "search" and "inference" include compilation; "compile" is the compilation
+time in both, from JAX's own events. "trace" extends from the launches to the path program, with the scene in memory.
+The ratio is (search + inference) / trace. Times are wall times on an otherwise idle machine, with processor times in
+brackets. The last table repeats the search with other seeds and with all 512 starts; it shows the optimum found and the
+number of evaluations.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from pathlib import Path
 STUDIES = ("demo", "nist_boulder", "auckland_tower")
 PARTS = ("import", "open", "trace", "compile", "search", "inference")
 SEEDS = range(1000, 1025)
-"""Seeds that were not used for any choice."""
+"""Seeds that were not used for any design choice."""
 
 
 def study_path(name: str) -> Path:
@@ -37,7 +38,7 @@ def study_path(name: str) -> Path:
 
 
 def at_hand(name: str) -> bool:
-    """Whether the study's scene is there: measured campaigns are no part of the repository."""
+    """Whether the study's scene is available: measured campaigns are not part of the repository."""
     from calibray.errors import InputError
     from calibray.study import Setup, Study
 
@@ -50,21 +51,21 @@ def at_hand(name: str) -> bool:
 
 
 class Clock:
-    """Wall and processor time of one part after the other."""
+    """Wall time and processor time of successive parts."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, tuple[float, float]] = {}
         self._wall, self._processor = time.perf_counter(), time.process_time()
 
     def lap(self, part: str) -> None:
-        """End a part, and begin the next one."""
+        """End the current part, and begin the next one."""
         wall, processor = time.perf_counter(), time.process_time()
         self.seconds[part] = wall - self._wall, processor - self._processor
         self._wall, self._processor = wall, processor
 
 
 def once(name: str) -> dict[str, object]:
-    """One calibration in this process: seconds by part, and what was found."""
+    """Run one calibration in this process; return the seconds of each part, and the outcome."""
     clock = Clock()
     from jax import monitoring
 
@@ -101,7 +102,7 @@ def once(name: str) -> dict[str, object]:
 
 
 def seeds(name: str) -> dict[str, object]:
-    """The optimum and the evaluations of `auto` from other seeds, and of all 512 starts from the first of them."""
+    """Optimum and evaluations of `auto` with other seeds, and of all 512 starts with the first of these seeds."""
     from calibray.engines.kinds.replay import replay
     from calibray.fitting.problem import Problem
     from calibray.fitting.search import choose, rounds, search
@@ -125,7 +126,7 @@ def seeds(name: str) -> dict[str, object]:
 
 
 def in_a_process(what: Callable[[str], object], name: str, cache: Path) -> dict:
-    """What a function of this file answers in a process of its own."""
+    """The return value of a function of this file that runs in a separate process."""
     command = [sys.executable, __file__, "--inside", what.__name__, "--studies", name]
     environment = {**os.environ, "CALIBRAY_CACHE": str(cache)}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)

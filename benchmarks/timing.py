@@ -1,4 +1,4 @@
-"""Timing of calls, shared by the benchmarks."""
+"""Timing of calls, used by several benchmarks."""
 
 from __future__ import annotations
 

@@ -3,9 +3,9 @@
     git worktree add --detach BEFORE COMMIT
     python benchmarks/unused_features.py BEFORE --rounds 3
 
-Both checkouts calibrate the demo study and replay its paths, by turns and in processes of their own. Printed are the
-numbers that differ, of parameters, intervals, draws and path losses, and the ratio of processor times, the median over
-the rounds. Paths are traced once and then read from the cache.
+Both checkouts calibrate the demo study and replay its paths, alternately and in separate processes. The script prints
+the parameters, intervals, draws and path losses that differ, and the ratio of processor times (median over the rounds).
+Paths are traced once and then read from the cache.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ print(json.dumps({"numbers": numbers, "calibration": calibration, "replay": min(
 
 
 def measured(checkout: Path) -> dict:
-    """What a checkout gives, in a process of its own."""
+    """The results of a checkout, from a separate process."""
     environment = os.environ | {"PYTHONPATH": str(checkout.resolve() / "src")}
     answer = subprocess.run(
         [sys.executable, "-c", MEASURED], env=environment, check=True, capture_output=True, text=True
@@ -62,7 +62,7 @@ def measured(checkout: Path) -> dict:
 
 
 def main() -> None:
-    """Run both checkouts by turns, and compare."""
+    """Run both checkouts alternately, and compare the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("before", type=Path, help="checkout of the earlier commit")
     parser.add_argument("--rounds", type=int, default=3)

@@ -1,13 +1,13 @@
-"""From raw files to a report by commands alone: the three example walks and both campaigns, in one table.
+"""From raw files to a report by commands alone, for the three example walks and both campaigns, in one table.
 
     python benchmarks/walks.py [--walks town flat hill boulder auckland] [--folder FOLDER] [--samples N]
 
-Each walk runs `scene`, `init`, `run`, `predict` on the links of the result, `export`, and the exported script in
-plain Sionna RT. The campaigns begin at `run` with the study in `examples`; CALIBRAY_DATA names the folder of their
-data. The table has the links without a path, the error of the fit and in held-out blocks, which model predicts, and
-the largest differences [dB] over the links: between the reported path loss and that of the exported scene in Sionna
-RT, and between `predict` at the measured links, where the residual field acts, and the reported path loss. To compare
-with another version of Calibray, set PYTHONPATH to its `src`: a step that fails there is shown with its message.
+Each walk runs `scene`, `init`, `run`, `predict` on the links of the result, `export`, and the exported script in plain
+Sionna RT. The campaigns begin at `run` with the study in `examples`; CALIBRAY_DATA names the folder of their data. The
+table has the links without a path, the errors of the fit and in held-out blocks, the prediction model, and the largest
+difference over the links [dB] from the reported path loss: that of the exported scene in Sionna RT, and that of
+`predict` at the measured links, where the residual field acts. To compare with another version of Calibray, set
+PYTHONPATH to its `src`: a step that fails there is shown with its message.
 """
 
 from __future__ import annotations
@@ -69,13 +69,13 @@ class Step:
 
 @dataclass
 class Walk:
-    """A walk in its folder: the steps taken."""
+    """A walk in its folder, with the steps completed so far."""
 
     folder: Path
     steps: list[Step] = field(default_factory=list)
 
     def take(self, command: str, *words: str) -> bool:
-        """Run a command in the folder, and say whether it succeeded."""
+        """Run a command in the folder, and return whether it succeeded."""
         started = time.monotonic()
         done = subprocess.run(words, cwd=self.folder, capture_output=True, text=True, check=False)
         seconds = time.monotonic() - started
@@ -130,7 +130,7 @@ def differences(walk: Walk) -> tuple[float | None, float | None]:
 
 
 def line(name: str, walk: Walk) -> str:
-    """The table's line of a walk."""
+    """The line of a walk in the table."""
     seconds = sum(step.seconds for step in walk.steps)
     failed = [step for step in walk.steps if step.status]
     for step in failed:
@@ -158,7 +158,7 @@ def line(name: str, walk: Walk) -> str:
 
 
 def missing(table: Path) -> str:
-    """How many links of a table of predictions have none; a dash without a table."""
+    """Number of links without a prediction in a table; a dash if there is no table."""
     return str(int(pd.read_csv(table)["path_loss_db"].isna().sum())) if table.exists() else "-"
 
 
@@ -171,8 +171,8 @@ def main() -> None:
     """Take the walks and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--walks", nargs="+", choices=WALKS, default=list(WALKS))
-    parser.add_argument("--folder", type=Path, help="keep what is written in this folder")
-    parser.add_argument("--samples", type=int, help="launch so many rays in the campaigns")
+    parser.add_argument("--folder", type=Path, help="write into this folder and keep it")
+    parser.add_argument("--samples", type=int, help="number of rays launched in the campaigns")
     options = parser.parse_args()
     base = options.folder or Path(tempfile.mkdtemp(prefix="walks-"))
     lines = []

@@ -2,8 +2,8 @@
 
     python benchmarks/window_view.py [--buildings 5000] [--points 10000] [--repeats 3]
 
-The first view is the time from the request of the page to the first drawing with all links, in a browser that has no
-cache. Panning drags the map for some seconds and counts the drawings of the canvas.
+The first view is the time from the request of the page to the first drawing with all links, in a browser with an empty
+cache. Panning drags the map for a few seconds and counts the drawings of the canvas.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SECONDS = 3.0
 
 
 def prepare(folder: Path, buildings: int, points: int) -> None:
-    """A study of a planted town with points anywhere in it."""
+    """A study of a synthetic town with points anywhere in it."""
 
     def calibray(*words: str) -> None:
         subprocess.run(
@@ -57,7 +57,7 @@ def first_view(browser, address: str, points: int):
 
 
 def panning(page) -> float:
-    """Frames a second while the map is dragged."""
+    """Frames per second while the map is dragged."""
     canvas = page.locator("#plan")
     box = canvas.bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -66,7 +66,7 @@ def panning(page) -> float:
     before, start, step = int(canvas.get_attribute("data-drawn")), time.monotonic(), 0
     while time.monotonic() - start < SECONDS:
         step += 1
-        # So far that the map is painted again on the way.
+        # The drag is so long that the map must be painted again on the way.
         page.mouse.move(
             x + 0.45 * box["width"] * np.sin(step / 30), y + 0.45 * box["height"] * np.cos(step / 30)
         )

@@ -3,8 +3,8 @@
     python benchmarks/window_walk.py [town|flat|hill ...] [--pictures FOLDER]
 
 Each walk uploads the files of `examples/bring_your_own`, makes the scene, drafts the study, calibrates and predicts.
-Then `calibray run` calibrates the study file that the window wrote; the values must be the same to the digit. Prints a
-table.
+Then `calibray run` calibrates the study file that the window wrote; the values must be identical in all digits. The
+script prints a table.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def same_digits(folder: Path) -> bool:
 
 
 def main() -> None:
-    """Walk, compare, and take pictures."""
+    """Run the walks, compare the results, and take pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", default=list(MAPS))
     parser.add_argument("--pictures", type=Path)

@@ -1,1 +1,1 @@
-"""Families of planted problems and landscapes in closed form, for judging methods where nobody tuned them."""
+"""Families of planted problems, and landscapes in closed form, for judging methods that were not tuned on them."""

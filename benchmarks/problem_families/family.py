@@ -5,8 +5,7 @@ measured with 1 to 4 dB of noise and perhaps offsets. It also determines an *eng
 a *cheap model* of the same scene that lacks some features of the engine (`Differences`) and may have wrong thicknesses
 and conductivities. Both evaluate traced paths, so a family is judged in minutes.
 
-A family is all problems of one kind over a range of seeds. Seeds below 1020 are for development; those from 1000 on
-judged earlier versions.
+A family consists of all problems of one kind over a range of seeds. Seeds below 1020 are for development.
 """
 
 from __future__ import annotations
@@ -47,13 +46,13 @@ OFFSET_DB: Final = 3.0  # standard deviation of a transmitter's offset
 UPPER_PERMITTIVITY: Final = (9.0, 15.0)
 CONDUCTIVITIES: Final = (1e-3, 1.0)  # [S/m], bounds of the search
 HALF_SPACE: Final = 100.0
-"""Thickness of a slab so lossy that no wave returns from its far side [m]."""
+"""Thickness at which a slab is so lossy that no wave returns from its far side [m]."""
 
 DRAWN: Final = 2.5
 """Links drawn for each one kept, because some have no path."""
 
 ONE_SIDED: Final = 8
-"""Of the links that only the engine reaches, one in this number is kept."""
+"""Of the links with a path only in the engine, one in this number is kept."""
 
 SAMPLES: Final = 100_000
 DIFFUSE_SAMPLES: Final = 1_000
@@ -81,8 +80,8 @@ class Differences:
         depth: Largest number of interactions of a path, of the engine and of the cheap model.
         diffraction: Whether the engine diffracts.
         diffuse_reflection: Whether its surfaces scatter.
-        half_space: Whether its walls have one face (Fresnel's coefficients) and those of the cheap model are slabs.
-        antennas: Whether its antennas are dipoles and those of the cheap model isotropic.
+        half_space: Whether its walls are half-spaces (Fresnel coefficients) while those of the cheap model are slabs.
+        antennas: Whether its antennas are dipoles while those of the cheap model are isotropic.
         position_error: Standard deviation between their positions, in x and y [m].
         wrong_constants: Whether the cheap model has wrong thicknesses and conductivities.
     """
@@ -102,8 +101,8 @@ class PlantedProblem:
 
     Attributes:
         kind: "district" or "office".
-        seed: Its seed.
-        frequency: Carrier [Hz].
+        seed: Seed of the problem.
+        frequency: Carrier frequency [Hz].
         parameters: The calibrated parameters with their bounds [d], which define the search space.
         engine: The expensive engine.
         cheap: The cheap model: the same parameters on the paths of a simpler trace, +inf for a link without a path.
@@ -165,17 +164,17 @@ class PlantedProblem:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of everything that an evaluation depends on, in hexadecimal."""
+        """SHA-256 of all data on which an evaluation depends, in hexadecimal."""
         digest = hashlib.sha256(json.dumps([self.kind, self.offsets, self.parameters.names]).encode())
         middle = self.evaluate(0.5 * (self.lower + self.upper)[None]).residuals
-        # Derived numbers may differ by rounding between machines.
+        # Derived numbers may differ by rounding errors between machines.
         for part in (self.lower, self.upper, self.measured, self.station, middle):
             digest.update(np.round(part, 6).astype("<f8").tobytes())
         return digest.hexdigest()
 
     @property
     def minimum_rmse_db(self) -> float:
-        """The lowest RMSE over the bounds [dB], found by least squares from `STARTS` points and then kept on disk."""
+        """The lowest RMSE within the bounds [dB], found by least squares from `STARTS` points and stored on disk."""
         kept = optima.find(self.fingerprint, STARTS)
         if kept is not None:
             return kept
@@ -188,7 +187,7 @@ class PlantedProblem:
         return search.best.y
 
     def _without_offsets(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Rows over the links [..., L] minus each transmitter's mean, if there are offsets."""
+        """Values over the links [..., L], minus each transmitter's mean if there are offsets."""
         if not self.offsets:
             return rows
         share = (self.station == np.arange(self.station.max() + 1)[:, None]).astype(np.float64)
@@ -199,17 +198,17 @@ class PlantedProblem:
 def problem(seed: int, kind: str = "district") -> PlantedProblem:
     """Draw a problem.
 
-    The first call traces, in some tens of seconds; traces are kept (`calibray.tracing.cache`).
+    The first call traces, which takes tens of seconds; traces are cached (`calibray.tracing.cache`).
 
     Args:
-        seed: Its seed; 1020 and beyond are for judging.
+        seed: Seed of the problem; 1020 and above are for judging.
         kind: "district" or "office".
 
     Returns:
         The problem.
 
     Raises:
-        InputError: There is no such kind, the seed is negative, or nothing can trace.
+        InputError: There is no such kind, the seed is negative, or no tracer is available.
     """
     if kind not in get_args(FamilyKind):
         raise InputError(
@@ -249,7 +248,7 @@ def problem(seed: int, kind: str = "district") -> PlantedProblem:
 
 
 def _kept(engine_paths: Paths, cheap_paths: Paths) -> NDArray[np.int64]:
-    """Links that the engine reaches, most of which the cheap model reaches too."""
+    """Links with a path in the engine, most of which also have a path in the cheap model."""
     engine, cheap = (
         np.bincount(paths.link, minlength=paths.num_links) > 0 for paths in (engine_paths, cheap_paths)
     )
@@ -257,7 +256,7 @@ def _kept(engine_paths: Paths, cheap_paths: Paths) -> NDArray[np.int64]:
 
 
 def _without_weak_paths(paths: Paths, parameters: Parameters) -> NumpyReplay:
-    """The program without paths that carry less than `WEAK` of their link's power for all of some candidates."""
+    """The program without paths that carry less than `WEAK` of their link's power at each of several candidates."""
     whole = NumpyReplay(paths, parameters)
     unit = design("sobol", PROBES, len(parameters), np.random.default_rng(0))
     power = whole.path_powers(parameters.from_unit(unit))
@@ -285,7 +284,7 @@ def _differences(site: Site, rng: np.random.Generator) -> Differences:
 def _material(
     ranges: MaterialRange, frequency: float, differences: Differences, rng: np.random.Generator
 ) -> Material:
-    """The true constants of a material, which the engine has."""
+    """The true constants of a material, which the engine uses."""
     conductivity = float(np.exp(rng.uniform(*np.log(ranges.conductivity)))) * frequency / 4e9
     thickness, scattering = rng.uniform(*ranges.thickness), rng.uniform(*ranges.scattering_coefficient)
     return Material(
@@ -299,7 +298,7 @@ def _material(
 def _believed(
     site: Site, truth: Mapping[str, Material], differences: Differences, rng: np.random.Generator
 ) -> dict[str, Material]:
-    """The materials of the cheap model: they do not scatter, and have two faces."""
+    """The materials of the cheap model: slabs that do not scatter."""
     believed = {}
     for name, material in truth.items():
         thickness = material.thickness
@@ -352,7 +351,7 @@ class _Links:
 
 
 def _displaced(ends: NDArray[np.float64], error: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Ends of links [n, 3], [m], displaced in the plan; equal ends stay equal."""
+    """Ends of links [n, 3], [m], displaced horizontally; equal ends stay equal."""
     positions, owner = np.unique(ends, axis=0, return_inverse=True)
     step = np.clip(rng.standard_normal((len(positions), 2)), -2.0, 2.0)
     return ends + error * np.pad(step, [(0, 0), (0, 1)])[owner.reshape(-1)]

@@ -1,7 +1,7 @@
 """Methods on a family of planted problems: how many they solve, with how many RT calls.
 
-A run solves its problem to a tolerance when its excess is within it. The share of runs that have solved theirs, over RT
-calls, is a data profile: J. J. Moré, S. M. Wild, SIAM J. Optim. 20 (2009) 172.
+A run solves its problem to a tolerance if its excess RMSE is at most this tolerance. The share of solved runs versus
+the number of RT calls is a data profile: J. J. Moré, S. M. Wild, SIAM J. Optim. 20 (2009) 172.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from calibray.tables import Column, Table, numbers
 from problem_families.family import FamilyKind
 from problem_families.problems import planted_problem
 
-CALLS: Final = (8, 15, 30, 60, 120, 225)  # after which excesses are tabulated
+CALLS: Final = (8, 15, 30, 60, 120, 225)  # after which the excess is tabulated
 TOLERANCES_DB: Final = (0.05, 0.02, 0.01)  # of the data profiles
 
 
@@ -51,8 +51,8 @@ class FamilyComparison:
         kind: The family.
         seeds: Seeds of its problems [p].
         methods: The methods, in the order requested.
-        runs: By method name, the runs on every problem [p][repeats].
-        optimum: Lowest objective known of every problem [p], [dB].
+        runs: The runs on every problem [p][repeats], by method name.
+        optimum: Lowest known objective of every problem [p], [dB].
         wrong_constants: Problems whose cheap model has wrong constants [p].
         failed_problems: Problems that could not be made and are left out: seed and reason of each.
     """
@@ -66,7 +66,7 @@ class FamilyComparison:
     failed_problems: tuple[tuple[int, str], ...] = ()
 
     def part(self, mask: NDArray[np.bool_]) -> FamilyComparison:
-        """The comparison on the problems where `mask` is True [p]."""
+        """The comparison on the problems for which `mask` [p] is True."""
         rows = np.flatnonzero(mask)
         return FamilyComparison(
             self.kind,
@@ -146,7 +146,7 @@ class FamilyComparison:
 
 
 def tables(comparison: FamilyComparison) -> tuple[Table, ...]:
-    """A table of median, 90th percentile and worst excess; and one of the data profile for each tolerance."""
+    """A table of the median, 90th percentile and worst excess, and one table per tolerance with the data profile."""
     calls = [number for number in CALLS if number <= max(method.budget for method in comparison.methods)]
     problems = f"{comparison.kind}, seeds {comparison.seeds[0]} to {comparison.seeds[-1]}"
     columns = (Column("method"), *(numbers(f"at {number}") for number in calls), numbers("seconds per run"))
@@ -187,7 +187,7 @@ def seed_range(text: str) -> range:
         The seeds.
 
     Raises:
-        InputError: It is neither.
+        InputError: The text is neither.
 
     Example:
         >>> seed_range("1000:1020")
@@ -238,16 +238,16 @@ def compare_family(
 ) -> FamilyComparison:
     """Run methods on every problem of a family at equal budgets of RT calls.
 
-    Every finished run is appended to `runs.jsonl` in `out` at once. Runs of the same problem, code of the method,
-    budget and seed that are in the file are not repeated.
+    Every finished run is appended to `runs.jsonl` in `out` at once. Runs already in the file with the same problem,
+    method code, budget and seed are not repeated.
 
     Args:
         kind: "district" or "office".
         seeds: Seeds of the problems.
-        names: Methods, each with the common budget or another one as in "gwo@600".
-        budget: RT calls of a run.
-        repeats: Runs of each method on each problem, from seeds 0, 1, ...
-        out: Folder that keeps the runs.
+        names: Methods, each with the common budget or its own, as in "gwo@600".
+        budget: RT calls per run.
+        repeats: Runs of each method on each problem, with seeds 0, 1, ...
+        out: Folder of the finished runs.
         workers: Number of processes.
         progress: Called after every problem made and every run.
         wrong_constants: Compare only problems whose cheap model has wrong constants, or only the others; None for all.
@@ -331,7 +331,7 @@ def _spread(
     stage: str,
     progress: Progress | None,
 ) -> Iterator[tuple[Any, Any]]:
-    """Each task with its result as they finish, in the processes of a pool if there is one."""
+    """Each task with its result, in the order of completion; the processes of a pool run them if there is one."""
     if pool is None:
         results = ((task, function(*task)) for task in tasks)
     else:
@@ -344,7 +344,7 @@ def _spread(
 
 
 class _Prepared(NamedTuple):
-    """Properties of a problem that are needed before it is searched."""
+    """Properties of a problem that are needed before the search."""
 
     fingerprint: str
     minimum: float

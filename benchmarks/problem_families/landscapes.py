@@ -1,8 +1,8 @@
 """Least-squares landscapes with exact derivatives: reflecting districts, sine tones, a curved valley.
 
-The district is a twin of the calibration problem in a few lines: every link is the power sum of 2 to 6
-paths, a path the product of 1 to 3 reflections at dielectric slabs (ITU-R P.2040-3, eqs. 31, 37, 43) at 4
-GHz, and the data are its path losses at planted permittivities with 3 dB of noise.
+The district imitates the calibration problem in a few lines. The gain of every link is the sum of the powers of 2 to 6
+paths, and a path is the product of 1 to 3 reflections from dielectric slabs (ITU-R P.2040-3, eqs. 31, 37, 43) at 4 GHz.
+The data are the path losses at planted permittivities with 3 dB of noise.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ class Landscape:
     """Residuals over a box.
 
     Attributes:
-        name: Its name.
+        name: Name of the landscape.
         lower: Lower bounds [d].
         upper: Upper bounds [d].
-        model: Points [n, d] to residuals [n, m] and Jacobian [n, m, d].
+        model: Function of points [n, d] that returns residuals [n, m] and the Jacobian [n, m, d].
         minimum: The lowest objective that any search has found.
     """
 
@@ -48,7 +48,7 @@ class Landscape:
         return self.evaluate(x)[0]
 
     def run(self, optimizer: Optimizer, budget: int | None = None) -> Optimizer:
-        """Drive an optimizer to its end, or until it has used its budget."""
+        """Run an optimizer until it ends or has used its budget."""
         while not optimizer.done and (budget is None or optimizer.evaluations < budget):
             x = optimizer.ask()
             optimizer.tell(x, *self.evaluate(x))
@@ -66,8 +66,8 @@ class District:
         first_of_path: Index of the first reflection of each path [p].
         path_gain_db: Free-space gain of each path [p].
         first_of_link: Index of the first path of each link [m].
-        thickness: Slab thickness of each material [k] in m.
-        conductivity: Conductivity of each material [k] in S/m.
+        thickness: Slab thickness of each material [k], [m].
+        conductivity: Conductivity of each material [k], [S/m].
     """
 
     material: NDArray[np.intp]
@@ -81,7 +81,7 @@ class District:
 
     @staticmethod
     def draw(links: int, materials: int, pane: float, rng: np.random.Generator) -> District:
-        """Draw walls, panes and, as the last material, ground that is seen at grazing angles."""
+        """Draw walls, panes and, as the last material, ground that is hit at grazing angles."""
         paths = rng.integers(2, 7, links)
         reflections = rng.integers(1, 4, paths.sum())
         count = reflections.sum()
@@ -99,7 +99,7 @@ class District:
         )
 
     def path_loss(self, permittivity: Array) -> tuple[Array, Array]:
-        """Path loss [n, m] in dB of permittivities [n, k], and its derivatives [n, m, k]."""
+        """Path loss [n, m], [dB], for permittivities [n, k], and its derivatives [n, m, k]."""
         power, slope = self._reflected_power(permittivity[:, self.material])
         log_path = np.add.reduceat(np.log(power), self.first_of_path, axis=1)
         path = 10.0 ** (self.path_gain_db / 10.0) * np.exp(log_path)
@@ -112,12 +112,12 @@ class District:
         return -10.0 * np.log10(link), -10.0 / np.log(10.0) * d_link / link[:, :, None]
 
     def _reflected_power(self, permittivity: Array) -> tuple[Array, Array]:
-        """Power reflection factor and its derivative by the permittivity [n, i]."""
+        """Power reflection factor and its derivative with respect to the permittivity [n, i]."""
         loss = 1j * self.conductivity[self.material] * WAVELENGTH * 59.96  # sigma / (2 pi f eps_0)
         power, slope = 0.0, 0.0
         for share, te in ((self.te_share, True), (1.0 - self.te_share, False)):
             here, step = self._slab(permittivity - loss, te), 1e-6 * permittivity
-            # Analytic in the permittivity, so a central difference along the real axis serves.
+            # The factor is analytic in the permittivity, so a central difference along the real axis is sufficient.
             there = self._slab(permittivity + step - loss, te) - self._slab(permittivity - step - loss, te)
             power = power + share * np.abs(here) ** 2
             slope = slope + share * 2.0 * np.real(np.conj(here) * there / (2.0 * step))
@@ -134,7 +134,7 @@ class District:
 
 @cache
 def district(materials: int = 3, links: int = 40, pane: float = 0.1, seed: int = 7) -> Landscape:
-    """Permittivities against path losses with 3 dB of noise; panes of 0.1 m resonate: many minima."""
+    """Permittivities fitted to path losses with 3 dB of noise; panes of 0.1 m resonate, which gives many minima."""
     rng = np.random.default_rng(seed)
     world = District.draw(links, materials, pane, rng)
     truth = rng.uniform(3.0, 8.0, materials)
@@ -155,7 +155,7 @@ def street() -> Landscape:
 
 
 def blocks() -> Landscape:
-    """Eight materials of thin panes and walls in 60 links."""
+    """Eight materials of thin panes and walls, with 60 links."""
     return replace(district(8, 60, pane=0.02, seed=1), name="blocks", minimum=2.77408251)
 
 
@@ -166,7 +166,7 @@ def hall() -> Landscape:
 
 @cache
 def tones() -> Landscape:
-    """Frequencies and phase of two sine tones in noise: a comb of local minima next to the global one."""
+    """Frequencies and phase of two sine tones in noise, with a series of local minima next to the global one."""
     rng = np.random.default_rng(3)
     time = np.sort(rng.uniform(0.0, 1.0, 30))
 
@@ -187,7 +187,7 @@ def tones() -> Landscape:
 
 @cache
 def rosenbrock() -> Landscape:
-    """The curved valley, its minimum 0 at (1, 1)."""
+    """The curved valley, with its minimum of 0 at (1, 1)."""
 
     def model(x: Array) -> tuple[Array, Array]:
         a, b = x.T
@@ -199,5 +199,5 @@ def rosenbrock() -> Landscape:
 
 
 def within(landscape: Landscape, lower: list[float], upper: list[float]) -> Landscape:
-    """The same residuals over another box."""
+    """The same residuals over a different box."""
     return replace(landscape, lower=np.array(lower), upper=np.array(upper))

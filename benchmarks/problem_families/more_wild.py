@@ -162,7 +162,7 @@ def _mancino_rest(x: Vector) -> Vector:
 
 
 def heart(x: Vector, m: int) -> Vector:
-    """Problem 22: HEART8LS of CUTEst; moments of two dipoles, which are powers of complex numbers."""
+    """Problem 22: HEART8LS of CUTEst; moments of two dipoles, expressed as powers of complex numbers."""
     first, second = x[0] + 1j * x[2], x[1] + 1j * x[3]
     p, q = x[4] + 1j * x[6], x[5] + 1j * x[7]
     measured = (-0.69 - 0.044j, -1.57 - 1.31j, -2.65 + 2j, -12.6 + 9.48j)
@@ -171,7 +171,7 @@ def heart(x: Vector, m: int) -> Vector:
 
 
 def _started(*values: float) -> Callable[[int], Vector]:
-    """A starting point, or one value for all parameters."""
+    """A starting point, or one starting value for all parameters."""
     return lambda n: np.full(n, values[0]) if len(values) == 1 else np.array(values)
 
 
@@ -209,7 +209,7 @@ COMBINATIONS: Final = (
     (20, 5, 5, 1), (20, 6, 6, 1), (20, 8, 8, 1), (21, 5, 5, 2), (21, 8, 8, 1), (21, 10, 10, 1), (21, 12, 12, 2),
     (22, 8, 8, 2),
 )  # fmt: skip
-"""Number of the function, of parameters, of residuals, and of starting points: the standard one, and ten times it."""
+"""Number of the function, and numbers of parameters, residuals and starting points (the standard one, ten times it)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +217,7 @@ class MoreWild:
     """One problem.
 
     Attributes:
-        name: Function, dimension and factor on the starting point.
+        name: Function, dimension and factor of the starting point.
         start: The starting point [n].
         residuals: Residuals [m] at a point [n].
     """

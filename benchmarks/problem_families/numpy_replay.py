@@ -1,10 +1,10 @@
 """A path program evaluated by NumPy, without compiling.
 
 Every problem of a family has its path program, and compiling one with diffraction takes more than ten seconds: longer
-than all its evaluations. Path loss equals that of `calibray.fields` to rounding, at some microseconds per interaction.
-Coefficients and their derivatives follow ITU-R P.2040-3. Derivatives are propagated from the receiver backwards: at
-every interaction, the later ones are summarized by one number b per polarization, such that a change dr of a
-coefficient changes the power of the path by 2 Re(b dr).
+than all its evaluations. Path loss equals that of `calibray.fields` to rounding, and takes a few microseconds per
+interaction. Coefficients and their derivatives follow ITU-R P.2040-3. Derivatives are propagated from the receiver
+backwards: at every interaction, the later ones are summarized by one number b per polarization, such that a change dr
+of a coefficient changes the power of the path by 2 Re(b dr).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ BLOCK: Final = 200_000
 """Coefficients evaluated at once, to bound the memory."""
 
 Wave = tuple[Complex, Complex]
-"""Both polarizations of the field along paths [n, T, p], or of its adjoint."""
+"""Both polarizations of the field along paths, or of its adjoint [n, T, p]."""
 
 _COLUMNS: Final = [list(FIELDS).index(name) for name in ACTING]
 
@@ -57,7 +57,7 @@ class Surfaces:
         frequency: Carrier [Hz].
         cosine: Cosine of the angle of incidence [J].
         transmitted: Whether the wave is transmitted [J].
-        raw: Whether the reflection is taken without the loss to scattering [J].
+        raw: Whether the reflection is computed without the loss due to scattering [J].
     """
 
     frequency: float
@@ -69,7 +69,7 @@ class Surfaces:
         """Evaluate the coefficients.
 
         Args:
-            constants: Of each slab, in the order of `ACTING` [4, n, J].
+            constants: Constants of each slab, in the order of `ACTING` [4, n, J].
 
         Returns:
             The coefficients.
@@ -85,20 +85,20 @@ class Surfaces:
         return Pair(*pair)
 
     def slopes(self, constants: NDArray[np.float64], bars: Pair) -> list[NDArray[np.float64]]:
-        """Derivatives of a real quantity by the constants, from those by the coefficients (reverse mode).
+        """Derivatives of a real quantity with respect to the constants, from those with respect to the coefficients.
 
         Args:
-            constants: Of each slab, in the order of `ACTING` [4, n, J].
+            constants: Constants of each slab, in the order of `ACTING` [4, n, J].
             bars: Numbers b such that a change dr of the coefficients changes the quantity by 2 Re(b dr).
 
         Returns:
-            Derivatives by each constant of `ACTING`, 4 times [n, J].
+            Derivatives with respect to each constant of `ACTING`, 4 times [n, J].
         """
         eta, root, phase = self._wave(constants)
         across, wavenumber = phase**2, 2.0 * np.pi * self.frequency / speed_of_light
         by_eta, by_thickness, by_scattering = 0.0, 0.0, 0.0
-        rise = 0.5 / root  # of the root by eta
-        turn = -1j * wavenumber * phase  # of the phase factor by thickness times root
+        rise = 0.5 / root  # derivative of the root with respect to eta
+        turn = -1j * wavenumber * phase  # of the phase factor, with respect to thickness times root
         kept = 1.0 - np.where(self.transmitted | self.raw, 0.0, constants[3] ** 2)
         for weighted, steep, bar in ((self.cosine, 0.0, bars.te), (eta * self.cosine, self.cosine, bars.tm)):
             half = (weighted - root) / (weighted + root)
@@ -118,7 +118,7 @@ class Surfaces:
         return [2.0 * np.real(part) for part in (by_eta, by_eta * lossy, by_thickness, mirrored)]
 
     def _wave(self, constants: NDArray[np.float64]) -> tuple[Complex, Complex, Complex]:
-        """The relative permittivity, the root that Snell's law gives, and the phase factor of one crossing."""
+        """The relative permittivity, the root in Snell's law, and the phase factor of one crossing."""
         eta = constants[0] - 1j * constants[1] / (2.0 * np.pi * self.frequency * epsilon_0)  # eq. 9
         root = np.sqrt(eta - (1.0 - self.cosine**2))
         # e^{-jq}, q of eq. 44
@@ -130,7 +130,7 @@ class Surfaces:
 
 
 class NumpyReplay:
-    """Stored paths, evaluated for any candidate; only Lambert's law and one polarization per port.
+    """Stored paths, evaluated for any candidate; limited to Lambertian scattering and one polarization per port.
 
     Args:
         paths: The path program.
@@ -175,7 +175,7 @@ class NumpyReplay:
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss of every link, and its derivatives by the parameters.
+        """Path loss of every link, and its derivatives with respect to the parameters.
 
         Args:
             candidates: Parameter values [n, d], in the fields' units.
@@ -225,7 +225,7 @@ class NumpyReplay:
         return np.stack([tables[:, self._material, column] for column in _COLUMNS])
 
     def _scattered(self, scattering: NDArray[np.float64]) -> NDArray[np.float64]:
-        """S sqrt(f_s dOmega) of the diffuse interactions, by Lambert's law [n, D]."""
+        """S sqrt(f_s dOmega) of the diffuse interactions, with the Lambertian pattern [n, D]."""
         table = self.paths.diffuse
         by_lambert = np.sqrt(np.maximum(table.cos_scattered / np.pi * table.solid_angle, 0.0))
         return scattering[:, self._diffuse] * by_lambert
@@ -233,7 +233,7 @@ class NumpyReplay:
     def _carried(
         self, index: NDArray[np.int64], steps: NDArray[np.int64], faces: Pair, scattered: NDArray[np.float64]
     ) -> list[Wave]:
-        """Waves along paths of one sequence of interactions [k, p]: before each, in its frame, and at the end."""
+        """Waves along paths with one sequence of interactions [k, p], before each in its frame, and at the end."""
         paths, waves = self.paths, []
         a, b = np.moveaxis(paths.tx_field[index], 0, -1).swapaxes(0, 1)[:, None]  # [1, T, p]
         for at in steps:
@@ -259,7 +259,7 @@ class NumpyReplay:
         return (rx[..., 0, :] * wave[0][:, None] + rx[..., 1, :] * wave[1][:, None]) * self._scale[index]
 
     def _received(self, index: NDArray[np.int64]) -> Complex:
-        """Fields of the receiver's ports, conjugate [1, R, 1, 2, p]."""
+        """Conjugate fields of the receiver's ports [1, R, 1, 2, p]."""
         return np.conj(np.moveaxis(self.paths.rx_field[index], 0, -1))[None, :, None]
 
     def _power(self, gain: Complex) -> NDArray[np.float64]:
@@ -278,7 +278,7 @@ class NumpyReplay:
         ]
 
     def _sloped(self, candidates: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Power gain of every path [n, P], and derivatives of that of every link by the parameters [n, L, d]."""
+        """Power gain of every path [n, P], and derivatives of every link's gain [n, L, d]."""
         constants, count = self._constants(candidates), len(candidates)
         faces, scattered = self._surfaces.coefficients(constants), self._scattered(constants[3])
         power = np.empty((count, self.paths.num_paths))
@@ -313,7 +313,7 @@ class NumpyReplay:
         bars: Pair,
         by_size: NDArray[np.float64],
     ) -> None:
-        """Fill in derivatives of the powers of paths by coefficients, and by the logarithm of the scattered size."""
+        """Fill in derivatives of path powers with respect to coefficients and the log amplitude of scattering."""
         paths, rx = self.paths, self._received(index)
         ahead = np.conj(gain) * self._scale[index] / paths.tx_field.shape[1]
         a_bar, b_bar = ((ahead * rx[..., k, :]).sum(axis=1) for k in range(2))
@@ -324,7 +324,9 @@ class NumpyReplay:
                 size = _size(a, b, te, tm, scattered[:, None, row])
                 cos, sin = paths.diffuse.rotation[row].T
                 a_bar, b_bar = size * (cos * a_bar - sin * b_bar), size * (sin * a_bar + cos * b_bar)
-                change = np.real(a_bar * a + b_bar * b)  # half of that by the logarithm of the size
+                change = np.real(
+                    a_bar * a + b_bar * b
+                )  # half the derivative with respect to the log amplitude
                 by_size[:, row] = 2.0 * change.sum(axis=1)
                 kept, incident = _powers(a, b, te, tm)
                 for bar, face, part in ((bars.te, te, a), (bars.tm, tm, b)):
@@ -350,7 +352,7 @@ class NumpyReplay:
 def _powers(
     a: Complex, b: Complex, te: Complex, tm: Complex
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Power that a mirror would reflect, and incident power; 1 where it is zero."""
+    """Power of a specular reflection, and incident power; 1 where it is zero."""
     kept, incident = np.abs(te * a) ** 2 + np.abs(tm * b) ** 2, np.abs(a) ** 2 + np.abs(b) ** 2
     return np.where(kept > 0.0, kept, 1.0), np.where(incident > 0.0, incident, 1.0)
 
@@ -358,14 +360,14 @@ def _powers(
 def _size(
     a: Complex, b: Complex, te: Complex, tm: Complex, amplitude: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Amplitude of a diffuse reflection: that of a mirror, times S sqrt(f_s dOmega)."""
+    """Amplitude of a diffuse reflection: that of a specular reflection times S sqrt(f_s dOmega)."""
     incident = np.abs(a) ** 2 + np.abs(b) ** 2
     kept = np.abs(te * a) ** 2 + np.abs(tm * b) ** 2
     return amplitude * np.sqrt(kept / np.where(incident > 0.0, incident, 1.0))
 
 
 def _by_kinds(paths: Paths) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Paths of the same sequence of kinds [p], and their interactions [k, p]."""
+    """Paths with the same sequence of kinds of interactions [p], and their interactions [k, p]."""
     depth = np.diff(paths.first)
     kinds = np.zeros((paths.num_paths, int(depth.max(initial=0))), dtype=np.int64)
     for step in range(kinds.shape[1]):

@@ -1,4 +1,4 @@
-"""The lowest RMSE of planted problems, kept in Calibray's cache folder, because finding one takes many searches."""
+"""The lowest RMSE of planted problems, stored in Calibray's cache folder, because finding one takes many searches."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from problem_families.family import PlantedProblem, problem
 
 
 def landscape_problem(name: str) -> ComparisonProblem:
-    """A landscape of `problem_families.landscapes`, by the name of the function that makes it."""
+    """A landscape of `problem_families.landscapes`, given the name of the function that makes it."""
     land: landscapes.Landscape = getattr(landscapes, name)()
 
     def evaluate(points: NDArray[np.float64], derivatives: bool) -> Evaluation:
@@ -41,7 +41,7 @@ def planted_problem(kind: str, seed: int) -> ComparisonProblem:
 
     Args:
         kind: "district" or "office".
-        seed: Its seed.
+        seed: Seed of the problem.
 
     Returns:
         The problem.
@@ -55,7 +55,7 @@ def planted_problem(kind: str, seed: int) -> ComparisonProblem:
         answer = planted.evaluate(points, derivatives)
         return Evaluation(*answer, answer.residuals, answer.value)
 
-    # Runs with the cheap model depend on its answers and on the ranges of its constants as well.
+    # Runs with the cheap model also depend on its answers and on the ranges of its constants.
     middle = planted.parameters.from_search(0.5 * (planted.lower + planted.upper)[None])
     constants = with_constants(planted.parameters, planted.cheap.paths.materials)
     digest = hashlib.sha256(planted.fingerprint.encode())
@@ -119,12 +119,12 @@ class PlantedRows:
 
 
 def cheap_model(planted: PlantedProblem) -> ReplayedModel:
-    """The cheap model of a planted problem, with its believed constants."""
+    """The cheap model of a planted problem, with its nominal constants."""
     return ReplayedModel(_compiled(planted), len(planted.parameters), PlantedRows(planted))
 
 
 @lru_cache(maxsize=1)
 def _compiled(planted: PlantedProblem) -> Replay:
-    """The replay of a cheap model, which the runs of one problem compile once."""
+    """The replay of a cheap model, compiled once for all runs of a problem."""
     paths = planted.cheap.paths
     return Replay(paths, with_constants(planted.parameters, paths.materials))

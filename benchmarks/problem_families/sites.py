@@ -23,10 +23,10 @@ class MaterialRange:
     """Ranges from which the constants of a material are drawn.
 
     Attributes:
-        relative_permittivity: Smallest and largest [1].
-        conductivity: Smallest and largest at 4 GHz [S/m]; it grows in proportion to the carrier.
-        thickness: Smallest and largest [m].
-        scattering_coefficient: Smallest and largest, where the surface scatters [1].
+        relative_permittivity: Smallest and largest relative permittivity [1].
+        conductivity: Smallest and largest conductivity at 4 GHz [S/m]; it is proportional to the carrier frequency.
+        thickness: Smallest and largest thickness [m].
+        scattering_coefficient: Smallest and largest scattering coefficient, if the surface scatters [1].
     """
 
     relative_permittivity: Range
@@ -51,8 +51,8 @@ class Site:
     """A scene with positions for links.
 
     Attributes:
-        materials: Ranges of each material of the scene, by its name.
-        write: Writes the scene into a folder, and returns the XML file.
+        materials: Ranges for each material of the scene, by name.
+        write: Function that writes the scene into a folder, and returns the XML file.
         tx: Transmitter of each link [n, 3], [m].
         rx: Receiver of each link [n, 3], [m].
         indoors: Whether waves pass through walls.
@@ -66,7 +66,7 @@ class Site:
 
 
 def district_site(rng: np.random.Generator, links: int) -> Site:
-    """Draw some blocks of a town.
+    """Draw a few blocks of a town.
 
     Args:
         rng: Random generator.
@@ -106,7 +106,7 @@ def district_site(rng: np.random.Generator, links: int) -> Site:
 
 
 _PLAIN: Final = {"relative_permittivity": 5.0, "conductivity": 0.05, "thickness": 0.3}
-"""Constants that the scene file requires; the family sets others."""
+"""Constants required in the scene file; the family replaces them."""
 
 _REACH: Final = (40.0, 400.0)  # [m], from a transmitter to a receiver
 
@@ -143,7 +143,7 @@ def _on_a_street(layout: Layout, rng: np.random.Generator) -> tuple[float, float
 
 
 def _stop(layout: Layout, station: NDArray[np.float64], rng: np.random.Generator) -> tuple[float, float]:
-    """A position on a street within reach of a transmitter; after 50 draws the last one."""
+    """A position on a street within reach of a transmitter; after 50 draws, the last one is used."""
     position = _on_a_street(layout, rng)
     for _ in range(50):
         if _REACH[0] <= float(np.hypot(*(np.array(position) - station))) <= _REACH[1]:
