@@ -22,7 +22,7 @@ from calibray.scenarios import demo_study_path
 from calibray.study import Setup, Study
 from calibray.support import figure_style as style
 from calibray.support.output_files import write_text
-from calibray.support.progress import Progress, with_stage
+from calibray.support.progress import Progress, with_prefix
 from calibray.tables import Column, Table, numbers, short_html, short_text
 
 RECORD: Final = "result.json"
@@ -37,7 +37,7 @@ MAPPING_CALLS: Final = 8
 def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = None) -> Demo:
     """Run the experiment with the engine "replay" (trace once) or "retrace" (trace for every RT call, as in the paper).
 
-    `progress` is called for every stage, whose name begins with the method.
+    `progress` is called for every stage; the name of the method precedes that of the stage.
 
     Raises:
         InputError: The engine or the seed is invalid.
@@ -51,12 +51,12 @@ def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = 
     paper_engine = replay if engine == "replay" else engines.make(setup, engine)
     results = {
         method: calibrate(
-            setup, method, seed, engine=paper_engine, progress=with_stage(progress, label(method))
+            setup, method, seed, engine=paper_engine, progress=with_prefix(progress, label(method))
         )
         for method in METHODS
     }
-    results[MAPPING] = _space_mapping(setup, seed, with_stage(progress, label(MAPPING)))
-    results[AUTO] = calibrate(setup, AUTO, seed, engine=replay, progress=with_stage(progress, label(AUTO)))
+    results[MAPPING] = _space_mapping(setup, seed, with_prefix(progress, label(MAPPING)))
+    results[AUTO] = calibrate(setup, AUTO, seed, engine=replay, progress=with_prefix(progress, label(AUTO)))
     truth = json.loads(demo_study_path().with_name("truth.json").read_text(encoding="utf-8"))["materials"]
     return Demo(
         results=results,

@@ -24,6 +24,19 @@ def with_stage(progress: Progress | None, stage: str) -> Progress | None:
     return lambda _, done, total: progress(stage, done, total)
 
 
+def with_prefix(progress: Progress | None, prefix: str) -> Progress | None:
+    """Report progress under the stages' names after a prefix, such as the method that is run.
+
+    Example:
+        >>> progress = with_prefix(lambda *parts: print(*parts), "SGWO-IM")
+        >>> progress("drawing", 3, 40)
+        SGWO-IM, drawing 3 40
+    """
+    if progress is None:
+        return None
+    return lambda stage, done, total: progress(f"{prefix}, {stage}", done, total)
+
+
 def with_total(progress: Progress | None, before: int, total: int) -> Progress | None:
     """Report the progress of one part as progress of the whole; `before` is the amount done in earlier parts.
 
