@@ -188,7 +188,7 @@ def test_paths_of_some_links_are_theirs_in_any_order(folder: Path) -> None:
     ("arguments", "message"),
     [
         ((0.0,), r"frequency = 0\.0: must be in 1e\+06 to 1e\+12 Hz"),
-        ((28.5,), r"frequency = 28\.5: .*28\.5 GHz is written 28\.5e9"),
+        ((28.5,), r"frequency = 28\.5: .*write 28\.5 GHz as 28\.5e9"),
         ((float("nan"),), "frequency = nan"),
         ((1e9, {"glass": None}), "no material 'glass' in the traced scene; it has soil, walls"),
     ],
@@ -395,7 +395,7 @@ def test_prediction_takes_the_carrier_of_each_link_or_else_the_scenes(
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (28.5, r"row 3: the frequency 28\.5 must be in 1e\+06 to 1e\+12 Hz .*28\.5 GHz is written 28\.5e9"),
+        (28.5, r"row 3: the frequency 28\.5 must be in 1e\+06 to 1e\+12 Hz .*write 28\.5 GHz as 28\.5e9"),
         (-1e9, r"row 3: the frequency -1e\+09 must be"),
         (np.nan, r"column 'carrier' is missing or not finite in 1 of 24 rows \(row 3\)"),
     ],

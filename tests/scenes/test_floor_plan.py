@@ -103,7 +103,7 @@ def test_what_is_left_of_a_longer_face_is_kept():
     assert (sheet.start, sheet.end) == (pytest.approx((0.1, 0.1)), pytest.approx((12.0, 0.1)))
     assert merged.report == [
         "brick: 2 merged from two faces, 0.20 m apart, 5.8 m long",
-        "brick: 1 kept of a face that is longer than the other, 6.0 m long",
+        "brick: 1 kept from a face that is longer than the opposite face, 6.0 m long",
         "brick: walls without a thickness get 0.2 m",
     ]
     (staggered,) = merge_faces([line(0, 0, 10, 0), line(4, 0.2, 14, 0.2)]).sheets
@@ -117,7 +117,7 @@ def test_two_walls_near_each_other_stay_two_walls_in_a_plan_of_single_lines():
     assert list(merged.sheets) == [*OUTER, line(5, 0, 5, 6), shaft]
     assert merged.lines == 0
     assert merged.report == [
-        "brick: 1 not merged with a parallel line, as most lines of this type have no other face, "
+        "brick: 1 not merged with a parallel line, as most lines of this type have no opposite face, "
         "0.44 m apart, 6.0 m long"
     ]
     # Drawn as single lines of another type, the same two lines are the whole type, and one wall.

@@ -110,9 +110,13 @@ def test_further_columns_are_ignored(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("corners", "faces", "message"),
     [
-        (CORNERS, [[0, 1, 2], [0, 2, 4]], r"face 1 names vertex 4, must be 0 to 3"),
-        (CORNERS, [[0, 1, 99_999_999], [0, 2, 3]], r"face 0 names vertex 1e\+08, must be 0 to 3"),
-        (CORNERS, [[0, 1, 2], [0, -1, 3]], r"face 1 (names vertex -1, must be 0|is '3 0 -1 3', must be 3)"),
+        (CORNERS, [[0, 1, 2], [0, 2, 4]], r"face 1 refers to vertex 4, must be 0 to 3"),
+        (CORNERS, [[0, 1, 99_999_999], [0, 2, 3]], r"face 0 refers to vertex 1e\+08, must be 0 to 3"),
+        (
+            CORNERS,
+            [[0, 1, 2], [0, -1, 3]],
+            r"face 1 (refers to vertex -1, must be 0|is '3 0 -1 3', must be 3)",
+        ),
         (CORNERS, [[0, 1, 2, 3]], "face 0 (has 4 corners, must have|is '4 0 1 2 3', must be) 3"),
         (CORNERS, [[0, 1, 2], [0, 2]], r"unexpected length|face 1 is '2 0 2', must be 3"),
         (np.where(CORNERS == 9, np.nan, CORNERS), FACES, r"x of vertex 1 is nan, must be finite"),
@@ -232,15 +236,18 @@ def test_a_header_that_declares_more_than_the_file_holds_allocates_nothing(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", r"line 3: 'v 0 nan 0': a vertex is three finite numbers"),
-        ("v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", "line 2: 'v 1 0': a vertex is"),
+        (
+            "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n",
+            r"line 3: 'v 0 nan 0': a vertex must be three finite numbers",
+        ),
+        ("v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", "line 2: 'v 1 0': a vertex must be"),
         (
             "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n",
-            "line 4: 'f 1 2 4': a face names three or more of the 3 vertices",
+            "line 4: 'f 1 2 4': a face must have three or more of the 3 vertices",
         ),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 0\n", "line 4: .*a face names three"),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2.5 3\n", "line 4: .*a face names three"),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 -2//1\n", "line 4: .*a face names three"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 0\n", "line 4: .*a face must have three"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2.5 3\n", "line 4: .*a face must have three"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 -2//1\n", "line 4: .*a face must have three"),
         ("v 0 0 0\n", "has no faces"),
     ],
 )

@@ -131,7 +131,7 @@ def without_accents(name: object) -> str:
 
 
 def words(name: object) -> frozenset[str]:
-    """Words of a column's name, in lower case; a camel-case word counts both as a whole and in parts.
+    """Words in a column's name, in lower case; a camel-case word counts both as a whole and in parts.
 
     Example:
         >>> sorted(words("Rx_X [m]"))

@@ -54,7 +54,7 @@ class _Layout:
 
 
 def read_text(path: Path) -> str:
-    """Text of a file in UTF-8, in UTF-16 with a byte order mark, or else in Windows-1252.
+    """Read the text of a file in UTF-8, in UTF-16 with a byte order mark, or else in Windows-1252.
 
     Raises:
         InputError: The file cannot be read, or contains bytes that are not text.
@@ -78,7 +78,7 @@ def read_text(path: Path) -> str:
 
 
 def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTable:
-    r"""Rows of a table in a text, without blank lines.
+    r"""Read the rows of a table in a text, without blank lines.
 
     Lines above the header are skipped if they have a different number of cells or mostly empty cells. Units in a row
     below the header are appended to the column names. Columns of numbers may contain placeholders (`PLACEHOLDERS`), and
@@ -216,7 +216,7 @@ def _with_unit(name: object, unit: str) -> str:
 def _plain_numbers(column: pd.Series, decimal: str) -> pd.Series:
     """Convert a column of texts to numbers if each is a number, a placeholder, or a number with the same unit.
 
-    White space at the ends of other texts is removed.
+    Leading and trailing white space is removed from other texts.
     """
     if not pd.api.types.is_string_dtype(column):
         return column

@@ -251,8 +251,8 @@ def _check_carriers(links: Measurements, frequency: NDArray[np.float64]) -> None
         )
     if (count := len(np.unique(frequency))) > MAX_CARRIERS:
         raise InputError(
-            f"{links.source}: {count} different frequencies, must be at most {MAX_CARRIERS}; give the carrier of each "
-            "link, not a frequency within the measured band"
+            f"{links.source}: {count} different frequencies, must be at most {MAX_CARRIERS}; give the "
+            "carrier frequency of each link, not a frequency within the measured band"
         )
 
 

@@ -168,7 +168,7 @@ def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:
         angle = multipath.angles.get((plane, end))
         if angle is None:
             raise InputError(
-                f"{statistic.kind} needs angles, which were not measured or are in several columns; give one column, "
+                f"{statistic.kind} needs angles, which are missing or in several columns; give one column, "
                 f"such as {plane}_{end}_deg"
             )
     snapshots: dict[str, list[float]] = {}

@@ -125,7 +125,7 @@ class Preparation:
         missing: Numbers that stand for a missing value, in addition to those that are detected.
         noise_floor_dbm: Noise floor [dBm]; missing powers count as below the floor.
         censored: Whether links at or below the noise floor are kept, as censored links at the floor.
-        frame: The scene's frame on the globe, if positions are longitude, latitude and height; None for lengths.
+        frame: Geographic frame of the scene, if positions are longitude, latitude and height; None if they are lengths.
         crs: Coordinate reference system of positions, if there is a frame.
         unit_m: Length of one unit of position columns in the scene's frame [m].
         ground: Height of the ground, if heights are measured from the ground.

@@ -1,4 +1,4 @@
-"""From a table to links: read the file, select rows, place them, average or merge, clear buildings, check.
+"""From a table to links: reading the file, selecting, placing, averaging or merging rows, and checking the links.
 
 Samples are averaged in linear power, to one row per area or place. Along a street, the power fades by several dB within
 a wavelength. Ray tracing to one point does not predict this fading; it predicts the mean power over a few tens of
@@ -78,7 +78,7 @@ def read_measurements(
 def measured_links(
     table: SourceTable, columns: LinkColumns, steps: Preparation | None = None
 ) -> Measurements:
-    """Convert the rows of a table to measured links; `prepared` counts what was left out, averaged or changed.
+    """Convert the rows of a table to measured links; `prepared` counts the rows left out, averaged or changed.
 
     Raises:
         InputError: A column is missing or malformed, a value is missing or implausible, a transmitter is unknown, or
@@ -480,7 +480,7 @@ def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkCol
 def join_positions(
     positions: NDArray[np.float64], group: NDArray[np.int64] | None = None
 ) -> NDArray[np.int64]:
-    """Number the distinct places among positions [N, axes], [m], in the order of their first occurrence [N].
+    """Number the distinct places [N] among positions [N, axes], [m], in the order of their first occurrence.
 
     Positions within `SAME_POSITION` of each other, directly or through other positions, are one place, unless they
     belong to different groups [N].

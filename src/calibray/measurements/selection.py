@@ -123,7 +123,7 @@ def plain_labels(column: Iterable[object]) -> list[str]:
 
 
 def comparison(names: Iterable[object]) -> Callable[[Iterable[object]], list[str]]:
-    """The function that normalizes labels and names for comparison: `plain_labels`, unless it makes two names equal."""
+    """Choose the function that normalizes names for comparison: `plain_labels`, unless it makes two names equal."""
     texts = list(map(str, names))
     if len(set(plain_labels(texts))) == len(set(texts)):
         return plain_labels

@@ -63,7 +63,7 @@ class SourceTable:
             InputError: No row remains.
         """
         if not mask.any():
-            raise InputError(f"{self.source}: {reason}: all of {len(self)} rows; change [links] of the study")
+            raise InputError(f"{self.source}: {reason}: all of {len(self)} rows; change [links] in the study")
         lost = int((~mask).sum())
         return (self.note(reason, lost) if lost else self).select(mask)
 
@@ -152,7 +152,7 @@ class SourceTable:
         """Positions [rows, 3], [m], in the scene's frame, from three numbers or columns; `end` is "tx" or "rx".
 
         Raises:
-            InputError: The coordinates are not three, or a column is missing, not numeric or named like degrees.
+            InputError: There are not three coordinates, or a column is missing, not numeric or named like degrees.
         """
         if isinstance(coordinates, str) or len(coordinates) != 3:
             raise InputError(f"{end} = {coordinates!r}: must be x, y and z, each a number [m] or a column")

@@ -223,7 +223,9 @@ def unusable(frame: pd.DataFrame, key: str, column: str) -> str:
     values = pd.to_numeric(frame[column], errors="coerce")
     missing = int(values.isna().sum())
     if missing or column not in numeric_columns(frame):
-        return f"{missing or len(frame)} of {len(frame)} rows contain no number; fill it in and state the key"
+        return (
+            f"{missing or len(frame)} of {len(frame)} rows contain no number; fill them in and state the key"
+        )
     if values.abs().max() > LARGEST_ANGLE[key]:
         return f"the value {values.abs().max():g} is not an angle in degrees"
     return ""

@@ -181,7 +181,7 @@ def _read_ply(content: bytes) -> Mesh:
     if (wrong := (corners < 0) | (corners >= len(vertices)) | (corners != np.floor(corners))).any():
         row, corner = np.argwhere(wrong)[0]
         raise InputError(
-            f"face {row} names vertex {corners[row, corner]:g}, must be 0 to {len(vertices) - 1}"
+            f"face {row} refers to vertex {corners[row, corner]:g}, must be 0 to {len(vertices) - 1}"
         )
     misread = any(kind.kind != "f" for kind in stored)
     # Only in single precision is the spacing large enough to matter.
@@ -222,15 +222,15 @@ def _read_obj(content: bytes) -> Mesh:
             positions.append([_number(word) for word in words[:3]])
             if len(words) < 3 or not np.isfinite(positions[-1]).all():
                 raise InputError(
-                    f"line {number}: {shortened(line.strip())!r}: a vertex is three finite numbers"
+                    f"line {number}: {shortened(line.strip())!r}: a vertex must be three finite numbers"
                 )
         elif keyword == "f":
             parts = [word.partition("/") for word in words]
             indices = [_obj_index(_number(index), len(positions)) for index, _, _ in parts]
             if len(indices) < 3 or None in indices:
                 raise InputError(
-                    f"line {number}: {shortened(line.strip())!r}: a face names three or more of the {len(positions)} "
-                    "vertices before it"
+                    f"line {number}: {shortened(line.strip())!r}: a face must have three or more of the "
+                    f"{len(positions)} vertices before it"
                 )
             first, *rest = (
                 vertices.setdefault((index, attributes), len(vertices))
@@ -247,7 +247,7 @@ def _read_obj(content: bytes) -> Mesh:
 
 
 def _obj_index(number: float, count: int) -> int | None:
-    """Index of a vertex given its number, from 1, or from -1 backwards; None if there is no such vertex."""
+    """Convert a vertex number, from 1 or backwards from -1, to an index; None if there is no such vertex."""
     index = number - 1 if number > 0 else number + count
     return int(index) if 0 <= index < count and index == np.floor(index) else None
 

@@ -23,7 +23,8 @@ from calibray.scenes.triangles import BATCH, LEVEL, Triangles, read_triangles, v
 from calibray.support.lazy_imports import library
 
 STEP: Final = 5.0
-"""Step at which lines are compared with the ground [m]; lengths in a wood on hills of 50 m then err by 0.1 m."""
+"""Spacing of the points at which a line's height above ground is computed [m]; lengths in a wood on 50 m hills are
+then wrong by 0.1 m."""
 
 LINES: Final = 5000
 """Largest number of lines processed at once; each may have hundreds of steps."""
@@ -411,7 +412,7 @@ def with_obstruction(
         frequency: Carrier frequency [Hz], used if the links do not state it.
         regions: The regions of extra loss by name; `REGION` is added only if there are any.
         clutter: Whether to add `CLUTTER`.
-        cluster_m: Side of the squares of `CLUSTER` [m], a grid through the scene's origin; None to omit the column.
+        cluster_m: Side of the grid squares for `CLUSTER` [m], aligned to the scene's origin; None to omit the column.
 
     Raises:
         InputError: A carrier frequency is outside the range of the clutter loss.
@@ -458,7 +459,7 @@ def clutter_loss_db(distance: ArrayLike, frequency: ArrayLike) -> NDArray[np.flo
         wrong = carrier_ghz[(carrier_ghz * 1e9 < low) | (carrier_ghz * 1e9 > high)].reshape(-1)[0]
         raise InputError(
             f"clutter_db: ITU-R P.2108 section 3.2 covers {low / 1e9:g} to {high / 1e9:g} GHz, not {wrong:g} GHz; "
-            "leave this nuisance out"
+            "omit this nuisance"
         )
     length_km = np.asarray(distance, dtype=float) / 1e3
     # Beyond 2 km, the loss equals that at 2 km (equation 6).

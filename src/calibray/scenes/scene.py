@@ -191,7 +191,7 @@ def has_copied_meshes(scene: Scene) -> bool:
 
 
 def xml_with_copied_meshes(scene: Scene, folder: Path) -> str:
-    """Make XML that the tracer loads instead of `Scene.xml`, and write copies of meshes in the local frame to a folder.
+    """Write copies of meshes in the local frame to a folder, and make the XML with which the tracer loads them.
 
     Raises:
         InputError: A mesh cannot be copied.

@@ -68,7 +68,7 @@ def plain_name(name: str) -> str:
 
 
 def unique_names(names: Iterable[str], taken: Collection[str] = (), kind: str = "_") -> list[str]:
-    """Make plain names unique: a repeated name becomes `NAME-2`, and one that is `taken` becomes `NAME-KIND`.
+    """Make plain and unique names: a repeated name becomes `NAME-2`, and a name in `taken` becomes `NAME-KIND`.
 
     Example:
         >>> unique_names(["Town hall", "Town/hall", '"><x'])
@@ -111,7 +111,7 @@ def scene_path(source: str) -> Path:
     path = Path(source)
     if not exists(path):
         raise InputError(
-            f"scene file {shortened(source, 300)}: does not exist; check the path (or name a bundled one, "
+            f"scene file {shortened(source, 300)}: does not exist; check the path (or give a bundled scene, such as "
             "sionna:munich)"
         )
     return path

@@ -24,7 +24,7 @@ STEEP: Final = 0.1
 """A face is a wall if the vertical component of its unit normal is at most this [1]."""
 
 WITHOUT_GAPS: Final = 0.9
-"""A level object that covers more than this fraction of its bounding box is a sheet, such as a floor or ceiling."""
+"""A level object that covers more than this fraction of its bounding box [1] is a sheet, such as a floor."""
 
 BATCH: Final = 2_000_000
 """Largest number of line-triangle pairs in memory at once; each pair needs about 100 bytes."""
@@ -80,7 +80,7 @@ class Triangles:
 
     @property
     def normal(self) -> NDArray[np.float64]:
-        """Normals [F, 3], [m^2], with the areas of the triangles as their lengths."""
+        """Normals [F, 3], [m^2], whose lengths are the areas of the triangles."""
         corners = self.corners
         return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
 

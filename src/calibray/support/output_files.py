@@ -152,7 +152,7 @@ def check_unchanged(file: Path) -> None:
 
 
 def is_unchanged_output(file: Path) -> bool:
-    """Whether Calibray wrote a file as it is now: the file is signed, or it is a path file, which has its own seal."""
+    """Whether a file is unchanged since Calibray signed it; path files have a seal of their own."""
     if _signature(file, file.name) in _signatures(file.parent):
         return True
     with file.open("rb") as stream:

@@ -46,7 +46,7 @@ TABLES: Final = (*SUFFIXES, ".xlsx", ".parquet")
 MESHES: Final = (".ply", ".obj")
 PARTS: Final = (".shx", ".dbf", ".prj", ".cpg", ".tif", ".tiff", ".gpx", ".xml", ".json")
 PLACE, CANDIDATES, SUGGESTED = "place.csv", "candidates.csv", "suggested.csv"
-"""Tables that the window writes: the place to predict, candidates for the next measurement, and the suggested ones."""
+"""Tables that the window writes: the place to predict, candidate places to measure, and the suggested places."""
 
 PREDICTED: Final = "-predicted.csv"
 """Suffix of the names of predicted tables."""

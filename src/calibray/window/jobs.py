@@ -231,7 +231,7 @@ def stages(log: str) -> list[Stage]:
 
 
 def main() -> None:
-    """Run the command whose words follow the exit-status file in the arguments, unless it is stopped before."""
+    """Run the command whose words follow the exit-status file in the arguments, unless it is stopped before then."""
     stopped: list[int] = []
     # A handler, unlike SIG_IGN, is not inherited by the command.
     signal.signal(signal.SIGINT, lambda number, _: stopped.append(number))

@@ -114,7 +114,7 @@ def show_result(desk: Desk) -> None:
     with ui.row():
         ui.button("Write the report again", on_click=lambda: desk.start(["report", chosen.value])).props(
             "outline"
-        ).tooltip("After a validation: with the errors of the held-out blocks")
+        ).tooltip("After a validation, the report includes the errors of the held-out blocks")
     link = ui.link("Open the report in a new tab", "#", new_tab=True)
     chosen.on_value_change(point)
     point()

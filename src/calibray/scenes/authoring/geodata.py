@@ -1,4 +1,4 @@
-"""Vector files and height models, opened with a closed list of drivers.
+"""Opening vector files and height models with a fixed list of drivers.
 
 GDAL has drivers that fetch URLs, open other files or run pipelines named in a file (VRT, WMS, WFS, GDALG), and it
 chooses the driver by the file's content. This module opens only formats without references to other files. They are

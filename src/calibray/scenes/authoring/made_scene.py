@@ -263,7 +263,7 @@ def make_scene(
     materials = [palette.wall, palette.window, palette.roof or palette.wall, palette.ground]
     scene = MadeScene(folder / SCENE_FILES[0], frame, *extent(objects), counts, guessed)
     write_made_scene(scene, objects, materials, overwrite)
-    # Removes the trees of a scene that this scene replaces.
+    # The trees of a scene that this scene replaces are removed.
     (folder / TREES_FILE).unlink(missing_ok=True)
     if trees is not None and frame is not None and len(trees):
         trees.write(folder, frame)
@@ -281,7 +281,7 @@ def _ground_heights(footprints: Footprints, terrain: Terrain | None) -> NDArray[
     )
     lowest = np.full(len(footprints), np.inf)
     np.minimum.at(lowest, building, terrain.heights(*corners.T))
-    # The heights of parts are measured from the base of the whole building, so that parts stand on each other.
+    # The heights of parts are measured from the ground of the whole building, so that parts stand on each other.
     parts, wholes = np.flatnonzero(footprints.part), np.flatnonzero(~footprints.part)
     inside = shapely.point_on_surface(footprints.polygon[parts])
     part, whole = shapely.STRtree(footprints.polygon[wholes]).query(inside, predicate="within")

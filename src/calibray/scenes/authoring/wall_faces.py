@@ -72,10 +72,10 @@ def merge_faces(segments: Sequence[Segment]) -> MergedPlan:
     sheets = [*_close_gaps([*merged, *rest]), *(segments[k] for k in single if k not in closing)]
     report = [
         *_described("merged from two faces", merged, distances),
-        *_described("kept of a face that is longer than the other", rest),
+        *_described("kept from a face that is longer than the opposite face", rest),
         *_described("ends of outlined walls left out", [segments[index] for index in sorted(closing)]),
         *_described(
-            "not merged with a parallel line, as most lines of this type have no other face",
+            "not merged with a parallel line, as most lines of this type have no opposite face",
             [segments[one] for one, _ in separate],
             [abs(_offset(segments[one], segments[other])) for one, other in separate],
         ),
