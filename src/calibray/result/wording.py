@@ -271,7 +271,7 @@ def _ray_mapping(values: dict[str, Any]) -> str:
         text = f"The model represents the program. {text}. Its surfaces are {surfaces}"
         text += f" with {constants}." if constants else "."
     else:
-        optimum = "the optimum is reached" if values["reached"] else "the optimum may be missed"
+        optimum = "the optimum is probably reached" if values["reached"] else "the optimum may be missed"
         text = (
             f"The model does not represent the program. {text}. A replay that agrees with the program at the best call "
             f"replaces it. Its minimum is {values['remaining_db']:.3f} dB below that call, where path loss differs by "
