@@ -28,9 +28,10 @@ from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, column, deviations_of,
 from calibray.measurements import Measurements
 from calibray.result.held_out import NEW_GROUP, NO_PATH, PredictionModel, ResidualField
 from calibray.result.record import Prediction
+from calibray.study.calibration_sections import TX_OFFSET
 from calibray.study.model import StudyModel
 from calibray.validation.held_out_statistics import interval_half_width
-from calibray.validation.models import TX_OFFSET, without_scene
+from calibray.validation.models import without_scene
 
 MOST_EXACT: Final = 1000
 """Number of measured links up to which all of them are used at every new link; if there are more, only the nearest

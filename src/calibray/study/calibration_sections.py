@@ -167,6 +167,19 @@ class OffsetSection(Section):
         return NuisanceTerm("constant", per, self.bounds, self.prior_db)
 
 
+OFFSET: Final = "offset"
+"""Name of the term of ``[offset]``."""
+
+FREE_OFFSET: Final = "free offset"
+"""Name of the term by which an undeclared offset is looked for."""
+
+TX_OFFSET: Final = "offset of the transmitter"
+"""Name of the term that gives each transmitter an offset in predictions."""
+
+OF_ALL_LINKS: Final = " of all links"
+"""Ending of the names of further terms in predictions."""
+
+
 class NuisanceSection(Section):
     """``[nuisance.NAME]``: a column of the links times an unknown coefficient, one for all links or one per group.
 

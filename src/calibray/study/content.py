@@ -31,9 +31,6 @@ VERSION: Final = 1
 BUNDLED: Final = "sionna:"
 """Prefix of the name of a scene bundled with Sionna RT."""
 
-OFFSET: Final = "offset"
-"""Name of the nuisance term that ``[offset]`` abbreviates."""
-
 
 def _first_stated(keys: Mapping[str, bool]) -> str | None:
     return next((key for key, stated in keys.items() if stated), None)
@@ -102,8 +99,10 @@ class StudyContent(Section, ABC):
         self._check_losses()
         self._check_poses()
         self._check_position_errors()
-        if OFFSET in self.nuisance:
-            raise InputError("nuisance.offset: [offset] has this name; choose another")
+        for name in self.nuisance:
+            reserved = (sections.OFFSET, sections.FREE_OFFSET, sections.TX_OFFSET)
+            if name in reserved or name.endswith(sections.OF_ALL_LINKS):
+                raise InputError(f"nuisance.{name}: Calibray has a term of this name; choose another")
         if getattr(self.engine, "rays", None) and (
             self.links.mountings or self.links.position_error_m is not None
         ):

@@ -22,8 +22,8 @@ from calibray.parameters import LogNormal, Parameter, Parameters, is_effect, spl
 from calibray.parameters.parameter import ROUGHNESS, check_material
 from calibray.scenes.obstruction import CLUTTER
 from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
-from calibray.study.calibration_sections import NuisanceTerm
-from calibray.study.content import BUNDLED, OFFSET, StudyContent
+from calibray.study.calibration_sections import OFFSET, NuisanceTerm
+from calibray.study.content import BUNDLED, StudyContent
 from calibray.study.regions import PREFIX
 from calibray.study.toml_file import expand, read_content, refuse_unquoted_names, split_engine_keys
 from calibray.support.messages import shortened, type_name

@@ -27,8 +27,7 @@ from calibray.measurements import (
     select_rows,
 )
 from calibray.scenes import write_scene
-from calibray.study.calibration_sections import HoldoutSection
-from calibray.study.content import OFFSET
+from calibray.study.calibration_sections import OFFSET, HoldoutSection
 from calibray.study.model import StudyModel
 from calibray.study.row_steps import position_steps, row_track, study_links
 from calibray.study.setup import Setup

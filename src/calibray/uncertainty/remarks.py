@@ -24,6 +24,7 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import BASINS, least_squares
 from calibray.result.verdict import CONFIDENCE, Interval, Remark, RemarkKind, Value
 from calibray.result.wording import MOST_ODDS
+from calibray.study.calibration_sections import FREE_OFFSET
 from calibray.study.model import StudyModel
 from calibray.tracing.settings import RANGES
 from calibray.uncertainty.draws import Draws
@@ -283,7 +284,7 @@ def fit_undeclared_offset(
     objective = problem.objective
     if has_offset(problem) or freedom < 2:
         return UndeclaredOffset()
-    terms = (*objective.nuisance.terms, make_term(problem.setup.links, "free offset"))
+    terms = (*objective.nuisance.terms, make_term(problem.setup.links, FREE_OFFSET))
     trial = replace(problem, objective=replace(objective, nuisance=Nuisance(len(objective.weight), terms)))
     best = least_squares(trial, STARTS, minima[:BASINS]).minima
     value = trial.squares(best).value

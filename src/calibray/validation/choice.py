@@ -28,6 +28,7 @@ from calibray.result.held_out import (
     PredictionModel,
 )
 from calibray.scenes.obstruction import OUT_OF_SIGHT
+from calibray.study.calibration_sections import TX_OFFSET
 from calibray.study.displacement import displaces
 from calibray.study.model import StudyModel
 from calibray.validation import models
@@ -241,7 +242,7 @@ def fitted_terms(
     for name, term in grouped.items():
         if term.labels == ("",):
             per = ""
-        elif name == models.TX_OFFSET:
+        elif name == TX_OFFSET:
             per = "transmitter"
         else:
             per = OFFSET if name == OFFSET else str(study.nuisance[name].per)

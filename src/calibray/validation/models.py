@@ -40,6 +40,7 @@ from calibray.parameters import LogNormal
 from calibray.result.held_out import AVERAGES, Model
 from calibray.scenes.obstruction import OUT_OF_SIGHT, WALLS
 from calibray.study import Setup
+from calibray.study.calibration_sections import OF_ALL_LINKS, TX_OFFSET
 from calibray.study.model import StudyModel
 from calibray.study.mounting import direct_gain
 from calibray.uncertainty.residual_correlation import fit_correlation
@@ -226,9 +227,6 @@ TOLERANCE: Final = 1e-6
 
 NO_MINIMA: Final[Mapping[Model, NDArray[np.float64]]] = {}
 
-TX_OFFSET: Final = "offset of the transmitter"
-"""Name of the term that gives each transmitter an offset."""
-
 
 def fit_variants(
     part: Problem, known_minima: Mapping[Model, NDArray[np.float64]] = NO_MINIMA
@@ -348,7 +346,7 @@ def _with_term(
     """The objective with one coefficient of a kind for all links, unless it has a term of that kind."""
     if any(term.by == by for term in objective.nuisance.terms):
         return objective
-    term = make_term(links, f"{by} of all links", by, prior=prior_db)
+    term = make_term(links, f"{by}{OF_ALL_LINKS}", by, prior=prior_db)
     terms = (*objective.nuisance.terms, term)
     return replace(objective, nuisance=Nuisance(len(links), terms))
 
