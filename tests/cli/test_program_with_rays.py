@@ -46,6 +46,14 @@ with open(sys.argv[2], "w") as file:
     json.dump({name: [row[k] for row in rows] for k, name in enumerate(names)}, file)
 """
 RIPPLE = "gain += math.sin(3 * permittivity + number)"
+BOTH_PATHS = "    add(2 * number, [tx, rx], 0.0)\n    add(2 * number + 1, [tx, ground, rx], gain)\n"
+ONE_PATH = """    if permittivity < 4: add(2 * number, [tx, rx], 0.0)
+    else: add(2 * number + 1, [tx, ground, rx], gain)
+"""
+SECOND_WITHOUT = """if len(open("calls.log").read()) == 2:
+        gain = -math.inf
+    add(2 * number, [tx, ground, rx], gain)
+    continue"""
 
 
 ISOTROPIC = {"pattern": "iso", "polarization": "H"}
@@ -170,6 +178,24 @@ def test_a_program_of_other_physics_is_not_understood(
     content = cb.Study.load(study).content() | {"method": {"name": "auto", "options": {"budget": 2}}}
     with pytest.raises(InputError, match=r"method\.options\.budget = 2; it must be a whole number >= 3"):
         cb.calibrate(cb.Study.from_content(content, study))
+
+
+def test_a_result_of_calls_without_a_common_path_is_loaded_and_states_the_reason(tmp_path: Path) -> None:
+    study = write_study(tmp_path / "study", holdout=None)
+    program = study.parent / "program.py"
+    program.write_text(program.read_text().replace(BOTH_PATHS, ONE_PATH))
+    ran = run("run", study, "--out", tmp_path / "out")
+    assert ran.exit_code == 0, ran.output
+    assert Result.load(tmp_path / "out").rt_calls >= 3
+    output = " ".join(ran.output.split())
+    assert "some of its" in output
+    assert "have no path, or no link with a path, in common" in output
+
+
+def test_a_call_without_any_path_is_named(tmp_path: Path) -> None:
+    study = write_study(tmp_path / "study", SECOND_WITHOUT, holdout=None)
+    with pytest.raises(EngineError, match=r"no path for any link at ground\.relative_permittivity = \d"):
+        cb.calibrate(cb.Study.load(study))
 
 
 def test_rays_that_do_not_fit_the_scene_are_refused_with_the_reason(tmp_path: Path) -> None:

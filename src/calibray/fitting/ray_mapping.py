@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from calibray.engines.rays.export import Export, Exporting
 from calibray.engines.replay import Replay
+from calibray.errors import EngineError
 from calibray.fitting.problem import Problem
 from calibray.fitting.ray_fit import Understanding, common, understand
 from calibray.fitting.ray_model import Call, RayModel
@@ -178,7 +179,13 @@ def map_rays(
     understanding: Understanding | None = None
 
     def call(candidate: NDArray[np.float64]) -> Call:
-        return Call(candidate, ask(candidate))
+        export = ask(candidate)
+        if not export.paths.num_paths:
+            values = ", ".join(f"{name} = {value:.6g}" for name, value in parameters.named(candidate).items())
+            raise EngineError(
+                f"The program finds no path for any link at {values}; check its scene and its answer"
+            )
+        return Call(candidate, export)
 
     calls = [call(parameters.start)]
     calls.append(call(_most_informative(problem, calls[0], np.random.default_rng(seed))))
@@ -255,9 +262,9 @@ def _gap(replay: Replay, call: Call) -> float:
 
 
 def _distance(path_loss: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Root mean square of the difference over the links that have a path in both [dB]."""
+    """Root mean square of the difference over the links that have a path in both [dB]; +inf if there are none."""
     both = np.isfinite(path_loss) & np.isfinite(other)
-    return float(np.sqrt(np.mean((path_loss[both] - other[both]) ** 2)))
+    return float(np.sqrt(np.mean((path_loss[both] - other[both]) ** 2))) if both.any() else np.inf
 
 
 def _most_informative(problem: Problem, call: Call, random: np.random.Generator) -> NDArray[np.float64]:
@@ -303,15 +310,19 @@ def _remark(mapped: RayMap) -> Remark:
     understanding = mapped.understanding
     model, at_best = understanding.model, (mapped.best.candidate, understanding.values)
     constants, half_spaces = dict(model.described(*at_best)), model.half_spaces(*at_best)
+    levels = {
+        "misfit_db": understanding.misfit_db,
+        "gap_db": mapped.gap_db,
+        "remaining_db": mapped.remaining_db,
+        "moved_db": mapped.moved_db,
+    }
     return Remark(
         RemarkKind.RAY_MAPPING,
         {
+            # A value is infinite if calls have no path, or no link, in common.
+            **{name: value for name, value in levels.items() if np.isfinite(value)},
             "understood": mapped.understood,
-            "misfit_db": understanding.misfit_db,
-            "gap_db": mapped.gap_db,
             "reached": mapped.reached,
-            "remaining_db": mapped.remaining_db,
-            "moved_db": mapped.moved_db,
             "calls": len(mapped.calls),
             "changed": mapped.changed,
             "changed_db": mapped.changed_db,
