@@ -1,6 +1,8 @@
 """The documentation: links, modules, commands and options exist, and pages are short."""
 
+import re
 import runpy
+import tomllib
 from pathlib import Path
 
 
@@ -12,6 +14,18 @@ def test_the_documentation_has_no_faults():
     scripts = [f"benchmarks/{name}.py" for name in ("position_errors", "no_such")]
     text = f"python {scripts[0]} --first 4 \\\n    --no-such # --comment\n`python {scripts[1]}`"
     assert list(tool["missing_scripts"](text)) == [f"{scripts[0]} --no-such", scripts[1]]
+
+
+def test_every_study_in_the_documentation_is_toml():
+    root = Path(__file__).parents[1]
+    for page in (root / "README.md", *sorted((root / "docs").rglob("*.md"))):
+        for block in re.findall(
+            r"^```toml\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+        ):
+            try:
+                tomllib.loads(block)
+            except tomllib.TOMLDecodeError as error:
+                raise AssertionError(f"{page.relative_to(root)}: {error}\n{block}") from error
 
 
 def test_the_lock_file_follows_extras_of_packages_that_were_met_before(monkeypatch):
