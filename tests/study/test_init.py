@@ -442,13 +442,26 @@ def test_codes_of_missing_values_and_unknown_transmitters_are_reported(scene, tm
     assert links.path_loss_db.max() < 80.0
 
 
+def test_rows_without_a_receiver_position_are_left_out_and_counted(scene, tmp_path):
+    """A logger also writes powers while its satellite receiver has no position."""
+    (tmp_path / "sites.csv").write_text("cell,x,y,z\nA,-30,0,15\nB,60,0,15\n")
+    east, north = np.arange(10.0), np.full(10, 20.0)
+    east[:2], north[1:3] = np.nan, np.nan
+    file = table(tmp_path, x=east, y=north, cell=list("AABBAABBAA"), rssi=np.arange(-90.0, -80.0))
+    drafted = draft(scene, file, tmp_path / "study.toml", tmp_path / "sites.csv", 3.5e9)
+    reasons = {assumption.what: assumption.reason for assumption in drafted.assumptions}
+    assert reasons["links.where"] == "no receiver position: 3 rows are left out"
+    assert assumed(drafted)["links.where"] == "(`x`.notna()) and `y`.notna()"
+    assert drafted.study.measurements().rx[:, 0].tolist() == [*range(3, 10)]
+
+
 def test_transmitters_are_found_by_their_names_whatever_the_column_is_called(scene, tmp_path):
     (tmp_path / "gateways.csv").write_text("id,x,y,z,floor\nA,-30,0,15,1\nB,60,0,15,2\n")
     file = table(tmp_path, x=np.arange(10.0), y=20.0, gatewayId=list("AABBAABBAC"), rssi=np.arange(-80, -70))
     drafted = draft(scene, file, tmp_path / "study.toml", tmp_path / "gateways.csv", 3.5e9)
     reasons = {assumption.what: assumption.reason for assumption in drafted.assumptions}
     assert reasons["links.transmitter"] == "its values are in column id of gateways.csv"
-    assert reasons["links.where"] == "gateways.csv lacks C: 1 rows are left out"
+    assert reasons["links.where"] == "gateways.csv lacks C: 1 row is left out"
     assert drafted.study.offset.per == ("gatewayId",)
     links = drafted.study.measurements()
     assert links.tx[:, 0].tolist() == [-30, -30, 60, 60, -30, -30, 60, 60, -30]

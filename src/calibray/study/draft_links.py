@@ -33,6 +33,7 @@ from calibray.scenes.checks import SceneSurfaces
 from calibray.study.content import BUNDLED, VERSION
 from calibray.study.link_checks import FAR
 from calibray.study.study import Study
+from calibray.support.messages import counted
 
 RECEIVER_HEIGHT: Final = 1.5
 """Height of a receiver without a column of heights [m]: a phone in the hand."""
@@ -122,6 +123,7 @@ class LinksDraft:
         self._add_transmitters()
         self.frequency = self._frequency()
         self.rx, self.tx = self._projected(*self._position_columns())
+        self._leave_out_unplaced_receivers()
 
     @cached_property
     def overhead(self) -> SceneSurfaces:
@@ -244,7 +246,21 @@ class LinksDraft:
         source = (
             "the table of transmitters" if self.given.transmitters is None else self.given.transmitters.name
         )
-        reason = f"{source} lacks {named or 'rows without a name'}: {lacking.sum()} rows are left out"
+        cause = f"{source} lacks {named}" if names else "no transmitter is stated"
+        reason = f"{cause}: {_left_out(int(lacking.sum()))}"
+        self.assume("links.where", self.section["where"], reason)
+        self.table = self.table.select(~lacking)
+
+    def _leave_out_unplaced_receivers(self) -> None:
+        """Draft a filter for rows without a receiver position, such as those logged before satellites were found."""
+        names = [name for name in (self.rx.x, self.rx.y, self.rx.height) if name is not None]
+        missing = self.table.frame[names].isna()
+        lacking = missing.any(axis=1).to_numpy()
+        if not lacking.any() or lacking.all():
+            return
+        for name in missing.columns[missing.any()]:
+            self.add_filter(f"`{name}`.notna()")
+        reason = f"no receiver position: {_left_out(int(lacking.sum()))}"
         self.assume("links.where", self.section["where"], reason)
         self.table = self.table.select(~lacking)
 
@@ -494,3 +510,7 @@ class LinksDraft:
                 f"the ground is at {ground.min():.0f} to {ground.max():.0f} m; heights are measured from it"
             )
             self.assume("links.heights", "ground", reason)
+
+
+def _left_out(number: int) -> str:
+    return f"{counted(number, 'row')} {'is' if number == 1 else 'are'} left out"
