@@ -239,7 +239,7 @@ def test_malformed_geojson_is_refused(tmp_path, old, new):
 def test_a_vector_file_needs_a_reference_system(tmp_path):
     path = layer(tmp_path / "town.shp", [1.0, 2.0, 3.0], "ESRI Shapefile")
     path.with_suffix(".prj").unlink()
-    with pytest.raises(InputError, match="no reference system"):
+    with pytest.raises(InputError, match="no coordinate reference system"):
         read_footprints(path, "hoehe")
     with pytest.raises(InputError, match="does not exist"):
         read_footprints(tmp_path / "nowhere.gpkg", "hoehe")
@@ -463,7 +463,7 @@ LOCAL = 'ENGCRS["site",EDATUM["site"],CS[Cartesian,2],AXIS["x",east],AXIS["y",no
         ({"unit": "cubits"}, "the unit 'cubits' of its heights is not known"),
         ({"unit": "m", "crs": "EPSG:32632+8228"}, "in another unit"),
         ({"crs": LOCAL}, "has no position on the globe"),
-        ({"crs": "EPSG:5773"}, "has no position on the globe|no reference system"),
+        ({"crs": "EPSG:5773"}, "has no position on the globe|no coordinate reference system"),
         ({"transform": Affine(0, 0, 5, 0, 0, 6)}, "is not a grid|cannot be read|no reference|does not cover"),
         ({"transform": Affine(float("nan"), 0, 5, 0, -1, 6)}, "is not a grid"),
     ],

@@ -49,7 +49,7 @@ class LinkDiagnostics:
     """Diagnostics of the links of a finished calibration.
 
     Attributes:
-        columns: Columns for the table of links: `leverage`, NaN for a link without weight; `depth`, the number of
+        columns: Columns for the table of links: `leverage`, NaN for a link of weight 0; `depth`, the number of
             interactions of the strongest path, NaN for a link without a path.
         power_shares: Mean share over the links of the power carried by paths with an interaction, by material and kind
             of interaction. A path counts in full for each of its interactions, so the sum of the shares can exceed 1.

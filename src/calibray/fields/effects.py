@@ -156,7 +156,7 @@ class DisplacementLoss:
 
         At each of the three inner knots, the change is compared with the straight line between the two neighbours. The
         RMS differences of the axes add in quadrature. A step of J dB next to the middle knot gives J / sqrt(6), the RMS
-        error of a line in place of a step at an unknown position; a step in an outer interval gives J / sqrt(12).
+        error of linear interpolation across a step at any position; a step in an outer interval gives J / sqrt(12).
         """
         middle = self.coefficients.shape[2] // 2
         if middle < 3:

@@ -1,7 +1,7 @@
 """Path loss of every link of a program, and its derivatives, for batches of candidates.
 
 With the slab formula, a batch is one compiled loop over its candidates: the data of one candidate stay in the core's
-first-level cache, and fewer candidates take less time. Within the loop, the stages are materialized
+L1 cache, and a smaller batch takes less time. Within the loop, the stages are materialized
 (`calibray.fields.arithmetic.materialize`), because XLA would otherwise fuse each stage into all its uses on the CPU and
 repeat it there.
 

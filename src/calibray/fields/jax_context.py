@@ -106,7 +106,7 @@ def _cache_of_jax(programs: Any) -> Iterator[None]:
 
 @cache
 def _kept_programs() -> Any:
-    """The store as a cache for JAX; None if its folder cannot be trusted or JAX has no such interface."""
+    """The store as a JAX cache; None if its folder cannot be trusted or JAX has no interface for caches."""
     store = cache_folder.compiled_programs()
     if store is None or not store.trusted:
         return None

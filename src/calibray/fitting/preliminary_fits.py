@@ -68,7 +68,7 @@ SEARCHES: Final = 32
 
 
 def leave_out_near_floor(problem: Problem, progress: Progress | None = None) -> Problem:
-    """Give the links whose predicted path loss is near the noise floor weight 0, and mark them in `faint`.
+    """Set the weight of links whose predicted power is near the noise floor to 0, and mark them in `faint`.
 
     The problem is unchanged without a noise floor, and on an engine without derivatives, because its calls are
     expensive. It is also unchanged, with a warning, if the remaining links determine fewer unknowns. The stage of

@@ -32,7 +32,8 @@ STARTS: Final = (16, 512)
 """Smallest and largest number of local searches of a multi-start method."""
 
 START_INTERACTIONS: Final = 4_000_000
-"""Target for the product of local searches and interactions of the path program, so that search times are similar."""
+"""Target for the number of local searches times the number of interactions of the path program. It keeps the time of a
+search similar for small and large programs."""
 
 
 def check_method(name: str) -> None:

@@ -26,7 +26,7 @@ CANDIDATES = 300
 
 @final
 class GaussianProcess(Optimizer):
-    """Bayesian optimization. Uses only the value; 20 d evaluations by default.
+    """Bayesian optimization. Uses only objective values; 20 d evaluations by default.
 
     Args:
         budget: Number of evaluations; 20 d if None.

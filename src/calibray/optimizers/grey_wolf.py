@@ -106,7 +106,7 @@ def whole_iterations(budget: int) -> dict[str, int]:
 
 @final
 class GWO(Optimizer):
-    """Grey Wolf Optimizer. Uses only the value; 600 evaluations at the paper's settings.
+    """Grey Wolf Optimizer. Uses only objective values; 600 evaluations at the paper's settings.
 
     Args:
         population: N, number of wolves.
@@ -187,7 +187,7 @@ def screened_iterations(budget: int) -> dict[str, int]:
 
 @final
 class SGWOIM(Optimizer):
-    """The paper's optimizer. Uses only the value; 225 evaluations at the paper's settings.
+    """The paper's optimizer. Uses only objective values; 225 evaluations at the paper's settings.
 
     Args:
         population: N, number of wolves.

@@ -81,7 +81,7 @@ def inverted(minimise: Callable[[Evaluate], None]) -> Search:
 
 @final
 class CMAES(Optimizer):
-    """Covariance matrix adaptation. Uses only the value, with the given budget. Needs `calibray[optimizers]`.
+    """Covariance matrix adaptation. Uses only objective values, with the given budget. Needs `calibray[optimizers]`.
 
     Args:
         budget: Number of evaluations.
@@ -210,7 +210,7 @@ def _minimise_residuals(
 
 @final
 class DifferentialEvolution(Optimizer):
-    """Differential evolution. Uses only the value, with the given budget.
+    """Differential evolution. Uses only objective values, with the given budget.
 
     Args:
         budget: Number of evaluations.

@@ -94,7 +94,7 @@ class Sampling(Optimizer):
 
 @final
 class RandomSearch(Sampling):
-    """Independent uniform points. Uses only the value, with the given budget.
+    """Independent uniform points. Uses only objective values, with the given budget.
 
     Example:
         >>> RandomSearch([0.0, 0.0], [1.0, 2.0], budget=10).ask().shape
@@ -106,7 +106,7 @@ class RandomSearch(Sampling):
 
 @final
 class LatinHypercube(Sampling):
-    """One point in each slice of every dimension. Uses only the value, with the given budget.
+    """One point in each slice of every dimension. Uses only objective values, with the given budget.
 
     Example:
         >>> sorted((LatinHypercube([0.0], [1.0], budget=4).ask()[:, 0] * 4).astype(int).tolist())
@@ -118,7 +118,7 @@ class LatinHypercube(Sampling):
 
 @final
 class Sobol(Sampling):
-    """A scrambled Sobol sequence. Uses only the value, with the given budget.
+    """A scrambled Sobol sequence. Uses only objective values, with the given budget.
 
     Example:
         >>> Sobol([0.0, 0.0], [1.0, 2.0], budget=10).ask().shape

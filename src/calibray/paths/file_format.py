@@ -296,7 +296,9 @@ def seal(path: str | Path) -> None:
                 while chunk := file.read(_CHUNK):
                     sealed.write(chunk)
     except OSError as error:
-        raise InputError(f"{target}: cannot be sealed ({error.strerror}); name a path file") from None
+        raise InputError(
+            f"{target}: cannot be sealed ({error.strerror}); give a path file that can be written"
+        ) from None
 
 
 def write_checksum(partial: Path) -> str:

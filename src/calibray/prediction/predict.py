@@ -380,7 +380,7 @@ def _replay(
 
 
 def _answers(program: Engine, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Path loss that a program returns for values of its parameters [n, d], [n, links], [dB].
+    """Path loss [n, links], [dB], that a program returns for the values [n, d] of its parameters.
 
     Raises:
         EngineError: A call failed.

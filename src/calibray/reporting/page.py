@@ -284,7 +284,9 @@ def _laws(result: Record) -> Table:
         for material, law in result.fit.laws.items()
     )
     columns = (Column("Material"), numbers("a"), numbers("b"), numbers("c"), numbers("d"))
-    return Table("Over frequency: eps_r = a f^b, sigma = c f^d [S/m], f in GHz (ITU-R P.2040)", columns, rows)
+    return Table(
+        "Frequency dependence: eps_r = a f^b, sigma = c f^d [S/m], f in GHz (ITU-R P.2040)", columns, rows
+    )
 
 
 def _worst(result: Record, links: Survey | None) -> Table:

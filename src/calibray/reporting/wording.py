@@ -297,7 +297,7 @@ def _leverage_text(table: pd.DataFrame) -> str:
 def _trade_offs_text(result: Record, table: pd.DataFrame) -> str:
     strong = table[table["correlation"].abs() > TRADE_OFF].head(3)
     if not len(strong):
-        return f"no two unknowns have a correlation above {TRADE_OFF:g}"
+        return f"no two unknowns have a correlation above {TRADE_OFF:g} in magnitude"
     shown = {
         f"{OFFSET}[{label}]": f"{OFFSET}[{group_text(result, label)}]" for label in result.nuisance.offsets_db
     }

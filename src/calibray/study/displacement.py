@@ -239,7 +239,7 @@ def reached(change_db: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def cubics(knots: NDArray[np.float64], change_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients [4, N - 1, L] of monotone cubics through changes of path loss [N, L] at knots [N, L], [m].
+    """Coefficients [4, N - 1, L] of monotone cubics through changes in path loss [N, L], [dB], at knots [N, L], [m].
 
     The cubics do not overshoot where paths appear or vanish between two positions (Fritsch and Carlson 1980).
     """

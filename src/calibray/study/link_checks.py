@@ -157,7 +157,7 @@ def _dominant_positions(links: Measurements, is_geographic: bool) -> Iterator[tu
         average = f"{{ by = 'cell', size = {cell:g} }}" if is_geographic else "'place'"
         yield (
             f"{count.max():,} of {len(links):,} links have the same position{within}, and each counts in fits, "
-            f"accuracy and intervals of predictions: the {len(count):,} positions count as about {effective:.0f}",
+            f"accuracy and prediction intervals: {len(count):,} positions count as about {effective:.0f} positions",
             f"average rows of one position: links.average = {average}",
         )
 

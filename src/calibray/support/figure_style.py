@@ -60,7 +60,7 @@ def styled(text_as: str = "path") -> Iterator[None]:
 
 
 def plain_figure(x: str, y: str, width: float = 6.4, height: float = 4.2) -> tuple[Figure, Axes]:
-    """Make an empty single-panel figure in the common style; labels state units, width and height are in inches."""
+    """Make an empty single-panel figure in the common style, with labels that state units; sizes are in inches."""
     with styled():
         figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
         axes = figure.add_subplot()

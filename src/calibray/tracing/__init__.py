@@ -30,7 +30,7 @@ class SionnaFactory:
         tx_antenna: Antenna,
         rx_antenna: Antenna,
     ) -> Tracer:
-        """Open a scene; see `TracerFactory`. It fails on a machine with neither a GPU nor an LLVM for tracing."""
+        """Open a scene; see `TracerFactory`. It fails on a machine without a usable GPU or LLVM library."""
         from calibray.tracing.sionna import Tracer as SionnaTracer
 
         return SionnaTracer(scene, frequency, settings, tx_antenna, rx_antenna)

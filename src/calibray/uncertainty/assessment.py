@@ -315,7 +315,7 @@ def remaining_widths(model: JointModel, posterior: Posterior) -> list[dict[Cause
     """For each parameter of the study, the share of its interval's width that remains without each cause.
 
     Draws without a cause, for example those with equal buildings, follow the posterior of a study that rules it out.
-    Constants that the scene fixes are ruled out by a linear regression of the parameter on them; their share is an
+    A linear regression of the parameter on the constants that the scene fixes removes their effect; their share is an
     upper bound, because the parameter may not depend linearly on them. Only causes that noticeably widen an
     interval are listed, in ascending order of their shares.
     """

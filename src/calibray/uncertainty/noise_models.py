@@ -42,7 +42,7 @@ from calibray.uncertainty.residual_correlation import (
 )
 
 CANDIDATES: Final = 16
-"""Number of candidates between the bounds whose median path loss is the twin's expectation for a link."""
+"""Number of candidates within the bounds; the median of their path losses is what the scene predicts for a link."""
 
 STRONGEST: Final = 0.05
 """Quantile of the excess loss that represents the strongest links: those in line of sight, if there are any."""

@@ -2,10 +2,10 @@
 
 Path loss and further observables may contradict each other beyond their errors, and require different parameters. The
 parameters are fitted to path loss alone, to the further observables alone, and to both. The increase in both sums of
-squares at the common fit, in units of the errors' variances, follows Fisher's F if one set of parameters explains
-everything. It is also possible that no parameters explain an observable, as if it were measured in a different scene.
-Measured values are regressed on modelled ones: the slope is 1 if the model is right, and near 0 if the two are
-unrelated.
+squares from the separate fits to the common one, divided by the variances of the errors and by the number of
+parameters, follows an F distribution if one set of parameters explains everything. It is also possible that no
+parameters explain an observable, as if it were measured in a different scene. Measured values are regressed on modelled
+ones: the slope is 1 if the model is right, and near 0 if the two are unrelated.
 """
 
 from __future__ import annotations

@@ -222,7 +222,7 @@ def _posterior(model: JointModel, members: Population, weight: NDArray[np.float6
 def _anneal(
     model: JointModel, size: int, last: int, random: np.random.Generator, stepped: Callable[[float], None]
 ) -> tuple[Population, float]:
-    """Members of a population after the likelihood's power has grown from 0 to 1, and its log evidence.
+    """Members of a population after the exponent of the likelihood has been raised from 0 to 1, and the log evidence.
 
     They are kept during the `last` sweeps. `stepped` is called with the share of the work done: half of it is done when
     the power is 1.

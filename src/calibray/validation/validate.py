@@ -169,7 +169,7 @@ def _announce_new_groups(problem: Problem, block: NDArray[np.int64]) -> None:
 
 
 def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:
-    """Block of every link, -1 for a link without weight, and the blocks' labels."""
+    """Block of every link, -1 for a link of weight 0, and the blocks' labels."""
     links, holdout = problem.setup.links, problem.setup.study.holdout
     if count is None and by is None and holdout is not None:
         count, by = holdout.blocks, holdout.by

@@ -370,7 +370,7 @@ def _read(path: Path, layer: str | None) -> tuple[NDArray[Any], dict[str, NDArra
     outlines = features.outline
     if features.crs is None:
         raise InputError(
-            f"footprints {path}: has no reference system; add its .prj file, or convert it to GeoJSON"
+            f"footprints {path}: has no coordinate reference system; add its .prj file, or convert it to GeoJSON"
         )
     # Polygons with one or more parts.
     is_polygon = np.isin(shapely.get_type_id(outlines), (3, 6))

@@ -197,7 +197,7 @@ def _read_geojson(path: Path) -> Features:
         shapely.GEOSException,
     ) as error:
         raise InputError(
-            f"{path}: cannot be read ({first_line(error)}); give valid GeoJSON of features, as UTF-8"
+            f"{path}: cannot be read ({first_line(error)}); give a valid Feature or FeatureCollection in UTF-8"
         ) from None
     # CRS84 is WGS 84 with longitude first, the order assumed for all coordinates here.
     return Features(outline, columns, WGS84 if crs is not None and crs.endswith("CRS84") else crs)
@@ -285,7 +285,7 @@ def open_height_model(path: Path) -> Iterator[HeightModel]:
             _check_layout(path, dataset)
             if dataset.crs is None:
                 raise InputError(
-                    f"height model {path}: has no reference system; give a GeoTIFF that states it"
+                    f"height model {path}: has no coordinate reference system; give a GeoTIFF that states it"
                 )
             horizontal, metres = _systems(path, dataset)
             yield HeightModel(path, dataset, horizontal, metres)

@@ -322,8 +322,9 @@ def _count_flipped(
     """Count the faces with wrong normals.
 
     The faces of each connected piece are first given a consistent orientation. The correct orientation is known if the
-    piece is closed or open only at its bottom (its volume is positive), or a level sheet (its normal points up). For
-    any other piece, such as a wall, either side may be outside, and the faces that differ from the majority count.
+    piece is closed or open only at its bottom (its signed volume must be positive), or if it is a horizontal sheet (its
+    normal must point up). For any other piece, such as a wall, either side may be outside, and the faces that differ
+    from the majority count.
     """
     if not len(faces):
         return 0

@@ -223,8 +223,8 @@ class Meshes:
 def sequence_keys(sequences: PathsBuffer, meshes: Meshes) -> NDArray[np.int64]:
     """Keys of interaction sequences: integers [C, k] that are equal for equal sequences.
 
-    A key contains the kinds of interaction, the reflecting planes and the faces of the edge. It omits the walls that a
-    ray passes through, because they do not bend the path.
+    A key contains the types of interaction, the reflecting planes and the faces of a diffracting edge. It omits walls
+    through which a ray passes, because they do not bend the path.
     """
     kind = per_interaction(sequences, "interaction_types")
     plane = np.where(kind == Kind.SPECULAR, meshes.surfaces.plane[meshes.triangles_of(sequences)], 0)

@@ -91,8 +91,8 @@ class LiveScene:
 def apply_materials(scene: object, materials: Mapping[str, Material], frequency: float | None = None) -> None:
     """Set the constants of a scene's materials by name.
 
-    The constants are valid at one carrier, `frequency` [Hz]; a different carrier of the scene causes a warning. ITU
-    materials no longer recompute their constants when `scene.frequency` is set, which would replace calibrated ones.
+    The constants are valid at one carrier, `frequency` [Hz]; a different carrier of the scene causes a warning. After
+    this, setting `scene.frequency` no longer replaces the constants of ITU materials.
 
     Raises:
         InputError: The object is not a scene of Sionna RT, or the scene lacks a material; then nothing is set.
