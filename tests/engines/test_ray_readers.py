@@ -20,6 +20,7 @@ from calibray.engines.rays.other_programs import Polyline, check_carrier, read_s
 from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.paths import Paths
+from calibray.tracing.settings import Antenna
 
 SCENE = "sionna:simple_street_canyon"
 FREQUENCY = 3.5e9
@@ -76,6 +77,21 @@ def test_paths_of_sionna_have_its_powers(paths: rt.Paths) -> None:
             ]
         )
         np.testing.assert_allclose(mine, np.sort(power[rx][power[rx] > 0]), rtol=1e-6)
+
+
+def test_antennas_of_orthogonal_polarization_receive_the_power_of_rounding_errors() -> None:
+    """Of the direct path, and of reflections in the plane of incidence: in closed form, they have no power."""
+    scene = rt.load_scene(rt.scene.simple_street_canyon)
+    scene.frequency = FREQUENCY
+    for end, polarization in (("tx", "V"), ("rx", "H")):
+        array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=polarization)
+        setattr(scene, f"{end}_array", array)
+    scene.add(rt.Transmitter("tx", [-33.0, 0.0, 20.0]))
+    scene.add(rt.Receiver("rx", [-29.0, 4.0, 1.5]))
+    crossed = rt.PathSolver()(scene, max_depth=2, refraction=False)
+    power = sum(np.array(part, dtype=float) ** 2 for part in crossed.a).sum()
+    program = read(crossed, antennas=(Antenna(), Antenna(polarization="H")))
+    np.testing.assert_allclose(path_loss(program), -10 * np.log10(power), atol=1e-4)
 
 
 def test_a_gain_of_sionna_that_is_not_a_number_is_refused(paths: rt.Paths) -> None:

@@ -162,6 +162,12 @@ WRONG = {
         "must state the same power_db",
     ),
     "path loss in place of gain": (lambda t: t.assign(power_db=-t.power_db), "path gain is negative"),
+    "amplitudes in microvolts": (
+        lambda t: t.drop(columns="power_db").assign(
+            gain_real=np.where(t.path == 1, 40.0, 1e-9), gain_imag=0.0
+        ),
+        "the magnitude 40, must be at most 1",
+    ),
     "received power in dBm": (lambda t: t.assign(power_db=t.power_db + 30), "30.0 dB above free space"),
     "delays in nanoseconds": (lambda t: t.assign(delay=t.delay * 1e9), "give the total delay in seconds"),
     "relative delays": (lambda t: t.assign(delay=t.delay - t.delay.min()), "not relative to the first path"),
@@ -302,6 +308,33 @@ def test_a_link_whose_paths_have_no_power_remains(yard: Tracer, in_study: bool) 
     np.testing.assert_allclose(path_loss(paths), [loss[0], np.inf, loss[2]], rtol=1e-12)
 
 
+@pytest.mark.parametrize("ending", ["csv", "json", "h5", "parquet"])
+def test_links_without_power_are_written_with_the_others(
+    yard: Tracer, traced: Paths, tmp_path: Path, ending: str
+) -> None:
+    """Otherwise, the path loss of later links would be compared with measurements of earlier ones."""
+    paths = take(traced, traced.link != 1)
+    paths = replace(paths, tx_field=np.where((paths.link == 2)[:, None, None], 0, paths.tx_field))
+    expected = np.where(np.isin(range(4), [1, 2]), np.inf, path_loss(traced))
+    cb.write_rays(paths, tmp_path / f"rays.{ending}")
+    np.testing.assert_allclose(path_loss(read(tmp_path / f"rays.{ending}", yard)), expected, rtol=1e-6)
+
+
+def test_a_null_of_the_antennas_has_the_power_of_a_rounding_error(yard: Tracer) -> None:
+    """A short dipole radiates nothing upwards; a program in single precision states some power, or none."""
+    rows = direct_paths(["aside", "zenith"])
+    rows.loc[3, ["y", "z"]] = 0.0, 22.0
+    level = np.where(rows.link == "aside", rows.power_db + 20 * np.log10(1.5**0.5), -200.0)
+    paths = read(rows.assign(power_db=level), yard, antennas=(Antenna("dipole"), Antenna()))
+    np.testing.assert_allclose(path_loss(paths), [-level[0], np.inf])
+    with pytest.raises(InputError, match="dB above free space with the antennas stated"):
+        read(
+            rows.assign(power_db=level + 80 * (rows.link == "zenith")),
+            yard,
+            antennas=(Antenna("dipole"), Antenna()),
+        )
+
+
 def direct_paths(labels: list[str]) -> pd.DataFrame:
     """Direct paths of 1, 2, 3, ... m, one for each link, with their power in free space."""
     number = np.repeat(np.arange(1, len(labels) + 1), 2)
@@ -362,7 +395,7 @@ def test_diffuse_paths_need_their_power(yard: Tracer) -> None:
     stone = yard.scene.materials["stone"]
     changed = {"stone": replace(stone, relative_permittivity=9.0, scattering_coefficient=0.6)}
     np.testing.assert_allclose(
-        path_loss(read(table, yard), changed), path_loss(scattered, changed)[:3], atol=1e-4
+        path_loss(read(table, yard), changed), path_loss(scattered, changed), atol=1e-4
     )
     with pytest.raises(InputError, match="need the power of the path"):
         read(table.drop(columns="power_db"), yard)

@@ -199,6 +199,6 @@ def write_rays(paths: Paths, file: str | Path, *, overwrite: bool = False) -> No
     The file name ends in .csv, .parquet, .json or .h5; `overwrite` replaces a file that Calibray did not write.
 
     Raises:
-        InputError: The file cannot be written, or a path has no power.
+        InputError: The file cannot be written.
     """
     write_ray_file(file, rays_of(paths).frame(), overwrite)

@@ -22,7 +22,7 @@ from calibray.engines.section import OpenedStudy
 from calibray.errors import InputError
 from calibray.fields import path_gains
 from calibray.measurements.reading import join_positions
-from calibray.paths import Kind, Paths, take_links
+from calibray.paths import Kind, Paths, take, take_links
 from calibray.paths.chains import Chains
 from calibray.scenes import Scene
 from calibray.support.messages import did_you_mean
@@ -42,6 +42,10 @@ by tenths of a decibel, while a wrong transmitted power or watts instead of deci
 
 DIRECT_GAIN_DB: Final = 60.0
 """Largest total gain of both antennas of a direct path [dB]: two dishes of 30 dBi."""
+
+ROUNDING: Final = 1e-12
+"""Power relative to free space below which a path lies in a null of the antennas: some roundings of a field in single
+precision, as in Sionna RT."""
 
 HIGH_GAIN_DB: Final = 25.0
 """Total gain of both antennas above which a warning is issued [dB]: 18 dBi of a sector antenna plus 7 dBi."""
@@ -97,6 +101,9 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
         # In double precision, because single precision would round vertices far from the origin.
         paths = replace(paths, vertex=table.vertex[table.kind != 0])
     if table.power is not None:
+        # A null of the antennas may leave no power in replay, and a rounding error in the engine.
+        kept = np.flatnonzero((powers(paths) > 0) | (table.power > ROUNDING * _free_space(paths)))
+        table, paths = table.take(kept), take(paths, kept)
         _check_direct(table, paths, table.power, setting.antennas is not None)
         paths = replace(paths, correction=_correction(table, paths, table.power))
     elif (table.kind == Kind.DIFFUSE).any():
@@ -110,25 +117,24 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
 def rays_of(paths: Paths) -> RayTable:
     """The ray table of a path program, with the power of every path at the constants of the program's materials.
 
-    Raises:
-        InputError: A path has no power.
+    A link without a path has a direct path of power 0, so that the table has all links.
     """
-    count, depth = paths.num_paths, np.diff(paths.first)
+    silent = np.asarray(paths.links_without_path, dtype=np.int64)
+    link = np.concatenate([paths.link, silent])
+    tx, rx = paths.tx_position[link], paths.rx_position[link]
+    delay = np.linalg.norm(rx - tx, axis=1) / speed_of_light
+    delay[: paths.num_paths] = paths.delay
+    power = np.concatenate([powers(paths), np.zeros(len(silent))])
+    count, depth = len(link), np.append(np.diff(paths.first), np.zeros(len(silent), dtype=np.int64))
     shape = count, int(depth.max(initial=0))
     present = np.arange(shape[1]) < depth[:, None]
     kind, vertex = np.zeros(shape, dtype=np.int64), np.zeros((*shape, 3))
     material = np.full(shape, "", dtype=object)
     kind[present], vertex[present] = paths.kind, paths.vertex
     material[present] = np.array(list(paths.materials), dtype=object)[paths.material]
-    power = powers(paths)
-    if not (power > 0).all():
-        raise InputError(
-            f"path {int(np.argmin(power))} has no power, which a ray table cannot state; remove it with "
-            f"calibray.paths.take"
-        )
     return RayTable(
-        "paths", np.arange(count), paths.link, paths.tx_position[paths.link],
-        paths.rx_position[paths.link], vertex, kind, material.astype(np.str_), np.full(shape, ""), power, paths.delay,
+        "paths", np.arange(count), link, tx, rx, vertex, kind, material.astype(np.str_), np.full(shape, ""), power,
+        delay,
     )  # fmt: skip
 
 
@@ -136,6 +142,11 @@ def powers(paths: Paths) -> NDArray[np.float64]:
     """Power gain of every path, summed over receive ports and averaged over transmit ports [P]."""
     gain = path_gains(paths).reshape(paths.num_paths, paths.rx_field.shape[1], paths.tx_field.shape[1])
     return (np.abs(gain) ** 2).sum(axis=1).mean(axis=1)
+
+
+def _free_space(paths: Paths) -> NDArray[np.float64]:
+    """Power gain of every path between isotropic antennas without losses at its interactions [P]."""
+    return (paths.spreading * speed_of_light / paths.frequency / (4 * np.pi)) ** 2
 
 
 def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
@@ -307,11 +318,9 @@ def _check_repeats(table: RayTable, link: NDArray[np.int64]) -> None:
 def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], known: bool) -> None:
     """Refuse a direct path whose power no antenna can explain."""
     direct = np.diff(paths.first) == 0
-    replayed = (
-        powers(paths) if known else (paths.spreading * speed_of_light / paths.frequency / (4 * np.pi)) ** 2
-    )
-    with np.errstate(divide="ignore"):
-        off = 10 * np.log10(power / replayed)
+    free_space = _free_space(paths)
+    replayed, least = powers(paths) if known else free_space, ROUNDING * free_space
+    off = 10 * np.log10(np.maximum(power, least) / np.maximum(replayed, least))
     wrong = direct & (np.abs(off) > FREE_SPACE_DB if known else off > DIRECT_GAIN_DB)
     if wrong.any():
         worst = int(np.argmax(np.where(wrong, np.abs(off), 0)))

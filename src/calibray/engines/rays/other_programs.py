@@ -227,12 +227,14 @@ def read_aodt(folder: Path) -> SourceTable:
                 f"{gains.source}: has no gains for ru_id, ue_id = {pair}, which have {len(rows)} paths"
             )
         power, delay = _aodt_response(gains.source, pair, responses[pair], len(rows))
+        with np.errstate(divide="ignore"):
+            level = 10 * np.log10(power)
         for number, (points, types) in enumerate(zip(rows["points"], rows["interaction_types"], strict=True)):
-            if power[number] != 0:
-                level = 10 * np.log10(power[number])
-                paths.append(
-                    Polyline(AODT_UNIT * _aodt_points(points), _aodt_types(rays, types), level, delay[number])
+            paths.append(
+                Polyline(
+                    AODT_UNIT * _aodt_points(points), _aodt_types(rays, types), level[number], delay[number]
                 )
+            )
     return rows_of(paths, str(folder))
 
 
@@ -438,8 +440,9 @@ def read_sionna_paths(paths: Any) -> SourceTable:
 
 def _sionna_polylines(paths: Any) -> Iterator[Polyline]:
     real, imaginary = (np.array(part, dtype=float) for part in paths.a)
-    power = (real**2 + imaginary**2).sum(axis=1).mean(axis=2)  # [R, T, P]
-    shape = power.shape
+    with np.errstate(divide="ignore"):
+        level = 10 * np.log10((real**2 + imaginary**2).sum(axis=1).mean(axis=2))  # [R, T, P]
+    shape = level.shape
     kinds, vertices = np.array(paths.interactions), np.array(paths.vertices, dtype=float)
     if not paths.synthetic_array:  # ports at one place have the same paths
         kinds, vertices = kinds[:, :, 0, :, 0], vertices[:, :, 0, :, 0]
@@ -450,13 +453,11 @@ def _sionna_polylines(paths: Any) -> Iterator[Polyline]:
         for ends, count in ((paths.sources, shape[1]), (paths.targets, shape[0]))
     )
     names = {int(kind): name for name, kind in TYPES.items()}
-    for rx, tx, path in np.argwhere((power != 0) & (delay >= 0)).tolist():
+    for rx, tx, path in np.argwhere(delay >= 0).tolist():
         kind = [int(code) for code in kinds[:, rx, tx, path] if code]
         inner = vertices[: len(kind), rx, tx, path]
         points = np.vstack([sources[tx], inner, targets[rx]])
-        yield Polyline(
-            points, [names[code] for code in kind], 10 * np.log10(power[rx, tx, path]), delay[rx, tx, path]
-        )
+        yield Polyline(points, [names[code] for code in kind], level[rx, tx, path], delay[rx, tx, path])
 
 
 def _sionna_positions(ends: Any, count: int) -> NDArray[np.float64]:

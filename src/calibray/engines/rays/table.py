@@ -169,7 +169,8 @@ class RayTable:
         if self.link is not None:
             columns["link"] = self.link[path]
         if self.power is not None:
-            columns["power_db"] = 10 * np.log10(self.power)[path]
+            with np.errstate(divide="ignore"):
+                columns["power_db"] = 10 * np.log10(self.power)[path]
         if self.delay is not None:
             columns["delay"] = self.delay[path]
         columns = {name: values for name, values in columns.items() if not (values == "").all()}
@@ -320,7 +321,13 @@ def _power(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray[np.float6
     if not gains:
         return None
     real, imaginary = (_per_path(table, name, row_path) for name in ("gain_real", "gain_imag"))
-    return real**2 + imaginary**2
+    power = real**2 + imaginary**2
+    if (power > 1).any():
+        raise InputError(
+            f"{table.source}: gain_real and gain_imag have the magnitude {np.sqrt(power.max()):g}, must be at most 1; "
+            "give the received field divided by the transmitted one, not volts or decibels"
+        )
+    return power
 
 
 LARGEST_JSON: Final = 2**26
