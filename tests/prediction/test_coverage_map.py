@@ -205,6 +205,14 @@ def test_cells_outside_the_scene_are_announced(result, caplog):
     assert "4 of 4 cells are outside the scene" in caplog.text
 
 
+def test_a_transmitter_outside_the_scene_is_announced(result, caplog):
+    arguments = {"cell": 5.0, "bounds": (-57.0, -57.0, -47.0, -52.0), "columns": WEST, "level": None}
+    cb.coverage_map(result, tx=TX, **arguments)
+    assert "the transmitter at" not in caplog.text
+    cb.coverage_map(result, tx=(2000.0, 0.0, 4.0), **arguments)
+    assert "the transmitter at (2000, 0, 4) m is outside the scene; check its position" in caplog.text
+
+
 def test_a_column_that_the_links_do_not_have_is_refused(result):
     study = result.study
     assert _column_values(result, np.array(TX), {"half": "west"}) == {"half": "west"}

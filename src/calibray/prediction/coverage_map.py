@@ -105,6 +105,9 @@ def coverage_map(
     one_link = pd.DataFrame({**position_columns(transmitter, transmitter[None] + np.eye(3)[2]), **constants})
     setup = open_for_links(result, as_links(result, one_link), allow_changed_inputs=allow_changed_inputs)
     triangles = read_triangles(setup.scene)
+    place = str(locate(triangles, transmitter[None])[0])
+    if place and not (place == INSIDE and is_indoors(result, triangles)):
+        _LOG.warning("the transmitter at (%g, %g, %g) m is %s; check its position", *transmitter, place)
     x, y = _grid(triangles, bounds, cell)
     z = ground_heights(triangles, x, y) + height
     east, north = np.meshgrid(x, y)
