@@ -103,9 +103,9 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
     if table.power is not None:
         # A null of the antennas may leave no power in replay, and a rounding error in the engine.
         kept = np.flatnonzero((powers(paths) > 0) | (table.power > ROUNDING * _free_space(paths)))
-        table, paths = table.take(kept), take(paths, kept)
-        _check_direct(table, paths, table.power, setting.antennas is not None)
-        paths = replace(paths, correction=_correction(table, paths, table.power))
+        power, table, paths = table.power[kept], table.take(kept), take(paths, kept)
+        _check_direct(table, paths, power, setting.antennas is not None)
+        paths = replace(paths, correction=_correction(table, paths, power))
     elif (table.kind == Kind.DIFFUSE).any():
         raise InputError(
             f"{table.source}: diffuse reflections need the power of the path, because the solid angle of their rays is "
