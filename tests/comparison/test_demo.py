@@ -41,7 +41,10 @@ def demo(tmp_path_factory):
         patch.setattr(module, "demo_study_path", lambda: study / "study.toml")
         patch.setattr(module, "MAPPING_CALLS", 1)  # each is a trace
         patch.setattr(module, "_space_mapping", mapping_with_few_rays)
-        finished = run_demo()
+        stages = []
+        finished = run_demo(progress=lambda stage, *_: stages.append(stage))
+    # After the search, a method's intervals are drawn, which takes longer.
+    assert {"GWO, drawing", "SGWO-IM, drawing", "auto (least squares), drawing"} <= set(stages)
     return finished, out, write_demo(finished, out)
 
 

@@ -25,7 +25,6 @@ from calibray.engines.protocol import PATH_LOSS
 from calibray.engines.replay import Replay
 from calibray.fitting.cheap_replay import CheapReplay
 from calibray.fitting.fidelity_loop import largest_gap
-from calibray.fitting.nuisance import OFFSET
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.measurements import Measurements, position_columns
@@ -45,6 +44,7 @@ from calibray.result.record import (
 from calibray.result.verdict import Remark, RemarkKind, Value
 from calibray.scenes.obstruction import OUT_OF_SIGHT, REGION
 from calibray.study import Setup, Study
+from calibray.study.calibration_sections import OFFSET
 from calibray.study.facades import without_facade_materials
 from calibray.study.model import StudyModel
 from calibray.tracing.protocol import EnclosedAntennas

@@ -20,13 +20,11 @@ from scipy import sparse
 
 from calibray.errors import InputError
 from calibray.measurements import Measurements
+from calibray.study.calibration_sections import OFFSET
 from calibray.study.model import StudyModel
 
 CONSTANT: Final = "constant"
 LOG_DISTANCE: Final = "log_distance"
-
-OFFSET: Final = "offset"
-"""Name of the term that `[offset]` creates."""
 
 UNKNOWN_DB: Final = 10.0
 """Assumed standard deviation between groups if only one is measured [dB per unit of the column]; it is large, because

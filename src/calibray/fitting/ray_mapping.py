@@ -112,7 +112,7 @@ class RayMap:
     def reached(self) -> bool:
         """Whether the last call was predicted, and the replay has no better minimum than the best call.
 
-        The optimum is then reached, even if the engine's assumptions are not identified.
+        The optimum is then probably reached, even if the engine's assumptions are not identified.
         """
         nothing_left = max(self.remaining_db, self.moved_db) <= LEFT_DB
         return self.gap_db <= GAP_DB and nothing_left and not self.lost

@@ -24,11 +24,11 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from calibray.errors import InputError
-from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, column, deviations_of, transmitters
+from calibray.fitting.nuisance import UNKNOWN_DB, column, deviations_of, transmitters
 from calibray.measurements import Measurements
 from calibray.result.held_out import NEW_GROUP, NO_PATH, PredictionModel, ResidualField
 from calibray.result.record import Prediction
-from calibray.study.calibration_sections import TX_OFFSET
+from calibray.study.calibration_sections import OFFSET, TX_OFFSET
 from calibray.study.model import StudyModel
 from calibray.validation.held_out_statistics import interval_half_width
 from calibray.validation.models import without_scene

@@ -18,7 +18,6 @@ from scipy.special import stdtrit
 from calibray.engines.kinds.replay import replay
 from calibray.engines.protocol import Answering, Engine
 from calibray.errors import EngineError, InputError
-from calibray.fitting.nuisance import OFFSET
 from calibray.materials import Material
 from calibray.measurements import Measurements, SourceTable
 from calibray.parameters import fixed_constant, split_name
@@ -37,6 +36,7 @@ from calibray.scenes.checks.positions import INSIDE, locate
 from calibray.scenes.obstruction import CLUSTER, OUT_OF_SIGHT
 from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Setup
+from calibray.study.calibration_sections import OFFSET
 from calibray.study.link_checks import refuse_far_receivers
 from calibray.support.messages import type_name
 from calibray.support.progress import Progress

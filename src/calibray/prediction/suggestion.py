@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibray.engines.kinds.replay import ReplaySection, replay
 from calibray.engines.protocol import Differentiable, Observing
 from calibray.errors import InputError
-from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, Term
+from calibray.fitting.nuisance import UNKNOWN_DB, Term
 from calibray.fitting.preliminary_fits import LEAST_NOISE_DB, with_estimated_errors, with_estimated_spreads
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.measurements import Measurements
@@ -40,6 +40,7 @@ from calibray.prediction.predict import (
 from calibray.result.record import Record
 from calibray.scenes import read_triangles
 from calibray.study import Setup
+from calibray.study.calibration_sections import OFFSET
 from calibray.support.messages import percent
 from calibray.support.progress import Progress
 from calibray.uncertainty.draws import evenly_spaced

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from math import inf, log
 from typing import Final
 
-from calibray.fitting.nuisance import OFFSET
 from calibray.parameters.parameter import PARAMETER_BOUNDS
 from calibray.reporting.wording import diagnostics_table, group_text
 from calibray.result import wording
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict
 from calibray.result.wording import explanation_text, interval_text
+from calibray.study.calibration_sections import OFFSET
 from calibray.tables import Column, Table, decibels, numbers, rows_text
 from calibray.tracing.protocol import EnclosedAntennas
 from calibray.validation.validation import Validation, observables_table

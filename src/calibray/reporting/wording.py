@@ -8,7 +8,6 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from calibray.fitting.nuisance import OFFSET
 from calibray.fitting.search import AUTO
 from calibray.measurements import FEW
 from calibray.measurements.column_names import find_frequency_unit
@@ -16,6 +15,7 @@ from calibray.optimizers import label
 from calibray.reporting.diagnostics import calibration_links, diagnostics, link_distance
 from calibray.result.held_out import HeldOutErrors, Model
 from calibray.result.record import Record
+from calibray.study.calibration_sections import OFFSET
 from calibray.study.displacement import RECEIVER
 from calibray.support.messages import counted, percent
 from calibray.tables import Column, Table, hertz, named, rows_text

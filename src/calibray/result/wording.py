@@ -258,17 +258,17 @@ def _antenna_directions(values: dict[str, Any]) -> str:
 
 
 def _ray_mapping(values: dict[str, Any]) -> str:
+    if any(name not in values for name in ("misfit_db", "gap_db", "remaining_db", "moved_db")):
+        return (
+            f"The model does not represent the program: some of its {values['calls']} calls have no path, or no link "
+            "with a path, in common. The optimum may be missed, and intervals are approximate. Check why paths "
+            "of the program appear or vanish with the materials, or choose a method that needs no rays."
+        )
     assumed = zip(values["names"], values["values"], strict=True)
     constants = ", ".join(f"{name} {value:.3g}" for name, value in assumed)
     surfaces = "half-spaces" if values["half_space"] else "slabs"
     if values["half_spaces"] and not values["half_space"]:
         surfaces = f"slabs, except half-spaces of {' and '.join(values['half_spaces'])},"
-    if any(name not in values for name in ("misfit_db", "gap_db", "remaining_db", "moved_db")):
-        return (
-            f"The model does not represent the program: some of its {values['calls']} calls have no path, or no link "
-            "with a path, in common. The optimum may be missed, and intervals are approximate. Check whether paths of "
-            "the program have to depend on the materials, or choose a method that needs no rays."
-        )
     text = (
         f"The model explains the ratios of the ray powers in {values['calls']} calls with a misfit of "
         f"{values['misfit_db']:.3f} dB, and predicted path loss at the last call within {values['gap_db']:.3f} dB"

@@ -171,7 +171,7 @@ OFFSET: Final = "offset"
 """Name of the term of ``[offset]``."""
 
 FREE_OFFSET: Final = "free offset"
-"""Name of the term by which an undeclared offset is looked for."""
+"""Name of the term that tests for an undeclared offset."""
 
 TX_OFFSET: Final = "offset of the transmitter"
 """Name of the term that gives each transmitter an offset in predictions."""

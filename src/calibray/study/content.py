@@ -99,8 +99,8 @@ class StudyContent(Section, ABC):
         self._check_losses()
         self._check_poses()
         self._check_position_errors()
+        reserved = (sections.OFFSET, sections.FREE_OFFSET, sections.TX_OFFSET)
         for name in self.nuisance:
-            reserved = (sections.OFFSET, sections.FREE_OFFSET, sections.TX_OFFSET)
             if name in reserved or name.endswith(sections.OF_ALL_LINKS):
                 raise InputError(f"nuisance.{name}: Calibray has a term of this name; choose another")
         if getattr(self.engine, "rays", None) and (

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from calibray.coordinates import Frame, find_projection
 from calibray.errors import InputError
@@ -246,10 +247,7 @@ class LinksDraft:
         source = (
             "the table of transmitters" if self.given.transmitters is None else self.given.transmitters.name
         )
-        cause = f"{source} lacks {named}" if names else "no transmitter is stated"
-        reason = f"{cause}: {_left_out(int(lacking.sum()))}"
-        self.assume("links.where", self.section["where"], reason)
-        self.table = self.table.select(~lacking)
+        self._leave_out(lacking, f"{source} lacks {named}" if names else "no transmitter is stated")
 
     def _leave_out_unplaced_receivers(self) -> None:
         """Draft a filter for rows without a receiver position, such as those logged before satellites were found."""
@@ -260,9 +258,14 @@ class LinksDraft:
             return
         for name in missing.columns[missing.any()]:
             self.add_filter(f"`{name}`.notna()")
-        reason = f"no receiver position: {_left_out(int(lacking.sum()))}"
+        self._leave_out(lacking, "no receiver position")
+
+    def _leave_out(self, rows: NDArray[np.bool_], cause: str) -> None:
+        """Leave out the rows that the drafted filter excludes, and count them."""
+        number = int(rows.sum())
+        reason = f"{cause}: {counted(number, 'row')} {'is' if number == 1 else 'are'} left out"
         self.assume("links.where", self.section["where"], reason)
-        self.table = self.table.select(~lacking)
+        self.table = self.table.select(~rows)
 
     def add_filter(self, condition: str) -> None:
         """Add a condition to the row filter."""
@@ -510,7 +513,3 @@ class LinksDraft:
                 f"the ground is at {ground.min():.0f} to {ground.max():.0f} m; heights are measured from it"
             )
             self.assume("links.heights", "ground", reason)
-
-
-def _left_out(number: int) -> str:
-    return f"{counted(number, 'row')} {'is' if number == 1 else 'are'} left out"

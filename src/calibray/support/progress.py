@@ -25,7 +25,7 @@ def with_stage(progress: Progress | None, stage: str) -> Progress | None:
 
 
 def with_prefix(progress: Progress | None, prefix: str) -> Progress | None:
-    """Report progress under the stages' names after a prefix, such as the method that is run.
+    """Report progress with a prefix before the name of every stage, such as the method that is run.
 
     Example:
         >>> progress = with_prefix(lambda *parts: print(*parts), "SGWO-IM")

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from calibray.engines.kinds.replay import replay
 from calibray.engines.protocol import ReplaysScene
 from calibray.fitting.fidelity_loop import path_loss_change, traced_again
-from calibray.fitting.nuisance import OFFSET
 from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
@@ -28,7 +27,7 @@ from calibray.result.held_out import (
     PredictionModel,
 )
 from calibray.scenes.obstruction import OUT_OF_SIGHT
-from calibray.study.calibration_sections import TX_OFFSET
+from calibray.study.calibration_sections import OFFSET, TX_OFFSET
 from calibray.study.displacement import displaces
 from calibray.study.model import StudyModel
 from calibray.validation import models
