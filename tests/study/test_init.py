@@ -524,6 +524,13 @@ def test_degrees_in_columns_named_x_and_y_are_degrees(scene, tmp_path):
     np.testing.assert_allclose(drafted.study.measurements().tx[:, :2], 0.0, atol=1e-3)
 
 
+def test_a_row_that_lacks_one_coordinate_does_not_hinder_placing_the_others(scene, tmp_path):
+    rows = {"x": np.arange(10.0), "y": 20.0, "tx_x": -30.0, "tx_y": 0.0, "rssi": np.arange(-60.0, -50.0)}
+    rows["x"][3] = np.nan
+    drafted = draft(scene, table(tmp_path, **rows), tmp_path / "study.toml", frequency=3.5e9)
+    assert drafted.study.measurements().rx[:, 0].tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+
+
 def test_the_origin_of_a_scene_without_a_frame_places_degrees(scene, tmp_path):
     """The radii of curvature of WGS 84 give the metres of a degree; without `--origin`, degrees have no place."""
     file = Path(scene)

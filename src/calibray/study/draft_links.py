@@ -353,12 +353,13 @@ class LinksDraft:
         frame = self.frame if rx.position == "scene" else None
         if frame is None or (tx is not None and tx.position != "scene"):
             return rx, tx
-        x, y = (pd.to_numeric(self.table.frame[name], errors="coerce").dropna() for name in (rx.x, rx.y))
+        placed = self.table.frame[[rx.x, rx.y]].dropna().astype(float)
+        x, y = placed[rx.x], placed[rx.y]
         low, high = self.overhead.bounds[:2], self.overhead.bounds[3:5]
         # Exports of geodata may call longitude and latitude x and y.
         if x.abs().max() <= 180 and y.abs().max() <= 90:
-            placed = frame.to_scene(x.to_numpy(), y.to_numpy())[:, :2]
-            if ((placed >= low) & (placed <= high)).mean() > 0.5:
+            on_scene = frame.to_scene(x.to_numpy(), y.to_numpy())[:, :2]
+            if ((on_scene >= low) & (on_scene <= high)).mean() > 0.5:
                 return replace(rx, position="geographic"), tx and replace(tx, position="geographic")
         centre, reach = (low + high) / 2, FAR * float(np.max(high - low))
         if np.hypot(x.median() - centre[0], y.median() - centre[1]) < reach:
