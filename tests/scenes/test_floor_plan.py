@@ -188,6 +188,17 @@ def test_the_unit_of_a_dxf_is_that_of_its_header_unless_stated(tmp_path, caplog,
     assert read_plan(path, unit=0.001)[0].length == pytest.approx(5)
 
 
+def test_blocks_of_a_dxf_are_named_because_their_walls_are_not_read(tmp_path, caplog):
+    path = tmp_path / "plan.dxf"
+    header = "0 SECTION 2 HEADER 9 $ACADVER 1 AC1015 0 ENDSEC "
+    room = "0 BLOCK 8 0 2 ROOM 70 0 10 0 20 0 3 ROOM 0 LINE 8 brick 10 0 20 0 11 0 21 3 0 ENDBLK 8 0"
+    inserted = "0 SECTION 2 ENTITIES 0 INSERT 8 walls 2 ROOM 10 4 20 0 0 INSERT 8 walls 2 ROOM 10 8 20 0"
+    dxf = header + f"0 SECTION 2 BLOCKS {room} 0 ENDSEC " + DXF.replace("0 SECTION 2 ENTITIES", inserted)
+    path.write_text("\n".join(dxf.split()) + "\n")
+    assert len(read_plan(path)) == 6
+    assert any("blocks are not read (2 inserted: ROOM)" in message for message in caplog.messages)
+
+
 def test_a_file_that_is_dxf_for_one_driver_and_vrt_for_another_is_refused(tmp_path):
     path = tmp_path / "plan.dxf"
     path.write_text("0\nSECTION\n<OGRVRTDataSource><OGRVRTLayer/></OGRVRTDataSource>")

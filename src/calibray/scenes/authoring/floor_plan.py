@@ -197,6 +197,12 @@ def _read_vector(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
     features = read_features(path, None)
     lines = [_parts(geometry) for geometry in features.outline]
     has_lines = [bool(parts) for parts in lines]
+    blocks = pd.Series(features.columns.get("BlockName", []), dtype=object).dropna()
+    if len(blocks):
+        _LOG.warning(
+            "floor plan %s: blocks are not read (%d inserted: %s); explode them in a CAD program if they have walls",
+            path, len(blocks), shortened(", ".join(map(str, blocks.unique()))),
+        )  # fmt: skip
     names = [f"feature {number}" for number in range(1, len(lines) + 1)]
     frame = pd.DataFrame(features.columns, index=names)[has_lines]
     frame = _with_known_names(path, frame, unit, dict.fromkeys(_OTHER_NAMES, ()))
