@@ -90,3 +90,22 @@ def test_a_table_in_windows_1252_is_read(tmp_path):
 def test_a_fault_is_refused_and_not_taken_for_a_layout(tmp_path, text, message):
     with pytest.raises(InputError, match=message):
         read(tmp_path, text).numbers("rssi")
+
+
+@pytest.mark.parametrize("mark", [";", "\t"])
+def test_a_comma_that_may_separate_thousands_is_refused(tmp_path, mark):
+    """Read as a decimal comma, 1,234 and 567 would be 1.234 and 567."""
+    rows = ["x;rssi", "1,234;-70", "567;-71"]
+    with pytest.raises(
+        InputError, match=r"row 2: '1,234' can mean 1.234 or 1234, because its column also has"
+    ):
+        read(tmp_path, "\n".join(rows).replace(";", mark))
+    for clear in ("0,567;-71", "567,000;-71", "567,5;-71"):
+        values = read(tmp_path, "\n".join([*rows[:2], clear])).frame["x"]
+        assert values.tolist() == [1.234, float(clear.split(";")[0].replace(",", "."))]
+
+
+@pytest.mark.parametrize("cell", ["1,234,567", "1,234.5", "1.234,5", "1'234.5"])
+def test_separators_of_thousands_are_named(tmp_path, cell):
+    with pytest.raises(InputError, match=r"row 2, .* is not a number; remove the separators of thousands"):
+        read(tmp_path, f"x;rssi\n{cell};-70\n7;-71\n").numbers("x")

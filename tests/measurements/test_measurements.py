@@ -1,4 +1,5 @@
 import sys
+from decimal import Decimal
 
 import numpy as np
 import pandas as pd
@@ -153,6 +154,15 @@ def test_parquet_reads_like_csv(tmp_path):
     path.write_bytes(b"not parquet")
     with pytest.raises(InputError, match="not a Parquet file"):
         read_measurements(path, [0, 0, 10.0], ["x", "y", "z"], "loss")
+
+
+def test_decimal_numbers_of_a_database_are_numbers(tmp_path):
+    path, values = tmp_path / "links.parquet", [Decimal("1.25"), None, Decimal("-70.50")]
+    pd.DataFrame({"x": values, "cell": [Decimal(5), Decimal(7), Decimal(5)]}).to_parquet(path)
+    for table in (read_table(path), *PiecedTable.open(path).pieces(10)):
+        np.testing.assert_array_equal(table.numbers("x", gaps=True), [1.25, np.nan, -70.5])
+        assert table.labels("cell").tolist() == ["5", "7", "5"]
+        assert table.where("x < 0").tolist() == [False, False, True]
 
 
 def test_a_row_with_a_missing_value_does_not_pass_a_filter(tmp_path):

@@ -236,20 +236,35 @@ def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
     """The decimal mark of the numbers in a CSV text.
 
     Raises:
-        InputError: The decimal mark is not the same in all numbers.
+        InputError: The decimal mark is not the same in all numbers, or may separate thousands.
     """
     lines: dict[str, int] = {}
+    # Cells such as 1,234 by column, and columns with whole numbers below 1000.
+    unclear: dict[int, tuple[int, str]] = {}
+    whole: set[int] = set()
+    is_clear = False
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=layout.separator, skipinitialspace=True)
     for cells in reader:
-        for cell in cells:
+        for column, cell in enumerate(map(str.strip, cells)):
             if "," in cell or "." in cell:
-                number = re.fullmatch(r"[+-]?\d*([.,])\d+(e[+-]?\d+)?(\s*dbm?)?", cell.strip(), re.IGNORECASE)
+                number = re.fullmatch(r"[+-]?\d*([.,])\d+(e[+-]?\d+)?(\s*dbm?)?", cell, re.IGNORECASE)
                 if number is not None:
-                    lines.setdefault(number[1], layout.skipped + reader.line_num)
+                    line = layout.skipped + reader.line_num
+                    lines.setdefault(number[1], line)
+                    is_clear |= re.fullmatch(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", cell) is None
+                    unclear.setdefault(column, (line, cell))
+            elif len(cell) <= 4 and cell.lstrip("+-").isdecimal():
+                whole.add(column)
     if len(lines) > 1:
         raise InputError(
             f"{path}: numbers have a decimal comma in row {lines[',']} and a decimal point in row {lines['.']}; use "
             "the same mark throughout"
+        )
+    if "," in lines and not is_clear and (both := sorted(whole & set(unclear))):
+        line, cell = unclear[both[0]]
+        raise InputError(
+            f"{path}, row {line}: {cell!r} can mean {cell.replace(',', '.')} or {cell.replace(',', '')}, because "
+            "its column also has numbers without a comma; remove separators of thousands, or write decimal points"
         )
     return "," if "," in lines else "."
 

@@ -115,8 +115,11 @@ class SourceTable:
         if (text := parsed.isna().to_numpy() & ~missing).any():
             first = int(np.flatnonzero(text)[0])
             value = column.iloc[first]
-            is_limit = str(value).strip().startswith(("<", "≤"))
-            remedy = "write the limit itself, and state links.noise_floor_dbm" if is_limit else "correct it"
+            remedy = "correct it"
+            if str(value).strip().startswith(("<", "≤")):
+                remedy = "write the limit itself, and state links.noise_floor_dbm"
+            elif re.fullmatch(r"[+-]?\d{1,3}([.,' ]\d{3})+([.,]\d+)?", str(value).strip()):
+                remedy = "remove the separators of thousands"
             raise InputError(f"{self.cell(first, source)}: {value!r} is not a number; {remedy}")
         numbers = parsed.to_numpy(dtype=np.float64, na_value=np.nan)
         unusable = np.isinf(numbers) if gaps else ~np.isfinite(numbers)

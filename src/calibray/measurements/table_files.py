@@ -306,7 +306,7 @@ def _read_parquet(path: Path) -> SourceTable:
     size = _check_size(path, groups, LARGEST_TABLE, "the table")
     _decode_elsewhere(path, size, LARGEST_TABLE, whole=True)
     try:
-        frame = pd.read_parquet(path, engine="pyarrow")
+        frame = _without_decimals(pd.read_parquet(path, engine="pyarrow"))
     except Exception as error:
         raise _damaged(path, error) from None
     return SourceTable(frame.reset_index(drop=True), source=str(path))
@@ -381,9 +381,15 @@ def _open_parquet(path: Path) -> Any:
 def _next_frame(path: Path, batches: Iterator[Any]) -> Any:
     try:
         batch = next(batches, None)
-        return None if batch is None else batch.to_pandas().reset_index(drop=True)
+        return None if batch is None else _without_decimals(batch.to_pandas().reset_index(drop=True))
     except Exception as error:
         raise _damaged(path, error) from None
+
+
+def _without_decimals(frame: pd.DataFrame) -> pd.DataFrame:
+    """A table with floats in place of the decimal numbers that databases export, which pandas keeps as objects."""
+    names = [name for name in frame if pd.api.types.infer_dtype(frame[name], skipna=True) == "decimal"]
+    return frame.astype(dict.fromkeys(names, np.float64))
 
 
 def _integer_columns_with_gaps(file: Any) -> list[str]:
