@@ -77,11 +77,11 @@ LABELS: Final = {
 }
 
 NO_OPTIONS: Final = {"lower", "upper", "seed", "objective", "cheap_model"}
-"""Constructor arguments that the study sets, so that users cannot set them."""
+"""Constructor arguments that follow from the rest of the study; `method.options` cannot contain them."""
 
 
 def method(name: str) -> type[Optimizer]:
-    """The class of a method, which states the parts of an evaluation and the schedule that the method uses.
+    """The class of a named method; it states which parts of an evaluation and which schedule the method uses.
 
     Raises:
         InputError: There is no such method.
@@ -96,7 +96,7 @@ def method(name: str) -> type[Optimizer]:
 
 
 def label(name: str) -> str:
-    """The name of a method, or of `METHOD@CALLS` with a budget, in tables and figures.
+    """The label of a method, or of a method with a budget (`METHOD@CALLS`), in tables and figures.
 
     Example:
         >>> label("gwo@600")
@@ -120,7 +120,7 @@ def make(
     cheap_model: CheapModel | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> Optimizer:
-    """Construct the optimizer of a named method, which receives only the arguments that it accepts.
+    """Construct the optimizer of a named method; arguments that the method does not use are ignored.
 
     Args:
         name: A method of `METHODS`.
@@ -130,7 +130,7 @@ def make(
         budget: Number of evaluations; the method's default if None. The budget is ignored if the method stops by
             itself.
         start: Starting points, [d] or [k, d], for methods that use them.
-        starts: Number of further starting points, for the same methods; the method's default if None.
+        starts: Number of starting points that such a method adds to `start`; the method's default if None.
         objective: Function from residuals to the value, for methods that use residuals; root mean square if None.
         cheap_model: A cheap model of the engine, for methods that use one.
         options: Settings of the method, which override the arguments above.

@@ -14,7 +14,7 @@ from calibray.errors import InputError
 
 
 def whole(name: str, value: int, at_least: int, at_most: float = inf) -> int:
-    """The whole number `value` of the argument `name`, if it is within its bounds.
+    """Check that the argument `name` is a whole number within the bounds, and return it.
 
     Raises:
         InputError: The value is not a whole number, or is out of range.
@@ -30,7 +30,7 @@ def whole(name: str, value: int, at_least: int, at_most: float = inf) -> int:
 
 
 def real(name: str, value: float, at_least: float, at_most: float = inf) -> float:
-    """The finite number `value` of the argument `name`, if it is within its bounds.
+    """Check that the argument `name` is a finite number within the bounds, and return it.
 
     Raises:
         InputError: The value is not a finite number, or is out of range.
@@ -43,7 +43,7 @@ def real(name: str, value: float, at_least: float, at_most: float = inf) -> floa
 
 
 def choice(name: str, value: str, allowed: Iterable[str]) -> str:
-    """The string `value` of the argument `name`, if it is one of the allowed strings.
+    """Check that the argument `name` is one of the allowed strings, and return it.
 
     Raises:
         InputError: The value is not allowed.
@@ -103,9 +103,9 @@ class Box:
         return np.clip(x, self.lower, self.upper)
 
     def to_unit(self, x: ArrayLike) -> NDArray[np.float64]:
-        """Map the box onto the unit cube: 0 at `lower`, 1 at `upper` [..., d]."""
+        """Map points [..., d] of the box to the unit cube: `lower` to 0 and `upper` to 1."""
         return (np.asarray(x, dtype=float) - self.lower) / self.width
 
     def from_unit(self, unit: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Map the unit cube onto the box; rounding never moves a point outside [..., d]."""
+        """Map points [..., d] of the unit cube to the box; rounding never moves a point outside the box."""
         return self.clip(self.lower + unit * self.width)

@@ -4,11 +4,12 @@ Both are local methods. They start in the middle of the box, or at the best poin
 at random points if they converge before their budget is used up.
 
 POUNDERS: S. M. Wild, "Solving Derivative-Free Nonlinear Least Squares Problems with POUNDERS", in Advances and Trends
-in Optimization with Engineering Applications, SIAM (2017), ch. 40. The authors' package IBCDFO needs a solver (MINQ)
-that no package index provides. Each residual is modelled by the quadratic of least curvature through evaluated points
-near the best one. The sum of squares of these models, to second order, is minimised in a box-shaped trust region.
-Points that span all directions within the region are used first: they make the models at least fully linear. If a
-direction is missing and the step failed, a point along this direction is evaluated before the region shrinks.
+in Optimization with Engineering Applications, SIAM (2017), ch. 40. Implemented here because the authors' package IBCDFO
+needs a solver (MINQ) that no package index provides. Each residual is modelled by the quadratic of least curvature
+through evaluated points near the best one. The sum of squares of these models, to second order, is minimised in a
+box-shaped trust region. Points that span all directions within the region are chosen first, because they make the
+models fully linear. If a direction is missing and the step failed, a point along this direction is evaluated before the
+region shrinks.
 
 Gauss-Newton is the approach of a user with a least squares solver but no derivatives. Every accepted point requires one
 further evaluation per parameter, all in one batch. `descent.py` computes the steps.
@@ -29,16 +30,16 @@ from calibray.optimizers.evaluations import Archive, Evaluations, Objective, roo
 from calibray.optimizers.protocol import Optimizer, Search, Session, first_start, limited
 
 SPANNING: Final = (1.75, 10.0)
-"""Largest distance / sqrt(d), in trust-region radii, of spanning points: for a fully linear model, and for any."""
+"""Largest distance of a spanning point / (radius sqrt(d)): for a fully linear model, then for any model."""
 
 NEW_DIRECTION: Final = 1e-3
-"""Smallest component along new directions, relative to the larger of the point's distance and the radius (theta_1)."""
+"""Smallest component of a new point outside the spanned directions, relative to max(distance, radius) (theta_1)."""
 
 INDEPENDENT: Final = 1e-3
-"""Smallest pivot with which a further point may determine curvature (theta_2)."""
+"""Smallest pivot (see `_pivot`) at which a further point is included in the model (theta_2)."""
 
 ACCEPTED: Final = 0.05
-"""Smallest share of the predicted decrease that makes a step successful; the trust region then does not shrink."""
+"""A step that achieves this share of the predicted decrease is successful; the trust region then does not shrink."""
 
 LARGEST: Final = 0.5
 """Largest trust-region radius, as a share of the box."""
@@ -46,10 +47,10 @@ LARGEST: Final = 0.5
 
 @final
 class POUNDERS(Optimizer):
-    """Derivative-free least squares with curvature. Uses residuals, with the given budget.
+    """Derivative-free least squares with quadratic models. Uses residuals and the whole budget.
 
     Args:
-        seed: Seed of the random points of restarts.
+        seed: Seed of the random points at which searches restart.
         budget: Number of evaluations.
         radius: Initial trust-region radius, as a share of the box.
         tolerance: Trust-region radius at which a search has converged, as a share of the box.
@@ -107,7 +108,7 @@ class _Points(NamedTuple):
 
 
 def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: float) -> Search:
-    """One local search in trust regions from `radius` down to `last`; yields candidates [n, d] in the box."""
+    """One local search with trust-region radii from `radius` down to `last`; yields candidates [n, d] in the box."""
     box, d = archive.box, len(start)
 
     def evaluated(
@@ -118,7 +119,7 @@ def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: 
         both = [new] if points is None else [points, new]
         return _Points(*(np.concatenate(part) for part in zip(*both, strict=True)))
 
-    # Towards the farther face.
+    # The first points lie towards the farther face along each axis.
     side = np.where(start <= 0.5, radius, -radius)
     points = yield from evaluated(None, np.vstack([start, start + np.diag(side)]))
     while radius > last:
@@ -132,7 +133,7 @@ def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: 
                 before = points.value[best]
                 points = yield from evaluated(points, np.clip(centre + step, 0.0, 1.0)[None])
                 ratio = (before - points.value[-1]) / predicted
-                # A good step that ends near the edge suggests a larger region.
+                # A successful step that ends near the edge of the trust region suggests a larger one.
                 if ratio >= ACCEPTED:
                     radius = min(2 * radius, LARGEST) if np.abs(step).max() > 0.75 * radius else radius
                     continue
@@ -143,9 +144,9 @@ def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: 
 
 
 def _spanning(points: _Points, best: int, radius: float) -> tuple[list[int], NDArray[np.float64] | None]:
-    """Points that span the directions around the best one, the latest first, and the directions that are missing.
+    """Indices of points that span the directions around the best point, and the missing directions [k, d].
 
-    Directions [k, d] are missing if no near points span them; the model is then not fully linear.
+    Directions are missing if near points do not span them; the model is then not fully linear. None if none is missing.
     """
     offset = (points.unit - points.unit[best]) / radius
     distance = np.linalg.norm(offset, axis=1)
@@ -164,13 +165,13 @@ def _spanning(points: _Points, best: int, radius: float) -> tuple[list[int], NDA
             if len(chosen) == offset.shape[1]:
                 return chosen, missing
         if missing is None:
-            # The null space of the directions that near points span.
+            # The orthogonal complement of the directions that near points span.
             missing = np.linalg.svd(basis)[2][len(basis) :] if len(basis) else np.eye(offset.shape[1])
     return chosen, missing
 
 
 def _enriched(points: _Points, best: int, chosen: list[int], radius: float) -> NDArray[np.int64]:
-    """The best point, those that span the directions, and further points that determine curvature well.
+    """Indices of the best point, the spanning points, and further points that determine the curvature well.
 
     There are at most 2 d + 1 points, as in the paper's experiments.
     """
@@ -186,15 +187,15 @@ def _enriched(points: _Points, best: int, chosen: list[int], radius: float) -> N
 
 
 def _pivot(offset: NDArray[np.float64]) -> float:
-    """Smallest singular value of the quadratic kernel of points, projected onto what no plane can represent."""
+    """Smallest singular value of the quadratic kernel, projected onto what linear functions cannot represent."""
     plane = np.hstack([np.ones((len(offset), 1)), offset])
-    # Combinations of the points on which every plane vanishes.
+    # Weights of the points with which the values of every linear function sum to zero.
     q = np.linalg.qr(plane, mode="complete")[0][:, plane.shape[1] :]
     return float(np.linalg.svd(q.T @ _quadratic(offset) @ q, compute_uv=False)[-1])
 
 
 def _quadratic(offset: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Kernel whose interpolant has the Hessian of least Frobenius norm, (x . y)^2 / 2."""
+    """The kernel (x . y)^2 / 2, whose interpolant has the Hessian with the smallest Frobenius norm."""
     return 0.5 * (offset @ offset.T) ** 2
 
 
@@ -205,12 +206,12 @@ def _step(
     offset = (points.unit[kept] - points.unit[best]) / radius
     count, d = offset.shape
     plane = np.hstack([np.ones((count, 1)), offset])
-    # Interpolation with the least curvature: one multiplier per point, then the constant and the slopes.
+    # Interpolation with the least curvature; the unknowns are one multiplier per point, the constant and the slopes.
     system = np.block([[_quadratic(offset), plane], [plane.T, np.zeros((d + 1, d + 1))]])
     side = np.vstack([points.residuals[kept], np.zeros((d + 1, points.residuals.shape[1]))])
     solved = np.linalg.lstsq(system, side, rcond=1e-12)[0]
     residuals, slopes = points.residuals[best], solved[count + 1 :]  # [m], [d, m]
-    # Sum of residuals times their curvatures, sum_i r_i sum_j lambda_ij s_j s_j^T, and the Gauss-Newton term.
+    # Curvatures weighted by residuals, sum_i r_i sum_j lambda_ij s_j s_j^T, plus the Gauss-Newton term.
     curvature = (offset.T * (solved[:count] @ residuals)) @ offset + slopes @ slopes.T
     gradient = slopes @ residuals
     low = np.maximum(-points.unit[best] / radius, -1.0)
@@ -232,10 +233,11 @@ def _step(
 def improving_point(
     centre: NDArray[np.float64], missing: NDArray[np.float64], radius: float
 ) -> NDArray[np.float64]:
-    """The next point of the unit cube [d] for a model around `centre` [d].
+    """A point of the unit cube [d] that improves the model around `centre` [d].
 
     It lies within the radius along a missing direction [k, d], opposite to one, or along an axis towards the farther
-    face, whichever has the largest component along the missing directions. In a corner, only the axes lead inside.
+    face. The point with the largest component along the missing directions is chosen; in a corner, it may be one along
+    an axis.
     """
     directions = np.vstack([missing, -missing, np.diag(np.where(centre <= 0.5, 1.0, -1.0))])
     edge = np.where(directions > 0, 1.0 - centre, centre)
@@ -248,10 +250,10 @@ def improving_point(
 
 @final
 class GaussNewton(Optimizer):
-    """Least squares with finite differences. Uses residuals, with the given budget.
+    """Gauss-Newton least squares with finite differences. Uses residuals and the whole budget.
 
     Args:
-        seed: Seed of the random points of restarts.
+        seed: Seed of the random points at which searches restart.
         budget: Number of evaluations.
         step: Finite-difference step, as a share of the box.
         tolerance: Relative decrease of the cost, or step as a share of the box, below which a search has converged.

@@ -1,9 +1,9 @@
 """Projected Levenberg-Marquardt from many starting points in parallel, for least squares in the unit cube.
 
-A step minimises the damped quadratic model g.p + p.(H + mu I) p / 2 with H = J^T J and g = J^T r within the cube.
-Components that would leave the cube are fixed at its face, and the system is solved again for the rest, until none
-leaves it. The damping mu is updated from the gain ratio as in H. B. Nielsen (Damping Parameter in Marquardt's Method,
-IMM-REP-1999-05, Technical University of Denmark).
+A step minimises the damped quadratic model g.p + p.(H + mu I) p / 2 within the cube, where H and g are J^T J and J^T r
+divided by the number of residuals. Components that would leave the cube are fixed at its face, and the system is solved
+again for the rest, until none leaves the cube. The damping mu is updated from the gain ratio as in H. B. Nielsen
+(Damping Parameter in Marquardt's Method, IMM-REP-1999-05, Technical University of Denmark).
 
 `descend` is a generator, so its caller decides how points are evaluated: `least_squares.py` calls the engine, and
 `descend_all` calls a model.
@@ -25,8 +25,8 @@ MERGE_DISTANCE = 1e-3
 """Distance in the unit cube below which two searches are assumed to approach the same minimum."""
 
 Residuals = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Residuals [s, m] and their Jacobian with respect to unit-cube coordinates [s, m, d]; a row that is not finite is a
-failed evaluation."""
+"""Residuals [s, m] and their Jacobian with respect to unit-cube coordinates [s, m, d]; a row of residuals that is not
+finite marks a failed evaluation."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Starts:
 
     Attributes:
         unit: Current points in the unit cube [s, d].
-        cost: Half the mean square of the residuals there [s].
+        cost: Half the mean square of the residuals at these points [s].
         gradient: Gradient g of the cost [s, d].
         curvature: Gauss-Newton matrix H of the cost [s, d, d].
         damping: Damping mu [s].
@@ -132,11 +132,11 @@ def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> St
 def merge(starts: Starts, settled: Starts) -> tuple[Starts, Starts, NDArray[np.bool_]]:
     """Find searches that are close to a better one and would only reach the same minimum.
 
-    Returns the moving and the settled searches, where `searches` of a better search counts those merged into it, and a
+    Returns the moving and the settled searches, whose counts `searches` include the searches merged into them, and a
     mask of the moving searches that can be dropped [s].
     """
     number, cost = len(settled.cost), np.concatenate([settled.cost, starts.cost])
-    # Ties are broken by position, so that of two close searches exactly one is better.
+    # Ties are broken by index, so that exactly one of two close searches is better.
     rank = np.lexsort((np.arange(len(cost)), cost)).argsort()
     distance = cdist(starts.unit, np.concatenate([settled.unit, starts.unit]))
     near = (distance < MERGE_DISTANCE) & (rank[None] < rank[number:, None])
@@ -156,13 +156,13 @@ def descend(
     earlier: Starts | None = None,
     followed: int | None = None,
 ) -> Generator[NDArray[np.float64], Residuals, Starts]:
-    """Advance all starting points [s, d] until each has converged, merged with a better one, or been abandoned.
+    """Search from all points [s, d] until each search has converged, merged with a better one, or been abandoned.
 
-    A search has converged if its model predicts a relative decrease in cost, or a step, below `tolerance`. A search is
-    abandoned if its cost exceeds the lowest one by more than `catch_up` times its predicted decrease. Searches that
-    come close to the end of an `earlier` one are merged with it. Only the `followed` starting points with the lowest
-    cost are used; all if None. Yields points to evaluate [s, d]. Returns the earlier searches, then those that
-    converged or were still moving at the end, then the abandoned ones.
+    Each search takes at most `iterations` steps. It has converged if its model predicts a relative decrease in cost, or
+    a step, below `tolerance`. A search is abandoned if its cost exceeds the lowest one by more than `catch_up` times
+    its predicted decrease. Searches that come close to the end of an `earlier` one are merged with it. Only the
+    `followed` starting points with the lowest cost are used; all if None. Yields points to evaluate [s, d]. Returns the
+    earlier searches, then those that converged or were still moving at the end, then the abandoned ones.
     """
     starts = begin(unit, (yield unit))
     # Searches do not start at failed evaluations.
@@ -206,7 +206,7 @@ def descend_all(
 
 
 def distinct(starts: Starts, separation: float) -> Starts:
-    """Of searches that ended within `separation` in the unit cube, keep the best; the lowest cost comes first."""
+    """Keep the best of the searches that ended within `separation` of each other, lowest cost first."""
     order = np.argsort(starts.cost, kind="stable")
     near = cdist(starts.unit[order], starts.unit[order]) < separation
     kept = np.zeros(len(order), dtype=bool)

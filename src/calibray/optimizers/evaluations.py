@@ -12,13 +12,13 @@ from calibray.errors import InputError
 from calibray.optimizers.arguments import Box
 
 Objective = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""Function from residuals [n, m] to the value [n], which rises with their mean square."""
+"""Function from residuals [n, m] to values [n], which must rise with the mean square of the residuals."""
 
 OBJECTIVE_TOLERANCE = 1e-4
-"""Largest relative difference between a value and the one computed from its residuals, for float32 engines."""
+"""Largest accepted relative difference between a value and the one computed from its residuals; allows for float32."""
 
 DECIMALS = 9
-"""Number of decimals to which the unit-cube coordinates of two points must agree for them to count as one."""
+"""Number of decimals to which unit-cube coordinates are rounded before repeated points are merged."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Evaluations:
 
 
 class Archive:
-    """All evaluations of a run in the order of `tell`, requested or not."""
+    """All evaluations of a run, requested or not, in the order in which `tell` received them."""
 
     def __init__(self, box: Box) -> None:
         self.box = box
@@ -106,7 +106,7 @@ class Archive:
 
     @property
     def best(self) -> Best:
-        """The point and value of the evaluation `leading`.
+        """The point and value of `leading`.
 
         Raises:
             InputError: No evaluation has been passed to `tell` yet.
@@ -126,7 +126,7 @@ class Archive:
 
     @property
     def lowest(self) -> float:
-        """Root mean square of the residuals of `leading`, +inf before a success; `y` may have a different scale."""
+        """Root mean square of the residuals of `leading`; +inf if none succeeded. `y` may have a different scale."""
         succeeded = self._leading is not None and np.isfinite(self._leading.y[0])
         return float(root_mean_square(self.leading.errors)[0]) if succeeded else np.inf
 
@@ -179,7 +179,7 @@ def checked_evaluations(
     uses: frozenset[str],
     objective: Objective | None = None,
 ) -> Evaluations:
-    """Validate and copy evaluations: points x [n, d], values y [n], and as `parts` residuals and jacobian.
+    """Validate and copy evaluations: points x [n, d], values y [n], and the residuals and Jacobian in `parts`.
 
     A value of +inf marks a failed evaluation, whose residuals and derivatives are ignored. Parts that the optimizer
     does not use are checked and dropped. Values are compared with the `objective` of the residuals unless it is None.
@@ -191,7 +191,7 @@ def checked_evaluations(
     points, values = _array("x", x, (None, box.dimension)), _array("y", y, (None,))
     if len(points) != len(values) or len(values) == 0:
         raise InputError(
-            f"x has {len(points)} rows, y {len(values)}; tell one value for each of n >= 1 points"
+            f"x has {len(points)} rows, y {len(values)}; pass one value for each of n >= 1 points"
         )
     _finite("x", points)
     for row, column in np.argwhere((points < box.lower) | (points > box.upper)):
@@ -201,7 +201,7 @@ def checked_evaluations(
         )
     # The comparison is negated so that NaN is refused as well.
     for (row,) in np.argwhere(~((values > -np.inf) & (values <= np.inf))):
-        raise InputError(f"y[{row}] = {values[row]}; it must be a number, +inf for a failed evaluation")
+        raise InputError(f"y[{row}] = {values[row]}; it must be a number, or +inf for a failed evaluation")
     residuals, jacobian = parts["residuals"], parts["jacobian"]
     for name in sorted(uses & parts.keys()):
         if parts[name] is None:
@@ -225,7 +225,7 @@ def checked_evaluations(
 
 
 def check_order(evaluations: Evaluations, archive: Archive) -> None:
-    """Check that a lower value means a lower mean square, among new evaluations and compared with the best so far.
+    """Check that a lower value means a lower mean square, among the new evaluations and the best one so far.
 
     Raises:
         InputError: An evaluation has a lower value than another one, but a higher mean square.
@@ -245,7 +245,7 @@ def check_order(evaluations: Evaluations, archive: Archive) -> None:
         if size[row] > (1.0 + OBJECTIVE_TOLERANCE) * size[before] + 1e-9:
             raise InputError(
                 f"y = {value[row]:g} with sqrt(mean(residuals**2)) = {size[row]:g}, but y = {value[before]:g} "
-                f"with {size[before]:g}; the mean square must rise with the value: tell deviance residuals"
+                f"with {size[before]:g}; the mean square must rise with the value: pass deviance residuals"
             )
 
 
@@ -287,7 +287,7 @@ def _finite(name: str, array: NDArray[np.float64], rows: NDArray[np.bool_] | Non
     for index in np.argwhere(bad):
         raise InputError(
             f"{name}[{', '.join(map(str, index))}] = {array[tuple(index)]}; it must be finite: "
-            "tell y = +inf for an evaluation that failed"
+            "pass y = +inf for a failed evaluation"
         )
 
 
@@ -300,7 +300,7 @@ def _check_value(
         if objective is root_mean_square:
             name, remedy = f"sqrt(mean(residuals[{row}]**2))", "put the weights into the residuals"
         else:
-            name, remedy = f"objective(residuals[{row}])", "tell the value that belongs to the residuals"
+            name, remedy = f"objective(residuals[{row}])", "pass the value that belongs to the residuals"
         raise InputError(
             f"y[{row}] = {values[row]:g}, but {name} = {computed[row]:g}; they must agree within "
             f"{OBJECTIVE_TOLERANCE:g}: {remedy}"

@@ -1,4 +1,4 @@
-"""Bayesian optimization of the objective: a Gaussian process of the value, and its expected improvement.
+"""Bayesian optimization: a Gaussian process models the value, and its expected improvement selects candidates.
 
 This method models one number, whereas `VectorSurrogate` models every residual; both use `regression.py`. A run begins
 with a maximin Latin hypercube. Every further candidate maximises the log expected improvement (D. R. Jones, M.
@@ -21,7 +21,7 @@ from calibray.optimizers.regression import Kriging, fit, solve
 from calibray.optimizers.sampling import SEPARATION, distance_to_nearest, draw_around, maximin_design
 
 CANDIDATES = 300
-"""Number of candidates drawn over the box, and of candidates around the best points."""
+"""Number of candidates drawn over the whole box, and number of candidates drawn around the best points."""
 
 
 @final
@@ -30,7 +30,7 @@ class GaussianProcess(Optimizer):
 
     Args:
         budget: Number of evaluations; 20 d if None.
-        initial: Size of the initial design; 2 (d + 1) if None. Points passed to `tell` before the first `ask` count.
+        initial: Size of the initial design; 2 (d + 1) if None. Points already passed to `tell` count.
 
     Raises:
         InputError: An argument is out of range.
@@ -68,7 +68,7 @@ class GaussianProcess(Optimizer):
                 x = self._rng.random(d)
             else:
                 kernel = None if model is None else model.process.kernel
-                # Scales are estimated at every step up to 40 points, and at every tenth step after that.
+                # The kernel is fitted again at every step up to 40 points, and at every tenth step after that.
                 if kernel is None or len(points) <= 40 or turn % 10 == 0:
                     model = fit(points, values, guess=kernel)
                 else:
@@ -93,7 +93,7 @@ class GaussianProcess(Optimizer):
 
 
 def log_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDArray[np.float64]:
-    """Log expected improvement [k] of the modelled value over the best one, at points x [k, d]."""
+    """Logarithm [k] of the expected improvement of the value over the best one, at points x [k, d]."""
     mean, share = model.predict(x)
     spread = np.sqrt(np.maximum(share * model.variance[0], 1e-300))
     z = (best - mean[:, 0]) / spread
@@ -101,7 +101,7 @@ def log_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDAr
 
 
 def log_shape(z: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The logarithm of phi(z) + z Phi(z), also accurate for tiny values; z [k] is in standard deviations.
+    """The logarithm of phi(z) + z Phi(z), accurate even for tiny values; z [k] is in standard deviations.
 
     Example:
         >>> import numpy as np

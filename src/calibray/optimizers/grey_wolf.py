@@ -1,6 +1,6 @@
 """Grey wolf optimizers: the canonical GWO, which is the paper's baseline, and the paper's method, SGWO-IM.
 
-GWO is S. Mirjalili, S. M. Mirjalili, A. Lewis, "Grey Wolf Optimizer", Advances in Engineering Software 69, 2014. The
+GWO: S. Mirjalili, S. M. Mirjalili, A. Lewis, "Grey Wolf Optimizer", Advances in Engineering Software 69, 2014. The
 following choices apply where descriptions and common implementations differ:
 
 - Iteration t = 1..T evaluates the whole population, then moves it with a(t) = 2 (1 - t/T). The move after the last
@@ -13,10 +13,10 @@ following choices apply where descriptions and common implementations differ:
 - C multiplies a position, so steps are short near the origin of the coordinates and long far from it. The pack is
   therefore biased towards the origin, as in the published method.
 
-SGWO-IM, the Surrogate-assisted Grey Wolf Optimizer with Individual Memory, is X. Zou, P. Tang, P. Liu, C. Tai,
-"Efficient and Accurate Surrogate-Assisted Electromagnetic Parameter Calibration for 6G Digital Twin Channels",
-Algorithm 1 and eqs. 2 to 4. Defaults are its Table II: N = 30, T = 20, cosine convergence, memory weight 0.1 to 0.3, 5
-full iterations, then K = 5 real evaluations per iteration: 5 * 30 + 15 * 5 = 225 evaluations.
+SGWO-IM, the Surrogate-assisted Grey Wolf Optimizer with Individual Memory: X. Zou, P. Tang, P. Liu, C. Tai, "Efficient
+and Accurate Surrogate-Assisted Electromagnetic Parameter Calibration for 6G Digital Twin Channels", Algorithm 1 and
+eqs. 2 to 4. Defaults are its Table II: N = 30, T = 20, cosine convergence, memory weight 0.1 to 0.3, 5 full iterations,
+then K = 5 real evaluations per iteration: 5 * 30 + 15 * 5 = 225 evaluations.
 
 The following choices apply where the paper is silent, in addition to those of GWO:
 
@@ -29,7 +29,7 @@ The following choices apply where the paper is silent, in addition to those of G
 - Predictions only determine which wolves are evaluated: leaders, memories and the best point come from the archive of
   real evaluations.
 
-With `w_min = w_max = 0`, linear convergence and no surrogate, this is GWO, bit for bit.
+With `w_min = w_max = 0`, linear convergence and no surrogate, SGWO-IM equals GWO bit for bit.
 
 The surrogate is SciPy's `RBFInterpolator`, cubic with a linear tail, on inputs scaled to the unit cube, with smoothing
 1e-6. Repeated points are merged and their objectives averaged. A failed evaluation counts as the worst successful one,
@@ -57,7 +57,7 @@ WOLVES = 30
 """Number of wolves, the paper's N (Table II)."""
 
 LEAST_BUDGET = 24
-"""Smallest budget that gives SGWO-IM three leaders."""
+"""Smallest budget of both methods; SGWO-IM then has three wolves, one for each leader, and uses the whole budget."""
 
 FULL_ITERATIONS = 5
 """Number of iterations that evaluate all wolves (Table II)."""
@@ -173,7 +173,7 @@ CONVERGENCE = {"cosine": cosine_decay, "linear": linear_decay}
 def screened_iterations(budget: int) -> dict[str, int]:
     """The settings of SGWO-IM for a budget: the paper's schedule for 225 evaluations, scaled for other budgets.
 
-    Two thirds are spent on 5 full iterations with at most 30 wolves, and the rest on 5 elites per iteration.
+    At most two thirds go to 5 full iterations of at most 30 wolves, and the rest to iterations of at most 5 elites.
 
     Example:
         >>> screened_iterations(225)

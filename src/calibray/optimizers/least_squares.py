@@ -1,22 +1,22 @@
 """Multi-start least squares with exact derivatives: projected Levenberg-Marquardt on all starts at once.
 
-Local searches are cheap if the engine returns derivatives, and a batch of candidates takes little longer than one.
-Many searches therefore run in parallel, and each `ask` returns the next trial point of every search still in progress.
-RMSE as a function of permittivities is multimodal (slab resonances), so one starting point is not enough. A search that
-comes close to a better one is merged with it. A search too far behind the best one to catch up is abandoned, and its
-last point is kept as a further minimum (`minima`). Minima that fit nearly as well show how ambiguous the best one is.
-`descent.py` computes the steps.
+Local searches are cheap if the engine returns derivatives, and a batch of candidates takes little longer than one
+candidate. Many searches therefore run in parallel, and each `ask` returns the next trial point of every search still in
+progress. RMSE as a function of permittivities is multimodal (slab resonances), so one starting point is not enough. A
+search that comes close to a better one is merged with it. A search too far behind the best one to catch up is
+abandoned, and its last point is kept as a further minimum (`minima`). Minima that fit nearly as well show how ambiguous
+the best one is. `descent.py` computes the steps.
 
 Starting points are used in rounds, until `RETURNS` searches have ended in the best minimum. If another minimum fitted
-better and had an equally wide basin, all searches would have missed it with a probability of e^-k after k returns.
-Problems with narrower basins use all their starting points. (The Bayesian rule of Boender and Rinnooy Kan, Mathematical
-Programming 37, 1987, counts the different minima, which requires every search to be followed to its end.)
+better and had an equally wide basin, all searches would have missed it with a probability of e^-k after k returns. All
+starting points are used if fewer searches end in the best minimum. (The Bayesian rule of Boender and Rinnooy Kan,
+Mathematical Programming 37, 1987, counts the different minima, which requires every search to be followed to its end.)
 
 If too few searches have ended in the best minimum, minima are combined into new starting points (`recombine`). Searches
-start from those that fit best, until they find no better minimum. If there is at least one full round of starting
-points, basin hopping follows (Wales and Doye, Journal of Physical Chemistry A 101, 1997): searches start from the best
-minimum with one or two coordinates redrawn. A resonating slab repeats minima along its own coordinate, and materials
-act nearly independently, so a lower minimum often differs in only a few coordinates.
+start from the combinations that fit best, until they find no better minimum. If there is at least one full round of
+starting points, basin hopping follows (Wales and Doye, Journal of Physical Chemistry A 101, 1997): searches start from
+the best minimum with one or two coordinates redrawn. A resonating slab repeats minima along its own coordinate, and
+materials act nearly independently, so a lower minimum often differs in only a few coordinates.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from calibray.optimizers.sampling import design
 from calibray.support.messages import shortened
 
 CATCH_UP = 100.0
-"""Default multiple of its predicted decrease by which a search may lag the best one before it is abandoned."""
+"""A search is abandoned if its cost exceeds the lowest one by more than this multiple of its predicted decrease."""
 
 NEARER = 10.0
-"""The same multiple for searches from combined minima, which start near their end."""
+"""The same multiple for searches from combined minima, which start near the minima that they reach."""
 
 COMBINATIONS = 32
-"""Number of combinations of minima tried at a time; never more than the number of starting points."""
+"""Number of combinations of minima tried at a time, or the number of starting points if that is smaller."""
 
 FOLLOWED = 0.2
-"""Share of the combinations from which searches start: those that fit best."""
+"""Share of the combinations from which searches start: the best-fitting ones."""
 
 PARENTS = 12
 """Number of lowest minima that are combined."""
@@ -62,7 +62,8 @@ HOPS = 8
 
 PATIENCE = 6
 """Number of successive rounds without a lower minimum after which basin hopping ends. In 24 development problems that
-use all starting points, 14 runs ended above the lowest known minimum without hopping, nine with three, two with six."""
+use all starting points, 14 runs ended above the lowest known minimum without hopping, nine with a patience of three,
+two with six."""
 
 RETURNS = 10
 """Number of searches that must end in the best minimum before the method stops starting new ones."""
@@ -71,7 +72,7 @@ LEVEL = 1e-4
 """Relative difference in mean square below which two minima fit equally well, for example along a valley."""
 
 NOISELESS = 1e-9
-"""The same, relative to the largest mean square: without noise, the lowest mean squares are rounding errors."""
+"""Addition relative to the largest mean square: without noise, the lowest mean squares are rounding errors."""
 
 APART = 0.01
 """Distance in the unit cube below which two searches count as having ended in the same minimum."""
@@ -79,20 +80,20 @@ APART = 0.01
 
 @final
 class LeastSquares(Optimizer):
-    """Multi-start Levenberg-Marquardt. Uses residuals and Jacobian; it has no budget and stops by itself.
+    """Multi-start Levenberg-Marquardt. Uses residuals and Jacobians; it has no budget and stops by itself.
 
     Args:
-        seed: Seed of the scrambled Sobol points that the searches start from.
-        starts: Largest number of these points; powers of two are spread best. Each costs about ten evaluations. If all
-            are used, combinations of the minima and basin hopping need about as many evaluations again. The best point
-            passed to `tell` before the first `ask`, if any, is a further starting point.
+        seed: Seed of the scrambled Sobol points from which searches start, and of basin hopping.
+        starts: Largest number of these points; powers of two cover the box most evenly. Each costs about ten
+            evaluations. If all are used, combinations of the minima and basin hopping need about as many evaluations
+            again. The best point passed to `tell` before the first `ask`, if any, is a further starting point.
         x0: Further starting points, [d] or [k, d].
         iterations: Largest number of steps of each search.
         tolerance: A search has converged if its model predicts a relative decrease of the mean square below this
             tolerance, or a step shorter than this in the unit cube.
-        catch_up: Multiple of its predicted decrease by which a search may lag the best one before it is abandoned. Use
-            a smaller number if some starting points are already minima and the others only need to show whether they
-            lead to a better one.
+        catch_up: A search is abandoned if its cost exceeds the lowest one by more than this multiple of its predicted
+            decrease. Use a smaller number if some starting points are already minima and the others only need to show
+            whether they lead to a better one.
 
     Raises:
         InputError: An argument is out of range.
@@ -159,7 +160,7 @@ class LeastSquares(Optimizer):
         number, before = min(COMBINATIONS, self.starts), np.inf
         followed = round(FOLLOWED * number)
         while followed and ended.cost.min() < before:
-            # Only a lower cost than this counts as a lower minimum.
+            # A lower minimum must have a cost below this value.
             before = ended.cost.min() - _slack(ended)
             unit = recombine(distinct(ended, SPACE).unit, number)
             if not len(unit):
@@ -200,14 +201,14 @@ def returns(ended: Starts) -> int:
 
 
 def recombine(minima: NDArray[np.float64], number: int) -> NDArray[np.float64]:
-    """Combine minima [k, d], the best first, into `number` points from which other minima may be reached.
+    """Combine minima [k, d], best first, into at most `number` points from which other minima may be reached.
 
     The best minimum is shifted by the difference between two others, or takes one coordinate from another. Shifts help
     because one cause, such as a resonating slab, repeats minima at equal distances whatever the other parameters are;
     they are the mutation of differential evolution (Storn and Price, Journal of Global Optimization 11, 1997).
-    Exchanges, its crossover, help if parameters act nearly independently, such as materials that rarely occur on the
-    same path. Points within `SPACE` of a minimum are excluded. Points from the lowest minima come first, alternating
-    between shifts and exchanges; there may be fewer points than requested.
+    Exchanges, its crossover, help if parameters act nearly independently, such as those of materials that rarely occur
+    on the same path. Points within `SPACE` of a minimum are excluded. Shifts and exchanges alternate, starting with
+    those of the lowest minima.
     """
     best, low, dimension = minima[0], minima[:PARENTS], minima.shape[1]
     target, source = np.nonzero(~np.eye(len(low), dtype=bool))

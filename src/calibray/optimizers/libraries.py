@@ -5,8 +5,8 @@
 - DFO-LS, in its authors' package: C. Cartis, J. Fiala, B. Marteau, L. Roberts, "Improving the Flexibility and
   Robustness of Model-Based Derivative-Free Optimization Solvers", ACM Trans. Math. Softw. 45 (2019) 32. It fits a
   linear model to every residual in a trust region, one evaluation at a time. It is a local method.
-- Differential evolution: R. Storn, K. Price, J. Global Optim. 11 (1997) 341, one generation per batch, without SciPy's
-  final polish, which would need derivatives.
+- Differential evolution: R. Storn, K. Price, J. Global Optim. 11 (1997) 341. Each batch is one generation. SciPy's
+  final polish, which would need derivatives, is omitted.
 
 All start at the best point already passed to `tell`, if any. They restart from a random point or population if they
 converge before their budget is used up.
@@ -42,7 +42,7 @@ class _AbandonedError(BaseException):
 
 
 def inverted(minimise: Callable[[Evaluate], None]) -> Search:
-    """Run a minimiser in a thread, and yield the candidates [n, d] that it asks to have evaluated.
+    """Run a minimiser in a thread, and yield the candidates [n, d] whose evaluations it requests.
 
     Raises:
         Exception: Whatever `minimise` raises.
@@ -81,11 +81,11 @@ def inverted(minimise: Callable[[Evaluate], None]) -> Search:
 
 @final
 class CMAES(Optimizer):
-    """Covariance matrix adaptation. Uses only objective values, with the given budget. Needs `calibray[optimizers]`.
+    """Covariance matrix adaptation. Uses only objective values and the whole budget. Needs `calibray[optimizers]`.
 
     Args:
         budget: Number of evaluations.
-        population: Number of candidates per generation; 4 + 3 ln d if None.
+        population: Number of candidates per generation; 4 + floor(3 ln d) if None.
 
     Raises:
         InputError: An argument is out of range, or `cma` is not installed.
@@ -133,10 +133,10 @@ class CMAES(Optimizer):
 
 @final
 class DFOLS(Optimizer):
-    """Derivative-free least squares. Uses residuals, with the given budget. Needs `calibray[optimizers]`.
+    """Derivative-free least squares. Uses residuals and the whole budget. Needs `calibray[optimizers]`.
 
     Args:
-        seed: Seed of the random points of restarts.
+        seed: Seed of the random points at which searches restart.
         budget: Number of evaluations.
         radius: Initial trust-region radius, as a share of the box.
         tolerance: Trust-region radius at which a search has converged, as a share of the box.
@@ -210,11 +210,11 @@ def _minimise_residuals(
 
 @final
 class DifferentialEvolution(Optimizer):
-    """Differential evolution. Uses only objective values, with the given budget.
+    """Differential evolution. Uses only objective values and the whole budget.
 
     Args:
         budget: Number of evaluations.
-        population: Number of candidates per generation as a multiple of d; SciPy uses at least 5 in total.
+        population: Number of candidates per generation as a multiple of d; SciPy uses at least 5 candidates.
 
     Raises:
         InputError: An argument is out of range.
@@ -242,7 +242,7 @@ def _evolve(population: int, archive: Archive, rng: np.random.Generator, evaluat
     def objective(unit: NDArray[np.float64]) -> NDArray[np.float64]:  # [d, n], SciPy's vectorized form
         return archive.imputed(evaluate(box.from_unit(unit.T))).y
 
-    # With other bounds than the unit cube, SciPy's rounding may place a start on a face outside them.
+    # With bounds other than the unit cube, rounding in SciPy may move a start on a face outside them.
     start = box.to_unit(archive.best.x) if len(archive) else None
     while True:
         differential_evolution(

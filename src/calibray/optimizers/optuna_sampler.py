@@ -1,9 +1,9 @@
 """SGWO-IM as a sampler for Optuna, for use with Optuna's storages, dashboard and workers.
 
-Every candidate that is returned is stored in its trial. A new sampler with the same seed on a stored study therefore
-repeats the same candidates, uses their stored answers, and continues where the study stopped. Trials that it did not
-propose (enqueued, or from another sampler) join the archive and can become leaders of the pack. A failed trial counts
-as a failed evaluation.
+Every candidate is stored in the trial that receives it. A new sampler with the same seed on a stored study therefore
+repeats the same candidates, uses their stored answers, and continues where the study stopped. Trials that the sampler
+did not propose (enqueued, or from another sampler) join the archive and can become leaders of the pack. A failed trial
+counts as a failed evaluation.
 
 The pack cannot move before the iteration is complete. If workers are evaluating every open candidate, a candidate of
 another process is returned again, because that process may have ended. If there is none, the trial is a random point.
@@ -93,7 +93,7 @@ class SGWOIMSampler(BaseSampler):
     def sample_relative(
         self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
     ) -> dict[str, Any]:
-        """Return a candidate of the pack that no other trial is evaluating; empty if Optuna should draw at random.
+        """Return a candidate of the pack, preferably one that no trial is evaluating; empty if Optuna should draw one.
 
         Raises:
             InputError: The study has several objectives.

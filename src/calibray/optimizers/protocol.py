@@ -1,4 +1,4 @@
-"""The interfaces of every optimizer (`ask` for candidates, `tell` their evaluations) and of the optional cheap model.
+"""Interfaces of optimizers (`ask` returns candidates, `tell` receives their evaluations) and of optional cheap models.
 
 An algorithm is written as in its paper: a generator that yields the candidates [n, d] of each iteration and receives
 their evaluations. A `Session` suspends it between `ask` and `tell`, checks the evaluations, keeps the archive, and
@@ -38,7 +38,7 @@ class Session:
     Args:
         box: The search box.
         uses: Parts of an evaluation that the algorithm uses: "value", "residuals", "jacobian".
-        search: Function that starts the algorithm on the archive; no part of it runs before the first `ask`.
+        search: Function that starts the algorithm on the archive; the algorithm does not run before the first `ask`.
         objective: Function that converts residuals to the value, if residuals are used.
 
     Attributes:
@@ -64,7 +64,7 @@ class Session:
 
     @property
     def done(self) -> bool:
-        """Whether the algorithm has ended; to determine this, it computes the next candidates."""
+        """Whether the algorithm has ended; to determine this, the next candidates may be computed."""
         # The algorithm does not start before the first `ask`, so that `tell` can still receive earlier evaluations.
         if self._asked is not None:
             self._advance()
@@ -91,7 +91,7 @@ class Session:
             links = evaluations.residuals.shape[1]
             if self._links not in (None, links):
                 raise InputError(
-                    f"residuals have {links} columns, earlier ones {self._links}; tell the same links"
+                    f"residuals have {links} columns, earlier ones {self._links}; pass the same links"
                 )
             if self._objective is not root_mean_square:
                 check_order(evaluations, self.archive)
@@ -99,19 +99,19 @@ class Session:
         self.archive.add(evaluations)
         if self._asked is None:
             return
-        # If the whole batch comes in its order, points need not be matched one by one.
+        # If the whole batch comes in the requested order, points need not be matched one by one.
         if np.array_equal(evaluations.x, self._asked) and len(self._open) == len(self._asked):
             self._answers, self._open = {0: evaluations}, self._open[:0]
             return
         for row, point in enumerate(evaluations.x):
-            # Each answer counts for the first open one of equal candidates in a batch.
+            # Of equal candidates in a batch, the answer belongs to the first that is still open.
             same = np.flatnonzero((self._asked[self._open] == point).all(axis=1))
             if same.size:
                 self._answers[int(self._open[same[0]])] = evaluations.rows(np.array([row]))
                 self._open = np.delete(self._open, same[0])
 
     def _advance(self) -> None:
-        """Continue with the next batch once this one is complete."""
+        """Compute the next batch if this one is complete."""
         if self._finished or len(self._open):
             return
         answers = [self._answers[row] for row in sorted(self._answers)]
@@ -135,7 +135,7 @@ def limited(search: Search, budget: int) -> Search:
 
 
 def first_start(archive: Archive) -> NDArray[np.float64]:
-    """Start of a local search in the unit cube [d]: the best point already passed to `tell`, or else the middle."""
+    """Starting point of a local search in the unit cube [d]: the best point passed to `tell`, or else the middle."""
     return archive.box.to_unit(archive.best.x) if len(archive) else np.full(archive.box.dimension, 0.5)
 
 
@@ -175,7 +175,7 @@ class Optimizer(ABC):
         uses: The parts of an evaluation that the method uses: "value", "residuals", "jacobian".
         schedule: How the method respects a budget; None if it stops by itself.
         takes_starts: Whether its constructor takes `x0`, starting points, and `starts`, the number of its own starting
-            points. In every other method, the best point passed to `tell` before the first `ask` guides the search.
+            points. Most methods also use the points passed to `tell` before the first `ask`.
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value"})
@@ -186,7 +186,7 @@ class Optimizer(ABC):
 
     @classmethod
     def needs_derivatives(cls) -> bool:
-        """Whether every evaluation must come with derivatives."""
+        """Whether every evaluation must include derivatives."""
         return "jacobian" in cls.uses
 
     @classmethod
@@ -238,7 +238,7 @@ class Optimizer(ABC):
         return len(self._session.archive)
 
     def ask(self) -> NDArray[np.float64]:
-        """The candidates [n, d] to evaluate next, inside the bounds; unchanged until all are evaluated.
+        """The candidates [n, d] to evaluate next, inside the bounds: those of the current batch without an answer.
 
         Raises:
             InputError: The optimizer is done.
@@ -262,7 +262,7 @@ class Optimizer(ABC):
             x: Points [n, d] inside the bounds.
             y: Values [n]; +inf for a failed evaluation.
             residuals: Residuals [n, m], weighted so that y = sqrt(mean(residuals**2)), or the value that the
-                constructor's `objective` gives. Residuals are ignored if only the value is used.
+                constructor's `objective` gives. Residuals are checked but not used if the method uses only the value.
             jacobian: Derivatives of the residuals with respect to the parameters [n, m, d].
 
         Raises:
@@ -273,7 +273,7 @@ class Optimizer(ABC):
 
 
 class CheapAnswer(NamedTuple):
-    """The answer of a cheap model to n points, each with one set of constants.
+    """The output of a cheap model at n points, each with its own set of constants.
 
     Attributes:
         residuals: Residuals in the order of the engine's residuals [n, m].
@@ -313,7 +313,7 @@ class Constants:
         return self.upper - self.lower
 
     def draw(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Draw constants [k, q] from their prior within the bounds, using standard normal numbers [k, q]."""
+        """Constants [k, q] drawn from their prior and clipped to the bounds, from standard normal numbers [k, q]."""
         return np.clip(self.centre + self.spread * normal, self.lower, self.upper)
 
 
@@ -335,5 +335,5 @@ class CheapModel(Protocol):
         ...
 
     def answer(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> CheapAnswer:
-        """Residuals and their derivatives at the same points and constants."""
+        """Residuals and their derivatives at points of the box [n, d] with constants [n, q]."""
         ...

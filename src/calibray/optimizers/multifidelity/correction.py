@@ -1,7 +1,7 @@
 """Corrects a cheap model until it agrees with the engine: first its constants, then the remaining discrepancy.
 
 *Input mapping*: the constants of the cheap model are set to the values that best explain the engine's answers. Errors
-are weighted by the covariance of the discrepancy, which is mostly an offset common to all points. A link's offset
+are whitened with the covariance of the discrepancy, which is mostly an offset common to all points. A link's offset
 therefore does not distort the constants. The constants have a prior around their assumed values. This is implicit space
 mapping (J. W. Bandler, Q. S. Cheng, N. K. Nikolova, M. A. Ismail, IEEE Trans. Microw. Theory Tech. 52 (2004) 378).
 *Output mapping*: `discrepancy.py` models the offset, the slope and the remainder.
@@ -9,8 +9,9 @@ mapping (J. W. Bandler, Q. S. Cheng, N. K. Nikolova, M. A. Ismail, IEEE Trans. M
 Slabs resonate, so there are many minima. A kernel that was fitted with wrong constants attributes their errors to the
 discrepancy, and then favours these constants. An input mapping therefore proceeds in rounds. A round tries many sets of
 constants, most of which differ from the present set in one or two constants. Each set is judged with the scale of the
-discrepancy that suits it best. Rounds alternate between the fitted kernel and the prior's. A round descends from the
-likeliest sets and fits the kernel to the best results. It accepts a result that makes the answers more probable.
+discrepancy that suits it best. Rounds alternate between the fitted kernel and the kernel at the mean of the prior. A
+round descends from the likeliest sets and fits the kernel to the best results. It accepts a result that makes the
+answers more probable.
 
 A few answers do not determine the constants of a cheap model. Several sets of constants explain the answers equally
 well and predict minima at different points, and the lowest of these predictions is the most optimistic one. A corrected
@@ -40,30 +41,30 @@ ROUNDS: Final = 4
 """Largest number of rounds of an input mapping."""
 
 GAINED: Final = 1.0
-"""Decrease in negative log density below which a round counts as without gain."""
+"""A round that decreases the negative log density by less than this has gained nothing."""
 
 TRIALS: Final = 300
 """Largest number of sets of constants tried in a round."""
 
 COMPARED: Final = 3000
-"""Largest product of the number of these sets and the number of answers with which each is compared."""
+"""Largest product of the number of sets tried in a round and the number of answers."""
 
 FOLLOWED: Final = 4
-"""Number of sets from which a round descends: those that explain the answers best."""
+"""Number of sets, in addition to the present one, from which a round descends: those that explain the answers best."""
 
 REFITTED: Final = 2
-"""Number of results of a round to which the kernel is fitted."""
+"""Number of results of a round for which the kernel is fitted again."""
 
 STEPS: Final = 12
 """Largest number of steps of an input mapping from one starting point."""
 
 CONVERGED: Final = 1e-4
-"""Relative decrease of the cost, or step in the unit cube, at which an input mapping has converged."""
+"""Relative decrease in cost, or step in the unit cube, below which an input mapping has converged."""
 
 
 @dataclass(frozen=True, eq=False)
 class UnitModel:
-    """A cheap model over the unit cube of a box."""
+    """A cheap model as a function of unit-cube coordinates."""
 
     model: CheapModel
     box: Box
@@ -87,7 +88,7 @@ class UnitModel:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """The response of a cheap model over the box.
+    """How the residuals of a cheap model vary over the box.
 
     Attributes:
         known: Mask of the residuals that the model predicts [m].
@@ -101,7 +102,7 @@ class Response:
 
     @staticmethod
     def of(residuals: NDArray[np.float64], known: NDArray[np.bool_]) -> Response:
-        """The response, from residuals [k, m] at points spread over the box; `known` marks the predicted ones [m]."""
+        """The response, from residuals [k, m] at points spread over the box; `known` [m] marks predicted columns."""
         centre = residuals.mean(axis=0)
         scale = float(np.sqrt(np.mean((residuals - centre)[:, known] ** 2))) if known.any() else 0.0
         return Response(known, centre, max(scale, 1e-6 * max(float(np.abs(residuals).max()), 1e-6)))
@@ -111,7 +112,7 @@ class Response:
         return Inputs(unit, self.scaled(residuals - self.centre))
 
     def scaled(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The predicted ones [k, r, ...] of residuals [k, m, ...], scaled together to a mean square of 1."""
+        """Select the r predicted columns of [k, m, ...]; one factor gives responses a mean squared norm of 1."""
         return rows[:, self.known] / (self.scale * np.sqrt(max(int(self.known.sum()), 1)))
 
 
@@ -124,7 +125,7 @@ class Corrected:
         constants: Adjusted constants of the cheap model [q].
         response: Response of the cheap model over the box.
         residuals: Answers of the engine [n, m].
-        discrepancy: The discrepancy.
+        discrepancy: Gaussian process of the discrepancy.
     """
 
     cheap: UnitModel
@@ -178,7 +179,7 @@ class Corrected:
         return replace(self, residuals=answers, discrepancy=process)
 
     def with_constants(self, constants: NDArray[np.float64], kernel: Kernel | None = None) -> Corrected:
-        """The model with other constants [q], and a discrepancy through the same answers; same kernel if None."""
+        """The model with other constants [q] and a discrepancy through the same answers; the kernel is kept if None."""
         moved = replace(self, constants=constants)
         cheap, inputs = moved.base(self.unit)
         process = discrepancy.solve(inputs, self.residuals - cheap, kernel or self.discrepancy.kernel)
@@ -196,7 +197,7 @@ def correct(
 ) -> Corrected:
     """Fit a corrected model to an engine's answers [n, m] at points of the unit cube [n, d].
 
-    The response of the cheap model is measured at the points of `cloud` [k, d]. The input mapping starts from the
+    The response of the cheap model is computed at the points of `cloud` [k, d]. The input mapping starts from the
     constants of `before`, a model fitted to fewer points. `noisy` states whether the answers are noisy.
     """
 
@@ -213,7 +214,7 @@ def correct(
         fitted = [corrected(constants, best) for constants in _likelier(shaped, random)]
         present, best = best, min([best, *fitted], key=_own_misfit)
         idle = idle + 1 if _own_misfit(present) - _own_misfit(best) < GAINED else 0
-        # A round with each of the two kernels gained nothing.
+        # Two successive rounds, one with each kernel, gained nothing.
         if idle == 2:
             break
     return best
@@ -228,7 +229,7 @@ def with_discrepancy(
     noisy: bool = False,
     guess: Corrected | None = None,
 ) -> Corrected:
-    """Fit only the discrepancy, with given constants [q]; see `correct`. `guess` provides a further start kernel."""
+    """Fit only the discrepancy, with given constants [q]; see `correct`. `guess` provides another initial kernel."""
     unit, residuals = answers
     response = Response.of(cheap.residuals(cloud, constants), cheap.model.known)
     base = cheap.residuals(unit, constants)
@@ -251,9 +252,9 @@ def constants_fit(
 ) -> Callable[[NDArray[np.float64]], Residuals]:
     """The least squares problem for the constants, with a fixed covariance of the discrepancy.
 
-    The prior is centred at `centre` [q], or at the cheap model's centre if None. `noise` perturbs the answers, in units
-    of their standard deviations [n m]. Returns a function that maps constants, scaled to the unit cube by their bounds
-    [s, q], to rows and their Jacobian. Half the sum of squares of the rows is the negative log density.
+    The prior is centred at `centre` [q], or at the cheap model's centre if None. `noise` [n m] perturbs the whitened
+    answers. Returns a function from constants, scaled to the unit cube by their bounds [s, q], to whitened errors and
+    their Jacobian. Half the sum of squared errors is the negative log density, up to a constant.
     """
     model, process, prior = corrected.cheap.model, corrected.discrepancy, corrected.cheap.constants
     points, width = corrected.cheap.box.from_unit(corrected.unit), prior.width
@@ -292,7 +293,7 @@ class Misfit(NamedTuple):
 
 
 def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> Misfit:
-    """The misfit of constants [s, q], with the shape of the discrepancy's kernel.
+    """The misfit of constants [s, q]; the discrepancy's kernel is known up to its scale.
 
     The variances of the links are integrated out. A link that the present constants do not explain therefore keeps its
     full weight for other constants.
@@ -308,7 +309,7 @@ def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> Misfit:
 
 
 def _likelier(corrected: Corrected, random: np.random.Generator) -> NDArray[np.float64]:
-    """The best constants at the end of one round [k, q], with the kernel of `corrected`."""
+    """The best constants that one round finds [k, q], with the kernel of `corrected`."""
     prior, present = corrected.cheap.constants, corrected.constants
     trials = np.vstack([present, _trials(corrected, random)])
     tried = misfit(corrected, trials)
@@ -324,7 +325,7 @@ def _likelier(corrected: Corrected, random: np.random.Generator) -> NDArray[np.f
 
 
 def _trials(corrected: Corrected, random: np.random.Generator) -> NDArray[np.float64]:
-    """Sets of constants [s, q], of which one, two or all are drawn from their prior and the rest are unchanged."""
+    """Sets of constants [s, q]; in each set, one, two or all constants are drawn from the prior."""
     size, count = len(corrected.constants), max(FOLLOWED, min(TRIALS, COMPARED // len(corrected.unit)))
     drawn = corrected.cheap.constants.draw(random.standard_normal((count, size)))
     one, another = np.eye(size, dtype=bool)[random.integers(0, size, (2, count))]
@@ -334,13 +335,13 @@ def _trials(corrected: Corrected, random: np.random.Generator) -> NDArray[np.flo
 
 
 UNLIKELY: Final = 30.0
-"""Excess in negative log density, over the number of constants plus three, above which a member is left out.
+"""A member is left out if its excess in negative log density, divided by the number of constants plus 3, reaches this.
 
 Links share errors, so the true posterior is wider than this density, which assumes independent links.
 """
 
 CAPPED: Final = 100.0
-"""Largest ratio of squared error to predicted variance that one step can contribute."""
+"""Larger ratios of squared error to predicted variance are reduced to this value."""
 
 
 class Prediction(NamedTuple):
@@ -378,14 +379,14 @@ class Averaged:
         return Prediction(mean, variance / len(predictions), predictions)
 
     def with_point(self, point: NDArray[np.float64]) -> Averaged:
-        """Add a point of the unit cube [d] as if its evaluation equalled the prediction; all members agree there."""
+        """Add a point of the unit cube [d] as if its evaluation equalled the prediction; all members then agree."""
         residuals = self.predict(point[None]).mean
         return Averaged(tuple(member.with_point(point, residuals) for member in self.members))
 
 
 @dataclass
 class ErrorRecord:
-    """Ratios of the errors of the steps so far to their predicted variances.
+    """Ratios of squared errors to predicted variances for all steps so far.
 
     Attributes:
         ratios: Ratio of mean square error to predicted variance for every step.

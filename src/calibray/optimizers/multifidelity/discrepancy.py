@@ -1,10 +1,11 @@
 """The discrepancy between an expensive model and a cheap one: a Gaussian process over the box for every residual.
 
 The discrepancy consists of an offset, a change in response and a remainder: v_0, v_1 and v_2 of `regression.py`. h(x)
-is the deviation of the cheap model's residuals from their mean over the box. Links respond similarly to the parameters,
-so paths that the cheap model lacks respond as other links do. The v_1 term is therefore the slope of a link's output
-mapping, and also helps with links that the cheap model does not predict. Each residual has its own variance, which is
-integrated out with an inverse gamma prior. A few links that the cheap model predicts badly do not affect the others.
+is the scaled deviation of the cheap model's residuals from their mean over the box. Links respond similarly to the
+parameters, so paths that the cheap model lacks respond like those of other links. The v_1 term is therefore the slope
+of a link's output mapping, and also helps with links that the cheap model does not predict. Each residual has its own
+variance, which is integrated out with an inverse gamma prior. A few links that the cheap model predicts badly do not
+affect the others.
 
 M. C. Kennedy, A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, sec. 4.
 
@@ -12,8 +13,8 @@ A process gives the uncertainty at each point, but errors at two nearby points a
 minima of an uncertain function requires samples of whole functions. A function is drawn from the prior as a sum of the
 kernel's features with normal weights. A process through the differences between the answers and that function at the
 evaluated points is then added (J. T. Wilson et al., Efficiently sampling functions from Gaussian process posteriors,
-ICML 2020, eq. 10). Features of the Matern kernel are cosines with Student's t frequencies, 5 degrees of freedom (A.
-Rahimi, B. Recht, Random features for large-scale kernel machines, NIPS 2007).
+ICML 2020, eq. 10). Features of the Matern kernel are cosines whose frequencies follow a t distribution with 5 degrees
+of freedom (A. Rahimi, B. Recht, Random features for large-scale kernel machines, NIPS 2007).
 """
 
 from __future__ import annotations
@@ -68,10 +69,10 @@ def fit(
     noisy: bool = False,
     guess: Kernel | None = None,
 ) -> Process:
-    """Fit the process to discrepancies [n, m], by the largest posterior density of its hyperparameters.
+    """Fit the process to discrepancies [n, m], with the hyperparameters of largest posterior density.
 
-    The prior is relative to `scale`, the root mean square of the cheap model's response. `noisy` also estimates the
-    nugget. `guess` is an additional starting point of the kernel search.
+    The prior is relative to `scale`, the root mean square of the cheap model's response. If `noisy`, the nugget is
+    estimated too. `guess` is an additional starting point of the kernel search.
     """
     likelihood = Likelihood(inputs, values, freedom=FREEDOM)
     prior = _prior(inputs.unit.shape[1], noisy)
@@ -188,7 +189,7 @@ def sample_function(process: Process, random: np.random.Generator, stretch: floa
         draws = random.standard_normal((rows, count)) @ process.whitened
         return (draws + independent) / np.sqrt(count + FREEDOM)
 
-    # A t variable is a normal one divided by the root of a chi-square variable over its degrees of freedom.
+    # A t variable is a normal variable divided by sqrt(c / n); c is a chi-square variable with n degrees of freedom.
     tail = np.sqrt(random.chisquare(SMOOTHNESS, (COSINES, 1)) / SMOOTHNESS)
     prior = PriorDraw(
         size[0] * correlated(1)[0],
@@ -197,13 +198,13 @@ def sample_function(process: Process, random: np.random.Generator, stretch: floa
         random.uniform(0.0, 2.0 * np.pi, COSINES),
         size[2] * np.sqrt(2.0 / COSINES) * correlated(COSINES),
     )
-    # The answers are a function plus errors, so a draw of the errors is subtracted too.
+    # The answers are the function plus errors, so a draw of the errors is subtracted too.
     scatter = stretch * np.sqrt(kernel.nugget) * correlated(count)
     missed = process.values - prior.values(inputs) - scatter
     return SampledFunction(prior, solve(inputs, missed, kernel))
 
 
 def standardized_error(process: Process, points: NDArray[np.intp]) -> float:
-    """Root mean square of leave-out errors divided by their expected standard deviations; 1 if both agree."""
+    """Root mean square of leave-one-out errors divided by their expected standard deviations; 1 if both agree."""
     expected = 1.0 / np.outer(process.inverse_diagonal, process.precision)
     return float(np.sqrt(np.mean((process.left_out_errors() ** 2 / expected)[points])))

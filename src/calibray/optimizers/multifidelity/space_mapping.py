@@ -1,27 +1,27 @@
 """Space mapping searches an expensive model with the help of a cheap one, which is corrected after every call.
 
 If you know the physics, you already have a cheap approximation of the expensive model, possibly with wrong constants.
-Its minimum is the first call. After every call, the cheap model is corrected until it agrees with all answers
+The first call is at its minimum. After every call, the cheap model is corrected until it agrees with all answers
 (`correction.py`). Many local searches then find its minima in all basins. Steps are of two kinds:
 
-- *exploitation*: among the minima of the corrected model within a trust region, the one with the lowest expected mean
-  square, uncertainty included. The trust region is a box around the best point. It is halved after a step that does not
-  improve and doubled after one that does;
-- *exploration*: the point with the largest expected improvement over the whole box, from draws of the discrepancy, as
-  in `vector_surrogate.py`. Minima of the corrected model in other basins are among the candidates. An exploration
-  follows an exploitation that gained almost nothing, and replaces one that would repeat a point.
+- *exploitation*: the engine is called at one of the minima of the corrected model within a trust region, the one with
+  the lowest expected mean square, uncertainty included. The trust region is a box around the best point. It is halved
+  after a step that does not improve and doubled after one that does;
+- *exploration*: the engine is called at the point with the largest expected improvement over the whole box, computed
+  from draws of the discrepancy as in `vector_surrogate.py`. Minima of the corrected model in other basins are among the
+  candidates. An exploration follows an exploitation that gained almost nothing, and replaces one without a new minimum.
 
 Both account for constants that a few answers cannot determine, and for the errors of earlier predictions
-(`correction.py`). Otherwise, steps on synthetic districts with planted parameters jump across half the box to predicted
-minima that do not exist.
+(`correction.py`). Otherwise, steps jump across half the box to predicted minima that do not exist, as seen on synthetic
+districts.
 
 The cheap model is used only while it helps. Each point is predicted from all other points, once by the corrected model
-and once by the same process without a cheap model; `error_ratio` compares the squared errors of the median link. After
-three and after four calls, the cheap model must reach a ratio of `HELPFUL`. Later it is dropped if the ratio exceeds
-`MISLED` twice in a row. The vector surrogate then continues with all evaluations so far. It also runs from the first
-call if there is no cheap model. The median link decides, because a few links dominate the sum over all links. On
-problems with planted parameters (eight with their cheap model, four with random sinusoids instead), the ratio was at
-most 0.66 after four calls with the right model (once 1.9 after three), and at least 1.01 with sinusoids.
+and once by the same process without a cheap model; `error_ratio` compares the squared errors of the median link. The
+first two checks, after three and four calls, fail if the ratio exceeds `HELPFUL`; later ones fail if it exceeds
+`MISLED`. After two failed checks in a row, the vector surrogate continues with all evaluations so far. It also runs
+from the first call if there is no cheap model. The median link decides, because a few links dominate the sum over all
+links. In twelve synthetic problems, eight had their own cheap model, and four had random sinusoids instead. After four
+calls, the ratio was at most 0.66 with the right model (once 1.9 after three), and at least 1.01 with sinusoids.
 
 J. W. Bandler et al., "Space mapping: the state of the art", IEEE Trans. Microw. Theory Tech. 52 (2004) 337.
 """
@@ -51,26 +51,25 @@ from calibray.optimizers.sampling import design, distance_to_nearest, draw_aroun
 from calibray.optimizers.vector_surrogate import VectorSurrogate, improvement
 
 CLOUD: Final = 64
-"""Number of points at which the cheap model's response is measured."""
+"""Number of points at which the cheap model's response is computed."""
 
 FIRST_SEARCHES: Final = 64
 """Number of local searches on the uncorrected cheap model."""
 
 SEARCHES: Final = 16
-"""Number of new local searches on each corrected model, in addition to those from earlier minima and the best
-points."""
+"""Number of local searches on each corrected model that start from Sobol points."""
 
 KEPT: Final = 8
-"""Number of earlier minima, and of best points, from which local searches start."""
+"""Number of earlier minima, of best points and of random points in the trust region from which local searches start."""
 
 SEARCH_STEPS: Final = 30
 """Largest number of steps of a local search on a model."""
 
 CONVERGED: Final = 1e-6
-"""Relative decrease of the cost, or step in the unit cube, at which a local search has converged."""
+"""Relative decrease in cost, or step in the unit cube, below which a local search has converged."""
 
 CANDIDATES: Final = 300
-"""Number of candidates drawn over the box, and of candidates around the best points."""
+"""Number of candidates drawn over the whole box, and number of candidates drawn around the best points."""
 
 DRAWS: Final = 512
 """Number of draws of the discrepancy for the expected improvement, in total over all members."""
@@ -79,10 +78,10 @@ APART: Final = 0.003
 """Distance in the unit cube below which two minima count as one."""
 
 MEMBERS: Final = 8
-"""Number of models with other constants over which predictions for the first steps are averaged."""
+"""Largest number of models with other constants that are averaged with the corrected model in the first steps."""
 
 AVERAGED: Final = 10
-"""Number of calls up to which predictions are averaged over these models."""
+"""Largest number of calls with which predictions are averaged over these models."""
 
 SEPARATION: Final = 1e-3
 """Distance in the unit cube below which a point counts as already evaluated."""
@@ -91,19 +90,19 @@ REACHES: Final = (0.02, 1.0)
 """Smallest and largest half width of the trust region, in the unit cube."""
 
 GAINED: Final = 1e-3
-"""Relative decrease in root mean square that an exploitation must reach for another one to follow."""
+"""An exploration follows an exploitation that decreases the root mean square by less than this share."""
 
 JUDGED: Final = 3
 """Number of calls after which checks of the cheap model begin."""
 
 HELPFUL: Final = 0.8
-"""Error ratio of the median link above which one of the first checks fails."""
+"""Error ratio above which one of the first `DOUBTS` checks fails."""
 
 MISLED: Final = 2.0
-"""Error ratio above which a later check fails; points are then so close together that any process predicts them."""
+"""Error ratio above which a later check fails; by then, points are so close that any process predicts them well."""
 
 DOUBTS: Final = 2
-"""Number of successive failed checks after which the cheap model is dropped, and number of the first checks."""
+"""Number of successive failed checks after which the cheap model is dropped; also the number of first checks."""
 
 
 @final
@@ -112,7 +111,7 @@ class SpaceMapping(Optimizer):
 
     Args:
         budget: Number of evaluations; 20 d if None.
-        cheap_model: The cheap model; without one, the vector surrogate searches.
+        cheap_model: The cheap model; without one, `VectorSurrogate` is used instead.
         batch: Number of candidates per batch, for engines that run in parallel.
         noisy: Whether the engine's answers are noisy.
 
@@ -152,7 +151,7 @@ class SpaceMapping(Optimizer):
 
     @property
     def corrected(self) -> Corrected | None:
-        """The cheap model as corrected by all evaluations before the last step; None if it is not used."""
+        """The cheap model as corrected with all evaluations before the last step; None if it is not used."""
         return self._corrected
 
     def _search(self, archive: Archive) -> Search:
@@ -202,7 +201,7 @@ class SpaceMapping(Optimizer):
             surrogate.tell(answers.x, answers.y, residuals=answers.residuals)
 
     def _first(self, model: CheapModel, count: int, turn: int) -> NDArray[np.float64]:
-        """The lowest minima [count, d] of the cheap model with its assumed constants, without the first `turn`."""
+        """The lowest minima [count, d] of the uncorrected cheap model, without the first `turn`; else random points."""
         d = self.box.dimension
 
         def evaluate(unit: NDArray[np.float64]) -> Residuals:
@@ -213,7 +212,7 @@ class SpaceMapping(Optimizer):
         return np.vstack([self._minima[turn:], self._rng.random((count, d))])[:count]
 
     def _averaged(self, corrected: Corrected) -> Averaged:
-        """The corrected model and others that explain the answers; half of them start from the previous members."""
+        """The corrected model and others that explain the answers; up to half of these start from previous members."""
         prior = corrected.cheap.constants
         if len(corrected.residuals) > AVERAGED or not len(prior.centre):
             return Averaged((corrected,))
@@ -235,7 +234,7 @@ class SpaceMapping(Optimizer):
         evaluated, d = archive.all(), self.box.dimension
         taken = self.box.to_unit(evaluated.x)[np.argsort(evaluated.y, kind="stable")]
         best = archive.lowest
-        # The first point is the best one.
+        # `taken[0]` is the best point.
         near = np.clip(taken[0] + self._reach * self._rng.uniform(-1.0, 1.0, (KEPT, d)), 0.0, 1.0)
         starts = np.vstack([taken[:KEPT], near, self._minima[:KEPT], design("sobol", SEARCHES, d, self._rng)])
         ends = descend_all(starts, model.members[0].mean_and_slope, SEARCH_STEPS, CONVERGED)
@@ -268,7 +267,7 @@ class SpaceMapping(Optimizer):
         prediction, gain = model.predict(candidates), np.zeros(len(candidates))
         draws = max(1, DRAWS // len(model.members))
         for member, (residuals, share) in zip(model.members, prediction.members, strict=True):
-            # Earlier squared errors exceeded predicted variances by this factor, so deviations are scaled by its root.
+            # Squared errors so far exceeded predicted variances by this factor, so deviations grow by its square root.
             mean = prediction.mean + np.sqrt(stretch) * (residuals - prediction.mean)
             normal = self._rng.standard_normal((draws, len(member.root)))
             gain += improvement(mean, stretch * share, normal @ member.root, best)
@@ -285,7 +284,7 @@ class SpaceMapping(Optimizer):
 
 
 def error_ratio(corrected: Corrected, *, noisy: bool = False) -> float:
-    """Ratio of the squared error with the cheap model to that without it, for the median link.
+    """Median over the links of the ratio of the squared errors with and without the cheap model.
 
     Each of at least three points is predicted from all others. The cheap model helps if the ratio is below 1. `noisy`
     states whether the answers are noisy, for the process without the cheap model.
