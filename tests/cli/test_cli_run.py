@@ -241,7 +241,7 @@ def test_predict_takes_the_measured_table_and_the_results_own(folder, ran, tmp_p
         (("trace", "{study}", "-o", "{folder}"), "is a folder; name a file in it"),
         (("trace", "{study}"), "trace: give -o FILE to store the paths, --check to check them, or both"),
         (("validate", "{study}", "--out", "{damaged}"), "result.json: is not a result"),
-        (("predict", "{folder}", "{file}"), "is not a result of `calibray run`"),
+        (("predict", "{folder}", "{file}"), "is not a result written by `calibray run`"),
         (("predict", "{result}", "{twice}"), "has the columns 'path_loss_db' and 'input_path_loss_db'"),
         (("predict", "{result}", "{folder}/absent.csv"), "absent.csv: no such file"),
         (

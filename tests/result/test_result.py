@@ -162,14 +162,14 @@ def test_a_crash_while_saving_leaves_the_older_files(result, folder, monkeypatch
 
 
 def test_only_folders_with_a_result_are_loaded(folder, tmp_path):
-    with pytest.raises(InputError, match="is not a result of `calibray run`"):
+    with pytest.raises(InputError, match="is not a result written by `calibray run`"):
         Result.load(tmp_path)
     text = (folder / "result.json").read_text()
     (folder / "result.json").write_text(text[:100])
     with pytest.raises(InputError, match="is not a result"):
         Result.load(folder)
     (folder / "result.json").write_text(text.replace('"version": 1,', '"version": 99,', 1))
-    with pytest.raises(InputError, match="version 99, need 1; run the study again"):
+    with pytest.raises(InputError, match="version 99, must be 1; run the study again"):
         Result.load(folder)
 
 
@@ -231,7 +231,7 @@ def edited(folder, **changes):
             },
             "verdict = 'x'",
         ),
-        ({"version": 2}, "has version 2, need 1"),
+        ({"version": 2}, "has version 2, must be 1"),
         ({"study__version": 7}, "reads version 1"),
     ],
 )

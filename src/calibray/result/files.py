@@ -68,14 +68,14 @@ COLUMNS: Final = {"result-links.csv": LINKS, "result-history.csv": HISTORY}
 """Columns of each file and the NumPy kind of their values: integer, float or Boolean."""
 
 OPTIONAL: Final = ("leverage", "depth", "out_of_sight", "obstruction_m", "region_m")
-"""Columns of numbers that are optional."""
+"""Optional columns of numbers."""
 
 FINITE: Final = ("measured_db", "log_distance_db", "best_db", "seconds")
-"""Columns without infinite or missing values; in other columns, a link without a path is infinite or empty."""
+"""Columns with only finite values; in other columns, the value of a link without a path can be infinite or empty."""
 
 
 class LinkCounts(Section):
-    """Numbers of links, for readers of the file; see `Record.counts`. `read` ignores them."""
+    """Numbers of links, for people who read the file; see `Record.counts`. `read` ignores this section."""
 
     calibrated_on: Count
     held_out: Count
@@ -87,7 +87,7 @@ class LinkCounts(Section):
 class Stored(Section):
     """The content of `result.json`: the sections of a `Record`.
 
-    `study_from_here` is the path of the study file relative to the result's folder, as both may have moved together.
+    `study_from_here` is the path of the study file relative to the result's folder, because both may move together.
     """
 
     version: Literal[1]
@@ -112,9 +112,9 @@ SECTIONS: Final = ("fit", "accuracy", "uncertainty", "nuisance", "prediction", "
 def content(
     record: Record, sentences: tuple[str, ...] = (), files: dict[str, str] | None = None
 ) -> dict[str, Any]:
-    """The content of `result.json` for a result: everything but its tables, and its remarks as sentences.
+    """The content of `result.json`: everything in a result except its tables, plus its remarks as sentences.
 
-    `files` is the SHA-256 of each other file of the result, by name, once they are written.
+    `files` has the SHA-256 of the other files of the result, by name, if these are already written.
     """
     parts = {name: getattr(record, name) for name in SECTIONS}
     values = {name: TypeAdapter(type(part)).dump_python(part, mode="json") for name, part in parts.items()}
@@ -141,7 +141,7 @@ def write(
 
     Each file is written under a temporary name and then renamed, so every file is complete or absent. `result.json` is
     written last and contains the digests of the other files: if the run is killed before that, `read` rejects the
-    mixture of two runs. Sentences and the figures of the validation are for readers of the files.
+    mixture of two runs. `sentences` and the figures in `validation` are for people; `read` ignores them.
 
     Raises:
         InputError: The folder cannot be written, or a file there must not be replaced.
@@ -177,11 +177,11 @@ def write(
 def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str, Any]:
     """Read the fields of a `Record` from a folder that `write` wrote.
 
-    With `allow_changed_inputs`, files may have been changed after they were written.
+    With `allow_changed_inputs`, files that were edited after they were written are accepted.
 
     Raises:
-        InputError: The folder contains no result, a result of a different version, a damaged or edited one, or files of
-            several runs.
+        InputError: The folder contains no result, a result of a different version, a damaged or edited result, or files
+            of several runs.
     """
     source = as_path(folder, "result") / RESULT_FILE
     stored, study = _read_stored(source)
@@ -222,13 +222,13 @@ def _read_stored(source: Path) -> tuple[Stored, Study]:
         values = json.loads(source.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
-            f"{source}: is not a result of `calibray run` ({error}); give its --out folder"
+            f"{source}: is not a result written by `calibray run` ({error}); give its --out folder"
         ) from None
     if not isinstance(values, dict):
         raise InputError(f"{source}: must contain a JSON object; run the study again")
     if values.get("version") != VERSION:
         raise InputError(
-            f"{source}: has version {shortened(repr(values.get('version')))}, need {VERSION}; run the study again"
+            f"{source}: has version {shortened(repr(values.get('version')))}, must be {VERSION}; run the study again"
         )
     try:
         # In JSON mode Pydantic accepts lists as tuples and converts nothing else.
@@ -265,7 +265,7 @@ def _check_consistent(stored: Stored, study: Study, source: Path) -> None:
                 "study again"
             )
         value, calibrated = getattr(fit.materials[material], constant, None), fit.parameters[name]
-        # A coefficient of a law is not a constant of the material, so that `value` is None for it.
+        # A coefficient of a law is not a constant of the material, so its `value` is None.
         if value is not None and abs(value - calibrated) > 1e-9 * max(abs(value), 1e-300):
             raise InputError(
                 f"{source}: fit.materials.{material}.{constant} = {value:g}, but fit.parameters has {calibrated:g}; "
@@ -294,7 +294,7 @@ def _check_consistent(stored: Stored, study: Study, source: Path) -> None:
 
 
 def check_same_study(study: Study, folder: Path) -> None:
-    """Reject a folder whose result cannot be read or belongs to another study; accept one without a result.
+    """Reject a folder whose result cannot be read or belongs to another study; accept a folder without a result.
 
     Raises:
         InputError: The result cannot be read or belongs to another study.
@@ -308,10 +308,10 @@ def check_same_study(study: Study, folder: Path) -> None:
 
 
 def write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figures: dict[str, Any]) -> None:
-    """Write held-out errors of a study into a folder; the figures are for readers of the file.
+    """Write the held-out errors of a study to a folder; the figures are for people who read the file.
 
     Raises:
-        InputError: The folder contains a result of another study or of different links, or one that cannot be read.
+        InputError: The folder contains a result of another study or of different links, or an unreadable result.
     """
     check_same_study(study, folder)
     if (folder / RESULT_FILE).is_file():
@@ -319,8 +319,8 @@ def write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figure
         if not _same(held_out.measured_db, measured_db):
             raise InputError(
                 f"{folder}: its result has different links ({len(measured_db)}, but the validation has "
-                f"{len(held_out.measured_db)}); give another folder, or run the study again, with [holdout] by if --by "
-                "separates rows of one link"
+                f"{len(held_out.measured_db)}); give another folder, or run the study again, and set [holdout] by if "
+                "--by separates rows of one link"
             )
     _write_validation(held_out, study, folder, figures)
 
@@ -348,7 +348,7 @@ def _rounded(values: NDArray[np.float64]) -> list[float | None]:
 
 
 def _problem_digest(study: Study) -> str:
-    """SHA-256 of what determines a study's validation: not the method, seed or engine, which `run` may change."""
+    """SHA-256 of a study without its hold-out, and without method, seed and engine, which `run` may change."""
     content = {
         key: value for key, value in study.content().items() if key not in ("method", "engine", "holdout")
     }
@@ -361,12 +361,14 @@ def _problem_digest(study: Study) -> str:
 
 
 def _same(first_db: NDArray[np.float64], second_db: NDArray[np.float64]) -> bool:
-    """Whether path loss was measured on the same links [links], [dB]; files contain rounded values."""
+    """Whether two arrays of measured path loss [links], [dB], agree to within the rounding of values in files."""
     return len(first_db) == len(second_db) and bool(np.abs(first_db - second_db).max() <= 1e-3)
 
 
 def read_validation(folder: Path, study: Study, measured_db: NDArray[np.float64]) -> HeldOutErrors | None:
-    """Read the held-out errors of a result with measured path loss [links], [dB]; None if it was not validated.
+    """Read the held-out errors of a result; None if it was not validated.
+
+    `measured_db` is the measured path loss of the result's links [links], [dB].
 
     Raises:
         InputError: The file was damaged or edited, or belongs to another study or to different links.
@@ -382,19 +384,19 @@ def read_validation(folder: Path, study: Study, measured_db: NDArray[np.float64]
         raise
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(
-            f"{file}: is not a validation of `calibray validate` ({error}); validate again"
+            f"{file}: is not a validation written by `calibray validate` ({error}); validate again"
         ) from None
     if not belongs or not _same(held_out.measured_db, measured_db):
         raise InputError(
-            f"{file}: belongs to a different study or measurements from {RESULT_FILE}; run the study again, or "
-            "remove the file and validate again"
+            f"{file}: belongs to a different study or different measurements from {RESULT_FILE}; run the study again, "
+            "or remove the file and validate again"
         )
     return held_out
 
 
 def _checked_validation(file: Path, values: dict[str, Any], links: int) -> HeldOutErrors:
     if values["version"] != VERSION:
-        raise InputError(f"{file}: has version {values['version']!r}, need {VERSION}; validate again")
+        raise InputError(f"{file}: has version {values['version']!r}, must be {VERSION}; validate again")
     rows = values["links"]
     held_out = HeldOutErrors(
         labels=tuple(map(str, values["blocks"])),
@@ -408,7 +410,9 @@ def _checked_validation(file: Path, values: dict[str, Any], links: int) -> HeldO
     lengths = {"block": len(block), "position": len(position), "measured_db": len(held_out.measured_db)}
     lengths |= {name: len(errors) for name, errors in held_out.errors.items()}
     if wrong := [name for name, length in lengths.items() if length != links]:
-        raise InputError(f"{file}: {wrong[0]} must have the result's {links} links; validate again")
+        raise InputError(
+            f"{file}: {wrong[0]} must have a value for each of the {links} links; validate again"
+        )
     judged = block >= 0
     if position.shape != (links, 3) or not judged.any() or block.max() >= len(held_out.labels):
         raise InputError(f"{file}: blocks or positions are invalid; validate again")
@@ -416,7 +420,7 @@ def _checked_validation(file: Path, values: dict[str, Any], links: int) -> HeldO
         raise InputError(f"{file}: an error of a judged link is missing; validate again")
     if not {Model.INITIAL, Model.CALIBRATED} <= set(held_out.errors):
         raise InputError(
-            f"{file}: is not a validation of `calibray validate` (a model is missing); validate again"
+            f"{file}: is not a validation written by `calibray validate` (a model is missing); validate again"
         )
     if not 0 < held_out.level < 1:
         raise InputError(f"{file}: level = {held_out.level:g}: must be between 0 and 1; validate again")
@@ -424,10 +428,10 @@ def _checked_validation(file: Path, values: dict[str, Any], links: int) -> HeldO
 
 
 def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
-    """Read a table from a result's folder; check the required columns, each of kind "i", "f" or "b".
+    """Read a table from a result's folder, and check the required columns against their kinds: "i", "f" or "b".
 
     Raises:
-        InputError: The file does not exist, lacks a column, or has invalid values in one.
+        InputError: The file does not exist, lacks a column, or has invalid values in a column.
     """
     file = folder / name
     if not exists(file):
@@ -437,13 +441,13 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
         table = pd.read_csv(file, converters={"group": without_formula_mark})
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{file}: is not a table of `calibray run` ({str(error).splitlines()[0]}); give its --out folder"
+            f"{file}: is not a table written by `calibray run` ({str(error).splitlines()[0]}); give its --out folder"
         ) from None
     for column, kind in columns.items():
         if column not in table:
             raise InputError(f"{file}: has no column {column!r}; run the study again")
         actual = table[column].dtype.kind
-        # Integers are valid floats. Columns of a table without rows have no kind.
+        # Integers are valid floats. In a table without rows, columns have no kind to check.
         if len(table) and actual != kind and not (kind == "f" and actual == "i"):
             raise InputError(f"{file}: column {column!r} has values of the wrong type; run the study again")
         if kind == "f":

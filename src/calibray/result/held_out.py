@@ -31,7 +31,7 @@ class Model(StrEnum):
 
 
 WITHOUT_MATERIALS: Final = (Model.LOG_DISTANCE, Model.OBSTRUCTION)
-"""Models that use no paths; the second uses the scene's walls and roofs."""
+"""Models that use no paths; the second one uses the walls and roofs of the scene."""
 
 BASELINES: Final = (Model.INITIAL, *WITHOUT_MATERIALS, Model.KRIGING)
 """Models that calibrate no material."""
@@ -52,7 +52,7 @@ AVERAGE_OF: Final[dict[str, Model]] = {
     Model.CALIBRATED: Model.AVERAGE_CALIBRATED,
     Model.OFFSETS: Model.AVERAGE_OFFSETS,
 }
-"""The average that makes the predictions if blocks choose a model."""
+"""The average that replaces a chosen model in predictions."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class ObservableErrors:
         unit: The unit.
         links: Number of held-out links with a value.
         rmse: RMSE of the calibrated model.
-        mean_rmse: RMSE of predicting the mean of the other links.
-        distance_rmse: RMSE of a distance law fitted to the other links.
+        mean_rmse: RMSE of a baseline that predicts the mean value of the other links.
+        distance_rmse: RMSE of a baseline that is linear in distance or its logarithm, fitted to the other links.
     """
 
     unit: str
@@ -85,7 +85,7 @@ class HeldOutErrors:
         position: Positions of the end that moves [links, 3], [m]; see `moving_end`.
         measured_db: Measured path loss [links], [dB].
         level: Nominal coverage of the intervals.
-        observables: Errors of the further observables by name; empty in a loaded result, whose accuracy contains them.
+        observables: Errors of the further observables by name; empty in a loaded result, where `Accuracy` has them.
     """
 
     labels: tuple[str, ...]
@@ -99,14 +99,14 @@ class HeldOutErrors:
 
 @dataclass(frozen=True)
 class Judgement:
-    """The calibrated model compared with its best baseline, on links to which neither was fitted.
+    """Comparison of the calibrated model with its best baseline, on links to which neither was fitted.
 
     Attributes:
         links: Number of links.
         rmse_db: RMSE of the calibrated model [dB].
         baseline: Name of the best baseline.
-        baseline_rmse_db: Its RMSE [dB].
-        error_db: Bootstrap standard error of the difference [dB]; None if the links form one cluster.
+        baseline_rmse_db: RMSE of this baseline [dB].
+        error_db: Bootstrap standard error of the difference in RMSE [dB]; None if there are fewer than two clusters.
         clusters: Number of clusters of neighbouring links that were resampled.
     """
 
@@ -124,10 +124,10 @@ class Judgement:
 
     @property
     def helped(self) -> bool:
-        """Whether the gain exceeds its standard error significantly (Student's t, clusters - 1 degrees of freedom)."""
+        """Whether the gain is significantly greater than zero (Student's t, clusters - 1 degrees of freedom)."""
         if self.error_db is None:
             return False
-        # The standard error comes from resampling the clusters.
+        # Clusters are resampled to compute the standard error, so they determine its degrees of freedom.
         return self.gain_db > float(stdtrit(max(self.clusters - 1, 1), (1 + CONFIDENCE) / 2)) * self.error_db
 
 
@@ -145,11 +145,11 @@ class FittedTerm:
     Attributes:
         name: Name of the term.
         by: Column of the term: "constant", "log_distance", or a column of the links' table.
-        per: Groups of the term: "offset" for those of the study's offset, "transmitter", a column, or "" for none.
-        coefficients: Coefficient by group, [dB] per unit of the column; groups without data have the others' mean.
+        per: Groups of the term: "offset" for the groups of the study's offset, "transmitter", a column, or "" for none.
+        coefficients: Coefficient by group, [dB] per unit of the column; other groups get the mean of these.
         centre: Value that is subtracted from the column.
-        spread_db: Standard deviation between groups of a random effect, [dB] per unit of the column; None for the
-            standard deviation of the coefficients.
+        spread_db: Standard deviation between the groups of a random effect, [dB] per unit of the column; if None, the
+            standard deviation of the coefficients is used.
     """
 
     name: str
@@ -162,15 +162,15 @@ class FittedTerm:
 
 @dataclass(frozen=True)
 class BlockErrors:
-    """Errors on new links at two levels: within blocks of neighbouring links, and common to a block.
+    """Errors on new links at two levels: within blocks of neighbouring links, and common to all links of a block.
 
     Attributes:
         within_db: Standard deviation of the error of an individual link [dB].
         between_db: Standard deviation of the error that the links of a new block have in common [dB].
         blocks: Number of blocks.
-        reach_m: Distance from a held-out link to the nearest calibration link, 90 % quantile [m].
-        groups_db: RMS contribution to these errors of random effects whose group has no links outside the block [dB].
-        out_of_sight: Errors of links out of sight relative to those of all links; at least 1.
+        reach_m: 90 % quantile of the distance from a held-out link to the nearest calibration link [m].
+        groups_db: RMS contribution to these errors by the random effects of groups that occur in one block only [dB].
+        out_of_sight: RMS error of links out of sight divided by that of all links; at least 1.
     """
 
     within_db: float
@@ -187,14 +187,14 @@ class PredictionModel:
 
     Attributes:
         name: Name of the model; see `held_out.Model`.
-        parameters: Values of the parameters in the fields' units; None if the model uses no scene.
+        parameters: Values of the parameters, in their units; None if the model uses no scene.
         terms: Nuisance terms of the model.
-        residual_db: RMS of its residuals on new links [dB]; None if there are too few links.
+        residual_db: RMS of the model's residuals on new links [dB]; None if there are too few links.
         basis: Description of the links on which these residuals were computed.
         links: Number of these links, or degrees of freedom if they are calibration links.
-        sizes_db: Absolute held-out residuals, ascending, or 400 quantiles of them if there are more [dB].
-        blocks: Standard deviations of these residuals at two levels; None if no links, or too few, were held out.
-        averaged: Second set of parameter values, if path loss is the average over both sets; otherwise None.
+        sizes_db: Absolute held-out residuals, ascending [dB]; 400 quantiles if there are more than 400 residuals.
+        blocks: Standard deviations of these residuals at two levels; None if no links or too few were held out.
+        averaged: Second set of parameter values, if path loss is the average over two sets; otherwise None.
     """
 
     name: str

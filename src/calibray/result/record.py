@@ -25,7 +25,7 @@ from calibray.scenes import Scene
 from calibray.study import Study
 from calibray.tracing.protocol import EnclosedAntennas
 
-# `files` validates the sections with Pydantic when it reads them, including these bounds of numbers.
+# When `files` reads the sections, Pydantic validates them, including these bounds of numbers.
 NonNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=0)]
 Offset = Annotated[float, Field(ge=-500, le=500)]
@@ -35,7 +35,7 @@ Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 @dataclass(frozen=True)
 class ObservableFit:
-    """Accuracy of the calibrated model for a further observable of the calibration links.
+    """Accuracy of the calibrated model for a further observable, on the calibration links.
 
     Attributes:
         kind: What was measured.
@@ -43,8 +43,8 @@ class ObservableFit:
         links: Number of calibration links with a value.
         rmse: RMSE of the calibrated model.
         initial_rmse: RMSE with the initial materials.
-        mean_rmse: RMSE of predicting the mean value, as a baseline.
-        error: Standard deviation of a value's error, stated or estimated.
+        mean_rmse: RMSE of a baseline that predicts the mean value for every link.
+        error: Standard deviation of the error of a value, stated or estimated.
         biases: Bias by group; the group "" means all links.
         bias_errors: Standard error of each bias, including the uncertainty of the parameters.
     """
@@ -65,19 +65,19 @@ class Fit:
     """The candidate with the lowest RMSE, and its accuracy on the calibration links.
 
     Attributes:
-        parameters: Calibrated values by name, in the fields' units.
+        parameters: Calibrated values by parameter, in the units of the parameters.
         initial_parameters: Values before calibration.
-        materials: All materials of the scene at its carrier, with the calibrated values.
-        laws: Coefficients itu_a to itu_d of ITU-R P.2040 by material, if one of them is a parameter.
+        materials: All materials of the scene at the study's carrier, with the calibrated values.
+        laws: Coefficients itu_a to itu_d of ITU-R P.2040 by material, for laws with a coefficient among the parameters.
         rmse_db: RMSE over the calibration links (paper eq. 1) [dB].
         initial_rmse_db: RMSE with the initial materials and no nuisance [dB].
         nuisance_only_rmse_db: RMSE with the initial materials and fitted nuisances [dB]; None without nuisances.
         log_distance_rmse_db: RMSE of a log-distance model fitted to the calibration links [dB].
         retrace_gap_db: Largest change of a calibration link's path loss when the scene is traced again with the
             calibrated materials [dB]; None if the paths do not depend on the materials.
-        power_shares: Share of the links' power by material and kind of interaction; "line of sight" for paths
-            without interaction. Shares add up to more than 1, because a path counts for each of its interactions.
-        observables: The further observables by name.
+        power_shares: Share of the links' power by material and kind of interaction; "line of sight" for paths without
+            interaction. The shares can add up to more than 1, because a path counts for each of its interactions.
+        observables: Accuracy for the further observables by name.
     """
 
     parameters: dict[str, float]
@@ -102,7 +102,7 @@ class Accuracy:
         initial_holdout_rmse_db: RMSE with the initial materials and no nuisance [dB].
         nuisance_only_holdout_rmse_db: RMSE with the initial materials and fitted nuisances [dB].
         log_distance_holdout_rmse_db: RMSE of the log-distance model fitted to the calibration links [dB].
-        judgement: The calibrated model compared with its best baseline.
+        judgement: Comparison of the calibrated model with its best baseline.
         observables: Errors of the further observables by name.
     """
 
@@ -121,8 +121,8 @@ class Uncertainty:
     Attributes:
         intervals: 95 % interval and verdict by parameter.
         draws: Draws from the posterior by parameter, constant and nuisance coefficient; empty if none could be made.
-        constants_db: Constants that the scene fixes and that vary in the draws, each with the change of path loss per
-            standard deviation [dB].
+        constants_db: Constants that the scene fixes and that vary in the draws, each with the change in path loss per
+            standard deviation of the constant [dB].
         noise: Posterior weights of the noise models and of an undeclared offset.
         undeclared_offset_db: The best-fitting offset if the study declares none [dB]; None if it was not estimated.
         undeclared_offset_error_db: Standard error of this offset [dB].
@@ -143,9 +143,9 @@ class Nuisance:
     """Coefficients of the study's nuisances at the candidate with the lowest RMSE.
 
     Attributes:
-        coefficients: By term and group, [dB] per unit of the term's column; the offset is the term "offset", and the
-            group "" means all links.
-        centres: Value that is subtracted from the column of a term, by term.
+        coefficients: Coefficient by term and group, [dB] per unit of the term's column; the offset is the term
+            "offset", and the group "" means all links.
+        centres: Value that is subtracted from the term's column, by term.
         groups_without_path: Groups without an offset, because none of their calibration links has a path.
     """
 
@@ -155,7 +155,7 @@ class Nuisance:
 
     @property
     def offsets_db(self) -> dict[str, float]:
-        """Offsets by group [dB]; empty without an offset."""
+        """Offset by group [dB]; empty if the study has no offset."""
         return self.coefficients.get("offset", {})
 
 
@@ -164,9 +164,10 @@ class Prediction:
     """The model that predictions, maps, exports and the report use.
 
     Attributes:
-        model: The model: the one that held-out links choose, or the calibrated one if no links were held out.
-        materials: All materials of the scene at its carrier with the model's parameters; None if it uses no scene.
-        residual_field: The correlated part of its residuals; None if they are uncorrelated.
+        model: The prediction model: chosen by errors on held-out links, or the calibrated model if there are too few.
+        materials: All materials of the scene at the study's carrier, with the values of the model's parameters; None if
+            the model uses no scene.
+        residual_field: The spatially correlated part of the residuals; None if the residuals are uncorrelated.
         fallback: The model for links without a path; None if the model uses no scene, or the study states a ceiling.
     """
 
@@ -183,7 +184,7 @@ class Cost:
     Attributes:
         rt_calls: RT calls of the method, including those answered by the ledger.
         ledger_hits: RT calls that the ledger answered.
-        seconds: Time taken by the method, without tracing [s].
+        seconds: Time taken by the method, excluding tracing [s].
         trace_seconds: Time taken by tracing and loading before the search [s].
         uncertainty_replays: Number of replays for intervals and draws.
         uncertainty_seconds: Time taken by these replays [s].
@@ -218,22 +219,22 @@ class Provenance:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Record:
-    """The data of a finished calibration: abstract; `calibration.result.Result` is the final class.
+    """The data of a finished calibration. This class is abstract; `calibration.result.Result` is the final class.
 
     Attributes:
         study: The study, with the method, seed and engine that ran.
         fit: The candidate with the lowest RMSE.
         accuracy: Accuracy on held-out links.
-        uncertainty: Intervals, draws, warnings.
+        uncertainty: Intervals, draws and warnings.
         nuisance: Coefficients of the nuisances.
         prediction: The model that predictions use.
         cost: RT calls, replays and time.
         provenance: The inputs of the calibration.
-        links: One row per link: row in the source file; path loss [dB] measured, before and after calibration, of the
-            log-distance model, of the prediction model (of its fallback for links without a path), and of its scene
-            alone; has_path; held_out; change of path loss when traced again [dB]; positions tx_x to rx_z [m]. Where
-            they apply: group, frequency [Hz], path loss with the nuisances alone [dB], values in the measured
-            quantity, leverage, depth, and whether the link is censored or expected near the noise floor.
+        links: One row per link: row in the source file; path loss [dB] as measured, before and after calibration, by
+            the log-distance model, by the prediction model (by the fallback for links without a path), and by the scene
+            of the prediction model alone; has_path; held_out; change in path loss when traced again [dB]; positions
+            tx_x to rx_z [m]. Where they apply: group, frequency [Hz], path loss with the nuisances alone [dB], values
+            in the measured quantity, leverage, depth, and whether the link is censored or near the noise floor.
         history: One row per RT call: number, iteration, RMSE, best so far, seconds since the start.
         held_out: Held-out errors of every model, if blocks were held out in turn; None otherwise.
         scene: The scene as it was read; None in a loaded result.
@@ -256,12 +257,12 @@ class Record:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Calibrated values by name, in the fields' units."""
+        """Calibrated values by parameter, in the units of the parameters."""
         return self.fit.parameters
 
     @property
     def materials(self) -> dict[str, Material]:
-        """All materials of the scene at its carrier, with the calibrated values."""
+        """All materials of the scene at the study's carrier, with the calibrated values."""
         return self.fit.materials
 
     @property
@@ -276,7 +277,7 @@ class Record:
 
     @property
     def scene_materials(self) -> dict[str, Material]:
-        """The materials that exports write: the prediction model's, or the calibrated ones if it uses no scene."""
+        """The materials that exports write: those of the prediction model, or the calibrated ones if it has none."""
         return self.materials if self.prediction.materials is None else self.prediction.materials
 
     @property

@@ -23,13 +23,11 @@ class Verdict(StrEnum):
 class ReasonKind(StrEnum):
     """Reasons for a verdict; the comments list the values of each kind."""
 
-    WIDTH = (
-        "width"  # share of the range or a customary one; further ranges of the interval: lower, upper, weight
-    )
+    WIDTH = "width"  # share of the range or of a usual range; ranges: other parts of the interval: lower, upper, weight
     SEEN_BUILDINGS = "seen buildings"  # share of the range for the buildings that were measured
     SEPARATE_RANGES = "separate ranges"  # ranges: most probable value, weight
-    AT_BOUND = "at bound"  # side and the other end of the interval
-    NO_EFFECT = "no effect"  # change_db of any link over the whole range
+    AT_BOUND = "at bound"  # side, "lower" or "upper"; value, the other end of the interval
+    NO_EFFECT = "no effect"  # change_db, the largest change in path loss of a link over the whole range
     TRADE_OFF = "trade-off"  # the other parameter and the rank correlation
     CONFOUNDED = "confounded"  # change_db over the range, compensated by other unknowns
     NOISE = "noise"  # change_db over the range, noise_db
@@ -72,15 +70,15 @@ class Interval:
 
     Attributes:
         standard_error: Standard error from the curvature of the sum of squares at the optimum, in the parameter's unit.
-        lower: Lower end of the 95 % interval, within the bounds; if there are several pieces, of the lowest.
-        upper: Upper end of the interval; if there are several pieces, of the highest.
+        lower: Lower end of the 95 % interval, within the bounds; that of the lowest piece if there are several pieces.
+        upper: Upper end of the interval; that of the highest piece if there are several pieces.
         verdict: The verdict on the parameter.
         pieces: Lower and upper end of every piece, ascending, if the interval was computed from draws.
         reason: The reason for the verdict.
-        approximate: Whether an emulator replaced an engine that gives no derivatives.
-        seen: Pieces of the 95 % interval for the buildings that the links meet, which predictions use; empty if they
-            equal the pieces for the mean over all buildings of this kind.
-        without: Share of the width that remains if a cause is ruled out, by cause, for the causes that matter.
+        approximate: Whether the interval comes from an emulator, because the engine gives no derivatives.
+        seen: Pieces of the 95 % interval for the buildings that the links' paths meet; predictions use these. Empty if
+            they equal the pieces for the mean over all buildings of this material.
+        without: Share of the width that would remain if a cause were ruled out, by cause; only for causes that matter.
     """
 
     standard_error: float
@@ -119,9 +117,8 @@ class RemarkKind(StrEnum):
     HETEROGENEITY = "heterogeneity"  # weight, gaussian_weight
     UNDECLARED_OFFSET = "undeclared offset"  # offset_db, error_db, rmse_db, rmse_without_db
     MISSED_OPTIMUM = "missed optimum"  # draws_db, found_db
-    OUTSIDE_INTERVAL = (
-        "outside interval"  # names, values, pieces (ends in a row), most_probable, cause, odds, blocks
-    )
+    # names, values, pieces (lower and upper ends in turn), most_probable, cause, odds, blocks
+    OUTSIDE_INTERVAL = "outside interval"
     FEW_DRAWS = "few draws"
     APPROXIMATE_INTERVALS = "approximate intervals"  # engine, calls, error_db, replay
     # understood, reached, calls, changed (paths), changed_db and lost (links), half_space (all surfaces), half_spaces
@@ -138,13 +135,12 @@ class RemarkKind(StrEnum):
     ANTENNA_DIRECTIONS = "antenna directions"
     # column, labels, differences_db, errors_db, others (columns that also explain residuals), per, chance
     DIFFERING_GROUPS = "differing groups"
-    UNREACHED_LINKS = (
-        "unreached links"  # links, of (all), sample, switches, reached (links of the sample by switch)
-    )
+    # links, of (all), sample, switches, reached (links of the sample by switch)
+    UNREACHED_LINKS = "unreached links"
 
 
 Value = float | int | bool | str | list[str] | list[float] | list[list[float]]
-"""Types of a remark's values, all of which JSON can express."""
+"""Types that the values of a remark can have; JSON can express all of them."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The sentences of a result, for terminal, page and JSON: this module converts the data of the statistics to text."""
+"""The sentences of a result for the terminal, the page and JSON. This module converts the statistics to text."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def reason_text(reason: Reason | None) -> str:
 
 
 def explanation_text(interval: Interval) -> str:
-    """The reason for a verdict, and what would narrow the interval: clauses without a full stop; empty without any."""
+    """The reason for a verdict, and what would narrow the interval: clauses without a full stop; empty if none."""
     clauses = [reason_text(interval.reason)]
     if interval.seen:
         ends = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in interval.seen[:SHOWN_PIECES])
@@ -102,11 +102,11 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
         f"it trades off with {values['parameter']} (rank correlation {values['correlation']:.2f})"
     ),
     ReasonKind.CONFOUNDED: lambda values, _: (
-        f"links change by up to {values['change_db']:.1f} dB over its range, but other unknowns can compensate: an "
-        "offset, or errors that links share"
+        f"path loss changes by up to {values['change_db']:.1f} dB over the range, but other unknowns can compensate: "
+        "an offset, or errors that links share"
     ),
     ReasonKind.NOISE: lambda values, _: (
-        f"links change by up to {values['change_db']:.1f} dB over its range, too little compared with noise of "
+        f"path loss changes by up to {values['change_db']:.1f} dB over the range, too little compared with noise of "
         f"{values['noise_db']:.1f} dB"
     ),
     ReasonKind.OUTSIDE_INTERVAL: lambda values, _: (
@@ -120,8 +120,8 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
     ),
     ReasonKind.NO_NOISE: lambda values, _: "the data contain no noise",
     ReasonKind.TOO_MANY_LINKS: lambda values, _: (
-        f"from the curvature at the optimum alone: for more than {values['limit']:,.0f} links, correlated noise is not "
-        "considered"
+        f"the interval follows from the curvature at the optimum alone: with more than {values['limit']:,.0f} links, "
+        "correlated noise is not considered"
     ),
 }
 
@@ -221,7 +221,7 @@ def _conflict(values: dict[str, Any]) -> str:
             f"Measured {observables} changes from link to link by {values['slope']:.2f} times the change that the "
             f"calibrated model predicts (standard error {values['slope_error']:.2f}), "
             f"{values['standard_errors']:.1f} standard errors below 1. Path loss or further observables alone require "
-            f"{answers}. Check that the values belong to these links and this scene, and the receiver's range."
+            f"{answers}. Check the receiver's range, and that the values belong to these links and this scene."
         )
     return (
         f"Path loss and {observables} require parameter values that differ by {values['standard_errors']:.1f} standard "
@@ -379,11 +379,11 @@ _BASELINES: Final[dict[str, str]] = {
     Model.LOG_DISTANCE: "a log-distance model",
     Model.OBSTRUCTION: "a log-distance model with obstruction",
 }
-"""Names of baselines within a sentence, if they differ from the models' names; an offset is a nuisance."""
+"""Names of baselines within a sentence, if they differ from the names of the models."""
 
 
 def judgement_text(judgement: Judgement) -> str:
-    """Whether calibration helped on held-out links, by how much compared with the best baseline, and how certainly."""
+    """Whether calibration improved on the best baseline on held-out links, by how much, and with what certainty."""
     error = f"RMSE {judgement.rmse_db:.2f} dB on {counted(judgement.links, 'held-out link')}"
     certainty = "no bootstrap error: one cluster of links"
     if judgement.error_db is not None:
@@ -397,9 +397,10 @@ def judgement_text(judgement: Judgement) -> str:
 
 
 def choice_text(chosen: str, best: str, partner: str | None = None) -> str:
-    """Which model held-out blocks choose, and why; `best` is their best model of those that can predict any link.
+    """Which model is chosen on held-out blocks, and why.
 
-    `partner` is the model with which the chosen one is averaged.
+    `best` has the lowest RMSE there of the models that can predict any link. `partner` is the model with which the
+    chosen one is averaged.
     """
     if partner is None:
         used, preferred = f"The blocks choose the model {str(chosen)!r}", ""
@@ -430,14 +431,14 @@ def chosen_model_text(record: Record) -> str:
 
 
 def remarks(record: Record, choice: str = "") -> tuple[str, ...]:
-    """All remarks about a result: warnings and advice, the judgement on held-out links, the choice of the model.
+    """All remarks about a result: warnings, advice, the judgement on held-out links and the choice of the model.
 
     `choice` is the reason for the prediction model, if validation chose it.
     """
     sentences = [
         remark_text(remark)
         for remark in record.uncertainty.remarks
-        # A finished result can have been validated since.
+        # A finished result may have been validated later.
         if remark.kind != RemarkKind.NOT_JUDGED or record.held_out is None
     ]
     if record.accuracy.judgement is not None:

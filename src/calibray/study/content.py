@@ -238,8 +238,8 @@ class StudyContent(Section, ABC):
         key = _first_stated(self._without_replay() | stated)
         if names and key is not None:
             raise InputError(
-                f"parameters: {names[0]!r}: path loss between traced positions is interpolated in replay, at "
-                f"one carrier; it cannot be combined with {key}"
+                f"parameters: {names[0]!r}: a displacement needs the engine 'replay' at one carrier, because path loss "
+                f"is interpolated between traced positions; it cannot be combined with {key}"
             )
         own = [
             name for name in names if name.startswith(RECEIVER) and not name.startswith(f"{RECEIVER}{EVERY}.")

@@ -305,14 +305,14 @@ def _content(links: LinksDraft) -> dict[str, Any]:
 
 
 def _hold_out_blocks(links: LinksDraft, content: dict[str, Any]) -> None:
-    """Hold out blocks of neighbouring links in turn, if three of four blocks have enough links and places for a fit."""
+    """Hold out blocks in turn if there are enough links per unknown, and enough receiver positions in each block."""
     study = Study.from_content(content, links.target)
     measured = study.measurements()
     places = len(np.unique(measured.rx[:, :2], axis=0))
     if count_unknowns(study, measured) or places < DEFAULT_BLOCKS * LINKS_PER_UNKNOWN:
         return
     content["holdout"] = {"blocks": DEFAULT_BLOCKS}
-    reason = "each block of neighbours is predicted from the others; this chooses the model of predictions"
+    reason = "each block of neighbouring links is predicted from the others; the errors decide the prediction model"
     links.assume("holdout.blocks", DEFAULT_BLOCKS, reason)
 
 

@@ -67,10 +67,10 @@ _TURNS: Final[dict[str, _Turn]] = {
 
 
 def suspicions(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
-    """As `examine`, but without checks of a scene that only an external program reads, or of positions without shapely.
+    """Like `examine`; a warning if shapely is missing, and nothing if only an external program can read the scene.
 
     Raises:
-        InputError: The links are far from the scene, or the scene cannot be read.
+        InputError: All links are far from the scene, or it cannot be read, and the engine is no external program.
     """
     if find_spec("shapely") is None:
         problem = "positions were not checked against the scene: shapely is not installed"

@@ -211,7 +211,8 @@ def summary(study: StudyModel) -> tuple[Table, Table]:
 
 VALUE: Final = "measured"
 LARGEST_PERMITTIVITY: Final = 15.0
-"""Default upper bound of a calibrated permittivity, twice that of any building material in ITU-R P.2040."""
+"""Default upper bound of a calibrated permittivity: more than twice the largest permittivity of a building material in
+ITU-R P.2040."""
 
 
 def permittivity_bounds(start: float) -> list[float]:
