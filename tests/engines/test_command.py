@@ -114,9 +114,9 @@ def test_answers_that_can_be_read(tmp_path, content, num_links, loss):
         ('{"path_loss_db": [70, 8', "not JSON"),
         ("[70, 80]", "no key 'path_loss_db'"),
         ('{"path_loss": [70, 80]}', "no key 'path_loss_db'"),
-        ('{"path_loss_db": [70]}', r"shape \(1,\), must be \(2,\)"),
+        ('{"path_loss_db": [70]}', r"shape \(1,\); it must be \(2,\)"),
         ('{"path_loss_db": [[70, 80]]}', r"contains \[70, 80\] in path_loss_db, which is not a number"),
-        ('{"path_loss_db": [70, NaN]}', r"path_loss_db\[1\] = nan; must be a number"),
+        ('{"path_loss_db": [70, NaN]}', r"path_loss_db\[1\] = nan; it must be a number"),
         ('{"path_loss_db": [-Infinity, 70]}', r"path_loss_db\[0\] = -inf"),
         ('{"path_loss_db": [70, true]}', "contains true in"),
         ('{"path_loss_db": [70, "80"]}', 'contains "80" in'),
@@ -152,7 +152,7 @@ def test_hdf5_answers_that_are_refused(tmp_path):
         ("os.abort()", "", "ended with signal SIGABRT; it gave no output"),
         ("print('I forgot')", "", r"wrote no response file; its output:\nI forgot"),
         ("losses[3] = math.nan", programs.ANSWER, r"path_loss_db\[3\] = nan"),
-        ("losses.pop()", programs.ANSWER, r"shape \(11,\), must be \(12,\)"),
+        ("losses.pop()", programs.ANSWER, r"shape \(11,\); it must be \(12,\)"),
         ("import time; time.sleep(60)", "", "gave no answer within timeout = 0.5 s and was killed"),
     ],
 )
@@ -368,7 +368,7 @@ def test_a_worker_that_dies_costs_its_candidate_alone(tmp_path):
         (0, None, "must be at least 1"),
         (2, "tcp://here:1", "give only one of them"),
         *(
-            (None, address, "--scheduler .*: not an address; give host and port, as tcp://")
+            (None, address, "--scheduler .*: not an address; give host and port, for example tcp://")
             for address in (
                 *("", "x", "127.0.0.1", "tcp://", "tcp://127.0.0.1:0", "tcp://127.0.0.1:99999", "tcp://[::1"),
                 *("tcp://127.0.0.1:abc", "http://127.0.0.1:80", "inproc://1", "ucx://a:1", "a:b:c:d"),

@@ -78,7 +78,7 @@ def test_one_call_answers_for_path_loss_and_observables(tmp_path):
     ("observables", "message"),
     [
         ("", "no key 'observables'"),
-        (', "observables": [[1, 2], [3, 4]]', r"shape \(2, 2\), must be \(1, 2\)"),
+        (', "observables": [[1, 2], [3, 4]]', r"shape \(2, 2\); it must be \(1, 2\)"),
         (', "observables": [[1, 2], [3]]', "lists of different lengths"),
         (', "observables": [[1, "many"]]', 'contains "many" in observables'),
     ],
@@ -97,7 +97,7 @@ def test_two_observables_of_one_link_may_be_a_list_of_numbers(tmp_path):
     _, observed = read_answer(file, "json", 1, 2)
     assert observed.tolist() == [[1.0], [2.0]]
     file.write_text('{"path_loss_db": 70, "observables": []}')
-    with pytest.raises(Unusable, match=r"shape \(0,\), must be \(2, 1\)"):
+    with pytest.raises(Unusable, match=r"shape \(0,\); it must be \(2, 1\)"):
         read_answer(file, "json", 1, 2)
 
 

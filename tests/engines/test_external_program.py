@@ -203,7 +203,7 @@ def test_a_program_is_told_apart_from_its_absence(tmp_path):
         ('mkdir "$2"', "is not a file but a folder, a FIFO or a device"),
         ('ln -s /dev/zero "$2"', "must be a file, not a link to one"),
         ('echo \'{"path_loss_db": [70, 80]}\' > elsewhere; ln -s "$PWD/elsewhere" "$2"', "not a link to one"),
-        ('truncate -s 20G "$2"', "has 21,474,836,480 bytes, must have 16,785,408 or fewer"),
+        ('truncate -s 20G "$2"', "has 21,474,836,480 bytes; it must have 16,785,408 or fewer"),
         (f'{sys.executable} -c \'print("[" * 1000000)\' > "$2"', "nests lists or objects too deeply"),
     ],
 )
@@ -217,12 +217,12 @@ def test_responses_that_are_no_files_of_a_sensible_size(tmp_path, script, messag
     [
         (
             "-85.2",
-            r"path_loss_db\[1\] = -85.2; must be a number between 20 and 300 dB.*does the program answer with gains\?",
+            r"path_loss_db\[1\] = -85.2; it must be a number between 20 and 300 dB.*answer with gains\?",
         ),
-        ("19.9", r"= 19.9; must be a number between 20 and 300 dB, or infinite without a path$"),
-        ("300.1", "= 300.1; must be a number between 20 and 300 dB"),
+        ("19.9", r"= 19.9; it must be a number between 20 and 300 dB, or infinite without a path$"),
+        ("300.1", "= 300.1; it must be a number between 20 and 300 dB"),
         ("1e308", r"= 1e\+308; must"),
-        ("-1e4", "= -10000; must be a number between 20 and 300 dB, or infinite without a path$"),
+        ("-1e4", "= -10000; it must be a number between 20 and 300 dB, or infinite without a path$"),
     ],
 )
 def test_path_loss_out_of_range_is_refused_with_a_hint_at_the_sign(tmp_path, value, message):

@@ -2,7 +2,7 @@
 
 The result is the excess of every method versus RT calls, as numbers, tables, files and a figure. The excess is the best
 objective so far minus the global optimum of the same data. The optimum comes from least squares with many starts, or
-from a run that reached a lower value.
+from another search that reached a lower value.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Comparison:
     Attributes:
         name: The problem.
         methods: The methods, in the order requested.
-        runs: Their runs by name, one per seed.
+        runs: The runs of each method by its name, one per seed.
         optimum: Lowest known objective [dB].
         found_by: The search that found the optimum.
     """
@@ -137,7 +137,7 @@ class Comparison:
         }
         for calls in (*CALLS, None):
             column = "end" if calls is None else str(calls)
-            # A smaller budget says nothing about this number of calls. No run has 2^62 calls, which mean the end.
+            # With a smaller budget, there is no value at this number of calls. 2^62 calls stand for the end of the run.
             reached = calls is None or method.stops_by_itself or calls <= method.budget
             excess = self.excess(method.name, 2**62 if calls is None else calls)
             for statistic, share in (("median", 0.5), ("q25", 0.25), ("q75", 0.75), ("worst", 1.0)):
@@ -248,7 +248,7 @@ def figure(comparison: Comparison) -> Figure:
 
 
 ROUNDING_DB: Final = 1e-7
-"""Difference below which two objectives count as equal."""
+"""Difference below which two objectives count as equal [dB]."""
 
 OPTIMUM: Final[RunKey] = ("optimum", 0, 0)
 """Key of the reference search among the runs."""
@@ -314,7 +314,7 @@ def compare(
 
 
 def parse_methods(names: Sequence[str], budget: int) -> tuple[BudgetedMethod, ...]:
-    """Parse method names, such as "gwo@600"; `budget` applies to names without one, and duplicates are left out.
+    """Parse method names, such as "gwo@600"; `budget` applies to names that state none, and duplicates are left out.
 
     Raises:
         InputError: The list is empty, a method is unknown, or a budget is invalid.

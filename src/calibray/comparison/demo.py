@@ -1,7 +1,7 @@
 """The experiment of the paper: the demo district calibrated by GWO, SGWO-IM, space mapping and `auto`.
 
-Space mapping runs on the ray tracer itself, which traces again for every candidate. Its cheap model is a trace with
-fewer interactions. This represents an engine without stored paths. `auto` runs on stored paths.
+Space mapping runs on the ray tracer itself, which traces again for every candidate and so represents an engine without
+stored paths. The cheap model replays a trace with fewer interactions. `auto` runs on stored paths.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ MAPPING_CALLS: Final = 8
 
 
 def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = None) -> Demo:
-    """Run the experiment with the engine "replay" (trace once) or "retrace" (trace for every RT call, as in the paper).
+    """Run the experiment; the paper's methods use the engine "replay" (trace once) or "retrace" (trace each RT call).
 
-    `progress` is called for every stage; the name of the method precedes that of the stage.
+    `progress` is called for every stage; the name of the method precedes the name of the stage.
 
     Raises:
         InputError: The engine or the seed is invalid.
@@ -223,7 +223,7 @@ def accuracy(demo: Demo) -> Table:
 
 
 def trust(result: Result) -> Table:
-    """Intervals and verdicts of the parameters of `auto`."""
+    """Intervals and verdicts of the parameters, from `auto`."""
     columns = (Column("parameter"), numbers("value"), numbers("95 % interval"), Column("verdict"))
     rows = tuple(
         (name, f"{result.parameters[name]:.2f}", interval_text(interval), interval.label)

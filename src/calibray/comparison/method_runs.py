@@ -33,7 +33,7 @@ class ComparisonProblem:
     """A problem on which any method can be run.
 
     Attributes:
-        name: Its name.
+        name: Name of the problem.
         fingerprint: Digest of everything that determines an evaluation.
         lower: Lower bounds of the search space [d].
         upper: Upper bounds [d].
@@ -77,7 +77,7 @@ def study_problem(path: str | Path) -> ComparisonProblem:
     problem = with_preliminary_fits(Problem.of(setup, engine))
     objective, parameters = problem.objective, problem.parameters
     lower, upper = parameters.search_bounds
-    # Everything that changes an evaluation: the study except its method, its files, and the data derived from them.
+    # Everything that changes an evaluation: the study without its method, the files, and the data derived from these.
     content = {key: section for key, section in problem.setup.study.content().items() if key != "method"}
     record = (
         fingerprint(setup),
@@ -117,9 +117,9 @@ class BudgetedMethod:
     """A method with its budget.
 
     Attributes:
-        name: Its name in tables, as requested.
-        method: Its name in `METHODS`.
-        budget: Number of RT calls that it may use.
+        name: Name of the method in tables, as requested.
+        method: Name of the method in `METHODS`.
+        budget: Largest number of RT calls.
     """
 
     name: str
@@ -133,7 +133,7 @@ class BudgetedMethod:
 
     @staticmethod
     def parse(name: str, budget: int) -> BudgetedMethod:
-        """Parse a method name, such as "gwo@600"; `budget` applies if the name states none [RT calls].
+        """Parse a method name, such as "gwo@600"; `budget` [RT calls] applies if the name states none.
 
         Raises:
             InputError: The method is unknown or takes no budget, or the budget is not a whole number or is too small.
@@ -190,13 +190,13 @@ class MethodRun:
 
     Attributes:
         method: The method.
-        budget: Number of RT calls that it was allowed; 0 if it stops by itself.
-        seed: Its seed.
-        evaluations: RT calls that it used.
-        calls: Numbers of the RT calls that improved on all earlier ones.
+        budget: Largest number of RT calls; 0 if the method stops by itself.
+        seed: Seed of the run.
+        evaluations: Number of RT calls in the run.
+        calls: Numbers, from 1, of the RT calls that improved on all earlier ones.
         best: Objectives of these calls [dB].
         seconds: Duration [s].
-        failure: The error that ended it; empty if it finished.
+        failure: The error that ended the run; empty if it finished.
     """
 
     method: str

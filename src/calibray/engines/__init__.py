@@ -7,8 +7,9 @@
 - `Command` calls an external program.
 - `Recorded` adds a `Ledger` to the last two, so that no RT call is repeated.
 
-One RT call is a run of one candidate over all links. Every engine counts its own calls. `engines.kinds` defines the
-engine sections of a study file and is imported with the study; modules that need JAX are loaded on first use.
+One RT call is one run of an engine for one candidate over all links. Every engine counts its own calls. `engines.kinds`
+defines the engine sections of a study file and is imported with the study; modules that need JAX are loaded on first
+use.
 """
 
 from typing import TYPE_CHECKING

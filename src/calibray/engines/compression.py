@@ -1,12 +1,12 @@
-"""Compression replaces tens of thousands of paths with a few weighted paths, within a stated error of path loss.
+"""Compression replaces tens of thousands of paths with a few weighted paths, within a stated error in path loss.
 
-The power of a link is a sum over its paths, P(x) = sum_p p_p(x), of functions of the candidate x. Within the bounds of
-a few parameters these functions span a low-dimensional space, so a few of them with weights w >= 0 suffice:
-sum_p w_p p_p(x) is fitted to P(x) at training candidates by non-negative least squares. Paths are added greedily until
-the fit is good enough (C. Farhat, T. Chapman, P. Avery, Int. J. Numer. Methods Eng. 102 (2015) 1077).
+The power of a link is a sum over its paths, P(x) = sum_p p_p(x), where x is the candidate. Within the bounds of a few
+parameters, the p_p span a low-dimensional space, so a few paths with weights w >= 0 suffice: sum_p w_p p_p(x) is fitted
+to P(x) at training candidates by non-negative least squares. Paths are added greedily until the fit is good enough (C.
+Farhat, T. Chapman, P. Avery, Int. J. Numer. Methods Eng. 102 (2015) 1077).
 
-Weights are non-negative and the paths are physical, so a compressed link behaves as a link between the training
-candidates as well. The error is nevertheless measured at new candidates, many of them on faces of the bounds. If a
+Weights are non-negative and the paths are physical, so a compressed link remains physically plausible between the
+training candidates. The error is nevertheless checked at new candidates, many of them on faces of the bounds. If a
 link's error there exceeds half the tolerance, the link is fitted again to more candidates, or keeps all its paths.
 """
 
@@ -43,22 +43,22 @@ TRAINING: Final = 16
 bounds."""
 
 CORNER_PARAMETERS: Final = 5
-"""Number of parameters whose bounds define the fitted corners; further parameters have their middle value there."""
+"""Largest number of parameters whose bounds define the corners; other parameters have their middle value there."""
 
 CHECKED: Final = 48
 """Number of new candidates in every check."""
 
 ROUNDS: Final = 6
-"""Number of fits of a link before it keeps all its paths."""
+"""Largest number of fits of a link; if all fail the check, the link keeps all its paths."""
 
 RANKING: Final = 16
 """Number of candidates used to rank the paths by power."""
 
 POOL: Final = 2000
-"""Number of a link's strongest paths that may be kept, and also of randomly chosen weaker paths."""
+"""Largest number of a link's strongest paths in the fit, and largest number of its other paths, chosen at random."""
 
 BATCH_POWERS: Final = 400_000_000
-"""Largest number of powers, paths times candidates, in memory at once."""
+"""Largest number of powers (paths times candidates) in memory at once."""
 
 FIRST_INTERVALS: Final = 512
 """Initial number of intervals in a table of coefficients."""
@@ -69,8 +69,8 @@ class Compressed:
     """A compressed program.
 
     Attributes:
-        paths: The program over the same links. The weights are part of the spreading factors of its paths, so it is
-            valid only for the sum of powers, not for delays or sums of fields.
+        paths: The program over the same links. The weights are part of the spreading factors of its paths, so the
+            program is valid only for the sum of powers, not for delays or sums of fields.
         error_db: Largest difference in path loss from the full program at the checked candidates [L], [dB].
         candidates: Number of candidates, not used in the fit, at which every compressed link was checked.
     """
@@ -81,7 +81,7 @@ class Compressed:
 
 
 def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERANCE_DB) -> Compressed:
-    """Compress a program for given parameters within their bounds, for path loss from the sum of powers.
+    """Compress a program; it is valid for the given parameters within their bounds, and for power summed over paths.
 
     `tolerance_db` is the largest error of a link's path loss [dB]. Returns the compressed program and its error.
 
@@ -122,10 +122,11 @@ def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERAN
 
 
 def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
-    """A program without the weakest paths, which together carry at most `share` of a link's power; for sums of powers.
+    """A program without the weakest paths, which together carry at most `share` of a link's total power.
 
     The shares are summed over candidates spread over the parameters' bounds, so the omitted paths carry even less at a
-    single candidate. Raises InputError if a parameter's material is not in the paths.
+    single candidate. The program is meant for sums of powers. Raises InputError if a parameter's material is not in the
+    paths.
     """
     from scipy.stats import qmc  # the import takes 0.4 s
 
@@ -162,8 +163,8 @@ def _evaluate_all(
 ) -> tuple[list[NDArray[np.float64]], NDArray[np.float64], float]:
     """Evaluate the whole program.
 
-    Returns power of every link at each set of candidates [n, L], the share of every path in its link's power, summed
-    over the ranking candidates [P], and the largest error of a tabulated coefficient.
+    Returns the power of every link at each set of candidates [n, L], the share of every path in its link's power,
+    summed over the ranking candidates [P], and the largest error of a tabulated coefficient.
     """
     plan = layout(paths, np.float32, intervals, phases=False)
     totals, errors = [], []
@@ -181,7 +182,7 @@ def _evaluate_all(
 
 
 def _pool(paths: Paths, strength: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Indices of paths that may be kept, ascending: for links with many paths, the strongest and as many at random."""
+    """Ascending indices of paths that may be kept: for links with many paths, the strongest ones and random others."""
     random, pool = np.random.default_rng(0), []
     for of_link in np.split(np.arange(paths.num_paths), np.flatnonzero(np.diff(paths.link)) + 1):
         if len(of_link) > MIN_PATHS:
@@ -221,7 +222,7 @@ class _Powers:
 def _fit_link(
     powers: _Powers, paths: slice, totals: list[NDArray[np.float64]], tolerance_db: float
 ) -> tuple[NDArray[np.float64], float] | None:
-    """Weights of the candidate paths of a link, and the largest error at new candidates; None if that is too large.
+    """Weights of a link's paths in the pool, and the largest error at new candidates; None if it stays too large.
 
     Candidates without power, for instance without scattering, are left out, because no weight changes a zero.
     """

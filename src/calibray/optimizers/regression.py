@@ -3,12 +3,13 @@
     K(x, x') = v_0 + v_1 h(x).h(x') + v_2 M(x, x') + nugget [x = x']
 
 M is the Matern-5/2 kernel with one rate (inverse length scale) per coordinate of the unit cube. h(x) is the response of
-a cheap model at x, if there is one. v_0 therefore allows an offset, v_1 a change in the response and v_2 a smooth
-remainder. All residuals share K, so one factorization serves any number of residuals. With a linear trend, the
+a cheap model at x, if there is one. v_0 thus allows for an offset, v_1 for a change in the response and v_2 for a
+smooth remainder. All residuals share K, so one factorization serves any number of residuals. With a linear trend, the
 coefficients of 1 and x are unknown and have no prior (universal kriging).
 
-One derivation covers both cases. C [n, f] contains orthonormal combinations of the points on which the trend vanishes;
-without a trend, C is the identity. C^T y has covariance A = C^T K C, and P = C A^-1 C^T takes the place of K^-1.
+One derivation covers regression with and without a trend. The columns of C [n, f] are orthonormal combinations of the
+points for which the trend vanishes; without a trend, C is the identity. C^T y has covariance A = C^T K C, and P = C
+A^-1 C^T takes the place of K^-1.
 
 C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, MIT Press 2006, eqs. 2.25, 2.26, 2.41,
 2.42, 4.17, 5.9 and sec. 9.9; closed-form leave-one-out errors: S. Rippa, Adv. Comput. Math. 11 (1999) 193.
@@ -40,7 +41,7 @@ class Inputs:
 
     Attributes:
         unit: Coordinates in the unit cube [n, d].
-        response: Response h of a cheap model there [n, r]; r = 0 without a cheap model.
+        response: Response h of a cheap model at the points [n, r]; r = 0 without a cheap model.
     """
 
     unit: NDArray[np.float64]
@@ -113,7 +114,7 @@ class Trend(NamedTuple):
 
     @staticmethod
     def of(unit: NDArray[np.float64], linear: bool) -> Trend:
-        """The linear trend at points [n, d], or no trend."""
+        """The trend at points [n, d]: a linear one, or none."""
         if not linear:
             return Trend(np.eye(len(unit)), np.zeros((0, len(unit))))
         basis = trend_basis(unit)
@@ -129,7 +130,7 @@ class Process:
 
     Attributes:
         inputs: The evaluated points.
-        values: Values of every residual there [n, m].
+        values: Values of every residual at these points [n, m].
         kernel: The kernel.
         linear: Whether there is a linear trend.
         freedom: Degrees of freedom of the prior of a residual's variance; 0 if the variance is profiled out.
@@ -153,12 +154,12 @@ class Process:
 
     @property
     def precision(self) -> NDArray[np.float64]:
-        """Inverse of the variance of each residual, relative to K [m]."""
+        """Inverse of the factor by which K is multiplied for each residual [m]."""
         return _precision(len(self.whitened), np.sum(self.whitened**2, axis=0), self.freedom)
 
     @property
     def root(self) -> NDArray[np.float64]:
-        """Factor B [f, m] of the residuals' covariance B^T B relative to K; [f + m, m] with a prior."""
+        """Factor B of the covariance B^T B between residuals, relative to K: [f, m], or [f + m, m] with a prior."""
         rows = self.whitened
         if self.freedom:
             rows = np.vstack([rows, np.sqrt(self.freedom) * np.eye(rows.shape[1])])
@@ -185,12 +186,12 @@ class Process:
         return mean, np.maximum(prior - np.sum(known**2, axis=0), 0.0)  # eqs. 2.25, 2.26, 2.41, 2.42
 
     def mean(self, at: Inputs) -> NDArray[np.float64]:
-        """Predicted residuals at points [k, m]."""
+        """Predicted mean at points [k, m]."""
         mean = self.kernel.covariance(at, self.inputs) @ self.weights
         return mean + trend_basis(at.unit) @ self.coefficients if self.linear else mean
 
     def slope(self, at: Inputs, response_slope: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """Derivatives of the mean [k, m, d] in the unit cube, given the derivatives of the responses [k, r, d]."""
+        """Derivatives of the mean by unit-cube coordinates [k, m, d], given those of the responses [k, r, d]."""
         rates, variances = self.kernel.rates, self.kernel.variances
         # dM / dx_j = M'(r) / r x rate_j^2 x (difference along j).
         toward = (at.unit[:, :, None] - self.inputs.unit.T) * rates[:, None] ** 2
@@ -259,7 +260,7 @@ class Likelihood:
         weights = inverse @ self.values
         square = np.maximum(np.sum(self.values * weights, axis=0), 1e-300)
         free = len(lower)
-        # Negative log density of Student's t, or without degrees of freedom, of a Gaussian with profiled variances.
+        # Negative log density: Student's t or, if `freedom` is 0, a Gaussian with profiled variances.
         value = residuals * np.log(np.diag(lower)).sum()
         value += 0.5 * (self.freedom + free) * np.log((self.freedom + square) / (self.freedom + free)).sum()
         # Derivative with respect to K (eq. 5.9); each residual is weighted by its precision.
@@ -299,9 +300,9 @@ def most_probable(
 ) -> Kernel:
     """The kernel with the largest posterior density.
 
-    The variances and the nugget are multiplied by `scale` squared. The loss is divided by `divisor`, which determines
-    the size of the first step. Searches of at most `steps` steps start at the prior's mean and at `guess`, such as the
-    kernel of an earlier fit.
+    The variances and the nugget are multiplied by `scale` squared. The negative log density is divided by `divisor`,
+    which determines the size of the first step. Searches of at most `steps` steps start at the prior's mean and at
+    `guess`, such as the kernel of an earlier fit.
     """
     held, learned = prior.mean[: prior.fixed], slice(prior.fixed, None)
 
@@ -354,12 +355,12 @@ NOISE_PRIOR = (np.log(1e-4), 3.0)
 """Mean and standard deviation of the logarithm of the nugget if it is estimated."""
 
 CONSTANT = 1e-9
-"""Relative standard deviation of a residual below which it does not affect the scales."""
+"""A residual does not affect the scales if its standard deviation is below this share of the largest one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Kriging:
-    """A fitted model.
+    """A fitted kriging model.
 
     Attributes:
         process: The process; its variances are relative to the variances of the residuals.
@@ -380,7 +381,7 @@ class Kriging:
         return np.sum(self.root**2, axis=0)
 
     def predict(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Predicted mean [k, m], and predictive variance as a share of the prior, equal for all residuals [k]."""
+        """Predicted mean [k, m], and predictive variance as a share of the prior variance [k], for all residuals."""
         return self.process.predict(Inputs.plain(unit))
 
     def mean_and_slope(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -389,7 +390,7 @@ class Kriging:
         return self.process.mean(inputs), self.process.slope(inputs)
 
     def with_point(self, point: NDArray[np.float64]) -> Kriging:
-        """Add a point [d] as if its evaluation equalled the prediction; mean and prior stay unchanged."""
+        """Add a point [d] as if its evaluation equalled the prediction; the mean and the prior stay unchanged."""
         unit = np.vstack([self.process.inputs.unit, point])
         residuals = np.vstack([self.residuals, self.predict(point[None])[0]])
         return Kriging(solve(unit, residuals, self.process.kernel).process, self.root)
@@ -404,8 +405,8 @@ def fit(
 ) -> Kriging:
     """Fit a model and its input scales to residuals [n, m] at distinct points of the unit cube [n, d].
 
-    There must be at least d + 2 points that span the cube. `noisy` also estimates the nugget, for an engine whose
-    answers are noisy; otherwise the model interpolates. `guess` is an additional starting point of the kernel search.
+    There must be at least d + 2 points that span the cube. If `noisy`, the nugget is estimated too, for an engine with
+    noisy answers; otherwise the model interpolates. `guess` is an additional starting point of the kernel search.
     """
     spread = residuals.std(axis=0)
     varying = residuals[:, spread > CONSTANT * max(spread.max(), 1e-300)]

@@ -1,6 +1,6 @@
-"""Designs of points in a box, and searches that evaluate one design and stop: the negative controls.
+"""Designs of points in the unit cube, and searches that evaluate one design and stop.
 
-An optimizer that is not better than these at an equal budget has learned nothing from its evaluations.
+An optimizer that is not better than these searches at an equal budget has learned nothing from its evaluations.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> N
     """
     if kind == "random":
         return rng.random((count, dimension))
-    from scipy.stats import qmc  # takes 0.4 s, so it is imported only for a search
+    from scipy.stats import qmc  # the import takes 0.4 s
 
     if kind == "latin-hypercube":
         return qmc.LatinHypercube(dimension, rng=rng).random(count)
@@ -39,7 +39,7 @@ def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> N
 def maximin_design(
     count: int, dimension: int, rng: np.random.Generator, tries: int = 50
 ) -> NDArray[np.float64]:
-    """The best of `tries` Latin hypercubes [count, dimension]: its smallest distance between points is the largest."""
+    """Of `tries` Latin hypercubes [count, dimension], the one with the largest minimum distance between points."""
     drawn = [design("latin-hypercube", count, dimension, rng) for _ in range(tries)]
     spacing = [pdist(points).min(initial=np.inf) for points in drawn]
     return drawn[int(np.argmax(spacing))]
@@ -94,7 +94,7 @@ class Sampling(Optimizer):
 
 @final
 class RandomSearch(Sampling):
-    """Independent uniform points. Uses only objective values, with the given budget.
+    """Independent uniform points. Uses only objective values and the whole budget.
 
     Example:
         >>> RandomSearch([0.0, 0.0], [1.0, 2.0], budget=10).ask().shape
@@ -106,7 +106,7 @@ class RandomSearch(Sampling):
 
 @final
 class LatinHypercube(Sampling):
-    """One point in each slice of every dimension. Uses only objective values, with the given budget.
+    """One point in each slice of every dimension. Uses only objective values and the whole budget.
 
     Example:
         >>> sorted((LatinHypercube([0.0], [1.0], budget=4).ask()[:, 0] * 4).astype(int).tolist())
@@ -118,7 +118,7 @@ class LatinHypercube(Sampling):
 
 @final
 class Sobol(Sampling):
-    """A scrambled Sobol sequence. Uses only objective values, with the given budget.
+    """A scrambled Sobol sequence. Uses only objective values and the whole budget.
 
     Example:
         >>> Sobol([0.0, 0.0], [1.0, 2.0], budget=10).ask().shape

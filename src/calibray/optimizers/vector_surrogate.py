@@ -1,4 +1,4 @@
-"""The vector surrogate: a model of every residual instead of their root mean square, searched globally.
+"""The vector surrogate models every residual instead of their root mean square, and searches this model globally.
 
 The objective is a sum over links, so an evaluation that returns the residual of every link contains far more
 information than that sum. Residuals are smoother than the objective, and tens of them share one kernel over the
@@ -6,12 +6,12 @@ parameters (`regression.py`).
 
 A run begins with a maximin Latin hypercube. The design needs few points even for many parameters, because residuals can
 be modelled as soon as the points determine a plane. After the design, three kinds of step alternate on a model that is
-refitted after every batch:
+updated after every batch:
 
 - *exploration*: the point with the largest expected improvement in the mean square of the residuals, over draws from
   the model (R. Astudillo, P. Frazier, ICML 2019). Assuming a normal distribution of the mean square instead (D. R.
   Jones, M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15) would give weight to impossibly low values.
-  In many dimensions, it wastes the step on the emptiest corner;
+  In many dimensions, it would waste steps on the emptiest corner of the box;
 - *exploitation*: the lowest minimum of the predicted objective that has not been evaluated yet, found by many local
   searches with exact derivatives of the model;
 - *another basin*: the lowest minimum of the predicted objective where the model is still uncertain, so that refining
@@ -40,10 +40,10 @@ from calibray.optimizers.regression import Kriging, fit, solve
 from calibray.optimizers.sampling import SEPARATION, distance_to_nearest, draw_around, maximin_design
 
 FIRST = 5
-"""Largest number by which points of the initial design exceed the parameters."""
+"""Largest excess of the number of points in the initial design over the number of parameters."""
 
 CANDIDATES = 600
-"""Number of candidates drawn over the box, and of candidates around the best points."""
+"""Number of candidates drawn over the whole box, and number of candidates drawn around the best points."""
 
 DRAWS = 256
 """Number of draws of the residuals for the expected improvement."""
@@ -58,7 +58,7 @@ SEARCHES = 16
 """Number of local searches on the model."""
 
 UNCERTAIN = 1e-3
-"""Share of the prior variance above which a predicted minimum counts as another basin."""
+"""A predicted minimum counts as another basin if its variance exceeds this share of the prior variance."""
 
 
 @final
@@ -67,8 +67,8 @@ class VectorSurrogate(Optimizer):
 
     Args:
         budget: Number of evaluations; 20 d if None.
-        initial: Size of the initial design; the lesser of 2 (d + 1) and d + 5 if None. Points passed to `tell` before
-            the first `ask` count; points closer together than half the design's spacing count as one.
+        initial: Size of the initial design; the smaller of 2 (d + 1) and d + 5 if None. Points already passed to `tell`
+            count, except that points closer together than half the design's spacing count as one.
         batch: Number of candidates per batch after the initial design, for engines that run in parallel.
         noisy: Whether the engine's answers are noisy; the model then smooths instead of interpolating.
 
@@ -134,7 +134,7 @@ class VectorSurrogate(Optimizer):
             left, turn = left - count, turn + count
 
     def _design(self, earlier: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The initial design [k, d], without the points that earlier ones [n, d] replace."""
+        """The initial design [k, d], without the points that earlier evaluated points [n, d] replace."""
         points = maximin_design(self.initial, self.box.dimension, self._rng)
         spacing, counted = 0.5 * float(pdist(points).min()), earlier[:0]
         for point in earlier:
@@ -146,7 +146,7 @@ class VectorSurrogate(Optimizer):
         return points
 
     def _fitted(self, points: NDArray[np.float64], residuals: NDArray[np.float64]) -> Kriging:
-        """A model of all points, with new scales if their number has grown enough to improve them."""
+        """A model of all points, with new scales if the number of points has grown enough."""
         if self._model is None:
             self._learned = len(points)
             return fit(points, residuals, noisy=self.noisy)
@@ -216,8 +216,8 @@ def improvement(
 ) -> NDArray[np.float64]:
     """Expected improvement [k] in the mean square of the residuals over the best one, by Monte Carlo.
 
-    `mean` are predictions [k, m], `share` their variance relative to the prior [k], and `draws` are drawn with the
-    prior covariance [n, m]. The result is 0 if no draw improves. `best` is the lowest root mean square so far.
+    `mean` contains predictions [k, m], `share` their variances relative to the prior [k], and `draws` random vectors
+    with the prior covariance [n, m]. The result is 0 if no draw improves. `best` is the lowest root mean square so far.
     """
     # |r + s v|^2 = r.r + 2 s r.v + s^2 v.v for prediction r and draw v.
     along, across = 2.0 * np.sqrt(share)[:, None] * (mean @ draws.T), np.sum(draws**2, axis=1)

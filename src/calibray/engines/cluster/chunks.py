@@ -3,7 +3,7 @@
 The division, and thus every result, depends only on the links and the study, never on the workers. A command can
 therefore read from the cache chunks that an earlier command traced. For replay, each chunk is traced and compiled on
 one worker, and stays there. Candidates are sent to the workers, which return the path loss of their chunks; with
-`reducing` they return only a few sums, for any number of links.
+`reducing` they return only a few sums, however many links there are.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ Content = TypeVar("Content")
 Answer = TypeVar("Answer")
 
 CHUNK_LINKS: Final = 1000
-"""Links per chunk if there are workers and the study states no number."""
+"""Number of links per chunk if the study states none, unless `MOST_CHUNKS` requires more."""
 
 MOST_CHUNKS: Final = 64
-"""Largest number of chunks if the study states no number of links: every chunk compiles a program and returns sums."""
+"""Largest number of chunks if the study states no number of links, because every chunk compiles its own program."""
 
 _SHARED: WeakValueDictionary[bytes, Shared[Any]] = WeakValueDictionary()
 
@@ -58,7 +58,7 @@ _LATEST: Final[deque[Shared[Any]]] = deque(maxlen=1)
 
 @final
 class Shared(Generic[Content]):
-    """Content that all chunks share, for instance an opened study; a process unpacks it once.
+    """Content that all chunks share, for instance an opened study; each process unpacks it once.
 
     A shared study needs to contain only one or a few links, because each chunk has its own links.
     """
@@ -101,11 +101,11 @@ def for_each_chunk(
     size: int,
     progress: Progress | None = None,
 ) -> list[tuple[NDArray[np.int64], Answer]]:
-    """Run a picklable function of the shared content and a chunk's links once for every chunk.
+    """Call a picklable function once for every chunk, with the shared content and the chunk's links.
 
-    Objects that the work loads into `content` stay on the worker; if a worker dies, its chunk is processed again. After
-    every chunk, `progress` is called with "tracing", the numbers of finished and of all links. Returns the
-    indices of every chunk's links, and the results of the work.
+    Objects that `work` loads into `content` stay on the worker; if a worker dies, its chunk is processed again. After
+    every chunk, `progress` is called with "tracing", the number of finished links and the number of all links. Returns
+    the indices of every chunk's links, and the results of `work`.
 
     Raises:
         EngineError: Workers die repeatedly, or none is left.
@@ -127,7 +127,7 @@ def identity(value: Content) -> Content:
 
 
 def count_links(chunks: Sequence[NDArray[np.int64]], progress: Progress | None) -> Callable[[int], None]:
-    """A function that is called with each finished chunk's number and reports the links done so far as "tracing"."""
+    """Make a function to call with each finished chunk's number; it reports the links done so far as "tracing"."""
     done, total = 0, sum(len(chunk) for chunk in chunks)
 
     def answered(index: int) -> None:
@@ -150,7 +150,7 @@ def stated_chunk_size(study: OpenedStudy) -> int | None:
 
 
 def cut(links: Measurements, size: int) -> list[NDArray[np.int64]]:
-    """Divide links into chunks of about equal size, each with few positions from which rays are launched.
+    """Divide links into chunks of about equal size up to `size`, each with few launching positions of rays.
 
     Returns the indices of every chunk's links, in ascending order.
 
@@ -159,7 +159,7 @@ def cut(links: Measurements, size: int) -> list[NDArray[np.int64]]:
         >>> [chunk.tolist() for chunk in cut(links, 2)]
         [[0, 2], [1, 3]]
     """
-    # Rays start at the end of the link that has fewer distinct positions; links with a common start stay together.
+    # Rays start at the transmitters or receivers, whichever have fewer positions; links that share one stay together.
     ends = (np.unique(end, axis=0, return_inverse=True) for end in (links.tx, links.rx))
     _, position = min(ends, key=lambda unique: len(unique[0]))
     order = np.argsort(position.reshape(-1), kind="stable")
@@ -181,7 +181,7 @@ def seconds_to_trace(study: OpenedStudy, chunks: Sequence[NDArray[np.int64]]) ->
 def trace_in_chunks(
     study: OpenedStudy, workers: Workers, *, check: bool = False, progress: Progress | None = None
 ) -> tuple[Paths, Convergence | None]:
-    """Trace a study's links in the same chunks as a calibration, or read them from the cache.
+    """Trace a study's links in the same chunks as a calibration, or read their paths from the cache.
 
     With `check`, every chunk is traced again with twice the samples, unless samples are added in rounds. Returns the
     path program of all links and, with `check`, the changes in path loss.
@@ -195,7 +195,7 @@ def trace_in_chunks(
     one_link = study.at(select_links(links, np.array([0])))
     answers = for_each_chunk(workers, partial(_trace_chunk, check), one_link, links, size, progress)
     paths = join_links([(chunk, chunk_paths) for chunk, (chunk_paths, _) in answers])
-    # Rounds of rays report how many rays were needed and what the last round changed; the worst chunk is reported.
+    # If rays are added in rounds, the settings state their number and the last change; the largest values are kept.
     worst = {
         name: max(cast(float, chunk_paths.settings[name]) for _, (chunk_paths, _) in answers)
         for name in ("rays", "last_round_db")
@@ -221,7 +221,7 @@ def _trace_chunk(check: bool, study: OpenedStudy, links: Measurements) -> tuple[
 
 
 Open = Callable[[OpenedStudy, Mapping[str, Material]], Differentiable]
-"""Opens the engine over a chunk from the opened study of its links and the materials for the trace."""
+"""Opens the engine of a chunk, given the opened study of its links and the materials for the trace."""
 
 _TRACING: Final = Lock()
 """A process traces one chunk at a time."""
@@ -234,8 +234,8 @@ class ChunkRecipe:
     Attributes:
         shared: The opened study.
         links: The chunk's links.
-        materials: Materials for the trace in place of the scene's, by name.
-        open: Opens the engine over the links.
+        materials: Materials that replace those of the scene in the trace, by name.
+        open: Opens the engine of the chunk.
     """
 
     shared: Shared[OpenedStudy]
@@ -250,7 +250,7 @@ class Chunk:
 
     Attributes:
         study: The opened study of the links.
-        engine: The engine over them.
+        engine: The engine for these links.
     """
 
     def __init__(self, recipe: ChunkRecipe) -> None:
@@ -261,7 +261,7 @@ class Chunk:
             self.engine = recipe.open(self.study, recipe.materials)
 
     def derived(self, make: Callable[[Chunk], Content]) -> Content:
-        """What `make` derives from this chunk; it is kept until something else is derived or the chunk is closed."""
+        """The result of `make` for this chunk; it is kept until another function is given."""
         if self._derived is None or self._derived[0] != make:
             self._derived = None  # frees the memory first
             self._derived = make, make(self)
@@ -277,14 +277,14 @@ Derive = Callable[[Chunk], Differentiable]
 
 @final
 class ChunkedReplay:
-    """Links in chunks on workers, evaluated for any candidate; all chunks are opened together.
+    """Replays links in chunks on workers, for any candidate; the constructor opens all chunks.
 
     Args:
         workers: Workers that keep the chunks.
         study: The opened study.
         chunks: Indices of every chunk's links; together they contain every link once.
-        opening: Opens the engine over a chunk's links; picklable.
-        materials: Materials for the trace in place of the scene's, by name.
+        opening: Opens the engine of a chunk; picklable.
+        materials: Materials that replace those of the scene in the trace, by name.
         progress: Called with "tracing" after every chunk.
 
     Attributes:
@@ -372,7 +372,7 @@ class ChunkedReplay:
     def traced_with(
         self, materials: Mapping[str, Material], progress: Progress | None = None
     ) -> ChunkedReplay:
-        """The same on paths traced with other materials; see `Chunked.traced_with`."""
+        """The same links on paths traced with other materials; see `Chunked.traced_with`."""
         return ChunkedReplay(self._workers, self._study, self.chunks, self._open, materials, progress)
 
     def derived(self, parameters: Parameters, derive: Derive) -> ChunkedReplay:

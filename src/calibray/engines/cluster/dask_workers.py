@@ -34,11 +34,11 @@ NO_WORKER_WAIT: Final = 600.0
 """Longest wait for a worker if none is left [s]."""
 
 MOST_DEATHS: Final = 4
-"""Number of workers that must die on one chunk to end the run; the chunk is then probably too large."""
+"""The run ends after this many workers have died on one chunk, which is then probably too large."""
 
 FETCH_WAIT: Final = POLL
 """First wait for an answer that a worker holds [s]; the wait doubles with every further request, so that large answers
-arrive eventually. Between requests, we check whether the worker has died."""
+arrive eventually. Between requests, dead workers are detected."""
 
 Answered = Callable[[int], None]
 """Called with a chunk's number after its answer has arrived."""
@@ -48,12 +48,12 @@ def count_death(deaths: Counter[int], chunk: int) -> None:
     """Count a worker that died on a chunk.
 
     Raises:
-        EngineError: Too many workers died on it.
+        EngineError: Too many workers died on this chunk.
     """
     deaths[chunk] += 1
     if deaths[chunk] >= MOST_DEATHS:
         raise EngineError(
-            f"chunk {chunk + 1}: {MOST_DEATHS} workers died with it; give workers more memory, or lower "
+            f"chunk {chunk + 1}: {MOST_DEATHS} workers died on it; give workers more memory, or lower "
             "engine.chunk_links"
         )
 
@@ -81,8 +81,8 @@ class DaskWorkers:
     """The workers of a Dask cluster, opened on first use.
 
     A chunk stays on one worker, its home. If that worker dies, its replacement, or another worker, gets the chunk and
-    makes its objects again. Paths then come from the cache, if workers share its folder. `connect` returns Dask's
-    client, and `open_executor` an executor for the calls of an external program.
+    makes its objects again. Paths then come from the cache if all workers share the cache folder. `connect` returns
+    Dask's client, and `open_executor` an executor for the calls of an external program.
     """
 
     def __init__(self, connect: Callable[[], Client], open_executor: Callable[[], Executor]) -> None:
@@ -143,7 +143,7 @@ class DaskWorkers:
                 future = self._client.submit(handle.make, handle.sources[index], workers=[home], pure=False)
                 handle.objects[index] = home, future
         objects = (handle.objects[index][1] for handle in handles)
-        # With pure=True, Dask would return the earlier result of an equal question.
+        # With pure=True, Dask would return the earlier result of an equal call.
         return self._client.submit(function, *objects, *arguments, workers=[home], pure=False)
 
     def _wait_for_any(self, futures: list[Future]) -> None:
@@ -251,7 +251,7 @@ def _wait_for_scheduler(scheduler: str) -> None:
     match = _ADDRESS.fullmatch(scheduler)
     if match is None or not 1 <= int(match["port"]) <= 65_535:
         raise InputError(
-            f"--scheduler {shortened(scheduler)}: not an address; give host and port, as tcp://10.0.0.1:8786"
+            f"--scheduler {shortened(scheduler)}: not an address; give host and port, for example tcp://10.0.0.1:8786"
         )
     host, end = match["host"].strip("[]"), time.monotonic() + SCHEDULER_WAIT
     while True:

@@ -1,8 +1,8 @@
 """Workers keep chunks of links for replay, and run the calls of an external program.
 
 Objects that are kept with a chunk are made on one worker and stay there. Functions are sent to the worker, which
-returns only their results. Chunks are numbered and results return in that order, so sums over chunks do not depend on
-the workers.
+returns only their results. Chunks are numbered and results are returned in this order, so sums over chunks do not
+depend on the workers.
 
 Workers on this machine are processes that communicate only through pipes, which they inherit. No port is open, so no
 other user of the machine can send code to a worker or to the main process.
@@ -71,7 +71,7 @@ class Workers(Protocol):
         """Call a picklable function on the objects kept with every chunk, and return the results by chunk.
 
         The first arguments of the function are the objects, given by their handles from `keep`; the other arguments are
-        the same for all chunks. `answered` is called with a chunk's number after its answer.
+        the same for all chunks. `answered` is called with a chunk's number after its answer has arrived.
 
         Raises:
             EngineError: Workers die repeatedly, or none is left.
@@ -81,10 +81,10 @@ class Workers(Protocol):
 
 @final
 class InProcess:
-    """This process works on one chunk at a time.
+    """Runs the work in this process, one chunk at a time.
 
-    It keeps `at_most` chunks, and makes others again for each question. If None, chunks are kept until they use a third
-    of the memory that was free at the start, because objects derived from them need as much again.
+    At most `at_most` chunks are kept; others are made again for each question. If None, chunks are kept until they use
+    a third of the memory that was free at the start, because objects derived from them need as much again.
     """
 
     def __init__(self, at_most: int | None = None) -> None:
@@ -221,7 +221,7 @@ class LocalWorkers:
             try:
                 answers = self._ask(function, handles, arguments, answered)
             except BaseException:
-                # Other processes may still be sending an answer.
+                # Other processes may still be sending answers to this question.
                 self.close()
                 raise
         return [answers[index] for index in range(len(answers))]
@@ -287,7 +287,7 @@ class LocalWorkers:
             self._workers.append(self._start(len(self._workers)))
 
     def _start(self, home: int) -> _Worker:
-        context = get_context("spawn")  # a fork would copy the threads' locks of Dr.Jit and XLA
+        context = get_context("spawn")  # a fork would copy locks held by threads of Dr.Jit and XLA
         ours, theirs = context.Pipe()
         process = context.Process(target=_serve, args=(theirs, home, self._count), daemon=True)
         process.start()
@@ -319,7 +319,7 @@ class LocalWorkers:
             worker.pipe.send_bytes(content)
 
     def _receive(self) -> list[tuple[int, tuple[Any, Exception | None] | None]]:
-        """The answers received, with the number of their worker; None for a worker that died."""
+        """The answers received, each with the number of its worker; None for a worker that died."""
         homes = {worker.pipe: home for home, worker in enumerate(self._workers)}
         answers: list[tuple[int, tuple[Any, Exception | None] | None]] = []
         for pipe in cast(list[Connection], wait(list(homes), POLL)):

@@ -151,7 +151,7 @@ def read_answer(
         values = values.reshape(-1)
     if values.shape != (num_links,):
         raise Unusable(
-            f"its response contains {ANSWER} of shape {values.shape}, must be ({num_links},): one per link"
+            f"its response contains {ANSWER} of shape {values.shape}; it must be ({num_links},): one value per link"
         )
     lower, upper = PATH_LOSS_DB
     wrong = ~((values >= lower) & (values <= upper) | np.isposinf(values))
@@ -163,7 +163,7 @@ def read_answer(
             else ""
         )
         raise Unusable(
-            f"its response contains {ANSWER}[{link}] = {values[link]:g}; must be a number between {lower:g} and "
+            f"its response contains {ANSWER}[{link}] = {values[link]:g}; it must be a number between {lower:g} and "
             f"{upper:g} dB, or infinite without a path{hint}"
         )
     shape = num_observables, num_links
@@ -174,7 +174,7 @@ def read_answer(
         observed = observed.reshape(shape)
     if observed.shape != shape:
         raise Unusable(
-            f"its response contains {OBSERVABLES} of shape {observed.shape}, must be {shape}: a list with one value "
+            f"its response contains {OBSERVABLES} of shape {observed.shape}; it must be {shape}: a list with one value "
             "per link for each observable, in the order of the request"
         )
     return values, np.where(np.isfinite(observed), observed, np.nan)
@@ -206,7 +206,7 @@ def _read_bytes(path: Path, limit: int) -> bytes:
         raise Unusable("its response is not a file but a folder, a FIFO or a device")
     with os.fdopen(handle, "rb") as file:
         if status.st_size > limit:
-            raise Unusable(f"its response has {status.st_size:,} bytes, must have {limit:,} or fewer")
+            raise Unusable(f"its response has {status.st_size:,} bytes; it must have {limit:,} or fewer")
         return file.read(limit)
 
 
@@ -226,7 +226,7 @@ def _read_json(response: bytes, name: str, _: int) -> NDArray[np.float64]:
         rows = [[_number(entry, name) for entry in row] for row in entries]
         if len({len(row) for row in rows}) > 1:
             raise Unusable(
-                f"its response contains {name} with lists of different lengths; must be one value per link"
+                f"its response contains {name} with lists of different lengths; each must have one value per link"
             )
         return np.array(rows)
     return np.array([_number(entry, name) for entry in entries])
@@ -260,7 +260,7 @@ def _read_hdf5(response: bytes, name: str, size: int) -> NDArray[np.float64]:
             # Checked before it is read, because a small compressed file may unpack to any size.
             if dataset.size != size:
                 raise Unusable(
-                    f"its response contains {name} of shape {dataset.shape}, must contain {size} numbers"
+                    f"its response contains {name} of shape {dataset.shape}; it must contain {size} numbers"
                 )
             return np.asarray(dataset[()], dtype=float)
     except Unusable:
