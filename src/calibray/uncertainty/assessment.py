@@ -45,7 +45,7 @@ from calibray.uncertainty.sequential_monte_carlo import Posterior, draw_posterio
 from calibray.uncertainty.verdicts import Axes, JudgedSet, consistent, local_intervals, verdicts, with_reason
 
 EQUAL: Final = 0.1
-"""Difference between emulators, relative to the errors of the links, below which only their mean is used."""
+"""If drawn emulators differ from their mean by less than this share of the lowest objective, only the mean is used."""
 
 KEPT_DRAWS: Final = 128
 """Draws kept with the result."""
@@ -57,24 +57,24 @@ MAX_LINKS: Final = 100_000
 """Number of links above which no draws are made: the whitening of correlated errors would take minutes."""
 
 MAX_COLUMNS: Final = 100
-"""Number of columns of the nuisance up to which the draws include its coefficients."""
+"""Largest number of nuisance columns for which the draws include the coefficients."""
 
 SHOWN_DIFFERENCE: Final = 0.1
-"""Smallest reported difference between the credible sets for the measured buildings and for all buildings, as a share
-of their range."""
+"""The credible set for the measured buildings is reported if it differs from the set for all buildings on more than
+this share of the range that both span."""
 
 CUSTOMARY: Final = {("relative_permittivity", "linear"): 10.0, ("conductivity", "log"): float(np.log(1000.0))}
-"""Usual widths of ranges: building materials have permittivities between 2 and 12, and conductivities that span three
-decades. Wider bounds therefore do not improve a verdict."""
+"""Usual widths of parameter ranges: building materials have permittivities between 2 and 12, and conductivities that
+span three decades. Verdicts refer to these widths, so wider bounds do not improve a verdict."""
 
 EXACT_DB: Final = 1e-6
 """RMSE below which the data count as free of noise, so that linear theory is exact [dB]."""
 
 FEWEST_DRAWS: Final = 30
-"""Smallest number of effective draws whose standard deviation is compared; it is then uncertain by 13 %."""
+"""Smallest number of effective draws whose standard deviation is compared; its uncertainty is then 13 %."""
 
 NOTABLE_SHARE: Final = 0.85
-"""Largest share that is reported; larger ones may be chance, because few draws leave a standard deviation uncertain."""
+"""Largest share that is reported; larger shares may be chance, as few draws give an uncertain standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -165,11 +165,11 @@ def _approximate(intervals: dict[str, Interval]) -> dict[str, Interval]:
 def _assess(
     problem: Problem, engines: Sequence[Problem], trail: Trail, progress: Progress | None
 ) -> Certainty:
-    """Uncertainty of a problem; the draws come from copies of it with equally likely engines."""
+    """Uncertainty of a problem; the draws come from `engines`, copies of the problem with equally likely engines."""
     optimum = problem.squares(problem.parameters.to_search(trail.best)[None], derivatives=True)
     freedom = optimum.num_rows - problem.unknowns
     if freedom < 1:
-        # If there are as many unknowns as residuals, the residuals say nothing about the errors.
+        # Without more residuals than unknowns, the residuals say nothing about the errors.
         reason = Reason(ReasonKind.TOO_FEW_LINKS, {"links": optimum.num_rows})
         return Certainty(Uncertainty(_full_ranges(problem.parameters, reason)))
     local = local_intervals(problem, trail, optimum)
@@ -285,7 +285,7 @@ def _intervals(
 
 
 def _differ(verdict: JudgedSet) -> bool:
-    """Whether the sets for the measured buildings and for the mean differ on more than a tenth of their range."""
+    """Whether the sets for measured and for all buildings differ on more than a tenth of the range that both span."""
     both = (np.array(verdict.pieces), np.array(verdict.seen))
     line = np.linspace(min(each.min() for each in both), max(each.max() for each in both), 1000)
     one, other = (((each[:, :1] <= line) & (line <= each[:, 1:])).any(axis=0) for each in both)
@@ -301,7 +301,7 @@ def _named_draws(problem: Problem, model: JointModel, posterior: Posterior) -> d
     values[:, : len(model.study)] = model.study.from_search(draws.point[kept])
     by_name = dict(zip(parameters.names, values.T.tolist(), strict=True))
     if 0 < len(nuisance.columns) <= MAX_COLUMNS:
-        # Given the parameters, coefficients scatter about their best values; undetermined ones stay there.
+        # Given the parameters, coefficients scatter about their best values; if undetermined, they keep these.
         objective = replace(problem.objective, noise_db=model.marginal.noise_db)
         normal = random.standard_normal((len(values), len(nuisance.columns)))
         scatter = np.where(objective.determined, normal @ objective.coefficient_root().T, 0.0)
@@ -314,10 +314,10 @@ def _named_draws(problem: Problem, model: JointModel, posterior: Posterior) -> d
 def remaining_widths(model: JointModel, posterior: Posterior) -> list[dict[Cause, float]]:
     """For each parameter of the study, the share of its interval's width that remains without each cause.
 
-    Draws without a cause, for example those with equal buildings, follow the posterior of a study that rules it out.
-    A linear regression of the parameter on the constants that the scene fixes removes their effect; their share is an
-    upper bound, because the parameter may not depend linearly on them. Only causes that noticeably widen an
-    interval are listed, in ascending order of their shares.
+    Draws without a cause, for example those with equal buildings, are draws from the posterior of a study that rules
+    this cause out. The effect of the constants that the scene fixes is removed by linear regression of the parameter on
+    them; the share that remains is an upper bound, because the true dependence may be nonlinear. Only causes that
+    noticeably widen an interval are listed, in ascending order of the shares.
     """
     draws, width = posterior.means, len(model.study)
     models = [model.marginal.models[index] for index in posterior.model]
@@ -334,7 +334,7 @@ def remaining_widths(model: JointModel, posterior: Posterior) -> list[dict[Cause
         without = np.where(mask, 0.0, draws.weight)
         if mask.any() and _effective(without) >= FEWEST_DRAWS:
             _note(shares, cause, _deviation(draws.point, without) / full)
-    # Coordinates that all represent one value become one coordinate.
+    # All coordinates that represent the same value, such as a scattering coefficient of 0, become one coordinate.
     parameters = model.parameters
     constants = parameters.to_unit(parameters.from_unit(posterior.joint))[:, width:]
     if constants.shape[1] and _effective(draws.weight) >= FEWEST_DRAWS + constants.shape[1]:
@@ -362,22 +362,22 @@ def _effective(weight: NDArray[np.float64]) -> float:
 
 
 REPEAT_M: Final = 0.01
-"""Largest distance between the ends of rows that repeat a link [m]; antennas are larger."""
+"""Largest distance between the ends of rows that count as repeats of a link [m]; antennas are larger."""
 
 REPEAT_DB: Final = 0.1
-"""Largest difference in their modelled path loss [dB]; a different antenna or carrier changes it by more."""
+"""Largest difference in modelled path loss between such rows [dB]; another antenna or carrier changes it by more."""
 
 
 def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     """Replace the rows that repeat a link by their mean; the problem is unchanged if no row repeats a link.
 
-    Rows at one position share the error of the link. If they counted as independent, intervals would be too narrow by
-    the square root of their number. Their scatter says nothing about that error either: a noise model with one
-    variance for both underestimates it if the rows agree closely.
+    Rows at one position share the error of the link. If they were treated as independent, intervals would be too narrow
+    by a factor of the square root of the number of rows. The scatter of the rows says nothing about the shared error:
+    if the rows agree closely, a noise model with one variance for both would underestimate this error.
 
     Rows repeat a link if their ends are at the same positions, they have the same nuisances and biases, and the model
-    gives them the same path loss, for the initial and for the best values. The first row gets the mean path loss, the
-    mean weight and the means of further observables; the other rows get the weight 0.
+    gives them the same path loss, both for the initial values and for the best candidate. The first row gets the mean
+    path loss, the mean weight and the means of further observables; the other rows get the weight 0.
 
     Args:
         problem: The problem.
@@ -394,7 +394,7 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     parameters = problem.parameters
     candidates = np.stack([parameters.to_search(best), parameters.to_search(parameters.start)])
     terms = objective.nuisance.terms
-    # In units of the largest difference between repeats; two groups differ by 2 or more.
+    # In units of the largest difference that repeats may have; different groups differ by 2 or more.
     columns = np.array([
         *np.nan_to_num(problem.modelled(candidates)[:, counted] / REPEAT_DB),  # inf without a path
         *(term.value[counted] / 1e-3 for term in terms),
@@ -427,7 +427,7 @@ def _means(
 ) -> NDArray[np.float64]:
     """Values [L] in which the first row of each link has the mean of the link's known values; NaN if none is known.
 
-    `first` is, for each counted row, the number of the first row of its link [m].
+    `first` has, for each of the m rows with weight, the index of the first row of the same link [m].
     """
     known = np.isfinite(values[counted])
     number = np.bincount(first[known], minlength=len(counted))

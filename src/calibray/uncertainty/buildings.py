@@ -31,7 +31,7 @@ BATCHES: Final = (1, 128)
 """Smallest and largest number of candidates per replay."""
 
 BATCH_INTERACTIONS: Final = 400_000
-"""Number of interactions per replay, which limits the memory: larger programs use fewer candidates at once."""
+"""Target for the interactions of one replay, over all its candidates; larger programs replay fewer at once."""
 
 MANY: Final = 10_000
 """Number of interactions above which weak paths are left out."""
@@ -42,7 +42,7 @@ in Auckland, 71 % of the interactions are left out, which changes the path loss 
 errors are 5.3 dB. With a share of 0.03, 61 % are left out, and the change is 0.02 dB."""
 
 EXPONENTS: Final = {exponent for _, exponent in LAWS.values()}
-"""Fields of parameters that are exponents of laws."""
+"""Fields of parameters that are exponents of laws of frequency."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +50,9 @@ class _Part:
     """The replay of one carrier.
 
     Attributes:
-        engine: The replay; its k parameters are constants of one building each, or of all objects.
+        engine: The replay; each of its k parameters is a constant of one building, or of all objects.
         links: Indices of its links.
-        constants: Indices of its constants among those of all carriers [k]; empty if it depends on none.
+        constants: Indices of its constants among those of all carriers [k]; empty if its paths depend on none.
     """
 
     engine: Replay
@@ -111,7 +111,7 @@ class SplitReplay(Split):
     """A split replay in this process.
 
     Attributes:
-        parameters: The parameters, which may be coefficients of laws.
+        parameters: The parameters; some may be coefficients of laws of frequency.
         parts: The replays of the carriers.
     """
 
@@ -225,10 +225,10 @@ def replayed_materials(problem: Problem) -> list[dict[str, Material]]:
 
 
 def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool) -> Split:
-    """Give a problem's replay further parameters, and each building of its scene its own constants.
+    """Give a problem's replay further parameters and, if `by_building`, each building of its scene its own constants.
 
-    The problem is one that `can_split`; the study's parameters come first. A further parameter is a constant that is
-    equal at all carriers. If the paths meet fewer than two buildings, no constant belongs to a building.
+    `can_split` must be true for the problem. The study's parameters come first; a further parameter is a constant that
+    is equal at all carriers. If the paths meet fewer than two buildings, no constant belongs to a building.
     """
     engine = cast(Replay | ReplayCarriers | Chunked, problem.engine)
     # Weak paths often arrive late, and delay spreads depend on late paths.
@@ -247,7 +247,7 @@ def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool)
 def _split_paths(
     radio: RadioSettings, replay: Replay, paths: Paths, building: NDArray[np.int64], parameters: Parameters
 ) -> tuple[Replay, list[tuple[int, int]]]:
-    """The replay of one carrier with the given paths; and the parameter and the building, or -1, of each constant.
+    """The replay of one carrier with the given paths; and for each constant, its parameter and its building (-1: none).
 
     If its paths depend on no constants, the replay is unchanged, and the list is empty.
     """
@@ -261,7 +261,7 @@ def _split_paths(
     for constant_index, constant in enumerate(at_carrier):
         # Both coefficients of a law set one constant.
         setting = np.flatnonzero(constant_of == constant_index).tolist()
-        # Buildings differ by factors of a constant or of its law's scale, but not if only the exponent is a parameter.
+        # A building's factor multiplies the constant, or the coefficient of its law; buildings share one exponent.
         scaling = [index for index in setting if parameters.items[index].field not in EXPONENTS]
         index = (scaling or setting)[0]
         if constant.is_effect:
@@ -295,7 +295,7 @@ def _chunk_materials(chunk: Chunk) -> list[dict[str, Material]]:
 
 
 def _split_chunk(chunk: Chunk, splitting: _Splitting) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
-    """Parameter and building of each constant of a chunk [c, 2], the buildings met, and the interactions."""
+    """Parameter and building of each constant of a chunk [c, 2], the buildings met, and the number of interactions."""
     split = chunk.derived(splitting)
     return np.stack([split.parameter_of, split.building_of], axis=1), split.met, split.interactions
 
@@ -308,13 +308,13 @@ def _chunk_respond(
     factors: NDArray[np.float64],
     wanted: tuple[Statistic, ...],
 ) -> Responses:
-    """A chunk's answer; the factors belong to the constants with the given keys."""
+    """The responses of a chunk; `factors` belong to the constants with the given keys."""
     split = chunk.derived(splitting)
     return split.respond(values, factors[:, np.searchsorted(keys, split.keys)], wanted)
 
 
 def _interaction_buildings(paths: Paths, scene: Scene) -> NDArray[np.int64]:
-    """Building of every interaction; -1 if its material is that of the ground [I]."""
+    """Building of every interaction [I]; -1 for an interaction with a material of the ground."""
     triangles = read_triangles(scene)
     ground_names = [list(scene.materials)[k] for k in np.unique(triangles.material[triangles.ground])]
     building = building_numbers(triangles, np.asarray(paths.vertex, dtype=np.float64))

@@ -17,7 +17,7 @@ class Draws:
         point: The points [n, d].
         density: Log posterior at the points, up to a constant [n].
         weight: Their weights, which sum to one [n].
-        agree: Whether independent populations of the sampler agree on them.
+        agree: Whether the independent populations of the sampler agree.
     """
 
     point: NDArray[np.float64]
@@ -44,7 +44,7 @@ def evenly_spaced(count: int, most: int) -> NDArray[np.int64]:
 def systematic_resampling(
     weight: NDArray[np.float64], count: int, random: np.random.Generator
 ) -> NDArray[np.intp]:
-    """Draw indices by weight [n] with evenly spaced quantiles and a common random shift, ascending [count]."""
+    """Draw indices [count], ascending, by weights [n], at evenly spaced quantiles with a common random shift."""
     total = np.cumsum(weight)
     quantile = (np.arange(count) + random.random()) / count * total[-1]
     return np.minimum(np.searchsorted(total, quantile), len(weight) - 1)

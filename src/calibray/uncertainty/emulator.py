@@ -1,11 +1,11 @@
 """Emulators of an engine without derivatives, made from its calls.
 
 Intervals need thousands of evaluations, and calls are expensive. A Gaussian process for the path loss of every link
-interpolates the calls (`multifidelity/discrepancy.py`). Its mean is the corrected replay of the study's scene, if there
-is one that is not misleading; otherwise a constant. The uncertainty of the process must widen the intervals. We
-therefore draw functions from it, use each as an engine, and pool their posteriors. Every call is also predicted from
-all others. If these leave-one-out errors exceed the expected ones, the spread of the drawn functions is increased by
-the same factor.
+interpolates the calls (`multifidelity/discrepancy.py`). The mean of the process is the corrected replay of the study's
+scene, if there is one and it is not misleading; otherwise a constant. The uncertainty of the process must widen the
+intervals. We therefore draw functions from it, use each as an engine, and pool the resulting posteriors. Every call is
+also predicted from all others. If the errors of these predictions exceed the expected errors, the spread of the drawn
+functions is increased by the same factor.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MAX_CALLS: Final = 200
 """Largest number of calls that the process interpolates; its matrix is factored about a hundred times."""
 
 NEAR: Final = 0.005
-"""Distance in the unit cube below which a call is redundant, if there are more than `MAX_CALLS`."""
+"""If there are more than `MAX_CALLS` calls, only the better of two calls closer than this in the unit cube is used."""
 
 
 class MeanFunction(Protocol):
@@ -60,7 +60,7 @@ class MeanFunction(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ConstantMean:
-    """A constant mean with linear responses, if there is no replay.
+    """A constant mean with linear responses, used if there is no replay.
 
     Attributes:
         centre: Mean path loss [m], [dB].
@@ -83,9 +83,9 @@ class ConstantMean:
 
 @dataclass(frozen=True, eq=False)
 class ResponseRows:
-    """The path loss of the links with weight, then the further observables, as residuals of a cheap model.
+    """The emulated rows, which are a cheap model's residuals: path loss of links with weight, then further observables.
 
-    Further observables are in units of their errors times the error of path loss, so that all rows are comparable.
+    Further observables are divided by their errors and multiplied by that of path loss, so that rows are comparable.
 
     Attributes:
         problem: The problem.
@@ -112,7 +112,7 @@ class ResponseRows:
     def residuals(
         self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64], observed: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """See `Rows.residuals`; without a path, the measured value of an observable is used."""
+        """See `Rows.residuals`; the measured value replaces an observable of a link without a path."""
         rows = [self.problem.objective.capped(path_loss)[:, self.links]]
         for index, (each, used) in enumerate(zip(self.problem.observed, self.used, strict=True)):
             values = observed[:, index, used] / each.scale
@@ -169,7 +169,7 @@ class EmulatedEngine:
         mean: The mean function.
         function: The function added to the mean.
         rows: The definition of the m emulated rows.
-        initial_loss: Initial path loss of all links, kept for links that are not emulated [L], [dB].
+        initial_loss: Path loss of all links at the initial values [L], [dB]; links that are not emulated keep it.
         calls: Number of candidates evaluated so far.
     """
 
@@ -197,7 +197,7 @@ class EmulatedEngine:
     def respond(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
     ) -> Responses:
-        """See `Observing.respond`; the emulator computes the study's observables, or none of them."""
+        """See `Observing.respond`; the emulator computes all observables of the study, or none if `wanted` is empty."""
         count = len(candidates)
         self.calls += count
         unit = self._box.to_unit(self.parameters.to_search(candidates))
@@ -235,7 +235,7 @@ class EmulatedEngine:
     def _further(
         self, rows: NDArray[np.float64], wanted: tuple[Statistic, ...]
     ) -> Iterator[tuple[Observed, NDArray[np.int64], NDArray[np.float64]]]:
-        """The observables, the links that have them, and their part of emulated rows [n, m, ...]."""
+        """Each further observable, the links that have it, and its part of the emulated rows [n, m, ...]."""
         first = len(self.rows.links)
         every = self.rows.problem.observed if wanted else ()
         for each, used in zip(every, self.rows.used, strict=False):
@@ -250,7 +250,7 @@ class Ensemble:
     Attributes:
         mean: The posterior mean of the process.
         drawn: Functions drawn from the process.
-        apart_db: Root mean square difference between these and the mean, over the parameters' whole range [dB].
+        apart_db: Root mean square difference between drawn functions and the mean, over all of the unit cube [dB].
         error_db: Root mean square leave-one-out error of the better half of the calls [dB].
         calls: Number of calls that the process interpolates.
         replayed: The corrected replay in the mean function; None if there is none, or if it is misleading.
@@ -265,12 +265,12 @@ class Ensemble:
 
 
 def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) -> Ensemble | None:
-    """Emulate an engine from its calls, with the replay of the study's scene if available; None if too few calls."""
+    """Emulate an engine from its calls and, if available, a replay of the scene; None if there are too few calls."""
     objective, parameters, method = problem.objective, problem.parameters, problem.setup.study.method
     box, rows = Box(*parameters.search_bounds), ResponseRows(problem, np.flatnonzero(objective.weight > 0))
     calls = _calls(problem, trail, box, rows)
     random, noisy = np.random.default_rng([method.seed, 8]), bool(method.options.get("noisy", False))
-    # The replay with responses as residuals, if it predicts any link.
+    # The replay with the emulated rows as its residuals, if it predicts any row.
     replayed = None if model is None else ReplayedModel(model.engine, model.count, rows)
     replayed = replayed if replayed is not None and replayed.known.any() else None
     corrected = None
@@ -316,7 +316,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
 
 
 def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Calls:
-    """The calls with a path loss for every link with weight; a selection that favours the best ones if too many."""
+    """The calls with a path loss for every link with weight; of too many calls, a selection that favours the best."""
     parameters = problem.parameters
     candidates, modelled = np.array(trail.candidates), np.array(trail.modelled)
     observed = np.array(trail.observed)

@@ -1,17 +1,17 @@
 """The joint model of everything that is unknown: parameters, fixed constants, buildings and errors.
 
 - The study's parameters have flat priors over their bounds, or the priors that the study declares.
-- Constants of the same materials that the scene fixes, such as thickness, have a log-normal prior around the scene's
+- Constants of these materials that come from the scene, such as thickness, have a log-normal prior around the scene's
   value, because they are never known exactly. A scattering coefficient of 0 is exact with a probability of one half.
-- The walls of building b have the constants x exp(s z_b), where x is the material's mean and z_b is standard normal.
-  The between-building spread s is zero with probability `ALIKE`, otherwise exponential.
+- A constant of the walls of building b is x exp(s z_b), where x is the material's mean and z_b is standard normal. The
+  between-building spread s is zero with probability `ALIKE`, otherwise exponential.
 - Errors follow one of several noise models (`noise_models.py`), whose level, nuisances and undeclared offset are
   integrated out.
 
 `sequential_monte_carlo.py` draws from the posterior.
 
 Under Gaussian noise, correlated or not, the density with noise level and nuisance integrated out is a power of a
-quadratic form of the gaps, whose matrix is computed once unless there are many links. Under heavy tails, gaps with and
+quadratic form of the gaps. Its matrix is computed once, unless there are many links. Under heavy tails, gaps with and
 without an offset are evaluated together.
 """
 
@@ -49,8 +49,8 @@ class QuadraticForms:
 
     Attributes:
         marginal: The density.
-        group: Models that are evaluated together: the index of each Gaussian model, -1 for Student's t, -2 for gross
-            errors [models].
+        group: Group of each model; models of one group are evaluated together [models]. It is the model's own index for
+            a Gaussian model, -1 for Student's t, -2 for gross errors.
         square: Matrix [m, m], constant and exponent of each Gaussian model's form, None for other models. Empty if
             there are too many links, or censored ones.
     """
@@ -95,8 +95,8 @@ FIXED_FIELDS: Final = ("thickness", "conductivity", "scattering_coefficient")
 """Constants that come from the scene if they are not parameters."""
 
 NO_EFFECT: Final = 0.02
-"""Change of path loss by one standard deviation of a fixed constant, relative to the noise, below which it stays
-fixed: its variance is then below 0.04 % of the noise variance."""
+"""A constant from the scene stays fixed if one standard deviation of it changes path loss by less than this share of
+the noise level: the resulting variance is then below 0.04 % of the noise variance."""
 
 ALIKE: Final = 0.5
 """Prior probability that buildings do not differ."""
@@ -105,15 +105,15 @@ MEAN_SPREAD: Final = 0.15
 """Mean of the exponential prior of the between-building spread if buildings differ."""
 
 SPREAD_BOUNDS: Final = (0.004, 0.8)
-"""Range of the spread of buildings that differ."""
+"""Range of the between-building spread if buildings differ."""
 
 GRID: Final = 2001
 """Number of points over the range of a parameter at which its prior is tabulated."""
 
 
 Gaps = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
-"""Maps points of the unit cube [n, d + k] and logarithms of the factors of buildings' constants [n, c] to measured
-minus modelled path loss, without the nuisance, times the square roots of the links' weights [n, m], [dB]."""
+"""Maps points of the unit cube [n, d + k] and logarithms of the factors on buildings' constants [n, c] to gaps [n, m],
+[dB]. A gap is measured minus modelled path loss, without the nuisance, times the square root of the link's weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,13 +129,13 @@ class JointModel:
         marginal: The density of the gaps under every noise model.
         parameter_of: Index of the parameter to which each of the c constants of single buildings belongs [c].
         building_of: Building of each of these constants, numbered from 0 [c].
-        only_buildings: Indices of the parameters whose constants all belong to buildings, so that these determine the
-            mean.
+        only_buildings: Indices of the parameters whose constants all belong to buildings, so that the buildings alone
+            determine the mean.
         spread: The between-building spread if the study declares it; otherwise None.
         interactions: Number of interactions per evaluation.
         effects_db: Change of path loss by one standard deviation of each fixed constant [dB].
-        observed: Number of rows of each further observable, which follow the m gaps of path loss; its degrees of
-            freedom; and whether the rows are in units of the stated error.
+        observed: For each further observable, the number of its rows, its degrees of freedom, and whether its rows are
+            in units of a stated error. The rows follow the m gaps of path loss.
     """
 
     study: Parameters
@@ -153,12 +153,12 @@ class JointModel:
     observed: tuple[tuple[int, int, bool], ...] = ()
 
     def densities(self, gaps: NDArray[np.float64], model: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Log likelihood of gaps that have one noise model each [n]."""
+        """Log likelihood of gaps [n], each under its own noise model [n]."""
         links, further = self._split(gaps)
         return self.forms.densities(links, model) + further
 
     def densities_by_model(self, gaps: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Log likelihood of gaps under every noise model, with its prior weight [n, models]."""
+        """Log likelihood of gaps under every noise model, plus the logarithm of its prior weight [n, models]."""
         links, further = self._split(gaps)
         return self.marginal.densities(links) + further[:, None]
 
@@ -178,13 +178,13 @@ class JointModel:
 
     @cached_property
     def forms(self) -> QuadraticForms:
-        """The density of gaps that have one noise model each."""
+        """The density of gaps, each under its own noise model."""
         return QuadraticForms.of(self.marginal)
 
     def at_scene_constants(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log posterior [n] at points of the study's search space [n, d], up to a constant.
 
-        Buildings are equal, and the constants are the scene's. The posterior is averaged over the noise models.
+        Buildings are equal, and further constants have the scene's values. The posterior is averaged over noise models.
         """
         constants = [item.start for item in self.parameters.items[len(self.study) :]]
         values = np.hstack([self.study.from_search(points), np.tile(constants, (len(points), 1))])
@@ -229,7 +229,7 @@ class JointModel:
 
 
 def joint_model(problem: Problem, best: NDArray[np.float64], square: float, freedom: int) -> JointModel:
-    """Set up the joint model of all that a study does not fix, from the optimum in the search space [d].
+    """Set up the joint model of everything that is unknown, from the optimum `best` in the search space [d].
 
     `square` is the mean square of the residuals there [dB^2], and `freedom` their number minus the number of unknowns.
     """
@@ -246,9 +246,9 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
     at_bound = (coefficients <= nuisance.lower) | (coefficients >= nuisance.upper)
     design = nuisance.design[counted].toarray() if nuisance.terms else np.zeros((len(counted), 0))
     used = objective.determined & ~at_bound
-    # Few links cannot distinguish noise models or buildings, so only those that the study states are used.
+    # Few links cannot distinguish noise models, or show that buildings differ: only what the study states is used.
     few = len(counted) < FEW
-    # With correlated errors, the probability of censoring is an integral over all censored links.
+    # With correlated errors, the probability of censoring would be an integral over all censored links together.
     uncorrelated = bool(censored.any()) or (few and section.range_m == "auto")
     out_of_sight = not uncorrelated and section.range_m == "auto"
     models = noise_models(
@@ -305,7 +305,7 @@ def _with_constants(
     best: NDArray[np.float64],
     gap: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> JointModel:
-    """The model with the constants that the scene fixes and that have an effect, and with buildings."""
+    """The model with buildings, and with those of the scene's fixed constants that affect path loss."""
     study, known_to = model.study, problem.setup.study.noise.constants_spread
     fixed = _fixed_constants(problem)
     every = replace(study, items=(*study.items, *fixed))
@@ -366,7 +366,7 @@ def _with_constants(
 
 
 def _further(problem: Problem, observed: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Rows of the further observables [n, m] each, in units of the error if it is stated."""
+    """Rows of each further observable [n, m], in units of its error if the study states it."""
     rows = []
     for index, each in enumerate(problem.observed):
         residuals, _ = each.residuals(observed[:, index], problem.objective.weight)
@@ -383,7 +383,7 @@ def has_offset(problem: Problem) -> bool:
 
 
 def _fixed_constants(problem: Problem) -> list[Parameter]:
-    """Constants that the scene fixes, equal at all carriers, of the materials that have a parameter.
+    """Constants of materials with a parameter that the scene fixes and that are equal at all carriers.
 
     A scattering coefficient of 0 that the study states is exact, also for facades of the material.
     """
@@ -415,7 +415,7 @@ def _fixed_constants(problem: Problem) -> list[Parameter]:
 def _weights_and_censoring(problem: Problem) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Weights of the links in the likelihood [L], and mask of the censored ones [L].
 
-    With censored links in the likelihood, links measured near the noise floor are used as well: the links are then not
+    With censored links in the likelihood, links measured near the noise floor are used as well, so that links are not
     selected by their measured values.
     """
     objective, links = problem.objective, problem.setup.links

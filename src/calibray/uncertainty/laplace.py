@@ -1,14 +1,14 @@
 """Densities of errors whose integrals over nuisance and scale have no closed form: Laplace's approximation.
 
-Heavy tails: the tails of Student's t decrease gradually. If most errors are ordinary and a few are gross, for example
-because a link's position was recorded wrongly, the ordinary errors are Gaussian, and a share of the errors has a
-larger standard deviation (J. W. Tukey, in: Contributions to Probability and Statistics, 1960). We fit both by
-iteratively reweighted least squares (K. L. Lange, R. J. A. Little, J. M. G. Taylor, J. Am. Stat. Assoc. 84 (1989) 881)
-and integrate at the mode, with the Fisher information.
+Heavy tails: either the errors follow Student's t, whose tails decrease gradually, or most errors are Gaussian and a few
+are gross, for example because a link's position was recorded wrongly. Gross errors are Gaussian with a larger standard
+deviation (J. W. Tukey, in: Contributions to Probability and Statistics, 1960). We fit both distributions by iteratively
+reweighted least squares (K. L. Lange, R. J. A. Little, J. M. G. Taylor, J. Am. Stat. Assoc. 84 (1989) 881) and
+integrate at the mode, with the Fisher information.
 
 Censored links, whose path loss is only known to be above the noise floor: a measured link contributes the density of
 its error, and a censored one the probability that its error is at least as large as the floor requires (J. Tobin,
-Econometrica 26, 1958). Without the censored links, only those with favourable errors would remain near the floor. For
+Econometrica 26, 1958). Without the censored links, only links with favourable errors would remain near the floor. For
 errors e = s u, with u standard normal or Student's t, and nuisance coefficients b, damped Newton steps in b and log s
 maximise the logarithm of
 
@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, log_ndtr, stdtr
 
 CENSORED_TOLERANCE: Final = 1e-9
-"""Predicted gain of the log density at which the iteration ends."""
+"""Predicted gain in log density below which the iteration ends."""
 
 LARGEST: Final = 1e4
-"""Limit for errors, in units of their median; applies to a censored link without a path, whose error is infinite."""
+"""Limit for the error of a censored link, in units of the median absolute error; it is infinite without a path."""
 
 
 class _Terms(NamedTuple):
@@ -41,7 +41,7 @@ class _Terms(NamedTuple):
 
 
 def log_survival(error: NDArray[np.float64], freedom: float) -> NDArray[np.float64]:
-    """Log probability of exceeding an error, in units of its scale; Gaussian if the degrees of freedom are infinite.
+    """Log probability that Student's t exceeds an error, in units of its scale; Gaussian if `freedom` is infinite.
 
     Example:
         >>> log_survival(np.array([0.0, 40.0]), np.inf).round(2).tolist()
@@ -184,7 +184,7 @@ MAX_STEPS: Final = 25
 """Largest number of steps to the mode."""
 
 TOLERANCE: Final = 1e-3
-"""Relative change of errors and scale at which the iteration ends; the density is flat at the mode."""
+"""Change of errors and scale, relative to the scale, at which the iteration ends; the density is flat at the mode."""
 
 GROSS_SHARE: Final = 0.1
 """Share of gross errors."""
@@ -241,7 +241,7 @@ def _student(freedom: NDArray[np.float64], constant: NDArray[np.float64]) -> Tai
 
 @cache
 def gross() -> Tail:
-    """Gaussian errors; a share `GROSS_SHARE` of them has a standard deviation larger by `GROSS_RATIO`."""
+    """Gaussian errors; a share `GROSS_SHARE` of them has a standard deviation that is `GROSS_RATIO` times as large."""
     share, times = GROSS_SHARE, GROSS_RATIO
     ratio, fall = share / (1.0 - share) / times, 0.5 * (1.0 - 1.0 / times**2)
     constant = float(np.log1p(-share) - 0.5 * np.log(2 * np.pi))

@@ -1,8 +1,8 @@
 """Search for a missing region, such as unmapped trees, whose extra loss explains the residuals best.
 
-All rectangles of a grid are tried, at several heights: the residuals are regressed on the length of each straight line
-inside. The same search over residuals in random order shows the effect of chance (a scan statistic; M. Kulldorff,
-Communications in Statistics 26, 1997).
+For each rectangle of cells of a grid, at several heights, the residuals are regressed on the length of every link's
+straight line inside it. The same search over residuals in random order shows what chance can explain (a scan statistic;
+M. Kulldorff, Communications in Statistics 26, 1997).
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ HEIGHTS: Final = (5.0, 10.0, 20.0)
 """Heights above the lowest antenna up to which the rectangles reach [m]: hedges, street trees, tall trees."""
 
 FEWEST_LINKS: Final = 30
-"""Smallest number of links that are searched."""
+"""Smallest number of links for a search."""
 
 MOST: Final = 20_000
-"""Largest number of links that are searched; of more links, every second, third, ... is used."""
+"""Largest number of links in a search; if there are more, every second, third, ... link is used."""
 
 SHUFFLES: Final = 99
-"""Number of random orders of the residuals; a rectangle is significant only if none of them gives a better one."""
+"""Number of random orders of the residuals; a rectangle is significant only if none has one that explains as much."""
 
 
 class Explained(NamedTuple):
     """The best rectangle of one width.
 
     Attributes:
-        explained: Sum of squares that it explains.
+        explained: Sum of squares that the rectangle explains.
         attenuation: Its attenuation [dB/m].
-        cells: Its corners, in cells [2, 2].
-        chance: Sum of squares that the best rectangle of this width explains for residuals in random order [k - 1].
+        cells: Its south-west and north-east corners, in cells [2, 2].
+        chance: Sum of squares that the best rectangle of this width explains, by random order of the residuals [k - 1].
     """
 
     explained: float
@@ -56,12 +56,12 @@ class MissingRegion:
     """A rectangle whose extra loss would explain residuals.
 
     Attributes:
-        box: West, south, east and north in the scene's frame [m].
-        height: Height up to which it reaches [m].
+        box: West, south, east and north sides in the scene frame [m].
+        height: Height of its top in the scene frame [m].
         attenuation: Loss per length inside [dB/m].
         links: Number of links whose straight line crosses it; an estimate if not all links are searched.
         share: Share of the mean square of the residuals that it explains.
-        chance: Median share that the best rectangle explains if residuals are in random order.
+        chance: Median share that the best rectangle explains of residuals in random order.
         significant: Whether at least `FEW` links cross it, and no random order has a rectangle that explains as much.
     """
 
@@ -94,7 +94,7 @@ def missing_region(
         known: Columns that explain residuals in another way, such as whether a link is out of sight [n].
 
     Returns:
-        The rectangle; None if there are too few links, or no extra loss explains anything.
+        The rectangle; None if there are too few links, or if extra loss in a rectangle explains no residuals.
     """
     if len(excess_db) < FEWEST_LINKS:
         return None
@@ -169,8 +169,8 @@ def _lengths(
 def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> Iterator[Explained]:
     """The best rectangle of the grid for each width.
 
-    The arguments are products of residuals and the columns of the cells, with unshuffled residuals first [cells, k],
-    and products of the columns of the cells [cells, cells].
+    `moments` are the scalar products of the cells' columns with the residuals, unshuffled residuals first [cells, k].
+    `products` are those of the cells' columns with each other [cells, cells].
     """
     moment = _summed(moments.reshape(GRID, GRID, -1), (0, 1))
     total = _summed(products.reshape((GRID,) * 4), (0, 1, 2, 3))
@@ -203,7 +203,7 @@ def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> 
 
 
 def _summed(values: NDArray[np.float64], axes: Sequence[int]) -> NDArray[np.float64]:
-    """Cumulative sums along axes, starting at 0, so that sums over ranges are differences."""
+    """Cumulative sums along axes, starting at 0, so that the sum over any range is a difference of two values."""
     for axis in axes:
         values = np.insert(np.cumsum(values, axis=axis), 0, 0.0, axis=axis)
     return values

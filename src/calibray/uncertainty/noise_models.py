@@ -2,22 +2,22 @@
 
 Errors may be independent and Gaussian, correlated between neighbours, larger out of sight, or heavy-tailed, and an
 offset may be undeclared. Larger errors out of sight are a discrepancy of the twin (M. C. Kennedy and A. O'Hagan, J.
-Royal Statistical Society B 63, 2001): paths that it lacks change the path loss of its weak links (`excess_db`).
-The right model is unknown, and choosing the best-fitting one ignores others that fit nearly as well. Every model
-therefore gets a prior weight, and results are averages over all models (Bayesian model averaging). A discrepancy that
-the data do not need thus has almost no weight, and leaves to the parameters what they explain.
+Royal Statistical Society B 63, 2001): paths that it lacks change the path loss of its weak links (`excess_db`). The
+right model is unknown, and choosing the best-fitting one ignores others that fit nearly as well. Every model therefore
+gets a prior weight, and results are averages over all models (Bayesian model averaging). A discrepancy that the data do
+not need therefore gets almost no weight, and does not absorb what the parameters explain.
 
 The noise level has the prior 1/level, and nuisances have their own priors, flat unless declared. For Gaussian noise
-with covariance C times an unknown variance, both have closed forms (D. A. Harville, Biometrika 61, 1974): with
-whitened errors y and design Z, ridge R, A = Z'Z + R'R and S = y'y - y'Z A^-1 Z'y,
+with covariance C times an unknown variance, the integrals over both have closed forms (D. A. Harville, Biometrika 61,
+1974): with whitened errors y and design Z, ridge R, A = Z'Z + R'R and S = y'y - y'Z A^-1 Z'y,
 
     p = (2 pi)^(-f/2) Gamma(f/2) / 2 (S/2)^(-f/2) |C|^(-1/2) |A|^(-1/2) |R|,
 
 where f is the number of links minus the number of columns with a flat prior. For heavy tails, both integrals use
 Laplace's approximation (`laplace.py`).
 
-Paths that the twin lacks, such as paths through buildings, add power. They hardly change links in sight, but raise the
-power of links out of sight by as much as the twin underestimates it.
+Paths that the twin lacks, such as paths through buildings, add power. They hardly change the power of links in sight.
+Out of sight, the twin underestimates the power by their contribution.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ from calibray.uncertainty.residual_correlation import (
 )
 
 CANDIDATES: Final = 16
-"""Number of candidates within the bounds; the median of their path losses is what the scene predicts for a link."""
+"""Number of candidates within the bounds; the scene's prediction for a link is the median of their path losses."""
 
 STRONGEST: Final = 0.05
 """Quantile of the excess loss that represents the strongest links: those in line of sight, if there are any."""
 
 
 def excess_db(problem: Problem) -> NDArray[np.float64]:
-    """Path loss of links out of sight in excess of free space and of the strongest links [L], [dB].
+    """Excess loss of links out of sight over free space, relative to that of the strongest links [L], [dB].
 
-    It is the median over candidates between the bounds; minus infinity in sight, where the twin has the line of sight.
+    It is the median over candidates between the bounds; minus infinity for links in sight, which have a direct path.
     """
     from scipy.stats import qmc  # takes 0.4 s
 
@@ -66,7 +66,7 @@ def excess_db(problem: Problem) -> NDArray[np.float64]:
 
 
 def missing_db(excess: NDArray[np.float64], level: float) -> NDArray[np.float64]:
-    """Change of path loss due to missing power, at a level below the line of sight, for links with this excess [dB]."""
+    """Change of path loss [dB] due to missing power `level` dB below the line of sight, for links with this excess."""
     # 10 log10(1 + 10^((excess - level) / 10)), without overflow.
     return 10.0 * np.logaddexp(0.0, (excess - level) * (0.1 * np.log(10.0))) / np.log(10.0)
 
@@ -84,26 +84,26 @@ RANGES: Final = 4
 """Number of correlation ranges tried, from the distance between neighbours to a third of the campaign's extent."""
 
 SAME_PLACE: Final = 0.01
-"""Correlation range of errors that only links at one position share, relative to the distance between neighbours."""
+"""Correlation range of errors that only links at one position share, as a share of the distance between neighbours."""
 
 FREEDOMS: Final = (2.0, 4.0)
 """Degrees of freedom of Student's t that are tried."""
 
 DEPARTURE: Final = 2.0
-"""Prior weight of an offset, of correlated and of heavy-tailed errors, relative to independent Gaussian ones: measured
-errors are rarely so. Larger errors out of sight have weight one: if the twin lacks refraction, their posterior weight
-exceeds 0.9 in five of nine development runs."""
+"""Prior weight of an offset, of correlated errors and of heavy-tailed errors, relative to none and to independent
+Gaussian errors: measured errors are rarely independent and Gaussian. Larger errors out of sight have weight one: if the
+twin lacks refraction, their posterior weight exceeds 0.9 in five of nine development runs."""
 
 IMPROBABLE: Final = 50.0
-"""Log odds at the optimum above which a model is left out for many links. At its own optimum, that model can gain a few
-units per parameter, which is far less than this."""
+"""With many links, a model is left out if the log odds against it at the optimum reach this. At its own optimum, the
+model can gain a few units per parameter, which is far less."""
 
 LEVELS: Final = (5.0, 15.0, 25.0)
-"""Levels tried for the power that the twin lacks out of sight: how far it is below the power in sight [dB]. In three
-development districts whose twins lack refraction, it is 2 to 35 dB below."""
+"""Trial levels of the power that the twin lacks out of sight, in dB below the power in sight. In three development
+districts whose twins lack refraction, the missing power is 2 to 35 dB below."""
 
 COMMON: Final = 0.5
-"""Share of these errors' variance that all links have in common: missing paths can only add power."""
+"""Share of the variance of errors out of sight that all links have in common: missing paths can only add power."""
 
 # Kinds of noise; "student-t" includes Gaussian noise with gross errors.
 GAUSSIAN, CORRELATED, OUT_OF_SIGHT, HEAVY = "gaussian", "correlated", "out_of_sight", "student-t"
@@ -213,7 +213,7 @@ class Marginal:
         noise_db: Approximate noise level, which scales priors [dB].
         models: The noise models.
         whiteners: Whitener of each correlated or "out_of_sight" model, by kind, range and share.
-        censored: Mask of the censored links, whose gaps are lower limits [m]; no model has a whitener then.
+        censored: Mask of the censored links, whose gaps are lower limits [m]; if any, no model has a whitener.
     """
 
     design: NDArray[np.float64]
@@ -246,7 +246,7 @@ class Marginal:
             noise_db: Approximate noise level [dB].
             models: The noise models.
             censored: Mask of the censored links [m]; none if None.
-            excess_db: Loss out of sight in excess of the links in sight [m]; None if no model is "out_of_sight" [dB].
+            excess_db: The function `excess_db` at these links [m], [dB]; None if no model is "out_of_sight".
         """
         censored = np.zeros(len(scale), dtype=bool) if censored is None else censored
         whiteners = {}
@@ -269,7 +269,7 @@ class Marginal:
         return replace(self, models=tuple(self.models[k] for k in kept)) if len(kept) else self
 
     def densities(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Log density of the measurements plus the log weight, for each model [n, models]; -inf without a finite gap.
+        """Log density of the measurements plus the log weight, for each model [n, models]; -inf if a gap is not finite.
 
         Gaps are measured minus modelled path loss, without the nuisance, times the square roots of the weights [n, m],
         [dB].
@@ -321,7 +321,7 @@ class Marginal:
         design, ridge = self._with_offset(bool(offset.any()))
         by_gap = np.tile(ridge / self.noise_db, (len(gap), 1))
         if offset.any():
-            # A ridge this large fixes the offset at 0. The normalisation of this prior cancels its integral.
+            # A ridge this large fixes the offset at 0. Its prior's normalisation cancels the integral over it.
             by_gap[~offset, -1] = NO_OFFSET
         freedom = np.array([model.freedom for model in models])
         return evidence(gap, design, by_gap, gross() if models[0].gross else student(freedom))

@@ -2,10 +2,10 @@
 
 - One or more parameters move along the difference of two other members (C. J. F. ter Braak, Statistics and Computing
   16, 2006).
-- One parameter is redrawn from the smoothed density of its values in the population. Reflections inside walls give a
-  permittivity several narrow ranges, and a member can reach any of them in one move.
-- One, two or all buildings are redrawn around their values (S. L. Cotter, G. O. Roberts, A. M. Stuart and D. White,
-  Statistical Science 28, 2013).
+- One parameter is redrawn from the smoothed density of its values in the population. Because of reflections inside
+  walls, several narrow ranges of a permittivity can fit; a member can reach any of them in one move.
+- The constants of one, two or all buildings are redrawn around their current values (S. L. Cotter, G. O. Roberts, A. M.
+  Stuart and D. White, Statistical Science 28, 2013).
 - The between-building spread is redrawn from its prior, together with all buildings: buildings become equal or
   different.
 - Means and spread are redrawn given the buildings' constants. The constants, and with them path loss, stay the same, so
@@ -92,7 +92,7 @@ class Lengths:
     """Lengths of moves, adapted to their acceptance.
 
     Attributes:
-        buildings: Length of a move of all buildings; 1 draws them independently of their values.
+        buildings: Length of a move of all buildings; 1 draws them independently of their current values.
         points: Length of a move along a difference, relative to the optimum for a normal density.
     """
 
@@ -125,7 +125,7 @@ class Moves:
     random: np.random.Generator
 
     def sweep(self, population: Population, lengths: Lengths) -> tuple[Population, Lengths]:
-        """Move every member in each way."""
+        """Apply each kind of move to every member, except for those of `redraw_categories`."""
         population, lengths = self._move_points(population, lengths)
         if len(self.model.parameter_of):
             population, lengths = self._move_buildings(population, lengths)
@@ -229,7 +229,7 @@ class Moves:
         return population
 
     def _redraw_mean(self, population: Population, index: int) -> Population:
-        """Given k buildings, log x is normal about their mean logarithm with deviation s / sqrt(k), times the prior."""
+        """Redraw mean x: log x is normal about the mean of k buildings with deviation s / sqrt(k), times the prior."""
         parameters, columns = self.model.parameters, self.model.parameter_of == index
         values, spread = parameters.from_unit(population.point), population.spread
         differing = spread > 0

@@ -32,12 +32,12 @@ from calibray.uncertainty.joint_model import has_offset
 from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, HEAVY, OUT_OF_SIGHT
 
 SIGNIFICANT: Final = 0.005
-"""Probability of a larger increase without a conflict, below which a conflict is reported; errors that neighbouring
-links share make small probabilities somewhat more frequent."""
+"""A conflict is reported if the probability of a larger increase without a conflict is below this. Errors that
+neighbouring links share make small probabilities slightly more frequent."""
 
 UNRELATED: Final = 0.02
-"""Probability of so small a slope under the model, below which an observable does not fit the scene; it is divided by
-the number of observables."""
+"""An observable does not fit the scene if the probability of so small a slope under the model is below this value,
+divided by the number of observables."""
 
 FEWEST: Final = 5
 """Degrees of freedom below which no slope is judged."""
@@ -46,15 +46,15 @@ CONFLICT_STARTS: Final = 32
 """Number of local searches per fit."""
 
 DOMINANT: Final = 1e3
-"""Factor by which the further observables count more than path loss in a fit that is meant to use only them, and less
-in a fit to path loss alone. All fits can then use the same compiled program."""
+"""Factor on the residuals of the further observables in the fit that is meant to use only them; the fit to path loss
+alone divides by it. All fits can then use the same compiled program."""
 
 
 def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...]:
-    """Compare the parameters that path loss and the further observables of a problem with minima [k, d] require.
+    """Compare the parameters that path loss requires with those that further observables require; `minima` are [k, d].
 
     Returns:
-        Remarks with both fits and the conflict in standard errors; none without a conflict.
+        Remarks that give both fits and the size of the conflict, in standard errors; empty if there is no conflict.
     """
     objective, width = problem.objective, len(problem.parameters)
     starts = minima[:BASINS]
@@ -112,7 +112,7 @@ class Slope(NamedTuple):
 
 
 def _slopes(problem: Problem, point: NDArray[np.float64]) -> list[Slope]:
-    """Slopes of the observables at a point of the search space, fitted with a constant or the biases of devices."""
+    """Slopes of the observables at a point of the search space, fitted with a constant or with the devices' biases."""
     modelled = problem.respond(problem.parameters.from_search(point[None])).observed[0]
     slopes = []
     for each, values in zip(problem.observed, modelled, strict=True):
@@ -132,7 +132,7 @@ def _slopes(problem: Problem, point: NDArray[np.float64]) -> list[Slope]:
 
 
 def _weighted(problem: Problem, weight: float) -> Problem:
-    """The problem with the rows of its further observables times a weight."""
+    """The problem with the rows of its further observables multiplied by a weight."""
     return replace(problem, observed=tuple(replace(each, std=each.std / weight) for each in problem.observed))
 
 
@@ -145,20 +145,20 @@ def _squares(problem: Problem, point: NDArray[np.float64]) -> NDArray[np.float64
 
 
 LIKELY: Final = 0.75
-"""Odds of three to one against independent Gaussian errors, or against equal buildings, at which a departure is
-reported. A priori, buildings differ with a probability of one half."""
+"""Probability above which a departure from independent Gaussian errors, or from equal buildings, is reported: odds of
+three to one. A priori, buildings differ with a probability of one half."""
 
 NOTABLE: Final = 0.25
 """Smallest posterior weight of a kind of noise that is reported; several kinds can share the weight."""
 
 SLACK: Final = 0.02
-"""Distance between a value and its interval, as a share of the range, above which it is reported."""
+"""A calibrated value is reported if its distance from its interval exceeds this share of the parameter's range."""
 
 MISSED_DB: Final = 0.01
-"""Improvement of the objective by a draw above which the method is reported to have missed the optimum [dB]."""
+"""The method is reported to have missed the optimum if a draw has an objective that is lower by at least this [dB]."""
 
 STARTS: Final = 16
-"""Number of local searches with a free offset, in addition to those from the minima without it."""
+"""Number of local searches with a free offset, in addition to those that start from the minima without an offset."""
 
 OFFSET_DB: Final = 0.1
 """Smallest undeclared offset that is reported [dB]."""
@@ -174,9 +174,9 @@ CAUSES: Final = (CORRELATED, OUT_OF_SIGHT, HEAVY, DIFFERING, GAUSSIAN)
 
 
 def departures(noise: Mapping[str, float], study: StudyModel) -> tuple[Remark, ...]:
-    """A remark for each noise model that the data favour over independent Gaussian noise, from their weights.
+    """A remark for each noise model that the data favour over independent Gaussian noise, from the posterior weights.
 
-    Noise that the study states is not reported. The study also shows which paths the model may lack.
+    Noise that the study states is not reported. A remark on errors out of sight lists tracer settings that add paths.
     """
     gaussian, remarks = float(noise.get(GAUSSIAN, 0.0)), []
     stated = {
@@ -199,7 +199,7 @@ def departures(noise: Mapping[str, float], study: StudyModel) -> tuple[Remark, .
 
 
 def _lacking(study: StudyModel) -> list[str]:
-    """Settings of the tracer that would find further paths, as in a study file; none for an external program."""
+    """Settings of the tracer that would find further paths, as in a study file; empty for an external program."""
     if study.engine.external:
         return []
     switches = [f"{name} = true" for name in ("refraction", "diffraction") if not getattr(study.trace, name)]
@@ -208,7 +208,7 @@ def _lacking(study: StudyModel) -> list[str]:
 
 
 def missed(problem: Problem, posterior: Draws, best_value: float) -> tuple[Remark, ...]:
-    """A remark if a draw has a lower objective [dB] than the best candidate of the method."""
+    """A remark if a draw has a lower objective [dB] than the method's best candidate, by at least `MISSED_DB`."""
     top = posterior.point[np.argsort(-posterior.density)[:16]]
     lowest = float(problem.squares(top).value.min())
     if lowest > best_value - MISSED_DB:
@@ -230,7 +230,7 @@ def outside_interval(
         problem: The problem.
         optimum: The calibrated values by parameter.
         intervals: The intervals.
-        most_probable: The values of the draw of highest density by parameter.
+        most_probable: The values by parameter of the draw with the highest density at the scene's constants.
         log_odds: Log density of that draw minus that of the calibrated values.
         noise: Posterior weights of the noise models.
     """
@@ -257,7 +257,7 @@ class UndeclaredOffset(NamedTuple):
     """An offset for all links, fitted in addition to the study's model.
 
     Attributes:
-        offset_db: The best offset [dB]; None if the study declares one, or if the fit does not change.
+        offset_db: The best offset [dB]; None if the study declares one, or if an offset does not improve the fit.
         error_db: Its standard error [dB].
         remarks: A warning if it is significant.
     """

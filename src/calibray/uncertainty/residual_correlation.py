@@ -2,13 +2,13 @@
 
 A link's error has a correlated and an uncorrelated part. Nearby receivers share the correlated part, for example
 because clutter that the scene lacks shadows all of them. Its covariance falls off exponentially with distance. Range
-and size maximise the restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971), so that fitted
-parameters do not bias the noise low. The fit is exact, with one Cholesky factorisation per trial, for up to a few
+and size maximise the restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971), so that the fit of
+parameters does not bias the noise low. The fit is exact, with one Cholesky factorisation per trial, for up to a few
 thousand links.
 
-Whitening makes errors independent. For up to a few hundred links, it factors their covariance. For more links, each
-error is its conditional mean given its nearest neighbours among the earlier links, plus an independent remainder (A. V.
-Vecchia, J. R. Stat. Soc. B 50, 1988). The time is then proportional to the number of links.
+Whitening makes errors independent. For up to a few hundred links, the covariance of the errors is factored. For more
+links, each error is modelled as its conditional mean given the errors of the nearest earlier links, plus an independent
+remainder (A. V. Vecchia, J. R. Stat. Soc. B 50, 1988). The time is then proportional to the number of links.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from calibray.support.memory import single_blas_thread
 from calibray.uncertainty.draws import evenly_spaced
 
 SHARES: Final = (0.001, 0.999)
-"""Bounds of the correlated share of the variance; at 1 the covariance of nearby links is singular."""
+"""Bounds of the correlated share of the variance; at 1, the covariance of links at one position would be singular."""
 
 FEWEST_LINKS: Final = 10
 """Number of links below which no correlation is reported; fewer links cannot show one."""
@@ -43,13 +43,13 @@ EXACT: Final = 600
 """Number of links up to which the covariance is factored exactly."""
 
 NEAREST: Final = 20
-"""Neighbours in Vecchia's approximation."""
+"""Number of neighbours in Vecchia's approximation."""
 
 CHUNK: Final = 500
 """Number of links whose neighbourhoods are solved together."""
 
 Neighbours = tuple[NDArray[np.int64], NDArray[np.int64]]
-"""An order of the links [m], and the places in it of each link's nearest earlier links, -1 for none [m, NEAREST]."""
+"""An order of the links [m], and the indices in it of each link's nearest earlier links [m, NEAREST]; -1 for none."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,8 @@ def fit_correlation(
 ) -> Correlation:
     """Fit range and size of the correlated part of errors [m], [dB], by restricted maximum likelihood.
 
-    Positions [m, k], [m], are those of the receivers or of both ends. The design has the columns that were fitted to
-    the same links, of full rank [m, q]: nuisances, and derivatives with respect to the parameters.
+    Positions [m, k], [m], are those of the receivers or of both ends. The columns of `design` [m, q], which has full
+    rank, were fitted to the same links: nuisances, and derivatives with respect to the parameters.
 
     Raises:
         InputError: The number of links exceeds that of columns by less than three, or all receivers share one position.
@@ -100,7 +100,7 @@ def fit_correlation(
         raise InputError("noise: all receivers have the same position; set range_m = 0")
     if not errors.any():
         raise EngineError("noise: all errors are zero, so no noise can be fitted; check the measured values")
-    # Below these ranges, errors are independent; above them, they are common to all links.
+    # Below the first range, errors are independent; above the second, they are common to all links.
     log_ranges = np.log([pairs[pairs > 0].min() / 3, 3 * pairs.max()])
 
     def trial(share: float, log_range: float) -> tuple[float, float]:
@@ -170,7 +170,7 @@ def variogram(
     """
     chosen = evenly_spaced(len(errors), MOST_LINKS)
     distance, half = pdist(position[chosen]), 0.5 * pdist(errors[chosen, None], "sqeuclidean")
-    if len(distance):  # pairs farther apart than half the extent are few, and all lie at its ends
+    if len(distance):  # pairs farther apart than half the extent are few, and all join opposite ends
         near = distance <= max(np.median(distance), distance.max() / 2)
         distance, half = distance[near], half[near]
     order = np.argsort(distance, kind="stable")
@@ -200,7 +200,7 @@ class Whitener:
 
 
 def pairwise(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances between positions [n, k] of links; for 2 `EXACT` links or more, those of a subset [m, m]."""
+    """Distances between positions [n, k] of links; of a subset [m, m] for at least twice `EXACT` links."""
     subset = position[:: max(1, len(position) // EXACT)]
     return np.asarray(cdist(subset, subset), dtype=np.float64)
 
@@ -215,9 +215,9 @@ def whitener(
 ) -> Whitener:
     """Make the whitener of errors of links whose ends have positions [m, k], [m].
 
-    The errors were multiplied by `scale` [m], so the uncorrelated part has the same variance for all. The covariance of
-    the correlated part, a share of the variance from 0 to below 1, falls to 1/e at the distance `range_m` [m]. Up to
-    `exact` links, the covariance is factored exactly. `neighbours` are computed if None.
+    The errors were multiplied by `scale` [m], so the uncorrelated part has the same variance for all. The correlated
+    part has `share` of the variance, from 0 to below 1, and its covariance falls to 1/e at the distance `range_m` [m].
+    Up to `exact` links, the covariance is factored exactly. `neighbours` are computed if None.
     """
     count = len(position)
     if count <= exact:
@@ -229,7 +229,7 @@ def whitener(
 def shared(error: NDArray[np.float64], share: float) -> Whitener:
     """The whitener of errors of unit variance plus further errors with these standard deviations [m].
 
-    All links have a share of the further variance in common; above `EXACT` links, all errors are independent.
+    All links have `share` of the further variance in common; above `EXACT` links, errors count as independent.
     """
     if len(error) > EXACT:
         variance = 1.0 + error**2
@@ -244,7 +244,7 @@ def _exact(covariance: NDArray[np.float64]) -> Whitener:
 
 
 def nearest_earlier(position: NDArray[np.float64]) -> Neighbours:
-    """A random order of links at positions [m, k], so that earlier ones are near and far; and the nearest of these."""
+    """A random order of links at positions [m, k], so that earlier links are near and far; and the nearest of these."""
     order = np.random.default_rng(0).permutation(len(position))
     shuffled, near = position[order], np.full((len(order), NEAREST), -1)
     for index in range(1, len(order)):
@@ -276,7 +276,7 @@ def _vecchia(
         # Conditional mean and variance of the last member given its neighbours.
         weight = np.linalg.solve(matrix[:, :-1, :-1], matrix[:, :-1, -1:])[..., 0]
         variance = matrix[:, -1, -1] - np.sum(matrix[:, -1, :-1] * weight, axis=1)
-        # A row: the member minus its conditional mean, over its conditional standard deviation.
+        # A row: the member minus its conditional mean, divided by its conditional standard deviation.
         entries[rows] = np.column_stack([-weight, np.ones(len(rows))]) / np.sqrt(variance)[:, None]
         log_determinant += float(np.log(variance).sum())
     row, column = np.nonzero(members >= 0)

@@ -1,8 +1,8 @@
 """Uncertainty if the measurements favour paths that the study's trace leaves out.
 
 If a twin lacks paths, such as paths through buildings, its intervals lie around wrong values: the constants compensate
-for the missing power. The links are therefore traced once more with refraction and diffraction. The evidence of both
-twins, from their draws, decides between them.
+for the missing power. The links are therefore traced once more with refraction and diffraction. The evidence for each
+of the two twins, estimated from its draws, decides between them.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ LONGEST_TRACE: Final = 60.0
 """Estimated duration above which no richer paths are traced [s]."""
 
 LIKELY_LOG_ODDS: Final = float(np.log(LIKELY / (1.0 - LIKELY)))
-"""Smallest logarithm of the odds in favour of richer paths at which their uncertainty is used."""
+"""The uncertainty with richer paths is used if the logarithm of the odds in their favour is at least this."""
 
 OF_THE_FIT: Final = (RemarkKind.MISSED_OPTIMUM, RemarkKind.OUTSIDE_INTERVAL)
 """Remarks that compare draws with the calibrated values."""
@@ -43,15 +43,15 @@ OF_THE_FIT: Final = (RemarkKind.MISSED_OPTIMUM, RemarkKind.OUTSIDE_INTERVAL)
 def assess_richer_paths(
     problem: Problem, trail: Trail, assessed: Certainty, progress: Progress | None = None
 ) -> Certainty:
-    """The uncertainty with richer paths, with a remark, if the measurements favour these; otherwise the given one.
+    """The uncertainty with richer paths, with a remark, if the measurements favour these paths; otherwise `assessed`.
 
-    Nothing is traced if the study states the noise, if its `fidelity.rounds` is 0, or if no link is out of sight. The
-    stages of `progress` are "tracing more paths" and "drawing with more paths".
+    Nothing is traced if `lacking` is empty: for example, if the study states the noise, if its `fidelity.rounds` is 0,
+    or if no link is out of sight. The stages of `progress` are "tracing more paths" and "drawing with more paths".
 
     Args:
         problem: The problem.
-        trail: Its search.
-        assessed: Its uncertainty.
+        trail: The finished search.
+        assessed: The uncertainty without richer paths.
         progress: Called with the stage, the work done and the total.
     """
     changes = lacking(problem)
@@ -104,7 +104,7 @@ def assess_richer_paths(
 
 
 def lacking(problem: Problem) -> dict[str, bool]:
-    """Settings of the tracer that find more paths than the study's; empty if none are to be tried."""
+    """Settings of the tracer with which it finds more paths than with the study's; empty if there is nothing to try."""
     study, counted = problem.setup.study, problem.objective.weight > 0
     traced = isinstance(problem.engine, Replay | ReplayCarriers) and study.rays_path is None
     displaced = any(displaces(name) for name in problem.parameters.names)

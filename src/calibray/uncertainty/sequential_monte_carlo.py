@@ -1,11 +1,11 @@
 """Draws from the joint posterior by tempered sequential Monte Carlo.
 
-A population drawn from the prior follows the prior times a power of the likelihood, as the power grows to 1 (P. Del
-Moral, A. Doucet and A. Jasra, J. Royal Statistical Society B 68, 2006). Each step raises the power until half of the
-population is effective, resamples the population, and moves its members (`population_moves.py`).
+A population is drawn from the prior, and tracks the prior times a power of the likelihood as the power grows to 1 (P.
+Del Moral, A. Doucet and A. Jasra, J. Royal Statistical Society B 68, 2006). Each step raises the power until half of
+the population is effective, resamples the population, and moves its members (`population_moves.py`).
 
-We start with two independent populations, and double their number while their two halves disagree and the budget allows
-it. Populations that agree are weighted by their estimates of the evidence, which are unbiased.
+We start with two independent populations, and double their number while the two halves of the populations disagree and
+the budget allows it. If they agree, each population is weighted by its estimate of the evidence, which is unbiased.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ SIZE: Final = (64, 256)
 """Smallest and largest number of members of a population."""
 
 BUDGET: Final = 1_100_000_000
-"""Number of interactions that all populations may evaluate together. With a tenth less, draws are worth 392 to 422
-independent ones in Auckland (`benchmarks/certainty_cost.py --seeds 3`)."""
+"""Number of interactions that all populations may evaluate together. With a budget that is smaller by a tenth, the
+draws in Auckland are worth 392 to 422 independent draws (`benchmarks/certainty_cost.py --seeds 3`)."""
 
 EVALUATIONS: Final = 100
 """Approximate number of evaluations per member: steps times moves."""
 
 POPULATIONS: Final = (2, 4, 8)
-"""Numbers of independent populations, increased while their two halves disagree. If several fringes of slabs fit, means
-of one population of 256 scatter by 0.2 posterior standard deviations; in three development districts, the draws of two
-or four populations agree for half of the true scenes."""
+"""Numbers of independent populations, increased while their two halves disagree. If several interference fringes of
+slabs fit, the mean of a population of 256 members scatters by 0.2 posterior standard deviations. In three development
+districts, the draws of two or four populations agree for half of the true scenes."""
 
 SWEEPS: Final = 4
 """Number of sweeps per step; a sweep moves every member in each way. The share of one of two distant ranges in five
 dimensions then scatters by 0.03 between seeds; with 2 sweeps by 0.08."""
 
 LAST_SWEEPS: Final = (8, 48)
-"""Smallest and largest number of further sweeps at power 1: more for a population that the budget makes smaller, so
-that it has as many draws, and more for a small program, as far as the budget allows. In districts of 300 to 800
+"""Smallest and largest number of further sweeps at power 1. A population that the budget makes smaller gets more
+sweeps, so that it gives as many draws; a small program gets as many as the budget allows. In districts of 300 to 800
 interactions, distribution functions after 8, 24 and 48 sweeps differ by 0.053, 0.043 and 0.036 from those of a million
 draws from the prior (`benchmarks/simulation_based.py --reference`). With 8 sweeps of 104 members, widths of intervals
 differ by up to 13 % between seeds in Auckland, and with 16 by up to 8 % (`benchmarks/certainty_cost.py --seeds 3`)."""
@@ -51,7 +51,7 @@ KEPT: Final = 2
 """Number of sweeps at power 1 between members that are kept as draws."""
 
 EFFECTIVE: Final = 0.5
-"""Effective share of the population after each step."""
+"""Share of the population that stays effective when a step raises the power."""
 
 MAX_STEPS: Final = 60
 """Largest number of steps, the last of which raises the power to 1; most posteriors need 8 to 20."""
@@ -61,8 +61,8 @@ APART: Final = 0.2
 256 independent draws differ by up to 0.12 in 19 of 20 cases; members of one population are not quite independent."""
 
 APART_BY_CHANCE: Final = 2.0
-"""The same distance for small populations, times the square root of half their size; 1.36 would be the 95 % point of
-independent draws (Kolmogorov and Smirnov)."""
+"""The same limit for small populations: it is this number times sqrt(2 / n) for halves of n members each; 1.36 would be
+the 95 % point of independent draws (Kolmogorov and Smirnov)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class Posterior:
     """Draws from the joint posterior.
 
     Attributes:
-        means: Draws of the study's parameters: means over all buildings, in its search space.
+        means: Draws of the study's parameters, in its search space; each is the mean over all buildings.
         seen: The same draws for the buildings that the links meet: the geometric means of their constants.
         joint: Points of the unit cube of all parameters [n, d + k].
         spread: Between-building spread of every draw [n].
@@ -107,7 +107,7 @@ def joined(posteriors: Sequence[Posterior]) -> Posterior:
 def population_size(interactions: int, budget: int = BUDGET, models: int = 1) -> int:
     """Number of members of each of two populations within a budget, from the interactions of one evaluation.
 
-    Draws of several models with equal weight are pooled, so that each needs fewer.
+    Draws of several models are pooled with equal weight, so that each model needs fewer members.
 
     Example:
         >>> population_size(1_000), population_size(50_000), population_size(1_000, models=8)
@@ -222,14 +222,14 @@ def _posterior(model: JointModel, members: Population, weight: NDArray[np.float6
 def _anneal(
     model: JointModel, size: int, last: int, random: np.random.Generator, stepped: Callable[[float], None]
 ) -> tuple[Population, float]:
-    """Members of a population after the exponent of the likelihood has been raised from 0 to 1, and the log evidence.
+    """Members of a population after the power of the likelihood has been raised from 0 to 1, and the log evidence.
 
-    They are kept during the `last` sweeps. `stepped` is called with the share of the work done: half of it is done when
-    the power is 1.
+    The states of the members during `last` sweeps at power 1 are kept. `stepped` is called with the share of the work
+    done; half of the work is done when the power reaches 1.
     """
     point = model.draw_prior(size, random)
     deviation = random.standard_normal((size, len(model.parameter_of)))
-    # Uniform, because the likelihood contains the weights of the models, which are raised to the power with it.
+    # Uniform: the likelihood contains the weights of the models, and both are raised to the same power.
     models = random.integers(0, len(model.marginal.models), size)
     empty = np.zeros(size)
     population = Population(

@@ -1,7 +1,7 @@
 """Verdicts from draws of the posterior: credible interval, verdict and reason of every parameter.
 
-A credible set is the smallest set that covers its share of the posterior. It has two pieces if two distant ranges fit
-the data. Gaussian kernels with locally adapted widths smooth the density of the weighted draws (B. W. Silverman,
+A credible set is the smallest set that contains a given share of the posterior. It has two pieces if two distant ranges
+fit the data. Gaussian kernels with locally adapted widths smooth the density of the weighted draws (B. W. Silverman,
 Density Estimation for Statistics and Data Analysis, 1986, section 5.2); they are mirrored at the bounds.
 
 If the posterior cannot be sampled, linear theory replaces it: intervals and covariances from the curvature of the sum
@@ -25,12 +25,12 @@ from calibray.uncertainty.draws import Draws, systematic_resampling
 
 
 def local_intervals(problem: Problem, trail: Trail, optimum: Evaluation) -> dict[str, Interval]:
-    """Intervals by linear theory, by name, in the search space, where a parameter that spans decades is logarithmic.
+    """Intervals by parameter from linear theory in the search space, where a parameter over decades is logarithmic.
 
     `optimum` is the evaluation of the optimum, with derivatives.
     """
     parameters = problem.parameters
-    # Compressed residuals are scaled to the sum of squares of the full ones.
+    # Compressed residuals are scaled so that their sum of squares is that of the full residuals.
     scale = np.sqrt(optimum.num_rows / optimum.residuals.shape[1])
     searched = linear_intervals(
         parameters.to_search(trail.best),
@@ -51,7 +51,7 @@ def local_intervals(problem: Problem, trail: Trail, optimum: Evaluation) -> dict
 
 
 def with_reason(local: dict[str, Interval], reason: Reason) -> dict[str, Interval]:
-    """Add to intervals by linear theory the reason why the posterior was not sampled.
+    """Add the reason why the posterior was not sampled to the intervals by linear theory.
 
     Curvature alone does not show other minima or correlated errors, so no parameter is more than weakly identified,
     unless the data contain no noise.
@@ -108,7 +108,7 @@ IDENTIFIED: Final = 0.25
 """Largest width of the credible set of an identified parameter, as a share of the range."""
 
 WEAKLY: Final = 0.5
-"""Largest width for a weakly identified parameter; with a wider set, it is not identifiable."""
+"""Largest such share for a weakly identified parameter; with a wider set, a parameter is not identifiable."""
 
 NO_EFFECT_DB: Final = 1.0
 """Change of path loss over a parameter's range below which no link counts as dependent on it [dB]."""
@@ -118,7 +118,7 @@ END: Final = 0.1
 depends on the parameter."""
 
 TRADE_OFF: Final = 0.5
-"""Rank correlation above which another parameter compensates."""
+"""Rank correlation above which another parameter is said to compensate for a parameter."""
 
 LARGE_EFFECT: Final = 3.0
 """Change of path loss, in standard deviations of the errors, above which one link would determine the parameter."""
@@ -139,23 +139,23 @@ STEPS: Final = np.array([0.5, 1.0, 1.5, 2.0, 3.0])
 """Distance of points beyond the outermost quantiles, in kernel widths."""
 
 KERNEL_SHARE: Final = 0.08
-"""Share of up to 200 draws within the width of a kernel; more draws allow narrower kernels (Silverman)."""
+"""Share of the draws within the width of a kernel, up to 200 draws; more draws allow narrower kernels (Silverman)."""
 
 MOST_INDEPENDENT: Final = 1000
-"""Largest number of draws that count as independent; further ones are mostly states of the same members. In four
-districts, 90 % sets then contain 0.88 to 0.90 of a reference, and those of windows have 1.5 pieces, where sets of the
-reference have 1.1. If all draws count, they contain 0.87 to 0.90, and those of windows have 2.0 pieces
-(`benchmarks/simulation_based.py --reference`)."""
+"""Largest number of draws that count as independent; further draws are mostly later states of the same members. In four
+districts, 90 % sets then contain 0.88 to 0.90 of a reference posterior. The sets of window constants have 1.5 pieces on
+average, those of the reference 1.1. If all draws count, the sets contain 0.87 to 0.90, and those of window constants
+have 2.0 pieces (`benchmarks/simulation_based.py --reference`)."""
 
 LEAST_SHARE: Final = 0.005
 """Smallest share of the posterior in a piece; smaller shares count as chance."""
 
 REACH: Final = 8.5
-"""Kernel widths beyond which a Gaussian is zero in double precision."""
+"""Number of kernel widths beyond which the tail of a Gaussian is zero in double precision."""
 
 LEAST_GAP: Final = 0.03
 """A gap between pieces counts as chance if it is narrower than this share of the range and than the wider piece. Pieces
-that all lie within this share of the range are one value for a user."""
+that all lie within this share of the range are merged: for a user, they are one value."""
 
 
 Modelled = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -195,7 +195,7 @@ class JudgedSet:
         pieces: Lower and upper end of every piece of the credible set, ascending, within the bounds.
         name: The verdict.
         reason: Its reason.
-        seen: The pieces for the measured buildings; the same if these are not distinguished.
+        seen: The pieces for the measured buildings; equal to `pieces` if the draws do not distinguish these buildings.
     """
 
     pieces: tuple[tuple[float, float], ...]
@@ -243,7 +243,7 @@ def verdicts(
         share, seen_share = _width(pieces) / extent, _width(seen_pieces) / extent
         range_ = {"customary": True} if extent < upper - lower else {}
         seen_ends = _bounds_reached(seen_pieces, lower, upper)
-        # If the posterior of all buildings is flat, its set reaches both bounds, and its pieces are due to chance.
+        # If the posterior for all buildings is flat, its set reaches both bounds, and its pieces are due to chance.
         judged = pieces if share <= WEAKLY else seen_pieces
         ends = _bounds_reached(judged, lower, upper) or seen_ends
         if share > WEAKLY >= seen_share and len(seen_pieces) == 1 and not seen_ends:
@@ -322,7 +322,7 @@ def _outlying_pieces(
 
 
 def _effect(index: int, modelled: Modelled, best: NDArray[np.float64], axes: Axes) -> float:
-    """Largest change of a link's path loss over the range of a parameter, with the others fixed [dB]."""
+    """Largest change of a link's path loss over the range of a parameter, with the other parameters fixed [dB]."""
     line = np.tile(best, (LINE, 1))
     line[:, index] = np.linspace(axes.lower[index], axes.upper[index], LINE)
     loss = modelled(line)
@@ -330,7 +330,7 @@ def _effect(index: int, modelled: Modelled, best: NDArray[np.float64], axes: Axe
 
 
 def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, noise_db: float) -> Reason:
-    """Why most of the range fits although links depend on the parameter: a trade-off, or large errors."""
+    """Why most of the range fits although links depend on the parameter: trade-offs with others, or large errors."""
     drawn = draws.point[systematic_resampling(draws.weight, RANKED, np.random.default_rng(0))]
     # Spearman's correlation is that of the ranks.
     rank = np.argsort(np.argsort(drawn, axis=0), axis=0)
@@ -349,7 +349,7 @@ def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, 
 
 
 def consistent(interval: Interval, value: float) -> Interval:
-    """The interval; ambiguous if it was identified but does not contain the value with the lowest RMSE."""
+    """The interval; its verdict becomes ambiguous if it is identified but does not contain the calibrated value."""
     identified = interval.verdict in (Verdict.IDENTIFIED, Verdict.WEAKLY_IDENTIFIED)
     if not identified or interval.contains(value, 1e-9 * abs(value)):
         return interval
@@ -364,7 +364,7 @@ def credible_sets(
     upper: float,
     levels: Sequence[float],
 ) -> list[tuple[tuple[float, float], ...]]:
-    """The smallest sets that cover shares of the posterior, for each level, from one smoothed density.
+    """For each level, the smallest set that contains this share of the posterior, from one smoothed density.
 
     Draws [n] have weights [n]; a set is the lower and upper end of every piece, ascending.
 
