@@ -178,7 +178,9 @@ def test_metadata_that_end_the_library_are_looked_at_in_another_process(tmp_path
     pd.DataFrame({"x": [1.0, 2.0]}).to_parquet(path)
     monkeypatch.setattr(table_files, "run_limited", lambda code, *_: "group.column" not in code)
     monkeypatch.setattr(pq, "ParquetFile", lambda *_, **__: pytest.fail("opened in this process"))
-    with pytest.raises(InputError, match="the library that reads this file fails on it; export it again"):
+    with pytest.raises(
+        InputError, match="the library that reads Parquet files crashes on it; export it again"
+    ):
         read_table(path)
 
 

@@ -170,7 +170,7 @@ def test_a_time_zone_with_which_more_rows_lie_on_the_track_is_named(join):
     # Rows before the track have no position with any clock: a recorder that started late.
     early = [str(minute - pd.Timedelta(minutes=20)) for minute in minutes]
     assert join(track, [*early, *local[-70:]], longest_gap=60.0).changes == {note: 65}
-    with pytest.raises(InputError, match=r"with links\.track\.clock = 7260 they do; check the time zone"):
+    with pytest.raises(InputError, match=r"with links\.track\.clock = 7260, some are; check the time zone"):
         join(track, [str(minutes[-1] + pd.Timedelta(hours=2))], longest_gap=60.0, clock=60.0)
 
 

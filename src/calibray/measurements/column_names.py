@@ -78,13 +78,13 @@ LENGTH_UNITS: Final = {
     "foot": 0.3048,
     "inch": 0.0254,
 }
-"""Units of length other than the metre that column names may state [m]."""
+"""Units of length, other than the metre, that column names may state, each with its length [m]."""
 
 WATTS: Final = frozenset({"w", "watt", "watts", "kw", "mw", "dbw"})
 """Words in a column's name that show that its powers are not in dBm."""
 
 FREQUENCY_UNITS: Final = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
-"""Units of carrier frequency that column names may state [Hz]."""
+"""Units of carrier frequency that column names may state, each with its value in hertz."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def find_flight_time(frame: pd.DataFrame) -> tuple[str, str, str] | None:
             continue
         unit = next((unit for unit in ("ps", "ns", "us", "ms", "s", "m") if unit in words(name)), None)
         if unit is not None and (without_codes(frame[name]).dropna() > 0).mean() > 0.5:
-            # A round trip in metres is stated as the one-way distance.
+            # Devices that give a round trip in metres state the one-way distance.
             returned = matches(name, "round-trip time") and unit != "m"
             return name, "round_trip_time" if returned else "time_of_flight", unit
     return None
@@ -195,7 +195,7 @@ def numeric_columns(frame: pd.DataFrame) -> list[str]:
 
 
 def text_instead(frame: pd.DataFrame, *rows: str) -> str:
-    """Hint at a column that matches the given rows of `PATTERNS` but is not numeric; empty without such a column.
+    """Hint at a column that matches one of the given rows of `PATTERNS` but is not numeric; empty if there is none.
 
     Example:
         >>> text_instead(pd.DataFrame({"Lat": ["51.2N", "51.3N"], "cell": "A"}), "latitude")
@@ -212,18 +212,18 @@ def text_instead(frame: pd.DataFrame, *rows: str) -> str:
 
 
 def no_degrees(frame: pd.DataFrame) -> str:
-    """Hint at a column named like longitudes or latitudes whose values are not degrees; empty without such a column.
+    """Hint at a column that is named longitude or latitude but does not contain degrees; empty if there is none.
 
     Example:
         >>> no_degrees(pd.DataFrame({"lat": [4734.12], "lon": [1041.84]}))
-        "; column 'lat' has values of about 4734, not degrees: write 47.5687 for 4734.12 (NMEA), or name metres x, y"
+        "; column 'lat' has values of about 4734, not degrees: write 47.5687 for 4734.12 (NMEA), or x, y for metres"
     """
     for name in numeric_columns(frame):
         largest = 90 if matches(name, "latitude") else 180
         if matches(name, "latitude", "longitude") and (median := abs(frame[name].median())) > largest:
             return (
                 f"; column {shortened(name)!r} has values of about {median:.0f}, not degrees: write 47.5687 for "
-                "4734.12 (NMEA), or name metres x, y"
+                "4734.12 (NMEA), or x, y for metres"
             )
     return ""
 
@@ -231,7 +231,7 @@ def no_degrees(frame: pd.DataFrame) -> str:
 def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) -> PositionColumns | None:
     """Find the columns that give the position of one end; metres are preferred to degrees.
 
-    With `unnamed`, columns whose names do not state an end may belong to this end.
+    With `unnamed`, columns whose names mention neither transmitter nor receiver may also belong to this end.
 
     Example:
         >>> find_position(pd.DataFrame({"time": [0], "lat": [50.0], "lon": [10.0]}), "rx", unnamed=True)
@@ -256,7 +256,7 @@ def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) 
 
 
 def _height(names: Iterable[str]) -> str | None:
-    """The first column of antenna heights, or else of heights other than those of the ground or of a building."""
+    """The first column of antenna heights, or else of other heights, except those of the ground or a building."""
     heights = [name for name in names if matches(name, "height") and not matches(name, "another height")]
     return min(heights, key=lambda name: not matches(name, "antenna"), default=None)
 
@@ -269,8 +269,8 @@ def find_transmitter_height(frame: pd.DataFrame) -> str | None:
 def find_value(table: SourceTable) -> ValueColumn:
     """Find the column of measured values, and its quantity.
 
-    Names with a decibel unit take precedence, then path loss over path gain over received power. The sign of the values
-    distinguishes loss from gain.
+    Path loss takes precedence over path gain, and path gain over received power; RSSI without a decibel unit comes
+    last. The sign of the values distinguishes loss from gain.
 
     Raises:
         InputError: No column looks like measured values.
@@ -300,7 +300,7 @@ def find_value(table: SourceTable) -> ValueColumn:
             f"({', '.join(map(str, table.frame))}); name it path_loss_db, path_gain_db or rsrp_dbm"
             f"{unlikely or text_instead(table.frame, *(row for row, _ in kinds))}"
         )
-    # Columns without a unit come last. Otherwise the order is losses, gains, reference signals, other powers.
+    # The order is losses, gains, powers of reference signals, other powers in decibels, other powers without a unit.
     candidates.sort(key=lambda candidate: candidate[:3])
     *_, name, quantity = candidates[0]
     median = float(np.nanmedian(without_codes(table.frame[name])))
@@ -394,7 +394,7 @@ def find_distance(frame: pd.DataFrame) -> str | None:
 
 
 def _are_degrees(longitude: pd.Series, latitude: pd.Series) -> bool:
-    """Whether coordinates can be degrees; some tables have projected coordinates in columns named like degrees."""
+    """Whether coordinates can be degrees; in some tables, columns named longitude and latitude are in metres."""
     return bool(longitude.abs().median() <= 180 and latitude.abs().median() <= 90)
 
 

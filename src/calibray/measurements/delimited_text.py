@@ -139,7 +139,7 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
 
 
 def _layout(text: str, separator: str | None) -> _Layout:
-    """Find the first line that can be the header of rows of equal width, and the separator with the most columns."""
+    """Find the first line that can be a header of rows of its width, and the separator that gives the most columns."""
     first_lines = list(islice(io.StringIO(text, newline=""), 30 + 4 * _HEAD))
     for above in range(31):  # number of lines above the header
         layouts: list[tuple[int, _Layout]] = []
@@ -172,7 +172,7 @@ def _layout(text: str, separator: str | None) -> _Layout:
 
 
 def _records(lines: Sequence[str], mark: str) -> list[tuple[list[str], int, int]]:
-    """Cells of the first records that are not blank; each with its first line and the line after its end."""
+    """Cells of the first records that are not blank, each record with its first line and the line after its end."""
     if mark == " ":
         lines = [re.sub(r"[ \t]+", " ", line.strip(" \t")) for line in lines]
     reader, records, start = csv.reader(lines, delimiter=mark, skipinitialspace=True), [], 0
@@ -187,7 +187,7 @@ def _records(lines: Sequence[str], mark: str) -> list[tuple[list[str], int, int]
 
 
 def _unit_row(records: Sequence[tuple[list[str], int, int]]) -> tuple[tuple[str, ...], tuple[int, int]]:
-    """Units of the columns and the lines of their row, if it is below the header and has units above numbers."""
+    """Units of the columns, and the lines where their row begins and ends; empty and (0, 0) without a row of units."""
     if len(records) < 3:
         return (), (0, 0)
     (header, *_), (cells, start, end), (below, *_) = records[:3]
@@ -214,7 +214,7 @@ def _with_unit(name: object, unit: str) -> str:
 
 
 def _plain_numbers(column: pd.Series, decimal: str) -> pd.Series:
-    """Convert a column of texts to numbers if each is a number, a placeholder, or a number with the same unit.
+    """Convert texts to numbers if all are numbers, numbers with the same decibel unit, or placeholders.
 
     Leading and trailing white space is removed from other texts.
     """
@@ -270,9 +270,9 @@ def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
 
 
 def _checked_layout(path: Path, text: str, layout: _Layout) -> tuple[list[str], list[int], bool]:
-    """Header and first line of each row of a CSV text; faults that pandas would silently repair are refused.
+    """Header, and line number of each row, of a CSV text; faults that pandas would silently repair are refused.
 
-    The third result states whether every row ends with an additional empty cell.
+    The third result is whether every row ends with an additional empty cell.
 
     Raises:
         InputError: A column appears twice, or a row has more or fewer cells than the header.

@@ -37,7 +37,7 @@ MAX_PATTERN_LENGTH: Final = 200
 """Largest number of characters in a regular expression."""
 
 MAX_SEARCH_STEPS: Final = 1e9
-"""Largest sum of squared text lengths in a column for patterns with a repetition; the search takes 2 to 5 s."""
+"""Largest sum of squared text lengths in a column that is searched for a repetition; this search takes 2 to 5 s."""
 
 _MAX_INTEGER: Final = int(np.iinfo(np.int64).max)
 
@@ -82,7 +82,7 @@ def _isin(column: pd.Series, values: Any) -> pd.Series:
 
 
 def _check_equality(column: pd.Series, values: Iterable[Any]) -> None:
-    """Refuse to compare a column of texts with numbers only, or of numbers with texts only: none would be equal."""
+    """Refuse to compare a column of texts with nothing but numbers, or one of numbers with nothing but texts."""
     kinds = {isinstance(value, str) for value in values if value is not None}
     is_text = pd.api.types.infer_dtype(column, skipna=True) == "string"
     if kinds == {False} and is_text:
@@ -141,7 +141,7 @@ def _affix(pat: Any, na: Any) -> Any:
     return pat
 
 
-# A regular expression with several repetitions, or with a repeated group, can take practically forever. The allowed
+# The search for a pattern with several repetitions, or with a repeated group, may never end in practice. The allowed
 # patterns are alternatives of single characters and classes, one of which may repeat in each alternative. `*+` is
 # possessive, so that checking a pattern is cheap as well.
 _CLASS: Final = r"\[\^?(?:\\.|[^\[\]\\])+\]"
@@ -204,7 +204,7 @@ _TOKENS: Final = re.compile(
 
 
 def _as_python(expression: str) -> tuple[str, dict[str, str]]:
-    """A filter as a Python expression, and the column for each name that replaces a backticked name."""
+    """A filter as a Python expression, and the column that each replacement of a backticked name stands for."""
     stem = "quoted"
     while stem in expression:
         stem += "_"
@@ -221,7 +221,7 @@ def _as_python(expression: str) -> tuple[str, dict[str, str]]:
 
 
 def _parse(code: str, columns: Iterable[object]) -> ast.expr:
-    """The syntax tree of an expression, which is refused if it is malformed or too large."""
+    """The syntax tree of an expression; refuses an expression that is malformed or too large."""
     try:
         tree = ast.parse(code, mode="eval").body
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:

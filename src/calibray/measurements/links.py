@@ -19,10 +19,10 @@ MIN_DISTANCE: Final = 1e-3
 """Distance between transmitter and receiver below which they count as coincident and have no path loss [m]."""
 
 FEW: Final = 8
-"""Number of links below which no trend, noise model or prediction error is estimated from their errors."""
+"""Smallest number of links from whose errors a trend, a noise model or a prediction error is estimated."""
 
 MAX_CARRIERS: Final = 32
-"""Largest number of carrier frequencies; a column with more values probably contains another quantity."""
+"""Largest number of carrier frequencies; a column with more values probably contains a different quantity."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -35,7 +35,7 @@ class Measurements:
         path_loss_db: Measured path loss [links], [dB]; all NaN for links without measured values.
         weight: Relative weights [links], [1], greater than 0; 1 unless given.
         group: Label [links] of each link's group, or None.
-        frequency: Carrier frequency of each link [links], [Hz]; None if all have that of the study.
+        frequency: Carrier frequency of each link [links], [Hz]; None if all links have the carrier of the study.
         limit_db: Largest measurable path loss [links], [dB]; None if unknown.
         censored: Mask [links] of the links below the noise floor, whose path loss is at least `path_loss_db`; None if
             no link is censored.
@@ -43,7 +43,7 @@ class Measurements:
 
     Raises:
         InputError: Shapes disagree, a position is not finite, a transmitter and its receiver coincide, a weight is not
-            positive, a carrier frequency or the number of them is implausible, or only some path losses are finite.
+            positive, a carrier frequency is implausible, there are too many, or only some path losses are finite.
 
     Example:
         >>> links = Measurements(tx=[[0, 0, 10]], rx=[[30, 40, 10]], path_loss_db=[85.0])
@@ -121,7 +121,7 @@ class Measurements:
 
     @property
     def prepared(self) -> dict[str, int]:
-        """Changes before rows became links, such as rows left out or averaged, each with the number of rows."""
+        """Changes to the table's rows, such as rows left out or averaged, each with the number of affected rows."""
         return dict(self.table.changes)
 
     @property
@@ -149,7 +149,7 @@ class Measurements:
 
     @property
     def carriers(self) -> tuple[tuple[float, NDArray[np.int64]], ...]:
-        """Carrier frequencies [Hz], ascending, each with the indices of its links; empty if all have the study's."""
+        """Carrier frequencies [Hz], ascending, each with the indices of its links; empty if `frequency` is None."""
         if self.frequency is None:
             return ()
         return tuple(
@@ -191,10 +191,10 @@ class Measurements:
         return self.table.where(expression)
 
     def held_out(self, holdout: str) -> NDArray[np.bool_]:
-        """Mask [links] of the links that a filter holds out; neither part is empty.
+        """Mask [links] of the links that a filter holds out: at least one, but not all.
 
         Raises:
-            InputError: The filter is not valid, or one of the two parts would be empty.
+            InputError: The filter is not valid, or holds out no link or every link.
         """
         held_out = self.where(holdout)
         for part, mask in (("the hold-out", held_out), ("calibration", ~held_out)):

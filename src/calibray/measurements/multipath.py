@@ -1,7 +1,7 @@
 """Observables of links from measured multipath components: the delay, power and angles of each path of each link.
 
-Each observable is the same statistic as the model computes, with a hard limit at the receiver's dynamic range. If a
-link was measured several times, for example with rotations of the receiving array, the snapshots are averaged.
+Each observable is the statistic that the model computes, but components outside the receiver's dynamic range are cut
+off sharply. If a link was measured several times, for example with a rotated array, the snapshots are averaged.
 Impulse responses are converted to components, which are the samples above a given threshold.
 """
 
@@ -54,7 +54,7 @@ class Multipath:
 
     Attributes:
         link: Label of each component's link [n].
-        snapshot: Label of the snapshot of the link to which each component belongs [n].
+        snapshot: Label of the snapshot in which each component was measured [n].
         delay: Delay [n], [s].
         level_db: Power gain [n], [dB].
         angles: Azimuths, counterclockwise from the x axis, and elevations or zenith angles [n], [rad], by plane and
@@ -73,7 +73,7 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
 
     The columns are recognized by their names: a delay (`delay_ns`), a path loss, path gain or power [dB]
     (`path_loss_db`), and, if present, an azimuth, an elevation, and the number of the rotation or snapshot. An angle
-    is used for both ends unless its name states one (`aoa_deg`, `azimuth_tx`).
+    is used for both ends unless the column's name states one of them (`aoa_deg`, `azimuth_tx`).
 
     Args:
         path: The table.
@@ -232,8 +232,8 @@ DELAYS: Final = ("delay", "delays", "tau", "time", "t")
 """Names under which a file may contain the delays of the samples [s]."""
 
 MARGIN_DB: Final = 10.0
-"""Margin above the mean noise power from which a sample counts as signal [dB]. The power of noise samples is
-exponentially distributed, so one in 22,000 exceeds its mean by this margin."""
+"""A sample counts as signal if it exceeds the mean noise power by this margin [dB]. The power of noise samples is
+exponentially distributed, so one noise sample in 22,000 does so too."""
 
 
 def read_impulse_responses(
@@ -243,7 +243,7 @@ def read_impulse_responses(
 
     Files may be in the format of NumPy (.npz, .npy), MATLAB (.mat, including version 7.3) or HDF5.
 
-    The noise power of a response is estimated as the median power of its samples divided by ln 2, which is the mean if
+    The mean noise power of a response is estimated as the median power of its samples divided by ln 2, because noise
     powers are exponentially distributed. Most samples of a response must therefore be noise.
 
     Args:
@@ -251,7 +251,7 @@ def read_impulse_responses(
             [links, snapshots, samples]; or a folder with one file per link, [samples] or [snapshots, samples].
         labels: Labels of the links.
         sample_rate: Samples per second [Hz]; None if the files state delays [s].
-        margin_db: Margin above the noise from which a sample counts as a component [dB].
+        margin_db: A sample counts as a component if it exceeds the mean noise power by this margin [dB].
 
     Returns:
         The samples above the threshold, with their powers, as components.
@@ -286,7 +286,7 @@ def read_impulse_responses(
 def _above_noise(
     label: str, response: NDArray[Any], delay: NDArray[np.float64], margin_db: float
 ) -> tuple[NDArray[Any], ...]:
-    """Link, snapshot, delay and level of the samples of a link's responses [snapshots, samples] above the noise."""
+    """Link, snapshot, delay and level of those samples of a link's responses [snapshots, samples] that exceed noise."""
     # Squares of small integer types, such as converter samples, would wrap around.
     power = np.abs(response).astype(np.float64) ** 2
     noise = np.median(power, axis=1, keepdims=True) / np.log(2)
@@ -314,7 +314,7 @@ def _read(file: Path, sample_rate: float | None) -> tuple[NDArray[Any], NDArray[
     ((name, response),) = largest.items()
     if response.dtype.kind != "c" and (response <= 0).all():
         raise InputError(f"{file}: {shortened(name)!r} is in decibels; give complex numbers or amplitudes")
-    # Remove the axes of a single transmitting or receiving antenna.
+    # Remove axes of length 1, such as the axis of a single transmit or receive antenna.
     response = np.squeeze(response) if response.ndim > 3 else response
     if not np.isfinite(response).all():
         raise InputError(f"{file}: {shortened(name)!r} contains values that are not finite")

@@ -38,7 +38,7 @@ KINDS: Final = {
 """Kinds of observables, each with the unit of its values."""
 
 FLIGHTS: Final = (TIME_OF_FLIGHT, ROUND_TRIP)
-"""Kinds that are times, which may contain a bias of the device."""
+"""Kinds that are times; measured times may contain a bias of the device."""
 
 SECTORS: Final = (DEPARTURE_SECTOR, ARRIVAL_SECTOR)
 PROFILES: Final = (DELAY_BIN, *SECTORS)
@@ -51,8 +51,8 @@ SHARE_RANGE_DB: Final = 30.0
 """Dynamic range of the fraction of power in a bin, unless a study states one [dB]."""
 
 ROUNDING: Final = 1e-12
-"""Distance within which delays [s] and azimuths [rad] count as on a limit, as for samples at multiples of 1 /
-bandwidth. It exceeds the rounding errors of their differences, and is below the resolution of any receiver."""
+"""A delay [s] or azimuth [rad] counts as on a limit if it is this close, as with samples at multiples of 1 / bandwidth.
+This exceeds the rounding errors of differences of delays or azimuths, and is below the resolution of any receiver."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class Statistic:
     Attributes:
         kind: One of `KINDS`.
         path: Path of a time of flight: "mean", "first" or "strongest".
-        dynamic_range_db: Largest level below the strongest path at which the receiver detects paths [dB]; None for all
-            paths.
+        dynamic_range_db: The receiver detects paths that are at most this far below the strongest path [dB]; None if it
+            detects all paths.
         floor_db: Path gain below which the receiver detects no paths [dB]; None for no limit.
         window: Longest delay after the first path [s]; None for no limit.
         bandwidth: Bandwidth of the receiver [Hz]; None if the receiver resolves all paths.
@@ -91,7 +91,7 @@ class Statistic:
         return low - ROUNDING, high - ROUNDING
 
     def limited(self, share_db: ArrayLike) -> NDArray[np.float64]:
-        """Fractions of power in the bin of one of `PROFILES` [dB], limited from below by the dynamic range.
+        """Fractions of power in a bin [dB], plus a constant fraction at the lower end of the dynamic range.
 
         An empty bin therefore has a finite value, both in the model and in measurements.
 
@@ -110,7 +110,7 @@ class Wanted:
     Attributes:
         name: Name of the observable in the study.
         statistic: The statistic.
-        unit: Unit of the program's answer.
+        unit: Unit in which the program returns the statistic.
         scale: Size of this unit in SI units.
     """
 

@@ -19,7 +19,7 @@ TRACK_COLUMNS: Final = ("track_longitude", "track_latitude")
 """The columns with a row's position on a track [deg]."""
 
 NOT_ON_TRACK: Final = "rows without a position on the track, left out"
-"""The entry in `changes` for rows outside the times of a track; extended if another time zone fits clearly better."""
+"""The entry in `changes` for rows outside the times of a track; names another time zone if it fits clearly better."""
 
 MAX_FILE_SIZE: Final = 200_000_000
 """Largest GPX file that is read [bytes]; a track with one point per second reaches this size after three weeks."""
@@ -29,7 +29,7 @@ def join_track(table: SourceTable, track: Track) -> SourceTable:
     """Give rows positions on a track, interpolated linearly in time; rows outside the track's times are left out.
 
     Times are texts in ISO 8601 (UTC unless they state a time zone), or seconds since 1970. Altitudes are not used,
-    because altitudes of satellite receivers have errors of several metres. The new columns are `TRACK_COLUMNS`.
+    because altitudes from satellite positioning have errors of several metres. The new columns are `TRACK_COLUMNS`.
 
     Raises:
         InputError: The track or a time cannot be read, or no row lies within the times of the track.
@@ -43,7 +43,7 @@ def join_track(table: SourceTable, track: Track) -> SourceTable:
     if not covered.any():
         first, last = points["time"].iloc[0], points["time"].iloc[-1]
         remedy = (
-            f"with {clock} they do; check the time zone" if shift else "check the time zone and the clock"
+            f"with {clock}, some are; check the time zone" if shift else "check the time zone and the clock"
         )
         raise InputError(
             f"{table.source} with {track.file}: none of {len(table)} times in column {track.time!r} is on the track, "
@@ -93,7 +93,7 @@ def _row_times(table: SourceTable, track: Track) -> NDArray[np.float64]:
 def _covered(
     times: NDArray[np.float64], seconds: NDArray[np.float64], longest_gap: float
 ) -> NDArray[np.bool_]:
-    """Mask of rows between two points of a track, at increasing `times`, that are not too far apart in time."""
+    """Mask of rows that lie between two successive track points with at most `longest_gap` between their times."""
     after = np.clip(np.searchsorted(times, seconds, side="left"), 0, len(times) - 1)
     # For a row at exactly the time of a point, the gaps next to this point do not matter.
     before = np.where(times[after] == seconds, after, np.maximum(after - 1, 0))
@@ -103,9 +103,9 @@ def _covered(
 
 
 def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], longest_gap: float) -> float:
-    """Offset of a time zone, ahead of the track's clock, that fits better [s]; 0 if none fits better.
+    """Time zone by which the rows' clock is ahead of the track's [s]; 0 unless it puts clearly more rows on the track.
 
-    Shifts are tried if more than a tenth of the rows are off the track, and must reduce this number by more than half.
+    Time zones are tried if at least a tenth of the rows are off the track; the best must more than halve that number.
     """
     seconds = seconds[np.isfinite(seconds)]
     seconds = seconds[:: 1 + len(seconds) // 10_000]
@@ -202,7 +202,7 @@ def place_rows(
     """Write the positions of both ends to the columns `TX_COLUMNS` and `RX_COLUMNS` in metres.
 
     A position is x, y, z (numbers in metres, columns in units of `steps.unit_m`), or with a frame, longitude, latitude
-    [deg] and height [m]. Returns the rows and the names of the columns, or the arguments if the only step is a filter.
+    [deg] and height [m]. Returns the rows and the names of the columns; if a filter is the only step, the arguments.
 
     Raises:
         InputError: A column is missing or not numeric, or a position is not on the globe.

@@ -20,10 +20,11 @@ Ground = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64
 """Height of the ground [m] as a function of x and y [m]."""
 
 MoveOutside = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
-"""Maps positions [n, 3] to positions outside buildings (NaN if too deep inside) and the moved distances [n], [m]."""
+"""Maps positions [n, 3] to positions outside buildings (NaN if too deep inside) and the distances of the moves [n],
+[m]."""
 
 Compute = Callable[[SourceTable], NDArray[np.float64] | None]
-"""Function from the rows of a table to the values of a new column [rows]; None if a column is missing."""
+"""Function from the rows of a table to the values of a new column [rows]; None if a column that it needs is missing."""
 
 Divide = Callable[[SourceTable], NDArray[Any]]
 """Function from the rows of a table to the labels of the parts to which they belong [rows]."""
@@ -80,8 +81,8 @@ class Averaging:
     """How samples are averaged, in linear power.
 
     Attributes:
-        by: Samples that are averaged together: at the same "place" (equal receiver positions), in a "cell" of a square
-            grid, in a stretch of "distance" travelled in the order of the rows, or in a window of "time".
+        by: Which samples are averaged together: those at one "place" (equal receiver positions), in one "cell" of a
+            square grid, in one stretch of "distance" travelled (in the order of the rows), or in one window of "time".
         size: Width or length [m], or duration [s]; not used for "place".
         time: Column of times, for "time".
         unbiased: Whether to correct the bias in the logarithm of a mean over few samples.
@@ -122,21 +123,21 @@ class Preparation:
         where: Row filter.
         transmitters: Table with one row per transmitter, whose other columns are added to the links.
         transmitter: Column that names the transmitter in both tables.
-        missing: Numbers that stand for a missing value, in addition to those that are detected.
+        missing: Numbers that stand for a missing value, in addition to those that are recognized automatically.
         noise_floor_dbm: Noise floor [dBm]; missing powers count as below the floor.
         censored: Whether links at or below the noise floor are kept, as censored links at the floor.
         frame: Geographic frame of the scene, if positions are longitude, latitude and height; None if they are lengths.
         crs: Coordinate reference system of positions, if there is a frame.
         unit_m: Length of one unit of position columns in the scene's frame [m].
-        ground: Height of the ground, if heights are measured from the ground.
+        ground: Function that gives the height of the ground; None if heights are not measured from the ground.
         averaging: How samples are averaged.
         keep: Columns whose groups are averaged separately, in addition to the transmitter column.
-        held_out: Labels of the parts that are held out separately; samples are not averaged or merged across parts.
+        held_out: Function that labels the parts held out separately; samples are not averaged or merged across parts.
         observables: Columns of additional measured values, which are averaged over rows that repeat a link.
         flights: Observables that are times of flight, in which certain numbers can stand for a missing value.
         computed: Functions that compute additional columns, by name, after the transmitters' columns are added. A
             function returns None if an optional column that it needs is missing.
-        inside: What to do with receivers inside buildings; nothing if None.
+        inside: What to do with receivers inside buildings: "drop", "move", or None to keep them where they are.
         outside: Function that moves positions out of buildings; required with `inside`.
     """
 

@@ -103,7 +103,7 @@ def links_from_table(
     tx: Coordinates = TX_COLUMNS,
     rx: Coordinates = RX_COLUMNS,
 ) -> Measurements:
-    """Make links without measured values, with NaN as path loss, from the rows of a table.
+    """Make links without measured values from the rows of a table; their path loss is NaN.
 
     If `group` names several columns, their labels are joined. `frequency` is a column of carrier frequencies; if it is
     None or missing in the table, all links have the study's carrier frequency. No step may leave out rows.
@@ -162,7 +162,7 @@ def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> 
 
 
 def _carriers(table: SourceTable, column: str | None) -> NDArray[np.float64] | None:
-    """Carrier frequency of each row [rows], [Hz], from a column in the unit of its name; None without a column."""
+    """Carrier frequency of each row [rows], [Hz], from a column in hertz or the unit in its name; None if not given."""
     if column is None:
         return None
     return table.numbers(column) * column_names.find_frequency_unit(column)
@@ -228,20 +228,20 @@ def _weights(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
 
 
 MAX_UNCERTAINTY_DB: Final = 1.0
-"""Largest uncertainty of an average due to samples below the noise floor [dB]; averages above it are left out."""
+"""Averages are left out if samples below the noise floor make them uncertain by more than this [dB]."""
 
 _AREA: Final = "calibray area"
 _PART: Final = "calibray part"
 
 
 def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
-    """Average the samples of each area, transmitter, frequency and group; without averaging, the table is unchanged.
+    """Average samples of the same area, transmitter, frequency and group; without averaging, the table is unchanged.
 
     A sample below the noise floor has a power between zero and the floor, and counts as half the floor. Averages whose
     uncertainty then exceeds `MAX_UNCERTAINTY_DB` are left out, because only their strongest samples are above the
-    floor. The steps `averaging`, `keep`, `held_out`, `transmitter` and `noise_floor_dbm` are used. Returns the row of
-    the first sample of each average, with the mean receiver position, the mean value, and the columns `std_db`
-    (standard deviation of the samples [dB], NaN for one sample) and `count`. Weights and other observables are means.
+    floor. The steps `averaging`, `keep`, `held_out`, `transmitter` and `noise_floor_dbm` are used. Each average is the
+    row of its first sample, with the mean receiver position, the mean value, the means of weights and other
+    observables, and the columns `std_db` (standard deviation of the samples [dB], NaN for one sample) and `count`.
 
     Raises:
         InputError: A column is missing or not numeric, a time cannot be read, or no average remains.
@@ -411,13 +411,13 @@ def _means(table: SourceTable, name: str, group: NDArray[np.int64]) -> NDArray[n
 
 
 LEAST_STEP_DB: Final = 1.0
-"""Smallest effect of a column's labels on the power that is noted if rows with different labels become one link."""
+"""If rows with different labels in a column become one link, effects of a label on the power are noted above this."""
 
 LEAST_RATIO: Final = 5.0
-"""Smallest ratio of this effect to its standard error; by chance, one in two million labels exceeds it."""
+"""The effect must also exceed its standard error by this factor; by chance, one in two million labels does."""
 
 MOST_LABELS: Final = 50
-"""Largest number of labels in such a column; a column with more labels probably names links or positions."""
+"""Columns with more labels are not examined for such effects, because they probably name links or positions."""
 
 
 def _note_steps(

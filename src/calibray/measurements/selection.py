@@ -23,8 +23,8 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
     The steps `wide`, `track`, `where`, `missing`, `flights`, `transmitters`, `computed`, `noise_floor_dbm` and
     `censored` run in this order, so a filter can use the columns of the track but not those of the transmitters.
     `value` is the column of the measured values; with `wide`, it is the name of the new column. Numbers that stand for
-    a missing value (`find_codes`) do not remain. With a noise floor, missing values and values at or below it are set
-    to the floor.
+    a missing value (`find_codes`) are treated as missing. With a noise floor, missing values and values at or below it
+    are set to the floor.
 
     Raises:
         InputError: A column is missing or malformed, a transmitter is unknown, or no row remains.
@@ -131,7 +131,7 @@ def comparison(names: Iterable[object]) -> Callable[[Iterable[object]], list[str
 
 
 def naming_column(transmitters: pd.DataFrame, labels: Iterable[object]) -> str | None:
-    """The column that names the transmitters in their table: no value is repeated, and it has at least half the labels.
+    """The column that names the transmitters in their table: no value twice, and at least half of the given labels.
 
     Returns None if no column or more than one column qualifies.
 
@@ -195,10 +195,10 @@ CODES: Final = (
 others."""
 
 MIN_GAP_DB: Final = 20.0
-"""Smallest difference between a code and any measured value [dB]."""
+"""A number counts as a code only if it differs from every measured value by at least this much [dB]."""
 
 LARGEST_LEVEL: Final = 190.0
-"""Magnitude above which a code with the sign of the other values cannot be a power [dBm] or gain [dB]."""
+"""Largest magnitude of a power [dBm] or gain [dB]; a listed code above it counts as a code whatever its sign."""
 
 
 def find_codes(values: ArrayLike, largest: float = LARGEST_LEVEL) -> tuple[float, ...]:
@@ -235,7 +235,7 @@ def without_codes(column: pd.Series) -> pd.Series:
 def mask_codes(
     table: SourceTable, columns: Sequence[str], stated: Sequence[float] = ()
 ) -> tuple[SourceTable, NDArray[np.bool_]]:
-    """Set the codes in columns of measured values to missing, and record their number.
+    """Replace the codes in columns of measured values by missing values, and record how many were replaced.
 
     Codes are detected in all columns together, which must contain the same quantity; `stated` codes always apply.
     Returns the table, and a mask of the rows that contained a code [rows].
@@ -259,7 +259,7 @@ def mask_codes(
 
 
 def _numbers(column: pd.Series) -> NDArray[np.float64]:
-    """The numbers in a column [rows]; NaN for text, which is refused, with its row, when values are used."""
+    """The numbers in a column [rows]; NaN for text, which a later step refuses with its row when it uses the values."""
     if not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_string_dtype(column)):
         return np.full(len(column), np.nan)
     return pd.to_numeric(column, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)

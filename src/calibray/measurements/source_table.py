@@ -27,9 +27,10 @@ class SourceTable:
 
     Attributes:
         frame: The rows.
-        row: Line number of each row in a CSV file (the header is line 1) or sheet, otherwise its number from 1 [rows].
+        row: Line number of each row in its CSV file (a header in the first line is line 1) or sheet; for other tables,
+            numbers from 1 [rows].
         source: Name of the file, or another name for messages.
-        changes: Changes by earlier steps, such as rows left out, averaged or moved, each with the number of rows.
+        changes: Changes by earlier steps, such as rows left out or averaged, each with the number of rows affected.
     """
 
     frame: pd.DataFrame
@@ -57,7 +58,7 @@ class SourceTable:
         return replace(self, frame=self.frame.loc[mask].reset_index(drop=True), row=self.row[mask])
 
     def keep(self, mask: NDArray[np.bool_], reason: str) -> SourceTable:
-        """The rows where a mask [rows] is true; `changes` records the number of removed rows under the reason.
+        """The rows where a mask [rows] is true; `changes` records the reason with the number of rows removed.
 
         Raises:
             InputError: No row remains.
@@ -147,7 +148,7 @@ class SourceTable:
                 f"{self.cell(first, names)}: the label is missing ({missing.sum()} in all); give a label"
             )
         if pd.api.types.is_float_dtype(column):
-            # A label must not depend on other rows; in a column with gaps or 0.9, pandas stores the integer 26 as 26.0.
+            # A label must not depend on other rows: if another row is empty or has 0.9, pandas stores 26 as 26.0.
             return column.astype(str).str.removesuffix(".0").to_numpy(dtype=np.str_)
         return column.astype(str).to_numpy(dtype=np.str_)
 

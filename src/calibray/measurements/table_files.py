@@ -123,7 +123,7 @@ def _rows(path: Path, computed: bool) -> Iterator[tuple[int, _Cells]]:
 
 
 def _with_formulas(values: _Cells, formulas: _Cells) -> _Cells:
-    """A row of computed values, or formulas as text where there is no computed value."""
+    """A row of computed values; cells without a computed value contain their formula as text."""
     padded = (*values, *[None] * (len(formulas) - len(values)))
     return tuple(
         formula if value is None and str(formula).startswith("=") else value
@@ -158,7 +158,7 @@ LARGEST_ROW_GROUP: Final = 2**30
 """Largest decompressed size of a row group, or of a piece, when a Parquet file is read in pieces [bytes]."""
 
 LARGEST_TABLE: Final = 2 * LARGEST_ROW_GROUP
-"""Largest decompressed size of a Parquet file that is read at once [bytes]; pandas needs up to twice as much memory."""
+"""Largest decompressed size of a Parquet file that is read as a whole [bytes]; pandas needs up to twice this memory."""
 
 DECODING_MEMORY: Final = 2 * LARGEST_TABLE
 """Limit on the address space of the process that first decodes a Parquet file [bytes]."""
@@ -198,7 +198,7 @@ except Exception as error:
 """
 
 _decoded: Final[set[tuple[str | int, ...]]] = set()
-"""Files that have already been decoded, each with its state at that time."""
+"""Programs that have already run without error, each with the state of its file at that time."""
 
 
 def read_table(path: str | Path) -> SourceTable:
@@ -287,7 +287,8 @@ class PiecedTable:
             integers_with_gaps, start = _integer_columns_with_gaps(file), 0
             batches = file.iter_batches(batch_size=min(size, PIECE_ROWS))
             while (frame := _next_frame(path, batches)) is not None:
-                # NumPy has no missing integer, so pandas converts such columns to float, also in pieces without gaps.
+                # NumPy has no missing integer: pandas reads an integer column with gaps as float, except in pieces
+                # without gaps, which are converted here.
                 numpy_columns = [
                     name
                     for name in integers_with_gaps
@@ -333,7 +334,7 @@ def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> int
 
 
 def _decode_elsewhere(path: Path, size: int, limit: int, whole: bool) -> None:
-    """Decode a Parquet file in a limited process: pages may be larger than declared, and rows may share one text.
+    """Decode a Parquet file in a limited process, as pages may be larger than declared, and rows may repeat one text.
 
     `size` is the declared size, and `limit` is the largest size of the rows in memory, both in bytes. The limit applies
     to the table if `whole`, and otherwise to each piece.
@@ -362,14 +363,14 @@ def _run_elsewhere(path: Path, code: str, size: int) -> None:
     except TimeoutError as error:
         raise InputError(f"{path}: cannot be decompressed {error}; export it again") from None
     if not is_read:
-        raise InputError(f"{path}: the library that reads this file fails on it; export it again")
+        raise InputError(f"{path}: the library that reads Parquet files crashes on it; export it again")
     _decoded.add(key)
 
 
 def _open_parquet(path: Path) -> Any:
     from pyarrow import parquet
 
-    # The library terminates the process if damaged metadata are contradictory.
+    # The library terminates the process if damaged metadata contradict each other.
     _run_elsewhere(path, _METADATA.format(path=str(path.resolve())), path.stat().st_size)
     try:
         # With pre_buffer, pyarrow reads ahead and keeps every row group in memory.

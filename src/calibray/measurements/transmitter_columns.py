@@ -1,7 +1,7 @@
 """Find the columns that describe transmitters.
 
-These columns join a table of links with a table of transmitters, each contain the values of one transmitter, or
-describe transmit antennas. Planning tools and operators use different names for them.
+Such a column names the transmitter in a table of links or of transmitters, contains the values of one transmitter, or
+describes transmit antennas. Planning tools and operators use different names for these columns.
 """
 
 from __future__ import annotations
@@ -84,10 +84,10 @@ def name_melted_values(columns: Iterable[str]) -> str:
 
 
 def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | None:
-    """Find the common column that names the transmitter in both tables, if any.
+    """Find the common column that names the transmitter in both tables; None if there is none.
 
-    It is the first common column of which each value in the links appears exactly once among the transmitters, or else
-    the first that is named like transmitters, names each of them once and has at least one value in both tables.
+    In the table of transmitters, its values are distinct. The first such column that contains all values of the links
+    is chosen; otherwise the first one that is named like a transmitter and shares at least one value with the links.
     """
     partial = None
     for name in transmitters:
@@ -162,13 +162,14 @@ def find_transmitter_names(transmitters: pd.DataFrame) -> list[str]:
     ]
     if not names:
         raise InputError(
-            f"transmitters: no column names them ({', '.join(map(str, transmitters))}); call it 'transmitter'"
+            f"transmitters: no column contains distinct names ({', '.join(map(str, transmitters))}); call one "
+            "'transmitter'"
         )
     return names
 
 
 def find_devices(frame: pd.DataFrame) -> list[str]:
-    """Columns that distinguish receiving devices."""
+    """Columns whose values may distinguish receiving devices."""
     quantities = (
         "x", "y", "longitude", "latitude", "height", "altitude or floor", "azimuth", "downtilt", "path gain", "power",
         "received power", "path loss", "decibel", "frequency", "bandwidth or shift", "time", "distance",

@@ -99,7 +99,8 @@ def main() -> None:
     """Print the reported and the computed path loss of links, and the largest difference."""
     if CALIBRATION.get("mounted"):
         sys.exit(
-            "Antennas differ between the links of this study: the scene can be loaded, but not compared."
+            "Antennas differ between the links of this study: the scene can be loaded, but path loss cannot be "
+            "computed here for comparison."
         )
     with (FOLDER / "links.csv").open(encoding="utf-8", newline="") as file:
         links = list(csv.DictReader(file))
