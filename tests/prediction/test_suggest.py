@@ -19,6 +19,8 @@ from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.measurements.observables import Statistic
 from calibray.prediction import suggestion
+from calibray.prediction.batches import predict_links
+from calibray.prediction.predict import as_links, open_for_links
 from calibray.scenes import read_scene
 from calibray.study import Study
 from calibray.tracing.settings import Antenna, TraceSettings
@@ -341,3 +343,21 @@ def test_fitted_heights_are_traced_at_their_values(folder, result, table):
     suggested = cb.suggest(placed, table, len(table)).set_index("row").path_loss_db.sort_index()
     # The offset of this fit is another one.
     assert np.ptp(suggested.to_numpy() - placed.predict(table)) < 1e-6
+
+
+def test_the_scene_is_loaded_once_for_all_links(result, table, monkeypatch):
+    loaded = []
+
+    def load(_, *arguments):
+        loaded.append(arguments)
+        return TwoRay(*arguments)
+
+    monkeypatch.setattr("calibray.tracing.SionnaFactory.__call__", load)
+    monkeypatch.setenv("CALIBRAY_CACHE", "")
+    result.suggest(table, 1)
+    assert len(loaded) == 1
+    setup = open_for_links(result, as_links(result, table))
+    for part in (table[:5], table[5:10]):
+        setup = setup.at(as_links(result, part))
+        predict_links(result, setup, 0.9)
+    assert len(loaded) == 2

@@ -344,8 +344,7 @@ def with_constants(result: Record, setup: Setup) -> Setup:
         values = {float(getattr(materials[material], constant)) for materials in carriers}
         item = None if len(values) > 1 else fixed_constant(name, values.pop(), spread)
         items += [] if item is None else [item]
-    parameters = replace(setup.parameters, items=(*setup.parameters.items, *items))
-    return replace(setup, parameters=parameters)
+    return setup.with_parameters(replace(setup.parameters, items=(*setup.parameters.items, *items)))
 
 
 def _replay(

@@ -115,7 +115,7 @@ def suggest(
     refuse_far_links(result, links, read_triangles(setup.scene))
     announce(result, len(links), "candidates")
     setup = with_constants(result, setup)
-    model = _ReplayedDraws(result, replace(calibrated, parameters=setup.parameters), progress)
+    model = _ReplayedDraws(result, calibrated.with_parameters(setup.parameters), progress)
     predicted, slope, errors = model.at(setup)
     reached = np.flatnonzero(np.isfinite(predicted).all(axis=0))
     if not len(reached):

@@ -142,6 +142,10 @@ class Setup:
         setup = self._with_tracer(replace(self, links=links, held_out=np.zeros(len(links), dtype=bool)))
         return setup.with_obstruction() if self.study.uses_obstruction else setup
 
+    def with_parameters(self, parameters: Parameters) -> Setup:
+        """The setup with other parameters; the scene is not loaded again."""
+        return self._with_tracer(replace(self, parameters=parameters))
+
     def with_obstruction(self) -> Setup:
         """The setup with the links' columns that are computed from the scene (`obstruction.COLUMNS`)."""
         study = self.study
