@@ -151,7 +151,7 @@ def _read_ply(content: bytes) -> Mesh:
     if header is None:
         raise InputError("is not a PLY file, or its header is damaged")
     body = content[header.end() :]
-    # Before it allocates memory, trimesh refuses a binary file whose size differs from that declared in its header.
+    # Before it allocates memory, trimesh refuses a binary file whose size differs from the size declared in its header.
     with np.errstate(all="ignore"):
         loaded = load_ply(
             BytesIO(_COMMENT.sub(b"", header[0]) + body), fix_texture=False, skip_materials=True

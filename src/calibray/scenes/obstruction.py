@@ -97,7 +97,7 @@ class Region:
     def _over_ground(
         self, spans: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """The parts of spans (line, lower, upper, prism) between bottom and top above the ground, found in steps."""
+        """The parts of spans (line, lower, upper, prism) at heights above ground from bottom to top, found in steps."""
         if self.ground is None:
             return spans
         step = (end - start)[spans[:, 0].astype(np.int64)]
@@ -139,7 +139,7 @@ def _between(
     bottom: NDArray[np.float64],
     top: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The part of each line between two heights, as two fractions of the line [k]; empty unless high exceeds low."""
+    """The part of each line between two heights, as fractions of the line [k]; empty unless the second is larger."""
     rise = last - first
     # A level line is between the heights along its whole length or nowhere.
     level = np.abs(rise) < 1e-9
@@ -159,7 +159,7 @@ OBSTACLES: Final = (OUT_OF_SIGHT, WALLS, "obstruction_m", "knife_edge_db")
 its length inside buildings [m], and the knife-edge diffraction loss of the dominant roof edge [dB]."""
 
 SAME_CROSSING: Final = 1e-3
-"""Distance below which two crossings count as one, as on an edge that two triangles share [m]."""
+"""Distance below which two crossings count as one, for example on an edge that two triangles share [m]."""
 
 CLEAR: Final = -0.78
 """Fresnel parameter at or below which an edge causes no loss (ITU-R P.526-15, section 4.1)."""
@@ -192,7 +192,7 @@ class Obstruction:
         return (self.length_m > 0) | (self.walls > 0) | self.other_floor
 
     def knife_edge_db(self, wavelength: NDArray[np.float64] | float) -> NDArray[np.float64]:
-        """Knife-edge diffraction loss of the dominant roof edge [n], [dB], by ITU-R P.526-15 equation 31.
+        """Knife-edge diffraction loss of the dominant roof edge [n], [dB], according to ITU-R P.526-15 equation 31.
 
         The wavelength [m] is one value for all links, or one for each link [n].
         """
@@ -289,7 +289,7 @@ def _pairs(
         twice = np.concatenate([sorted_azimuth, sorted_azimuth + 2 * np.pi])
         relative = corners[:, :, :2] - origin
         direction = np.arctan2(relative[..., 1], relative[..., 0])
-        # Azimuths relative to the first corner's, in (-pi, pi], so that a range across 180 degrees stays contiguous.
+        # Azimuths relative to the first corner, in (-pi, pi], so that a range across 180 degrees stays contiguous.
         turn = np.angle(np.exp(1j * (direction - direction[:, :1])))
         low, high = direction[:, 0] + turn.min(axis=1), direction[:, 0] + turn.max(axis=1)
         around = high - low > np.pi * (1 - 1e-9)  # the origin is inside the triangle or on its side
@@ -386,7 +386,7 @@ REGION: Final = "region_m"
 """Column with the length of the straight line inside regions of extra loss [m]."""
 
 CLUTTER: Final = "clutter_db"
-"""Column with the clutter loss at one end by ITU-R P.2108 [dB]."""
+"""Column with the clutter loss at one end according to ITU-R P.2108 [dB]."""
 
 CLUSTER: Final = "cluster"
 """Column with the label of the grid square that contains the receiver, for grouping links."""
@@ -434,14 +434,14 @@ def with_obstruction(
 
 
 SHORTEST: Final = 250.0
-"""Shortest path length that ITU-R P.2108 covers with one end in clutter [m]."""
+"""Shortest path length for which ITU-R P.2108 gives the loss of clutter at one end [m]."""
 
 CARRIERS: Final = (0.5e9, 67e9)
 """Range of carrier frequencies that ITU-R P.2108 covers [Hz]."""
 
 
 def clutter_loss_db(distance: ArrayLike, frequency: ArrayLike) -> NDArray[np.float64]:
-    """Median loss over locations in urban or suburban clutter at one end [n], [dB], by ITU-R P.2108-1 section 3.2.
+    """Median loss in urban or suburban clutter at one end [n], [dB], according to ITU-R P.2108-1 section 3.2.
 
     `distance` is the length of each path [n], [m]; `frequency` is one carrier frequency for all, or one for each path
     [n], [Hz]. The loss is 0 for paths shorter than `SHORTEST`, which the recommendation does not cover.

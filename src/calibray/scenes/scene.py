@@ -277,7 +277,7 @@ def _split_name(
 def _merge(
     base: Material | Mapping[str, object] | None, specific: Material | Mapping[str, object] | None
 ) -> Material | Mapping[str, object] | None:
-    """Merge constants given for a material with those given for some of its objects, which take precedence."""
+    """Merge constants given for a material with constants given for some of its objects; the latter take precedence."""
     if specific is None or isinstance(specific, Material) or base is None:
         return base if specific is None else specific
     if isinstance(base, Material):

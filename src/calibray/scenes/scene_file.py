@@ -289,7 +289,7 @@ def write_scene(
 ) -> Path:
     """Write a new scene: `scene.xml`, and `meshes/NAME.ply` for each object; returns the XML file.
 
-    A material whose `type` is an ITU-R P.2040 material takes its permittivity and conductivity from there. The frame is
+    A material whose `type` is an ITU-R P.2040 material has the permittivity and conductivity of that type. The frame is
     stored in a comment, which `read_frame` reads. With `overwrite`, files that Calibray did not write are replaced.
 
     Raises:

@@ -31,7 +31,7 @@ paths were found twice.
 """
 
 COARSE: Final = 1e-3
-"""Spacing of stored coordinates above which a warning is given [m]; path loss changes by more than 0.005 dB."""
+"""Spacing of stored coordinates above which a warning is given [m]; it changes path loss by more than 0.005 dB."""
 
 TOO_COARSE: Final = 1e-2
 """Spacing of stored coordinates above which a scene cannot be traced [m]: walls no longer meet, and paths are lost."""

@@ -196,7 +196,7 @@ def vertical_crossings(
 
     The points [n, 3], [m], must be sorted by x.
     """
-    # The lines are shifted by less than a micrometre; a line through an edge shared by two triangles would cross both.
+    # The lines are shifted by less than a micrometre, because a line through a common edge would cross both triangles.
     x, y = points[:, 0] + 3.1e-7, points[:, 1] + 1.7e-7
     low, high = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
     # As the points are sorted by x, those within a triangle's width are contiguous.

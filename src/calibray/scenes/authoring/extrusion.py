@@ -6,8 +6,8 @@ the same corners along their common border, so walls and roofs that meet share t
 
 A wall exists at each height where one side of a border is built and the other is not. Between buildings of different
 heights it begins at the lower roof, and between buildings of equal height there is no wall. All walls that meet at an
-end of a border use the same column of corners, so the surface is closed and its wedges are connected. Lengths are whole
-millimetres, so that corners are either identical or clearly different.
+end of a border use the same column of corners, so the surface is closed and its wedges are connected. Coordinates are
+whole millimetres, so that corners are either identical or clearly different.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def split_overlaps(
             cells += [Cell(part, (stand,)) for part in shapely.get_parts(footprints.polygon[single])]
             continue
         pieces, covers = _overlay(footprints.polygon[members])
-        # Smaller overlaps result from rounding to the grid [m^2].
+        # Overlaps of at most 0.1 m^2 result from rounding to the grid.
         shared = (covers.sum(axis=0) > 1) & (shapely.area(pieces) > 0.1)
         overlapping += int(covers[:, shared].any(axis=1).sum())
         for piece, cover in zip(pieces, covers.T, strict=True):
@@ -137,7 +137,7 @@ class Windows:
     strips of wall at both ends keep the wedges at the corners of the building in one material.
 
     Attributes:
-        share: Fraction of window in each wall, from 0 to below 1 [1].
+        share: Fraction of each wall that is window, at least 0 and less than 1 [1].
         module: Approximate distance between the centres of adjacent windows [m].
 
     Raises:
@@ -195,7 +195,7 @@ def extrude(
     """Extrude buildings from their cells, with heights in the scene's frame.
 
     Without `windows`, walls are not divided. `ground` is the height of the ground under each building [n], [m]; bodies
-    that stand on the ground are open at the bottom, all others are closed. With None, all bodies are closed.
+    that stand on the ground are open at the bottom, all others are closed. Without `ground`, all bodies are closed.
     """
     outlines = [_rings(cell.polygon) for cell in cells]
     standing = [
@@ -244,7 +244,7 @@ def _edges(ring: Sequence[Point]) -> Iterator[Edge]:
 
 
 def _wall_stands(standing: Sequence[tuple[Stand, ...]], cell_of: dict[Edge, int], edge: Edge) -> list[Stand]:
-    """The buildings to the left of an edge, over the heights without a building to its right [mm]."""
+    """The buildings to the left of an edge, cut to the heights at which no building is to its right [mm]."""
     opposite = cell_of.get((edge[1], edge[0]))
     free = list(standing[cell_of[edge]])
     for low, high, _ in standing[opposite] if opposite is not None else ():
@@ -281,14 +281,14 @@ def _columns(walls: dict[Edge, list[Stand]], strips: Strips) -> dict[Point, list
 def wall_triangles(
     left: Point, right: Point, left_levels: Iterable[int], right_levels: Iterable[int], low: int, high: int
 ) -> Iterator[tuple[Corner, Corner, Corner]]:
-    """Divide a vertical rectangle into triangles, counter-clockwise seen from the right of the line left to right.
+    """Divide a vertical rectangle into triangles, counter-clockwise for an observer to the right of its base line.
 
-    All numbers are in mm. `left` and `right` are x and y of the sides. `left_levels` and `right_levels` are the heights
-    of the corners on the sides, ascending, with both ends included. Yields the three corners of each triangle.
+    The base line runs from `left` to `right`, which are x and y of the sides. `left_levels` and `right_levels` are the
+    heights of the corners on the sides, ascending, including both ends. Yields the corners of each triangle [mm].
     """
     left_column = [(*left, level) for level in left_levels if low <= level <= high]
     right_column = [(*right, level) for level in right_levels if low <= level <= high]
-    # Both columns are climbed together: each step up one side makes a triangle with the current corner of the other.
+    # Both sides are followed upwards: each step up one side forms a triangle with the current corner of the other side.
     i = j = 0
     while i < len(left_column) - 1 or j < len(right_column) - 1:
         left_done, right_done = i == len(left_column) - 1, j == len(right_column) - 1

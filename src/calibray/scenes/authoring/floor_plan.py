@@ -39,7 +39,7 @@ VECTOR_SUFFIXES: Final = (".dxf", ".geojson", ".json", ".gpkg", ".shp", ".fgb", 
 """Extensions of vector files; any other file is read as CSV."""
 
 Lines = list[list[NDArray[np.float64]]]
-"""The points [n, 2] of each line, for each row."""
+"""The lines of each row of a plan; each line is an array of points [n, 2]."""
 
 _ENDS: Final = ("x0", "y0", "x1", "y1")
 _OTHER_ENDS: Final = (
@@ -163,7 +163,7 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
 
 
 def _read_table(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
-    """The columns of a table, as from `_with_known_names`, and the lines of each row."""
+    """The columns of a table, renamed by `_with_known_names`, and the lines of each row."""
     if not exists(path):
         raise InputError(f"floor plan {path}: is not a file; check the path")
     table = parse_text(path, read_text(path))
@@ -193,7 +193,7 @@ def _read_table(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
 
 
 def _read_vector(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
-    """The attributes of a vector file, as from `_with_known_names`, and the lines of each feature."""
+    """The attributes of a vector file, renamed by `_with_known_names`, and the lines of each feature."""
     features = read_features(path, None)
     lines = [_parts(geometry) for geometry in features.outline]
     has_lines = [bool(parts) for parts in lines]
@@ -216,7 +216,7 @@ def _read_vector(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
 def _with_known_names(
     path: Path, frame: pd.DataFrame, unit: float, others: Mapping[str, Sequence[str]]
 ) -> pd.DataFrame:
-    """Rename known columns to the names in this module, and convert lengths with a unit to the plan's unit [m]."""
+    """Rename known columns to the names in this module; convert lengths in a stated unit to the plan's unit [m]."""
     known = _known_names(map(str, frame), others)
     frame = frame.rename(columns=known)
     for column, name in known.items():

@@ -56,7 +56,7 @@ STOREY: Final = 1.8
 """Smallest height of a storey [m]; lower parts of walls, such as parapets, do not count as storeys."""
 
 ROUNDING: Final = 2.0
-"""Distance between a corner and its line that rounding can cause [mm]; walls of a plan are cut where they cross."""
+"""Largest distance [mm] by which rounding moves a corner, where crossing walls are cut, away from the wall's line."""
 
 _REACH: Final = 0.03  # largest distance from a wall's face at which the end of another wall meets it [m]
 
@@ -206,7 +206,7 @@ def _extend(
 
 
 def _pieces(sheets: Sequence[Segment], materials: Sequence[str]) -> Pieces:
-    """Cut lines where they cross; doors, windows and shorter lines take precedence for the sheets over a piece."""
+    """Cut lines where they cross; over each piece, doors and windows replace walls, and shorter lines longer ones."""
 
     def priority(number: int) -> tuple[bool, float, int]:
         return sheets[number].kind not in OPENINGS, round(sheets[number].length, 3), number

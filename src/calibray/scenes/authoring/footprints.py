@@ -34,7 +34,7 @@ SMALLEST: Final = 1.0
 """Smallest area of a building [m^2]."""
 
 HIGHEST: Final = 1000.0
-"""Largest height of a building or part of one [m]; the highest building is 828 m high."""
+"""Largest height of a building or of a part of a building [m]; the tallest building is 828 m high."""
 
 HeightSource = Literal["height", "levels", "default"]
 
@@ -191,7 +191,7 @@ def _check_heights(raw: Footprints, keep: NDArray[np.int64]) -> None:
 
 
 def _check_extent(polygons: NDArray[Any], names: Sequence[str]) -> None:
-    """Refuse a building far from the others, such as one at 0, 0, and maps across 180 degrees of longitude."""
+    """Refuse a building that is far from the others, for example at (0, 0), or on the other side of 180 degrees."""
     if not len(polygons):
         return
     bounds = library("shapely", "scenes").bounds(polygons)

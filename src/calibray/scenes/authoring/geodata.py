@@ -43,7 +43,7 @@ TEXT_GROWTH: Final = 15
 """Memory needed to parse GeoJSON or DXF, as a multiple of the file size [1]."""
 
 HEIGHTS: Final = (-1000.0, 10_000.0)
-"""Range of heights on land [m]; -32768 and -9999 mark gaps that the file does not declare."""
+"""Range of heights on land [m]; values outside it, such as -32768 and -9999, mark gaps that a file does not declare."""
 
 _MAGIC: Final = (
     (b"SQLite format 3\0", "GPKG"),
@@ -143,7 +143,7 @@ def _read_with_gdal(path: Path, layer: str | None, driver: str) -> Features:
     pyogrio, shapely = library("pyogrio", "scenes"), library("shapely", "scenes")
     # An absolute path, so that no part of the name is interpreted as a GDAL prefix, such as /vsicurl or WFS:.
     file = str(path.resolve())
-    # DXF blocks can be nested, so that a few kilobytes would expand to gigabytes.
+    # DXF blocks can be nested, and nested blocks can expand from a few kilobytes to gigabytes.
     pyogrio.set_gdal_config_options({"DXF_INLINE_BLOCKS": False})
     try:
         if layer is None:
@@ -222,7 +222,7 @@ class HeightModel:
         path: The file.
         dataset: The raster, as opened by rasterio.
         crs: Horizontal coordinate reference system as WKT.
-        metres: Unit of the heights after scale and offset [m].
+        metres: Unit in which the heights are stored, after scale and offset are applied [m].
     """
 
     path: Path

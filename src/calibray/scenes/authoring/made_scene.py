@@ -263,7 +263,7 @@ def make_scene(
     materials = [palette.wall, palette.window, palette.roof or palette.wall, palette.ground]
     scene = MadeScene(folder / SCENE_FILES[0], frame, *extent(objects), counts, guessed)
     write_made_scene(scene, objects, materials, overwrite)
-    # The trees of a scene that this scene replaces are removed.
+    # If this scene replaces an older one, the trees of the older scene are removed.
     (folder / TREES_FILE).unlink(missing_ok=True)
     if trees is not None and frame is not None and len(trees):
         trees.write(folder, frame)

@@ -55,7 +55,7 @@ class Trees:
 
     Attributes:
         outline: Shapely polygons in the scene's frame [n], [m].
-        kind: A value of `KINDS` [n].
+        kind: Kind of each polygon, one of the values of `KINDS` [n].
         bottom: Height of the bottom of each prism above the ground [n], [m].
         top: Height of the top of each prism above the ground [n], [m].
         assumed: Whether each height is an assumption [n].

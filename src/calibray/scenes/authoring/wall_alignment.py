@@ -2,9 +2,9 @@
 
 Coordinates are rounded: in OpenStreetMap to a centimetre, and in Calibray to a millimetre. The front of a row of
 houses, or a wall cut where another wall meets it, then consists of several planes that almost coincide. Sionna RT
-accepts images within 1 cm of each other but distinguishes planes by much smaller differences, so it finds the same
-reflection several times. Therefore, one straight line is fitted to collinear edges by least squares, and corners are
-moved onto the lines of their walls. Input is in whole millimetres, output in metres.
+treats planes that differ by much less than 1 cm as different planes, so it finds the same reflection several times.
+Therefore, one straight line is fitted to collinear edges by least squares, and corners are moved onto the lines of
+their walls. Input is in whole millimetres, output in metres.
 """
 
 from __future__ import annotations
@@ -199,7 +199,7 @@ def _across(
 def _fit_lines(
     segments: NDArray[np.float64], line: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """A point on each line and its direction, fitted to the segments' ends by total least squares, and total length."""
+    """A point on each line, its direction (by total least squares of its segments' ends), and its segments' length."""
     used = line >= 0
     ends, number = segments[used], np.repeat(line[used], 2)
     length = np.hypot(*(ends[:, 1] - ends[:, 0]).T)

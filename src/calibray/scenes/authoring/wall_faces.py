@@ -44,17 +44,17 @@ def merge_faces(segments: Sequence[Segment]) -> MergedPlan:
     """Merge the two faces of each wall into one sheet.
 
     Two lines are faces of one wall if they have the same type, bottom and top, are parallel, and overlap over a length
-    that exceeds the distance between them and half of the shorter line. No closer line may be the opposite face of
-    either. The distance is at most `THICKEST`, and within a fifth or 2 cm of the thickness if that is given. Where one
+    that exceeds both their distance and half of the shorter line. No closer line may be the opposite face of either.
+    Their distance is at most `THICKEST`; it differs from a given thickness by at most a fifth of it, or 2 cm. Where one
     long face is opposite several short ones, as between a corridor and its rooms, each pair gives a sheet, and gaps of
-    up to `THICKEST` between the sheets are closed. Ends are midway between the faces' ends, so that corners meet.
+    up to `THICKEST` between the sheets are closed. Sheets end midway between the faces' ends, so that corners meet.
 
     Where one face is longer than the opposite face, the remaining part is kept as a sheet in the same plane. The short
     lines that close the outline of a wall are left out. All walls of a type without a given thickness get the median
     distance between their faces, weighted by length.
 
-    If less than half of the total length of a type's lines has an opposite face, the type is drawn as single lines: two
-    lines that are close together are separate walls, and both are kept.
+    If less than half of the total length of a type's lines has an opposite face, each line of the type is taken as a
+    wall: two lines that are close together are separate walls, and both are kept.
 
     Returns the sheets, followed by the lines without an opposite face.
     """
@@ -168,10 +168,10 @@ def _part(segment: Segment, start: float, end: float, offset: float) -> Segment:
 
 
 def _merge_pair(one: Segment, other: Segment) -> Segment:
-    """The sheet between two faces, over their overlap; where both faces end near each other, it ends midway."""
+    """The sheet between two faces, over their overlap; where the faces' ends are close, the sheet ends midway."""
     low, high = sorted(_relative(one, other)[0].tolist())
-    # At a corner, one face ends a wall's thickness before the other; midway is the centre line of the wall that it
-    # meets.
+    # At a corner, one face ends a wall's thickness before the other. The point midway between these ends is on the
+    # centre line of the other wall.
     start = low / 2 if abs(low) <= THICKEST else max(low, 0.0)
     end = (high + one.length) / 2 if abs(high - one.length) <= THICKEST else min(high, one.length)
     sheet = _part(one, start, end, _offset(one, other) / 2)
@@ -179,7 +179,7 @@ def _merge_pair(one: Segment, other: Segment) -> Segment:
 
 
 def _left_over(index: int, pairs: Sequence[tuple[int, int]], segments: Sequence[Segment]) -> list[Segment]:
-    """The parts of a face, longer than `THICKEST`, without an opposite face, moved into the plane of the sheet."""
+    """Parts of a face that have no opposite face and are longer than `THICKEST`, moved into the plane of the sheet."""
     face = segments[index]
     opposite = [segments[sum(pair) - index] for pair in pairs if index in pair]
     spans = sorted((*_span(face, other), _offset(face, other)) for other in opposite)

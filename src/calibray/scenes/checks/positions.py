@@ -25,8 +25,8 @@ CLEARANCE: Final = 0.05
 """A surface counts as above an antenna if it is higher by more than this [m]."""
 
 CONTACT: Final = 0.01
-"""An antenna closer than this to a level surface touches it [m]. At 1 mm, Sionna RT misses reflections from the surface
-on all links, at 3 mm on most, and at 10 mm on none."""
+"""An antenna closer than this to a level surface counts as touching it [m]. At a distance of 1 mm, Sionna RT misses
+reflections from the surface on all links; at 3 mm, on most links; at 10 mm, on none."""
 
 BEYOND: Final = "outside the scene"
 UNDER: Final = "under the ground"
@@ -141,7 +141,7 @@ class SceneSurfaces:
         return lowest
 
     def lowest_surface(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Height of the lowest surface, as `ground_height`, but +inf where the scene has no surface."""
+        """Like `ground_height`, but returns +inf where the scene has no surface."""
         position = np.column_stack([np.asarray(x, dtype=float), np.asarray(y, dtype=float)])
         index, height = self._surfaces(position)
         lowest = np.full(len(position), np.inf)

@@ -27,7 +27,7 @@ _FLAT: Final = 1e-10  # area below which a face counts as empty [m^2]
 
 CLOSE: Final = 0.01
 """Distance below which Sionna RT confuses parallel faces [m]. At 10 m from the origin, it reflected twice from sheets
-1 mm apart and found no path through walls 0.1 to 5 mm apart; a gap of 10 mm was enough. At 900 m, it took 100 mm."""
+1 mm apart and found no path through walls 0.1 to 5 mm apart; a gap of 10 mm was enough. At 900 m, it needed 100 mm."""
 
 _PARALLEL: Final = 0.999  # smallest cosine of the angle between the normals of parallel faces
 
@@ -219,7 +219,7 @@ def scale_findings(low: NDArray[np.float64], high: NDArray[np.float64]) -> Itera
 
 
 def _overlap_findings(root: ElementTree.Element, path: Path) -> Iterator[Finding]:
-    """Exposed faces that another face covers, with the first such pair of objects."""
+    """Report exposed faces that nearly coincide with a parallel face, with one such pair of objects as an example."""
     shapes = root.findall("shape")
     meshes = [read_surface(shape, path) for shape in shapes]
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
@@ -234,7 +234,7 @@ def _overlap_findings(root: ElementTree.Element, path: Path) -> Iterator[Finding
     differs = np.array([names[one] != names[other] for one, other in pairs.tolist()])
     one, other = (shapes[number].get("id") for number in pairs[np.argmax(differs)].tolist())
     material = (
-        f", {differs.sum()} of them to one of another material, and a ray may hit either"
+        f", {differs.sum()} of them to a face of a different material, and a ray may hit either face"
         if differs.any()
         else ""
     )
@@ -324,7 +324,7 @@ def _count_flipped(
     The faces of each connected piece are first given a consistent orientation. The correct orientation is known if the
     piece is closed or open only at its bottom (its signed volume must be positive), or if it is a horizontal sheet (its
     normal must point up). For any other piece, such as a wall, either side may be outside, and the faces that differ
-    from the majority count.
+    from the majority are counted.
     """
     if not len(faces):
         return 0
@@ -357,7 +357,7 @@ def _open_above(
     by_position: NDArray[np.int64],
     lowest: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Number of open edges of each face above the bottom of its connected piece, at height `lowest` [F]."""
+    """Number of open edges of each face that lie above `lowest`, the bottom of its connected piece [F]."""
     _, edge, uses = _edges(by_position)
     is_open = (uses == 1)[edge].reshape(-1, 3)
     height = vertices[faces][:, :, 2]
