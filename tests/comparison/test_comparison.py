@@ -1,8 +1,10 @@
 """Methods at equal budgets: the runs, the tables and files, and continuing after a kill."""
 
 import json
+import os
 from dataclasses import replace
 from functools import partial
+from multiprocessing import current_process
 
 import numpy as np
 import pandas as pd
@@ -16,7 +18,7 @@ from calibray.comparison import comparison as module
 from calibray.comparison.comparison import FILES, FLOOR_DB, Comparison, compare, figure, parse_methods
 from calibray.comparison.comparison import table as render_table
 from calibray.comparison.method_runs import BudgetedMethod, MethodRun, RunFile, run_optimizer, study_problem
-from calibray.errors import InputError
+from calibray.errors import EngineError, InputError
 from calibray.optimizers import METHODS, SGWOIM, RandomSearch
 from calibray.study import Study
 from markdown_tables import render_markdown
@@ -150,6 +152,70 @@ def test_a_killed_comparison_continues_after_its_last_whole_line(small, tmp_path
     )
     assert steps == [("comparing", done, 12) for done in range(6, 13)]
     assert pd.DataFrame(again.history()).equals(small[0].history())
+
+
+def _failing(kind):
+    """A problem whose evaluations fail in the way named by `kind`."""
+    land = landscape_problem("street")
+
+    def evaluate(x, derivatives):
+        if kind == "dies" and current_process().name != "MainProcess":
+            os._exit(9)
+        if kind == "raises":
+            raise RuntimeError("no engine")
+        return land.evaluate(x, derivatives)._replace(value=np.full(len(x), np.inf))
+
+    return replace(land, evaluate=evaluate, minimum=np.inf)
+
+
+def test_failed_runs_are_repeated(small, tmp_path, monkeypatch):
+    methods = parse_methods(["random"], 45)
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            BudgetedMethod,
+            "run",
+            lambda method, _, seed: MethodRun(*method.key(seed), 0, (), (), 0.0, "MemoryError: full"),
+        )
+        patch.setattr(
+            module,
+            "_search_optimum",
+            lambda _: MethodRun("optimum", 0, 0, 0, (), (), 0.0, "MemoryError: full"),
+        )
+        failed = compare(STREET, methods, seeds=2, out=tmp_path)
+    assert len(failed.failures()) == 2
+    again = compare(STREET, methods, seeds=2, out=tmp_path)
+    assert again.failures() == []
+    assert [run.best for run in again.runs["random"]] == [run.best for run in small[0].runs["random"][:2]]
+    assert again.found_by == "many-start least squares"
+    assert failed.found_by == "earlier searches (many-start least squares failed: MemoryError: full)"
+
+
+@pytest.mark.parametrize(
+    ("kind", "workers", "message"),
+    [
+        ("dies", 2, "a worker process died, perhaps for lack of memory; finished runs are kept in"),
+        ("raises", 1, r"street: no evaluation of any run succeeded \(RuntimeError: no engine\)"),
+        ("is infinite", 1, r"no evaluation of any run succeeded \(the objective is infinite\)"),
+    ],
+)
+def test_a_comparison_without_any_result_ends_with_its_cause(kind, workers, message, tmp_path):
+    with pytest.raises(EngineError, match=message):
+        compare(
+            partial(_failing, kind),
+            parse_methods(["random"], 24),
+            seeds=2,
+            out=tmp_path,
+            workers=workers,
+        )
+
+
+@pytest.mark.parametrize(
+    "content", [b"\xff\xfe\x00", b"[1]\n", b'{"problem": "PROBLEM"}\n', b'{"runs": 1}\n']
+)
+def test_a_file_of_something_else_is_refused(content, tmp_path):
+    (tmp_path / "runs.jsonl").write_bytes(content)
+    with pytest.raises(InputError, match=r"runs\.jsonl: contains something other than finished runs"):
+        RunFile(tmp_path / "runs.jsonl", "PROBLEM")
 
 
 def test_runs_of_another_problem_do_not_count(small):
@@ -334,8 +400,11 @@ def test_the_command_writes_tables_and_figure(study, tmp_path):
     assert set(runs["seed"]) == {0, 1}
     assert runs.groupby(["method", "seed"])["best_db"].apply(lambda best: best.is_monotonic_decreasing).all()
     assert (out / FILES[2]).read_bytes()[:4] == b"\x89PNG"
-    refused = CliRunner().invoke(app, [*arguments, "--methods", "nothing"])
-    assert refused.exit_code == 2
+    assert "6 runs with 96 RT calls in total, not counting least-squares" in done.stderr
+    for faulty in (["--methods", "nothing"], ["--workers", "0"], ["--seeds", "0"]):
+        refused = CliRunner().invoke(app, [*arguments, "--overwrite", *faulty])
+        assert refused.exit_code == 2
+        assert "in total" not in refused.stderr
 
 
 def test_methods_are_not_compared_on_an_external_program(study):

@@ -119,17 +119,11 @@ def compare(
     names = [name.strip() for name in runs.methods.split(",") if name.strip()]
     check_outputs(out, FILES, Study.load(study_file).files(), overwrite)
     parsed = parse_methods(names, runs.budget)
-    calls = runs.seeds * sum(method.budget for method in parsed if not method.stops_by_itself)
-    free = "".join(f", not counting {method.name}" for method in parsed if method.stops_by_itself)
-    echo(
-        f"{runs.seeds * len(parsed):,} runs with {calls:,} RT calls in total{free}; "
-        f"runs that are kept in {out} are not repeated",
-        err=True,
-    )
     with progress_bars(log()) as progress:
         comparison = run_comparison(
             partial(study_problem, study_file),
             parsed, seeds=runs.seeds, out=out, workers=runs.workers, progress=progress,
+            announce=partial(echo, err=True),
         )  # fmt: skip
     write(comparison, out)
     echo(render(table(comparison), optimum_text(comparison)))

@@ -8,7 +8,7 @@ from another search that reached a lower value.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -30,7 +30,7 @@ from calibray.comparison.method_runs import (
     code_fingerprint,
     run_optimizer,
 )
-from calibray.errors import InputError
+from calibray.errors import EngineError, InputError
 from calibray.optimizers import METHODS, Optimizer, label
 from calibray.support.figure_style import COLORS, PALETTE, logarithmic, plain_figure, styled
 from calibray.support.figure_style import write as write_figure
@@ -270,11 +270,12 @@ def compare(
     out: str | Path,
     workers: int = 1,
     progress: Progress | None = None,
+    announce: Callable[[str], None] | None = None,
 ) -> Comparison:
     """Run methods with seeds 0, 1, ... on one problem at equal budgets of RT calls.
 
     Every finished run is appended to `runs.jsonl` in `out` at once. If the file contains a run of the same problem,
-    optimizer code, method, budget and seed, that run is not repeated.
+    optimizer code, method, budget and seed that did not fail, that run is not repeated.
 
     Args:
         open_problem: Makes the problem. With several workers, it must be picklable, and each worker calls it once.
@@ -283,9 +284,11 @@ def compare(
         out: Folder that keeps the runs.
         workers: Number of processes.
         progress: Called after every run.
+        announce: Called with the numbers of runs and RT calls, as text, before the first run.
 
     Raises:
         InputError: A method, a number or the folder is invalid.
+        EngineError: A worker process died, or no evaluation of any run succeeded.
     """
     for name, value in (("seeds", seeds), ("workers", workers)):
         if not 1 <= value <= LIMITS[name]:
@@ -298,11 +301,19 @@ def compare(
     tasks = [(method, seed) for seed in range(seeds) for method in methods]
     missing = [(method, seed) for method, seed in tasks if file.find(method.key(seed)) is None]
     done = len(tasks) - len(missing)
-    for run in _finished(open_problem, problem, missing, workers):
-        file.add(run)
-        done += 1
-        if progress is not None:
-            progress("comparing", done, len(tasks))
+    if announce is not None:
+        announce(_plan(methods, seeds, out))
+    try:
+        for run in _finished(open_problem, problem, missing, workers):
+            file.add(run)
+            done += 1
+            if progress is not None:
+                progress("comparing", done, len(tasks))
+    except BrokenExecutor:
+        raise EngineError(
+            f"a worker process died, perhaps for lack of memory; finished runs are kept in {out}: start again with "
+            "fewer --workers"
+        ) from None
     reference = file.find(OPTIMUM)
     if reference is None:
         reference = file.add(_search_optimum(problem))
@@ -310,7 +321,24 @@ def compare(
     for method in methods:
         finished = [file.find(method.key(seed)) for seed in range(seeds)]
         runs[method.name] = tuple(run for run in finished if run is not None)
-    return Comparison(problem.name, tuple(methods), runs, *_lowest(problem.minimum, reference, runs))
+    optimum, found_by = _lowest(problem.minimum, reference, runs)
+    if optimum == np.inf:
+        raise EngineError(
+            f"{problem.name}: no evaluation of any run succeeded ({reference.failure or 'the objective is infinite'})"
+        )
+    if reference.failure:
+        found_by += f" (many-start least squares failed: {reference.failure})"
+    return Comparison(problem.name, tuple(methods), runs, optimum, found_by)
+
+
+def _plan(methods: Sequence[BudgetedMethod], seeds: int, out: str | Path) -> str:
+    """The numbers of runs and RT calls, as text."""
+    calls = seeds * sum(method.budget for method in methods if not method.stops_by_itself)
+    free = "".join(f", not counting {method.name}" for method in methods if method.stops_by_itself)
+    return (
+        f"{seeds * len(methods):,} runs with {calls:,} RT calls in total{free}; "
+        f"runs that are kept in {out} are not repeated"
+    )
 
 
 def parse_methods(names: Sequence[str], budget: int) -> tuple[BudgetedMethod, ...]:

@@ -243,8 +243,9 @@ def run_optimizer(problem: ComparisonProblem, key: RunKey, make: Callable[[], Op
 class RunFile:
     """Finished runs of one problem, in a JSON Lines file that can also contain runs of other problems.
 
-    Runs are appended one by one, so an interrupted comparison continues where it stopped. The file is created when the
-    first run is added; `problem` is a digest of everything that determines a run apart from method, budget and seed.
+    Runs are appended one by one, so an interrupted comparison continues where it stopped. Failed runs in the file are
+    ignored, so that they are repeated. The file is created when the first run is added; `problem` is a digest of
+    everything that determines a run apart from method, budget and seed.
 
     Raises:
         InputError: The file contains something other than runs.
@@ -253,7 +254,11 @@ class RunFile:
     def __init__(self, path: Path, problem: str) -> None:
         self._path, self._problem = path, problem
         self._runs: dict[RunKey, MethodRun] = {}
-        text = path.read_text(encoding="utf-8") if exists(path) else ""
+        other = InputError(f"{path}: contains something other than finished runs; choose another folder")
+        try:
+            text = path.read_text(encoding="utf-8") if exists(path) else ""
+        except UnicodeDecodeError:
+            raise other from None
         # A killed process may have left an incomplete last line.
         self._torn = bool(text) and not text.endswith("\n")
         for line in text.splitlines():
@@ -261,13 +266,14 @@ class RunFile:
                 record = json.loads(line)
             except ValueError:  # an incomplete line of a killed process
                 continue
-            if not isinstance(record, dict) or "problem" not in record:
-                raise InputError(
-                    f"{path}: contains something other than finished runs; choose another folder"
-                )
-            if record.pop("problem") == problem:
-                run = MethodRun(**{**record, "calls": tuple(record["calls"]), "best": tuple(record["best"])})
-                self._runs[run.method, run.budget, run.seed] = run
+            try:
+                if record.pop("problem") == problem and not record["failure"]:
+                    run = MethodRun(
+                        **{**record, "calls": tuple(record["calls"]), "best": tuple(record["best"])}
+                    )
+                    self._runs[run.method, run.budget, run.seed] = run
+            except (AttributeError, KeyError, TypeError):
+                raise other from None
 
     def find(self, key: RunKey) -> MethodRun | None:
         """The finished run with the given key, or None."""
