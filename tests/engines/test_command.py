@@ -249,7 +249,7 @@ def test_a_program_that_breaks_down_ends_the_run_and_loses_nothing(tmp_path):
     study = Study.from_content(content | {"method": method}, tmp_path / "study.toml")
     out = tmp_path / "out"
     with pytest.raises(
-        EngineError, match=r"the licence ran out.*so did the 3 calls before it.*--forget-failed"
+        EngineError, match=r"the licence ran out.*the 3 calls before it failed too.*--forget-failed"
     ):
         calibrate(study, out=out)
     assert len(programs.calls(tmp_path)) == 12

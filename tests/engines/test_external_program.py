@@ -221,7 +221,7 @@ def test_responses_that_are_no_files_of_a_sensible_size(tmp_path, script, messag
         ),
         ("19.9", r"= 19.9; it must be a number between 20 and 300 dB, or infinite without a path$"),
         ("300.1", "= 300.1; it must be a number between 20 and 300 dB"),
-        ("1e308", r"= 1e\+308; must"),
+        ("1e308", r"= 1e\+308; it must"),
         ("-1e4", "= -10000; it must be a number between 20 and 300 dB, or infinite without a path$"),
     ],
 )

@@ -108,7 +108,7 @@ def test_a_failure_is_kept_until_it_is_taken_out(ledger):
 
 
 def test_an_engine_that_never_worked_leaves_nothing_behind(ledger):
-    with pytest.raises(EngineError, match="it failed; so did all 3 candidates of the first batch"):
+    with pytest.raises(EngineError, match="it failed; all 3 candidates of the first batch failed"):
         Recorded(Counting(fails=(12.0, 12.5)), ledger, "r", "command").path_loss(CANDIDATES)
     assert len(ledger.table()) == 0
     mended = Recorded(Counting(), ledger, "r", "command")

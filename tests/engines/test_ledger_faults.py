@@ -106,7 +106,7 @@ def test_a_damaged_entry_is_dropped_with_a_line_and_asked_again(path, caplog, ch
     assert resumed(path) == 2  # the damaged one, and one that was never run
     (record,) = caplog.records
     assert record.message.startswith(f"{path}: call 2 is damaged ({message}")
-    assert record.message.endswith("; deleted, and run again")
+    assert record.message.endswith("; it is deleted and run again")
     assert resumed(path) == 0
 
 
@@ -125,10 +125,10 @@ def test_damaged_entries_are_left_out_of_the_table(path, caplog):
         ("CREATE TABLE bookmarks (url TEXT)", "not a ledger but a database with a table 'bookmarks'"),
         (
             "CREATE TABLE answers (id, text)",
-            "its table 'answers' has the columns id, text, must have",
+            "its table 'answers' has the columns id, text; it must have",
         ),
-        ("CREATE TABLE claims (who)", "its table 'claims' has the columns who, must have"),
-        ("PRAGMA user_version = 3", "ledger of version 3, but this Calibray uses 2"),
+        ("CREATE TABLE claims (who)", "its table 'claims' has the columns who; it must have"),
+        ("PRAGMA user_version = 3", "ledger of version 3, but this Calibray uses version 2"),
     ],
 )
 def test_another_database_is_refused_and_left_as_it_is(tmp_path, script, message):
@@ -323,7 +323,7 @@ def test_a_damaged_answer_of_a_rescue_file_is_run_again(path, caplog):
     with closing(sqlite3.connect(file)) as connection, connection:
         connection.execute("UPDATE answers SET path_loss_db = ?", (doubles(82.0, np.inf),))
     assert resumed(path) == 1
-    assert "is damaged (a wrong checksum); deleted, and run again" in caplog.text
+    assert "is damaged (a wrong checksum); it is deleted and run again" in caplog.text
 
 
 def test_a_ledger_that_cannot_be_written_is_read(path, monkeypatch):

@@ -327,7 +327,7 @@ def test_a_null_of_the_antennas_has_the_power_of_a_rounding_error(yard: Tracer) 
     level = np.where(rows.link == "aside", rows.power_db + 20 * np.log10(1.5**0.5), -200.0)
     paths = read(rows.assign(power_db=level), yard, antennas=(Antenna("dipole"), Antenna()))
     np.testing.assert_allclose(path_loss(paths), [-level[0], np.inf])
-    with pytest.raises(InputError, match="dB above free space with the antennas stated"):
+    with pytest.raises(InputError, match="dB above free space with the stated antennas"):
         read(
             rows.assign(power_db=level + 80 * (rows.link == "zenith")),
             yard,

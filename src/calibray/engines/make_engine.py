@@ -1,4 +1,4 @@
-"""Make the engine of a study, and the fingerprint of everything but the candidate that determines its answers."""
+"""Make the engine of a study, and a fingerprint of everything that determines its answers apart from the candidate."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def make(
         progress: Called after every launch of a trace ("tracing"), or every RT call of a batch ("running").
         ledger: SQLite file that stores RT calls. Replay does not use it, because computing an answer is faster than
             reading one.
-        workers: Run the calls of a batch for "command", or keep chunks of links for "replay" (`open_workers`).
+        workers: Workers that run the calls of a batch for "command", or keep chunks of links for "replay".
         paths: Paths of the study's links for "replay"; if None, they are traced or read from the cache.
 
     Returns:
-        The engine, over all links of the study, including held-out links.
+        The engine, for all links of the study, including held-out links.
 
     Raises:
         InputError: The engine is unknown, does not suit the study, or does not support workers; the ledger cannot be
@@ -116,7 +116,7 @@ def fingerprint(study: OpenedStudy) -> str:
 
 
 def _fixed_constants(materials: Mapping[str, Material], free: set[str]) -> dict[str, dict[str, object]]:
-    """The constants of all materials that are not calibrated."""
+    """The constants that are not calibrated, for all materials."""
     return {
         name: {
             constant: value

@@ -54,12 +54,12 @@ class PoseError:
         axis: Theta vector of every path in the frame of its first interaction [P, 2].
         pose: Stated directions, each shared by several paths [M].
         mounted: Index of every path's pose [P].
-        of_antenna: Paths of each antenna.
+        of_antenna: Indices of the paths of each antenna.
         transmitter: Transmitter of every pose [M].
         weights: The changes of yaw [rad], downtilt [rad] and gain [dB] of a transmitter, per unit of each effect
             parameter [3, T, e].
         antennas: The distinct antennas.
-        gains: Content of the antennas: if a gain file changes but keeps its name, the program is compiled again.
+        gains: Content of the antennas, so that the program is compiled again if a gain file changes but keeps its name.
     """
 
     basis: Any

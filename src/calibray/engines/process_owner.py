@@ -12,8 +12,8 @@ from typing import Final
 import psutil
 
 CLOCK_TOLERANCE: Final = 2.0
-"""Largest difference between two readings of a process's start time [s]: if it is measured from 1970, the system clock
-may be corrected between the readings.
+"""Largest accepted difference between two readings of a process's start time [s]: a time since 1970 changes if the
+system clock is corrected between the readings.
 
 The system does not reuse a process number within this time, because it first uses all others.
 """

@@ -52,7 +52,7 @@ class Differentiable(Engine, Protocol):
 
     @property
     def large(self) -> bool:
-        """Whether a candidate takes milliseconds rather than microseconds."""
+        """Whether evaluating a candidate takes milliseconds rather than microseconds."""
         ...
 
     @property
@@ -101,7 +101,7 @@ def joined(parts: Sequence[Responses]) -> Responses:
 
 
 def of_links(parts: Sequence[Responses], links: Sequence[NDArray[np.intp]]) -> Responses:
-    """Combine the responses of subsets of the links; `links` are the indices of every subset among all links [l]."""
+    """Combine the responses of subsets of the links; `links` are the indices [l] of each subset's links."""
     count, arrays = sum(map(len, links)), []
     # Axis of the links in path loss, in observables, and in the derivatives of both.
     for column, axis in zip(zip(*(part.arrays() for part in parts), strict=True), (1, 2, 1, 2), strict=False):
@@ -155,7 +155,7 @@ class Chunked(Differentiable, Protocol):
     def ask(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
         """Call a picklable function on every chunk's worker, and return the results by chunk.
 
-        Its first argument is the chunk (`engines.cluster.chunks.Chunk`); the others are the same for all chunks.
+        The first argument is the chunk (`engines.cluster.chunks.Chunk`); the others are the same for all chunks.
         """
         ...
 
@@ -244,7 +244,7 @@ def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> ND
         if answer.failure:
             failures.append(answer.failure)
     if first and len(failures) == shape[0]:
-        more = f"; so did all {len(failures)} candidates of the first batch" if len(failures) > 1 else ""
+        more = f"; all {len(failures)} candidates of the first batch failed" if len(failures) > 1 else ""
         raise EngineError(f"{failures[0]}{more}")
     return losses
 
@@ -284,12 +284,12 @@ class Observable:
     """A quantity of a link that is both measured and modelled.
 
     Attributes:
-        name: Its name in messages.
-        unit: Its unit.
-        measured: Its measured values for given links [L].
-        modelled: An engine's values for candidates [n, d]: [n, L], +inf for a link without a path.
-        derivatives: An engine's values and their derivatives with respect to the parameters, [n, L] and [n, L, d]; None
-            if there are none.
+        name: Name in messages.
+        unit: Unit of the values.
+        measured: Function from links to measured values [L].
+        modelled: Function from an engine and candidates [n, d] to values [n, L]; +inf for a link without a path.
+        derivatives: Function from an engine and candidates to values [n, L] and their derivatives with respect to the
+            parameters [n, L, d]; None if there are no derivatives.
     """
 
     name: str

@@ -31,7 +31,7 @@ TABLE_TOLERANCE: Final = 1e-4
 """Largest error of a tabulated coefficient."""
 
 TABLE_CANDIDATES: Final = 32
-"""Number of candidates spread over the bounds; along with the start values they determine how fine tables must be."""
+"""Number of candidates spread over the bounds; these and the start values determine how fine tables must be."""
 
 BATCH: Final = 32
 """Largest number of candidates in one call."""
@@ -66,7 +66,7 @@ class Replay:
         combining: How a link's paths combine: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
         effects: Effects on the paths, in the order of `paths`.
-        computation: Precision and speed.
+        computation: Precision, tables and batch size.
 
     Raises:
         InputError: A parameter's material is not in the paths, or this kind of combining cannot be used.
@@ -155,7 +155,7 @@ class Replay:
         if self._combining.kind == "power":
             self.calls += len(values)
             return responses
-        # Only sums of powers follow from the powers of paths; the functions below count the candidates.
+        # Other combinations need more than the powers of paths; the functions below count the candidates.
         if not derivatives:
             return replace(responses, path_loss=self.path_loss(candidates))
         loss, slope = self.path_loss_and_jacobian(candidates)

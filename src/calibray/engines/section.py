@@ -141,7 +141,7 @@ class Openable(Protocol):
 
 
 class EngineSection(Section, ABC):
-    """``[engine]``: computes the path loss of candidates, chosen by its name.
+    """``[engine]``: the engine that computes the path loss of candidates; `name` states its kind.
 
     To add a kind of engine, write one final subclass in a separate module in `engines.kinds`, where it is discovered.
     Its fields are its keys in the study file, and its `name` is a literal. Put heavy imports into `open`, because
@@ -149,7 +149,7 @@ class EngineSection(Section, ABC):
 
     Attributes:
         name: The kind's name in study files.
-        expensive: Whether a call takes longer than a look-up, so that a ledger stores the calls.
+        expensive: Whether a call takes longer than reading a stored answer, so that a ledger stores the calls.
         external: Whether an external program answers, so that no ray tracer is needed.
         chunked: Whether chunks of links can be traced and replayed on workers.
     """
@@ -172,7 +172,7 @@ class EngineSection(Section, ABC):
     def open(
         self, study: OpenedStudy, paths: Paths | None, progress: Progress | None, workers: Workers | None
     ) -> Engine:
-        """The engine over all links of a study, on `paths` if they have already been traced.
+        """The engine for all links of a study; it uses `paths` if they have already been traced.
 
         Workers run the calls of a batch if the kind is `external`, and keep chunks of links if it is `chunked`.
 

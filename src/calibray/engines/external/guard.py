@@ -1,9 +1,10 @@
-"""The guard of an external program runs it to its end, limits its output, and kills all processes that it started.
+"""The guard runs an external program to its end, limits its output, and kills all processes that the program started.
 
 This is a separate script, `python -I -S guard.py LIBRARIES TIMEOUT FOLDER WORD...`, that imports no part of Calibray.
 It is a process between Calibray and the program for two reasons. First, on Linux it adopts orphans
 (PR_SET_CHILD_SUBREAPER), so that it finds processes that left the program's group and session. Second, it outlives
-Calibray: when its standard input ends, Calibray was killed, and the guard kills the program and removes the folder.
+Calibray: when its standard input ends, Calibray has ended or stopped the call; the guard kills the program and removes
+the folder.
 
 It prints one JSON object: `ended` ("status", "timeout", "stopped" or "unstarted"), `status` and `output`.
 """
@@ -44,7 +45,7 @@ class Output:
         self.tail = (self.tail + part[-TAIL:])[-TAIL:]
 
     def text(self) -> str:
-        """The output as text without control characters, which would garble a terminal, and without a long middle."""
+        """The output as text; control characters (harmful to terminals) are replaced, and a long middle is omitted."""
         left_out = self.length - len(self.head) - len(self.tail)
         middle = f" ... ({left_out} bytes left out) ... ".encode() if left_out else b""
         text = (self.head + middle + self.tail).decode("utf-8", "replace").replace("\r\n", "\n").strip()
@@ -52,7 +53,7 @@ class Output:
 
 
 def main(timeout: float, words: list[str]) -> dict[str, object]:
-    """Run a program until it ends, exceeds its time limit [s], or Calibray ends or stops it; report how."""
+    """Run a program until it ends, exceeds its time limit [s], or Calibray ends or stops it; report how it ended."""
     prctl = _prctl()
     prctl(PR_SET_CHILD_SUBREAPER, 1)
     streams = [os.pipe(), os.pipe()]
@@ -92,7 +93,7 @@ def _prctl():
 
 
 def _signal_pipe() -> int:
-    """A pipe that receives the number of every signal that ends a child or requests this process to end."""
+    """A pipe that receives the number of every signal that reports the end of a child or asks this process to end."""
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
@@ -119,7 +120,7 @@ def _listen(process: subprocess.Popen, deadline: float, signals: int, outputs: d
                         selector.unregister(ready.fd)
                 elif ready.fd == calibray or set(part) - {signal.SIGCHLD}:
                     return "stopped"
-            # A process that Calibray forked may hold the other end of standard input open.
+            # A process that Calibray forked may keep the other end of standard input open after Calibray has ended.
             if os.getppid() != parent:
                 return "stopped"
     return "status"

@@ -29,7 +29,7 @@ from calibray.errors import EngineError, InputError
 
 PLACEHOLDERS: Final = ("{request}", "{response}")
 GUARD_WAIT: Final = 2 * KILL_TIME  # longest wait for a guard that kills its program [s]
-PREFIX: Final = "calibray-call-"  # of the temporary folders of calls
+PREFIX: Final = "calibray-call-"  # prefix of the names of temporary folders of calls
 OWNER_FILE: Final = "owner.json"
 
 # `python -I -S guard.py LIBRARIES`: see `guard`.
@@ -61,8 +61,8 @@ class Outcome:
         path_loss_db: Path loss [L], [dB]; +inf for a link without a path, and for all links if the attempts failed.
         seconds: Total duration of all attempts [s].
         failure: Error of the last attempt; empty if it succeeded.
-        rays: The response of a program that answers with rays, from which path loss follows, or further observables [K,
-            L] in SI units as little-endian doubles; otherwise empty.
+        rays: The response of a program that answers with rays; otherwise further observables [K, L] in SI units as
+            little-endian doubles, or empty.
     """
 
     path_loss_db: NDArray[np.float64]
@@ -82,7 +82,7 @@ class ExternalProgram:
         timeout: Time limit for one attempt [s].
         retries: Number of further attempts after a failure.
         file_format: "json" or "hdf5".
-        rays: Whether it answers with a ray table instead of path loss.
+        rays: Whether the program answers with a ray table instead of path loss.
 
     Raises:
         InputError: A word contains a NUL character, which the system does not pass to programs.

@@ -60,18 +60,18 @@ class CommandSection(EngineSection):
     def _has_command(self) -> Self:
         if not self.command:
             raise InputError(
-                'name = \'command\' needs command, the program and its arguments, as ["octave-cli", "model.m"]'
+                'name = \'command\' needs command, the program and its arguments, such as ["octave-cli", "model.m"]'
             )
         return self
 
     def answers_by(self, study: OpenedStudy) -> list[str]:
-        """The program, its arguments, and whether it answers with rays; its version is unknown."""
+        """The program, its arguments, and whether it answers with rays; the program's version is unknown."""
         return [*self.command, *(["rays"] if self.rays else [])]
 
     def open(
         self, study: OpenedStudy, paths: Paths | None, progress: Progress | None, workers: Workers | None
     ) -> Command:
-        """The program over a study's links; see `EngineSection.open`."""
+        """The program as the engine of a study's links; see `EngineSection.open`."""
         folder = study.source.resolve().parent
         program = ExternalProgram(self.command, folder, self.timeout, self.retries, self.format, self.rays)
         executor = None if workers is None else workers.executor()
@@ -161,9 +161,9 @@ class Command:
             self._successive_failures = self._successive_failures + 1 if failure else 0
             if self._successive_failures >= self._give_up_after:
                 raise EngineError(
-                    f"{failure}; so did the {self._successive_failures - 1} calls before it. All answers are in the "
-                    "ledger: correct the program, remove the failures with `calibray ledger DIR --forget-failed`, and "
-                    "start again"
+                    f"{failure}; the {self._successive_failures - 1} calls before it failed too. All answers are in "
+                    "the ledger: correct the program, remove the failures with `calibray ledger DIR --forget-failed`, "
+                    "and start again"
                 )
 
     def _with_path_loss(self, outcome: Outcome) -> Outcome:
@@ -206,7 +206,7 @@ class Command:
         except (Exception, KeyboardInterrupt) as error:
             interruption = error
         finally:
-            # If all calls have ended, `stop` stays unset, so the caller can still wait for answers of another run.
+            # If all calls have ended, `stop` stays unset, so the caller can still wait for the answers of another run.
             if pending:
                 stop.set()
             for future in pending:
@@ -223,7 +223,7 @@ class Command:
             return future.result()
         except EngineError:
             raise
-        except Exception as error:  # a worker that dies loses its candidates, not the whole batch
+        except Exception as error:  # if a worker dies, only its candidates are lost, not the whole batch
             no_path = np.full(self.num_links, np.inf)
             return Outcome(no_path, 0.0, f"was lost with its worker ({type(error).__name__}: {error})")
 

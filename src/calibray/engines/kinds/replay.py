@@ -35,10 +35,10 @@ class ReplaySection(EngineSection):
 
     Attributes:
         name: "replay".
-        compress_db: Largest error of path loss when a few weighted paths replace all paths [dB]; if None, all paths are
+        compress_db: Largest error in path loss if a few weighted paths replace all paths [dB]; if None, all paths are
             replayed.
         chunk_links: Largest number of links that are traced and replayed together. If None, all links; with workers,
-            `chunks.CHUNK_LINKS` or as many as give at most `chunks.MOST_CHUNKS` chunks.
+            `chunks.CHUNK_LINKS`, or more if there would be over `chunks.MOST_CHUNKS` chunks.
         rays: Ray table with the paths of another engine, instead of a trace.
     """
 
@@ -80,8 +80,8 @@ class ReplaySection(EngineSection):
         displaced = [item.name for item in study.parameters if item.is_effect and item.field in DISPLACED]
         if displaced:
             raise InputError(
-                f"{study.source}: parameters: {displaced[0]!r}: path loss between traced positions can only be checked "
-                "in one process; calibrate without --workers and --scheduler (workers=None)"
+                f"{study.source}: parameters: {displaced[0]!r}: path loss between traced positions can be checked only "
+                "for all links at once; calibrate without workers (--workers, --scheduler) and engine.chunk_links"
             )
         chunks = cut(study.links, chunk_size(self.chunk_links, len(study.links)))
         if workers is None and (seconds := seconds_to_trace(study, chunks)) > LONG_TRACE_SECONDS:
@@ -112,7 +112,7 @@ def trace_and_replay(
 def replay(study: OpenedStudy, paths: Paths, compress_db: float | None = None) -> Replay | ReplayCarriers:
     """The replay of an opened study on stored paths, with one program per carrier.
 
-    `compress_db` is the largest error of path loss if a few weighted paths replace all paths [dB]; None keeps all.
+    `compress_db` is the largest error in path loss if a few weighted paths replace all paths [dB]; None keeps all.
     """
     from calibray.engines.compression import compress
     from calibray.engines.replay import CarrierPaths, Replay, ReplayCarriers

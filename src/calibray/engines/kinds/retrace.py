@@ -41,7 +41,7 @@ class RetraceSection(EngineSection):
     def open(
         self, study: OpenedStudy, paths: Paths | None, progress: Progress | None, workers: Workers | None
     ) -> Retrace:
-        """The ray tracer over a study's links; see `EngineSection.open`."""
+        """The ray tracer as the engine of a study's links; see `EngineSection.open`."""
         links = study.links
         if links.frequency is None:
             tracers = [CarrierTracer(study.tracer, links, np.arange(len(links)))]

@@ -1,11 +1,11 @@
-"""The SQLite file of a ledger: tables, transactions, errors, and entries with a digest against damage.
+"""The SQLite file of a ledger: tables, transactions, errors, and entries with a digest that reveals damage.
 
 A rescue file is written next to the ledger or, if that folder is gone or full, into the user's own state folder or the
 temporary folder. The next run with the ledger reads it.
 
-Claims state which run works on which candidate, so that two runs with one ledger do not both compute it. A claim is
-valid while its run renews it, and ends at once if the run's process has certainly ended. Each observer uses its own
-clock to time renewals, because the clocks of two machines may differ by hours.
+Claims state which run works on which candidate, so that two runs with one ledger do not compute the same candidate. A
+claim is valid while its run renews it, and ends at once if the run's process has certainly ended. Each run times the
+renewals of other runs with its own clock, because the clocks of two machines may differ by hours.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SKEW: Final = 86_400.0  # largest difference between the clocks of two machines 
 RENEWAL: Final = EXPIRY / 5  # interval between renewals [s]; a few may fail
 _active_runs: set[str] = set()  # the runs of this process
 _observed: dict[tuple[str, bytes, str], tuple[float, float]] = {}
-"""Claims of other runs: their `expires` at its last change, and this process's clock at that time [s]."""
+"""For each claim of another run: its latest `expires`, and the time on this process's clock when it changed [s]."""
 
 
 def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Sequence[bytes]) -> list[bytes]:
@@ -118,7 +118,7 @@ def renewing(file: Path, run: str) -> Iterator[None]:
 
 def _renew(file: Path, run: str, ended: Event) -> None:
     while not ended.wait(RENEWAL):
-        # If the ledger cannot be written, the engine's next answer fails and reports it.
+        # If the ledger cannot be written, storing the engine's next answer fails and reports this.
         with (
             suppress(sqlite3.Error),
             closing(sqlite3.connect(f"{file.as_uri()}?mode=rw", uri=True, isolation_level=None)) as ledger,
@@ -175,7 +175,7 @@ class LedgerEntry:
 def read_entry(
     problem: str, candidate: bytes, columns: tuple[object, ...], num_links: int | None = None
 ) -> LedgerEntry | str:
-    """Read an entry from a ledger row (path loss as bytes, seconds, failure, digest, rays); text if it is damaged."""
+    """Read an entry from a ledger row (path loss as bytes, seconds, failure, digest, rays); a text if damaged."""
     blob, seconds, failure, digest, rays = columns
     if not (isinstance(problem, str) and isinstance(candidate, bytes) and isinstance(blob, bytes)):
         return "a value of the wrong type"
@@ -243,7 +243,7 @@ def set_up(connection: sqlite3.Connection, path: Path) -> None:
 
     Raises:
         InputError: The file is another database, or a ledger of another version.
-        sqlite3.OperationalError: Other programs lock the file for too long, or it cannot be used.
+        sqlite3.OperationalError: Other programs lock the file for too long, or the file cannot be used.
         sqlite3.DatabaseError: The file is damaged.
     """
     deadline = time.monotonic() + LOCK_WAIT
@@ -265,7 +265,7 @@ def _set_up(connection: sqlite3.Connection, path: Path) -> None:
     tables = {name for (name,) in run("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if version not in (0, VERSION):
         raise InputError(
-            f"{path}: is a ledger of version {version}, but this Calibray uses {VERSION}; name another folder"
+            f"{path}: is a ledger of version {version}, but this Calibray uses version {VERSION}; name another folder"
         )
     if version == 0 and tables - set(_COLUMNS):
         raise InputError(
@@ -282,7 +282,7 @@ def _set_up(connection: sqlite3.Connection, path: Path) -> None:
             names = [row[1] for row in run(f"PRAGMA table_info({table})")]
             if names != columns:
                 raise InputError(
-                    f"{path}: is not a ledger, its table {table!r} has the columns {', '.join(names)}, must have "
+                    f"{path}: is not a ledger: its table {table!r} has the columns {', '.join(names)}; it must have "
                     f"{', '.join(columns)}; name another folder"
                 )
         if version != VERSION:
@@ -332,7 +332,7 @@ def explain(error: sqlite3.Error | OSError) -> str:
     remedy = {
         sqlite3.SQLITE_FULL: "free disk space and start again",
         sqlite3.SQLITE_IOERR: "free disk space, or repair the disk, and start again",
-        sqlite3.SQLITE_BUSY: f"another program has locked it for {LOCK_WAIT:g} s: end that and start again",
+        sqlite3.SQLITE_BUSY: f"another program has locked it for {LOCK_WAIT:g} s: end that program and start again",
         sqlite3.SQLITE_LOCKED: "another program has locked it; end that program and start again",
         sqlite3.SQLITE_READONLY: "make it and its folder writable and start again",
         sqlite3.SQLITE_CANTOPEN: "make its folder writable and start again",

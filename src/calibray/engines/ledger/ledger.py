@@ -131,7 +131,7 @@ class Ledger:
             entry = database.read_entry(problem, candidate, row[1:], num_links)
             if isinstance(entry, database.LedgerEntry):
                 return entry
-            _LOG.warning("%s: call %d is damaged (%s); deleted, and run again", self.path, row[0], entry)
+            _LOG.warning("%s: call %d is damaged (%s); it is deleted and run again", self.path, row[0], entry)
             self._connection.execute("DELETE FROM answers WHERE id = ?", (row[0],))
             self._connection.execute(
                 "DELETE FROM rays WHERE problem = ? AND candidate = ?", (problem, candidate)
@@ -272,7 +272,7 @@ def open_ledger(folder: str | Path) -> Ledger:
     """The ledger of a folder that `calibray run` has written.
 
     Raises:
-        InputError: The folder contains no ledger, or it cannot be read.
+        InputError: The folder contains no ledger, or the ledger cannot be read.
     """
     path = Path(folder) / LEDGER_FILE
     if not path.is_file():

@@ -22,12 +22,12 @@ from calibray.support.progress import Progress
 
 SHORTEST_WAIT: Final = 0.02
 LONGEST_WAIT: Final = 1.0
-"""Intervals between checks for the answers of another run [s]."""
+"""Shortest and longest interval between checks for the answers of another run [s]."""
 
 
 @final
 class Recorded:
-    """An engine with a ledger; it does not repeat candidates that any run has completed.
+    """An engine with a ledger; it does not run candidates again that any run has completed.
 
     Args:
         engine: The engine.
@@ -117,7 +117,7 @@ class Recorded:
             before = len(missing)
             yield from self._from_ledger(missing)
             if len(missing) == before and missing:
-                # Another run has claimed these candidates and computes them.
+                # Another run has claimed these candidates and is computing them.
                 if self._progress is not None:
                     self._progress("waiting", max(0, awaited - len(missing)), max(awaited, len(missing)))
                 time.sleep(pause)

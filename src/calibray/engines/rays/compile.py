@@ -1,7 +1,7 @@
 """Convert a ray table to a path program and back, with checks and the correction of every path's power.
 
-The correction is the power that the engine states divided by the power of the replay. It contains properties that only
-the engine knows, such as its antennas. Replay at other constants multiplies the replayed power by the correction.
+The correction is the power that the engine states divided by the power of the replay. It accounts for properties that
+only the engine knows, such as its antennas. Replay at other constants multiplies the replayed power by the correction.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from calibray.tracing.settings import Antenna
 _LOG: Final = logging.getLogger(__name__)
 
 UNKNOWN: Final = Antenna("iso", "VH")
-"""Antenna assumed at an end whose real antenna is unknown: its two ports lose no polarization, and the correction
-contains the rest."""
+"""Antenna assumed at an end whose real antenna is unknown: its two ports receive every polarization, and the correction
+accounts for the rest."""
 
 FREE_SPACE_DB: Final = 1.0
 """Largest deviation of a direct path from free-space power if antennas are known [dB]: pattern tables of engines differ
 by tenths of a decibel, while a wrong transmitted power or watts instead of decibels cause tens of decibels."""
 
 DIRECT_GAIN_DB: Final = 60.0
-"""Largest total gain of both antennas of a direct path [dB]: two dishes of 30 dBi."""
+"""Largest total gain of both antennas of a direct path [dB], for example two dishes of 30 dBi."""
 
 ROUNDING: Final = 1e-12
-"""Power relative to free space below which a path lies in a null of the antennas: some roundings of a field in single
-precision, as in Sionna RT."""
+"""Power relative to free space below which a path lies in a null of the antennas: a few rounding errors of a field in
+single precision, as in Sionna RT."""
 
 HIGH_GAIN_DB: Final = 25.0
 """Total gain of both antennas above which a warning is issued [dB]: 18 dBi of a sector antenna plus 7 dBi."""
@@ -101,7 +101,7 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
         # In double precision, because single precision would round vertices far from the origin.
         paths = replace(paths, vertex=table.vertex[table.kind != 0])
     if table.power is not None:
-        # A null of the antennas may leave no power in replay, and a rounding error in the engine.
+        # In a null of the antennas, a path may have no power in replay, and only a rounding error in the engine.
         kept = np.flatnonzero((powers(paths) > 0) | (table.power > ROUNDING * _free_space(paths)))
         power, table, paths = table.power[kept], table.take(kept), take(paths, kept)
         _check_direct(table, paths, power, setting.antennas is not None)
@@ -117,7 +117,7 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
 def rays_of(paths: Paths) -> RayTable:
     """The ray table of a path program, with the power of every path at the constants of the program's materials.
 
-    A link without a path has a direct path of power 0, so that the table has all links.
+    A link without a path gets a direct path of power 0, so that the table contains all links.
     """
     silent = np.asarray(paths.links_without_path, dtype=np.int64)
     link = np.concatenate([paths.link, silent])
@@ -233,7 +233,7 @@ def _check_straight(hits: Hits, transmits: NDArray[np.bool_]) -> None:
         number = int(np.argmax(np.where(transmits, bend, 0)))
         raise InputError(
             f"{hits.label[number]}: the path bends by {bend[number]:.3g} m at a transmission; a transmitted ray is "
-            "straight, so correct its type or its vertices"
+            "straight, so correct the type or the vertices"
         )
 
 
@@ -256,7 +256,7 @@ def _check_delays(table: RayTable, segment: NDArray[np.float64]) -> None:
 def _assign_links(
     table: RayTable, links: Links | None
 ) -> tuple[LinkPositions, NDArray[np.int64], NDArray[np.int64] | None]:
-    """Ends of distinct links, the link of every path among them, and the links of the program among them or None.
+    """Ends of distinct links, the index of every path's link, and the indices of the program's links, or None.
 
     Paths between positions that are not in `links` have the link -1.
 
@@ -325,7 +325,7 @@ def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], kno
     if wrong.any():
         worst = int(np.argmax(np.where(wrong, np.abs(off), 0)))
         side = "above" if off[worst] > 0 else "below"
-        what = "with the antennas stated" if known else "between isotropic antennas"
+        what = "with the stated antennas" if known else "between isotropic antennas"
         common = ""
         if np.ptp(off[direct]) < FREE_SPACE_DB and direct.sum() > 1:
             common = "; all direct paths differ by this amount, e.g. transmitted power or a cable loss: subtract it"

@@ -115,16 +115,16 @@ def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
 
 
 INSITE_TYPES: Final = {"R": "reflection", "D": "diffraction", "DS": "diffuse", "T": "transmission"}
-"""Types of interaction by their letters; foliage (F, X) is not a surface with a material."""
+"""Types of interaction by their letters; foliage (F, X) is refused, because it is not a surface with a material."""
 
 
 def read_insite(file: Path, tx_power_dbm: float | None) -> SourceTable:
     """Read the paths of one transmitter from a text file `*.paths.*.p2m` of Remcom Wireless InSite.
 
-    Lines that begin with # are comments. The first line is the number of receivers. For each receiver, its number and
-    its number of paths follow and, if there are any paths, a line of totals. A path has a line of nine numbers (number,
-    number of interactions, received power [dBm], phase [deg], time of arrival [s], four angles [deg]) or of eight
-    without the phase, a line such as Tx-R-D-Rx, and a line for each point.
+    Lines that begin with # are comments. The first line is the number of receivers. For each receiver, a line with its
+    number and its number of paths follows and, if there are any paths, a line of totals. A path has a line of nine
+    numbers (number, number of interactions, received power [dBm], phase [deg], time of arrival [s], four angles [deg])
+    or of eight without the phase, a line such as Tx-R-D-Rx, and a line for each point.
 
     Raises:
         InputError: The transmitted power is missing, the file is malformed, or a path crosses foliage.
@@ -198,7 +198,7 @@ AODT_TYPES: Final = {
 
 
 def read_aodt(folder: Path) -> SourceTable:
-    """Read the first time step with paths of NVIDIA's Aerial Omniverse Digital Twin, a folder with two tables.
+    """Read the first time step with paths from a folder of NVIDIA's Aerial Omniverse Digital Twin, with two tables.
 
     Both tables state the time, the radio unit and the user equipment. `raypaths` has a row for each path, with its
     points in units of the scene (centimetres) and its types of interaction. `cirs` has a row for each pair of antenna
@@ -241,7 +241,7 @@ def read_aodt(folder: Path) -> SourceTable:
 def _aodt_response(
     source: str, pair: Any, rows: Any, count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Power and delay of every path of a pair."""
+    """Power and delay of every path between a radio unit and a user equipment."""
     lists = [
         [_aodt_numbers(source, name, value) for value in rows[name]]
         for name in ("cir_re", "cir_im", "cir_delay")
@@ -271,7 +271,7 @@ def _aodt_numbers(source: str, name: str, values: Any) -> NDArray[np.float64]:
 
 
 def _aodt_element(element: Any) -> Any:
-    """An antenna element, which exports state as a number, a list or a dictionary, such as row, column and port."""
+    """A hashable antenna element; exports state a number, a list or a dictionary, such as row, column and port."""
     if isinstance(element, dict):
         return tuple(element.values())
     return tuple(element) if np.ndim(element) else element
@@ -355,7 +355,7 @@ def _deepmimo_paths(file: Path) -> Iterator[Polyline]:
             f"{tx.shape} and {rx.shape}; power, delay and inter must be [N, P], inter_pos [N, P, I, 3], tx_pos [1, 3] "
             "and rx_pos [N, 3]"
         )
-    # A path with a delay and interactions exists, so that a power of NaN is refused later.
+    # A path with a delay and interactions counts as existing, so that a power of NaN is refused later.
     exists = np.isfinite(inter) & (inter >= 0) & (np.isfinite(power) | np.isnan(power) & np.isfinite(delay))
     for receiver, path in np.argwhere(exists).tolist():
         codes = str(int(inter[receiver, path])) if inter[receiver, path] else ""
@@ -402,7 +402,7 @@ def is_sionna_paths(value: object) -> bool:
 
 
 def check_carrier(rays: Any, frequency: float) -> None:
-    """Refuse paths of Sionna RT that were solved at a carrier other than `frequency` [Hz]; other rays state none.
+    """Refuse paths of Sionna RT that were solved at a carrier other than `frequency` [Hz]; other rays state no carrier.
 
     Raises:
         InputError: The carriers differ.
@@ -422,7 +422,7 @@ def read_sionna_paths(paths: Any) -> SourceTable:
     """Read paths of Sionna RT in memory, as returned by its `PathSolver`, between antennas with one position each.
 
     Vertices and interactions are [D, R, T, P] with synthetic arrays, otherwise [D, R, Ra, T, Ta, P] for the antennas of
-    the arrays. Gains `a` are real and imaginary part [R, Ra, T, Ta, P].
+    the arrays. Gains `a` are pairs of real and imaginary parts [R, Ra, T, Ta, P].
 
     Powers are summed over the ports of a receiver and averaged over those of a transmitter.
 
@@ -433,7 +433,7 @@ def read_sionna_paths(paths: Any) -> SourceTable:
         if array.array_size != 1:
             raise InputError(
                 f"{SIONNA_PATHS}: an array has {array.array_size} antennas, whose paths are summed; trace with one "
-                "antenna each"
+                "antenna per array"
             )
     return rows_of(_sionna_polylines(paths), SIONNA_PATHS)
 

@@ -26,7 +26,7 @@ class Surfaces:
     """The triangles of a scene.
 
     Attributes:
-        corners: [F, 3, 3], [m].
+        corners: Corners of every triangle [F, 3, 3], [m].
         normal: Unit normals, pointing to either side [F, 3].
         material: Index in `Scene.materials` [F].
     """
@@ -57,7 +57,7 @@ class Surfaces:
     def near(
         self, point: NDArray[np.float64], within: float
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """Pairs of points [n, 3] and faces that lie within a distance [m]: point, face, distance, each [k]."""
+        """Pairs of points [n, 3] and faces within a distance [m]: indices of point and face, and distance, each [k]."""
         pairs = list(self._box_pairs(point, within))
         index, face = (
             (np.concatenate(part) for part in zip(*pairs, strict=True)) if pairs else np.zeros((2, 0), int)
@@ -92,14 +92,14 @@ class Hits:
     """Interactions with their directions and, if the table states it, their material.
 
     Attributes:
-        point: [n, 3], [m].
+        point: Positions [n, 3], [m].
         incident: Unit vectors of propagation before the interaction [n, 3].
         leaving: Unit vectors of propagation after the interaction [n, 3].
         length: Length of the shorter of the two adjacent segments [n], [m].
         reflects: Whether the law of reflection must hold [n].
         diffracts: Whether an edge diffracts the wave; the edge's faces may have different materials [n].
         material: Index of the stated material; -1 if none is stated [n].
-        label: Their names in messages [n].
+        label: Names of the interactions in messages [n].
     """
 
     point: NDArray[np.float64]
@@ -119,10 +119,9 @@ class Hits:
 
 
 def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.int64], float]:
-    """Face of every interaction [n], and the largest distance from it [m]; `names` are those of the materials.
+    """Index of every interaction's face [n], and the largest distance between them [m]; `names` are the materials.
 
-    Of the nearby faces, a reflection gets the nearest one that obeys the law of reflection, and any other interaction
-    the nearest.
+    A reflection gets the nearest face that obeys the law of reflection, and any other interaction the nearest face.
 
     Raises:
         InputError: A point is on no surface (of its material), faces of different materials coincide there, or no
@@ -162,7 +161,7 @@ def _off_surface(surfaces: Surfaces, hits: Hits, lost: NDArray[np.int64], names:
     surface = "surface of the scene" if stated < 0 else f"surface of {names[stated]!r}"
     return InputError(
         f"{hits.label[number]}: lies {surfaces.distance(hits.point[number], faces):.3g} m from the nearest {surface}, "
-        f"must lie within {TOLERANCE} m (so do {len(lost)} of {len(hits.point)} interactions); check units [m], axes "
+        f"must lie within {TOLERANCE} m ({len(lost)} of {len(hits.point)} interactions do not); check units [m], axes "
         "(argument axes), scene and material"
     )
 
@@ -190,7 +189,7 @@ class Edge:
 
     Attributes:
         face: The 0-face, which the wave illuminates.
-        normal_0: Its outward normal [3].
+        normal_0: Outward normal of the 0-face [3].
         normal_n: Outward normal of the other face [3].
         direction: Unit vector along the edge [3]; its cross product with the normal of the 0-face points into that
             face.
@@ -205,7 +204,7 @@ class Edge:
 
 
 def find_edge(surfaces: Surfaces, hits: Hits, number: int) -> Edge:
-    """The edge of a diffraction: of all pairs of faces there, the one that obeys Keller's law best.
+    """The edge of a diffraction: of all pairs of faces at the point, the one that obeys Keller's law best.
 
     Raises:
         InputError: No two faces form an edge there that diffracts the wave in the direction of the path.
@@ -227,7 +226,7 @@ def _edge(surfaces: Surfaces, hits: Hits, number: int, faces: tuple[int, int]) -
     point, incident, leaving = hits.point[number], hits.incident[number], hits.leaving[number]
     normal_0, normal_n = surfaces.normal[list(faces)]
     direction = np.cross(normal_0, normal_n)
-    # The sine between the normals: nearly coplanar faces form no edge.
+    # The norm is the sine of the angle between the normals: nearly coplanar faces form no edge.
     if hits.material[number] not in (-1, surfaces.material[faces[0]]) or np.linalg.norm(direction) < 0.05:
         return None
     into_0, into_n = surfaces.corners[list(faces)].mean(axis=1) - point

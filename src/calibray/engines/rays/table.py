@@ -1,7 +1,7 @@
-"""A ray table: one row for each point of a path, from the transmitter over its interactions to the receiver.
+"""A ray table: one row for each point of a path, from the transmitter via the interactions to the receiver.
 
-`docs/reference/ray-table.md` documents the columns. Rows may be in any order, because every row names its path and its
-position on it. Files are CSV, Parquet, JSON or HDF5, distinguished by their extension.
+`docs/reference/ray-table.md` documents the columns. Rows may be in any order, because every row states its path and its
+position on this path. Files are CSV, Parquet, JSON or HDF5, distinguished by their extension.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class RayTable:
     Attributes:
         source: Name of the table, for messages.
         path: Number or label of every path [P].
-        link: Number or label of its link [P]; None if their ends distinguish the links.
+        link: Number or label of every path's link [P]; None if the ends of the paths distinguish the links.
         tx: Transmitter of every path [P, 3], [m].
         rx: Receiver of every path [P, 3], [m].
         vertex: Interaction points [P, D, 3], [m].
@@ -197,7 +197,7 @@ def _with_known_names(table: SourceTable) -> SourceTable:
         if name not in known and (meant := _meant(name.strip().casefold(), absent)):
             raise InputError(
                 f"{table.source}: column {shortened(text)!r} is unknown and would be ignored; did you mean {meant!r} "
-                "(docs/reference/ray-table.md)? Name it so, in its unit, or remove it"
+                "(docs/reference/ray-table.md)? Use this name and its unit, or remove the column"
             )
     return replace(table, frame=table.frame.set_axis(names, axis=1))
 
@@ -377,7 +377,7 @@ def parse_rays(content: bytes, source: str) -> SourceTable:
 
 
 def columns_table(columns: Mapping[Any, Any], source: str) -> SourceTable:
-    """The rows of a table in memory, as an object with one list per column.
+    """The rows of a table in memory, given as one list per column.
 
     Raises:
         InputError: The columns have different lengths, or no rows.
@@ -420,7 +420,7 @@ def write_ray_file(file: str | Path, frame: pd.DataFrame, overwrite: bool = Fals
                     content[str(name)] = np.array(column, dtype=h5py.string_dtype()) if text else column
         case suffix:
             raise InputError(
-                f"{target}: cannot write {suffix or 'no ending'}; use .csv, .parquet, .json or .h5"
+                f"{target}: cannot write {suffix or 'a file without extension'}; use .csv, .parquet, .json or .h5"
             )
 
 
