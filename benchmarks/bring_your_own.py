@@ -262,7 +262,7 @@ def summary(entries: list[dict[str, object]]) -> Iterator[str]:
             yield (
                 f"{walk}, {name}: {records[0]['planted']:.4g} in {count} of {len(records)} intervals, "
                 f"{count / len(records):.2f} ({likely.low:.2f} to {likely.high:.2f}), of those called identified in "
-                f"{sum(map(holds, sure))} of {len(sure)}; found {middle:.4g} in the middle"
+                f"{sum(map(holds, sure))} of {len(sure)}; median estimate {middle:.4g}"
             )
 
 

@@ -255,15 +255,17 @@ def main() -> None:
                 f"repetition {seed + 1}: {chosen}; {np.mean(inside):.1%} of {len(inside)} links",
                 file=sys.stderr,
             )
-        share = f"{np.mean(inside):.1%} of {len(inside)} links of blocks left out"
-        print(f"{LEVEL:.0%} intervals hold {share}, {given.planted} planted truths in the demo district.")
+        share = f"{np.mean(inside):.1%} of {len(inside)} held-out links"
+        print(
+            f"{LEVEL:.0%} intervals contain {share}, with {given.planted} planted truths in the demo district."
+        )
     if not given.chance:
         return
     said = said_without_a_chance(given.chance, given.workers, given.out)
     right = sum(sentence.startswith("Calibration did not") for sentence in said)
-    print(f"A twin without a chance is called so in {right} of {given.chance} repetitions.")
+    print(f"A model that cannot help is reported as such in {right} of {given.chance} repetitions.")
     if right < 0.95 * given.chance:
-        sys.exit("too often a twin without a chance is said to help")
+        sys.exit("too often, a model that cannot help is reported to help")
 
 
 if __name__ == "__main__":

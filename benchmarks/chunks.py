@@ -180,8 +180,8 @@ def moved(links: int) -> None:
         size = sum(len(pickle.dumps(part)) for part in parts)
         whole = 64 * count * 8 * (1 + len(problem.parameters))
         print(
-            f"{count} links in {len(parts)} chunks: {size / 64:.0f} bytes a candidate come back with derivatives; "
-            f"path loss and derivatives of the links themselves would be {whole / 64:,.0f}"
+            f"{count} links in {len(parts)} chunks: {size / 64:.0f} bytes per candidate are returned with derivatives; "
+            f"path loss and derivatives of every link would take {whole / 64:,.0f}"
         )
 
 
@@ -203,8 +203,8 @@ def repeated(chunks: int, links: int) -> None:
     seconds = time.perf_counter() - started - opened
     each = 1e6 * seconds / STEPS / CANDIDATES / chunks / links
     print(
-        f"{chunks * links:>9,} links in {chunks:>4} chunks: {opened:.1f} s to open, {seconds:.1f} s for {STEPS} times "
-        f"{CANDIDATES} candidates with derivatives, {each:.3f} us a link and candidate, peak memory "
+        f"{chunks * links:>9,} links in {chunks:>4} chunks: {opened:.1f} s to open, {seconds:.1f} s for {STEPS} batches of "
+        f"{CANDIDATES} candidates with derivatives, {each:.3f} us per link and candidate, peak memory "
         f"{resident():.2f} GiB",
         flush=True,
     )

@@ -80,12 +80,12 @@ def main() -> None:
                 shutil.copy(file, options.keep)
             if shutil.which("chromium"):
                 taken.append(opened(file))
-                print(f"  opened in {taken[-1][0]:.2f} s, {taken[-1][1]:.2f} s of the processor")
+                print(f"  opened in {taken[-1][0]:.2f} s, with {taken[-1][1]:.2f} s of processor time")
     print(f"size below {LIMIT_MB:g} MB: {size < LIMIT_MB}")
     if taken:
         print(
-            f"opened below {LIMIT_S:g} s of the processor: {taken[-1][1] < LIMIT_S}; "
-            f"{taken[-1][1] / taken[0][1]:.1f} times the small one"
+            f"opened in less than {LIMIT_S:g} s of processor time: {taken[-1][1] < LIMIT_S}; "
+            f"{taken[-1][1] / taken[0][1]:.1f} times that of the small one"
         )
 
 

@@ -131,7 +131,7 @@ if __name__ == "__main__":
             total = reading + making
             print(
                 f"{count} buildings, {name}: {sum(made.triangles.values())} triangles, {total:.1f} s, "
-                f"{total / alone:.0f} times reading alone; {resident():.0f} MiB, {before:.0f} before"
+                f"{total / alone:.0f} times as long as reading; {resident():.0f} MiB, {before:.0f} MiB before"
             )
         print(f"{made.counts}")
         if arguments.trace:
