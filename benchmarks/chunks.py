@@ -203,9 +203,9 @@ def repeated(chunks: int, links: int) -> None:
     seconds = time.perf_counter() - started - opened
     each = 1e6 * seconds / STEPS / CANDIDATES / chunks / links
     print(
-        f"{chunks * links:>9,} links in {chunks:>4} chunks: {opened:.1f} s to open, {seconds:.1f} s for {STEPS} batches of "
-        f"{CANDIDATES} candidates with derivatives, {each:.3f} us per link and candidate, peak memory "
-        f"{resident():.2f} GiB",
+        f"{chunks * links:>9,} links in {chunks:>4} chunks: {opened:.1f} s to open, {seconds:.1f} s for "
+        f"{STEPS} batches of {CANDIDATES} candidates with derivatives, {each:.3f} us per link and candidate, "
+        f"peak memory {resident():.2f} GiB",
         flush=True,
     )
 

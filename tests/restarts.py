@@ -226,7 +226,14 @@ def result(folder: Path) -> tuple:
     content = json.loads((folder / "out" / "result.json").read_text())
     # The digest of the history changes with the times in it.
     del content["study_file"], content["files"]
-    clock = {"seconds", "trace_seconds", "uncertainty_seconds", "cheap_seconds", "ledger_hits"}
+    clock = {
+        "seconds",
+        "trace_seconds",
+        "uncertainty_seconds",
+        "cheap_seconds",
+        "total_seconds",
+        "ledger_hits",
+    }
     content["cost"] = {name: value for name, value in content["cost"].items() if name not in clock}
     history = np.genfromtxt(folder / "out" / "result-history.csv", delimiter=",", skip_header=1)[
         :, :4

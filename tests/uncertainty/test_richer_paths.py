@@ -78,6 +78,9 @@ def test_measurements_decide_whether_paths_are_missing(calibrated: tuple[bool, R
     assert len(remarks) == refracted
     # No stage seems to run twice.
     assert stages.count("drawing") == 1
+    assert "fitting more paths" in stages
+    cost = result.cost
+    assert cost.total_seconds >= cost.trace_seconds + cost.seconds + cost.uncertainty_seconds
     if refracted:
         assert "drawing with more paths" in stages
         values = remarks[0].values

@@ -145,7 +145,7 @@ def calibrate(
     else:
         problem, trail, *of_rays = search_rays(problem, exporting, progress)
         gap_db = None
-    timing = Timing(search=time.perf_counter() - traced, trace=traced - started)
+    timing = Timing(time.perf_counter() - traced, traced - started, started)
     assessment = certainty(problem, trail, progress, cheap.model)
     if can_trace and exporting is None:
         assessment = assess_richer_paths(problem, trail, assessment, progress)

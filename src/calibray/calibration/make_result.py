@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, cast
@@ -63,10 +64,11 @@ FAINT: Final = "predicted too near the noise floor, left out"
 
 @dataclass(frozen=True)
 class Timing:
-    """Times of the search, without tracing, and of the loading and tracing before it [s]."""
+    """Times taken by the search, without tracing, and by loading and tracing before it, and when the run began [s]."""
 
     search: float
     trace: float
+    started: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +186,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             uncertainty_seconds=certainty.seconds,
             cheap_replays=0 if cheap.model is None else cheap.model.calls,
             cheap_seconds=0.0 if cheap.model is None else cheap.model.seconds,
+            total_seconds=time.perf_counter() - run.timing.started,
         ),
         provenance=Provenance(setup.files, links.prepared | _faint_rows(problem), run.enclosed),
         links=table,

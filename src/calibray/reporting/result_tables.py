@@ -193,6 +193,8 @@ def costs(result: Record) -> Table:
         rows.append(("replays for intervals", replays))
     rows.append(("tracing", f"{cost.trace_seconds:.1f} s"))
     rows.append(("calibrating", f"{cost.seconds:.1f} s"))
+    if cost.total_seconds:
+        rows.append(("in total", f"{cost.total_seconds:.1f} s"))
     return Table("Cost", (Column(), numbers()), tuple(rows))
 
 

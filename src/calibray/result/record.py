@@ -187,9 +187,10 @@ class Cost:
         seconds: Time taken by the method, excluding tracing [s].
         trace_seconds: Time taken by tracing and loading before the search [s].
         uncertainty_replays: Number of replays for intervals and draws.
-        uncertainty_seconds: Time taken by these replays [s].
+        uncertainty_seconds: Time taken by intervals and draws [s].
         cheap_replays: Number of replays of the cheap model; none of them is an RT call.
         cheap_seconds: Time taken by the replays of the cheap model [s].
+        total_seconds: Time taken by the whole calibration, with validation [s]; 0 if unknown.
     """
 
     rt_calls: Count
@@ -200,6 +201,7 @@ class Cost:
     uncertainty_seconds: NonNegative = 0.0
     cheap_replays: Count = 0
     cheap_seconds: NonNegative = 0.0
+    total_seconds: NonNegative = 0.0
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ of the two twins, estimated from its draws, decides between them.
 from __future__ import annotations
 
 import logging
+import time
 from dataclasses import replace
 from typing import Final
 
@@ -46,7 +47,8 @@ def assess_richer_paths(
     """The uncertainty with richer paths, with a remark, if the measurements favour these paths; otherwise `assessed`.
 
     Nothing is traced if `lacking` is empty: for example, if the study states the noise, if its `fidelity.rounds` is 0,
-    or if no link is out of sight. The stages of `progress` are "tracing more paths" and "drawing with more paths".
+    or if no link is out of sight. The stages of `progress` are "tracing more paths", "fitting more paths" and "drawing
+    with more paths".
 
     Args:
         problem: The problem.
@@ -60,6 +62,7 @@ def assess_richer_paths(
     setup = problem.setup.with_trace(replace(problem.setup.study.trace, **changes))
     if setup.tracer.plan(setup.links).seconds > LONGEST_TRACE:
         return assessed
+    started = time.perf_counter()
     materials = problem.parameters.materials(trail.best, problem.engine.materials)
     try:
         paths = setup.trace(materials, with_stage(progress, "tracing more paths"))
@@ -71,15 +74,16 @@ def assess_richer_paths(
     if not np.isfinite(richer.engine.path_loss(trail.best[None])[0][counted]).all():
         return assessed
     method = LeastSquares(*problem.parameters.search_bounds, starts=STARTS[0], x0=trail.minima[:BASINS])
-    fitted = search(richer, method)
+    fitted = search(richer, method, with_stage(progress, "fitting more paths"))
+    calls = assessed.calls + fitted.rt_calls
     # Screen by the likelihood ratio of Gaussian errors of unknown level, because draws take much longer.
     if (
         counted.sum() * (np.log(trail.best_value) - np.log(max(fitted.best_value, EXACT_DB)))
         < LIKELY_LOG_ODDS
     ):
-        return assessed
+        return replace(assessed, calls=calls, seconds=assessed.seconds + time.perf_counter() - started)
     other = certainty(richer, fitted, with_stage(progress, "drawing with more paths"))
-    calls, seconds = assessed.calls + other.calls, assessed.seconds + other.seconds
+    calls, seconds = calls + other.calls, assessed.seconds + time.perf_counter() - started
     # No draws are needed if the richer paths explain the measurements exactly.
     log_odds = np.inf
     if other.posterior is not None:
