@@ -175,7 +175,7 @@ ONE = [[1.0, 1.0]]
         (([[1.0]], [1.0]), r"x has shape \(1, 1\); it must be \[n, 2\]"),
         (([1.0, 1.0], [1.0]), r"x has shape \(2,\)"),
         ((ONE, [[1.0]]), r"y has shape \(1, 1\); it must be \[n\]"),
-        ((ONE, [1.0, 2.0]), "x has 1 rows, y 2"),
+        ((ONE, [1.0, 2.0]), "x has 1 rows and y 2"),
         ((np.empty((0, 2)), []), "x has 0 rows"),
         (([[NAN, 1.0]], [1.0]), r"x\[0, 0\] = nan"),
         (([[1.0, 2.5]], [1.0]), r"x\[0, 1\] = 2.5 lies outside its bounds \[-2, 2\]; remove .* or widen"),

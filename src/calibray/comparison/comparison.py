@@ -58,7 +58,7 @@ class Comparison:
     """Finished runs of methods on one problem.
 
     Attributes:
-        name: The problem.
+        name: Name of the problem.
         methods: The methods, in the order requested.
         runs: The runs of each method by its name, one per seed.
         optimum: Lowest known objective [dB].
@@ -216,7 +216,7 @@ def _summary(comparison: Comparison) -> tuple[Table | str, ...]:
 
 FILES: Final = ("compare.csv", "runs.csv", "compare.png")
 FLOOR_DB: Final = 1e-4
-"""Smallest excess that is drawn [dB]; smaller values are drawn at this value."""
+"""Excesses below this value are drawn at this value [dB]."""
 
 
 def write(comparison: Comparison, folder: Path) -> None:
@@ -278,7 +278,7 @@ def compare(
     optimizer code, method, budget and seed that did not fail, that run is not repeated.
 
     Args:
-        open_problem: Makes the problem. With several workers, it must be picklable, and each worker calls it once.
+        open_problem: Function that makes the problem. Several workers receive it pickled, and each calls it once.
         methods: Methods with their budgets (`parse_methods`).
         seeds: Number of runs of each method.
         out: Folder that keeps the runs.

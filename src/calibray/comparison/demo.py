@@ -116,7 +116,7 @@ PAPER: Final = {
         "rt_calls": 225, "seconds": 336.51, "rmse_db": 2.97, "concrete": 5.82, "glass": 4.65, "soil": 4.21,
     },
 }  # fmt: skip
-"""The paper's results at its own site (its tables III and IV, and section IV-B)."""
+"""The paper's results at its own site (tables III and IV and section IV-B of the paper)."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -126,7 +126,7 @@ class Demo:
     Attributes:
         results: Results by method, `auto` last; space mapping runs on the engine "retrace".
         optimum_db: RMSE of the global optimum [dB], found by `auto` on stored paths.
-        truth: Planted mean permittivities by material.
+        truth: True mean permittivities by material.
         engine: Engine used by the paper's methods.
         trace_seconds: Time to load and trace the district, which replay needs once [s].
     """
@@ -185,7 +185,7 @@ def cost(demo: Demo) -> Table:
 
 
 def permittivity(demo: Demo) -> Table:
-    """Permittivities from every method, the planted values, and the paper's values at its own site."""
+    """Permittivities from every method, the true values, and the paper's values at its own site."""
     columns = (
         Column("material"),
         Column("before"),

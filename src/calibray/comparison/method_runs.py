@@ -42,7 +42,7 @@ class ComparisonProblem:
         large: Whether evaluations are too expensive for a reference search with many starts.
         minimum: Lowest objective known in advance; +inf if unknown.
         evaluate: The function to minimise.
-        cheap_model: Makes a cheap model of the function; None if there is none.
+        cheap_model: Function that makes a cheap model of `evaluate`; None if there is none.
         wrong_constants: Whether the cheap model has wrong constants.
     """
 

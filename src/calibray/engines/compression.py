@@ -7,7 +7,7 @@ Farhat, T. Chapman, P. Avery, Int. J. Numer. Methods Eng. 102 (2015) 1077).
 
 Weights are non-negative and the paths are physical, so a compressed link remains physically plausible between the
 training candidates. The error is nevertheless checked at new candidates, many of them on faces of the bounds. If a
-link's error there exceeds half the tolerance, the link is fitted again to more candidates, or keeps all its paths.
+link's error there exceeds half the tolerance, it is fitted again to more candidates, or keeps all its paths.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths, take
 
 TOLERANCE_DB: Final = 0.01
-"""Default tolerance: largest error of a link's path loss [dB]."""
+"""Default of the largest error in a link's path loss [dB]."""
 
 MIN_PATHS: Final = 64
 """A link with fewer paths is not compressed, because the gain would be small."""
@@ -83,7 +83,7 @@ class Compressed:
 def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERANCE_DB) -> Compressed:
     """Compress a program; it is valid for the given parameters within their bounds, and for power summed over paths.
 
-    `tolerance_db` is the largest error of a link's path loss [dB]. Returns the compressed program and its error.
+    `tolerance_db` is the largest error in a link's path loss [dB]. Returns the compressed program and its error.
 
     Raises:
         InputError: The tolerance is not a positive number, or a parameter's material is not in the paths.
@@ -125,7 +125,7 @@ def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
     """A program without the weakest paths, which together carry at most `share` of a link's total power.
 
     The shares are summed over candidates spread over the parameters' bounds, so the omitted paths carry even less at a
-    single candidate. The program is meant for sums of powers. Raises InputError if a parameter's material is not in the
+    single one. The program is meant for sums of powers. Raises InputError if a parameter's material is not in the
     paths.
     """
     from scipy.stats import qmc  # the import takes 0.4 s
@@ -194,7 +194,7 @@ def _pool(paths: Paths, strength: NDArray[np.float64]) -> NDArray[np.int64]:
 def _batches(
     links: NDArray[np.integer], size: NDArray[np.int64], candidates: int
 ) -> list[NDArray[np.integer]]:
-    """Batches of links; the powers of all candidate paths of a batch fit into memory."""
+    """Batches of links; the powers of all paths in the pool of a batch fit into memory."""
     batch = np.cumsum(size[links]) * candidates // BATCH_POWERS
     return [part for part in np.split(links, np.flatnonzero(np.diff(batch)) + 1) if len(part)]
 

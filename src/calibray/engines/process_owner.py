@@ -15,7 +15,7 @@ CLOCK_TOLERANCE: Final = 2.0
 """Largest accepted difference between two readings of a process's start time [s]: a time since 1970 changes if the
 system clock is corrected between the readings.
 
-The system does not reuse a process number within this time, because it first uses all others.
+The system does not reuse a process number within this time, because it first uses all other numbers.
 """
 
 
@@ -90,8 +90,7 @@ def _start_time(pid: int) -> float:
     """Start time of a process [s]. On Linux it is measured from boot, so it does not depend on the system clock.
 
     Raises:
-        FileNotFoundError: The process does not exist; the same applies to `ProcessLookupError` and
-            `psutil.NoSuchProcess`.
+        FileNotFoundError: The process does not exist; may also be `ProcessLookupError` or `psutil.NoSuchProcess`.
     """
     if not _boot():
         return psutil.Process(pid).create_time()

@@ -121,7 +121,7 @@ class Observing(Engine, Protocol):
     def respond(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
     ) -> Responses:
-        """Path loss and the statistics `wanted` of every link for candidates [n, d], one RT call each.
+        """Path loss and the statistics `wanted` of every link for candidates [n, d]; each candidate is one RT call.
 
         Raises:
             InputError: The candidates have the wrong width, or a value is not finite or unphysical.
@@ -309,4 +309,4 @@ PATH_LOSS: Final = Observable(
     modelled=lambda engine, candidates: engine.path_loss(candidates),
     derivatives=lambda engine, candidates: engine.path_loss_and_jacobian(candidates),
 )
-"""Path loss [dB], to which the paper calibrates."""
+"""Path loss [dB], the observable to which the paper calibrates."""

@@ -113,7 +113,7 @@ class Replay:
 
     @property
     def large(self) -> bool:
-        """Whether there are so many interactions that a candidate takes milliseconds."""
+        """Whether there are so many interactions that evaluating a candidate takes milliseconds."""
         return self.interactions > LARGE
 
     def scene_path_loss(
@@ -349,7 +349,7 @@ class ReplayCarriers:
 
     @property
     def large(self) -> bool:
-        """Whether any carrier has so many interactions that a candidate takes milliseconds."""
+        """Whether any carrier has so many interactions that evaluating a candidate takes milliseconds."""
         return any(replay.large for replay, _, _ in self._carriers)
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:

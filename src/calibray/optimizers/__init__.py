@@ -1,4 +1,4 @@
-"""Ask/tell optimizers over a box: NumPy arrays in and out, seeded, independent of the radio model.
+"""Seeded ask/tell optimizers that minimise over a box; they use NumPy arrays and do not depend on the radio model.
 
 Every class is an `Optimizer`. It states which parts of an evaluation it uses, how it respects a budget and whether it
 takes starting points. `METHODS` lists the classes by their names in study files, and `make` constructs one. Optional

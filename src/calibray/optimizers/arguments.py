@@ -66,7 +66,7 @@ class Box:
         """Build a box from lower and upper bounds [d], which are copied.
 
         Raises:
-            InputError: The bounds are not two finite vectors of equal length >= 1 with lower below upper.
+            InputError: The bounds are not finite vectors of equal length >= 1, or not lower < upper.
 
         Example:
             >>> Box.between([1.0, 0.0], [9.0, 1.0]).to_unit([[5.0, 0.25]])

@@ -4,14 +4,14 @@ Both are local methods. They start in the middle of the box, or at the best poin
 at random points if they converge before their budget is used up.
 
 POUNDERS: S. M. Wild, "Solving Derivative-Free Nonlinear Least Squares Problems with POUNDERS", in Advances and Trends
-in Optimization with Engineering Applications, SIAM (2017), ch. 40. Implemented here because the authors' package IBCDFO
-needs a solver (MINQ) that no package index provides. Each residual is modelled by the quadratic of least curvature
+in Optimization with Engineering Applications, SIAM (2017), ch. 40. It is implemented here because the authors' package
+IBCDFO needs a solver (MINQ) that no package index offers. Each residual is modelled by the quadratic of least curvature
 through evaluated points near the best one. The sum of squares of these models, to second order, is minimised in a
 box-shaped trust region. Points that span all directions within the region are chosen first, because they make the
 models fully linear. If a direction is missing and the step failed, a point along this direction is evaluated before the
 region shrinks.
 
-Gauss-Newton is the approach of a user with a least squares solver but no derivatives. Every accepted point requires one
+Gauss-Newton represents a user who has a least squares solver but no derivatives. Every accepted point requires one
 further evaluation per parameter, all in one batch. `descent.py` computes the steps.
 """
 
@@ -30,10 +30,10 @@ from calibray.optimizers.evaluations import Archive, Evaluations, Objective, roo
 from calibray.optimizers.protocol import Optimizer, Search, Session, first_start, limited
 
 SPANNING: Final = (1.75, 10.0)
-"""Largest distance of a spanning point / (radius sqrt(d)): for a fully linear model, then for any model."""
+"""Largest distance of a spanning point, in units of radius x sqrt(d): for a fully linear model, then for any model."""
 
 NEW_DIRECTION: Final = 1e-3
-"""Smallest component of a new point outside the spanned directions, relative to max(distance, radius) (theta_1)."""
+"""A point spans a new direction if its component along this, divided by max(distance, radius), reaches theta_1."""
 
 INDEPENDENT: Final = 1e-3
 """Smallest pivot (see `_pivot`) at which a further point is included in the model (theta_2)."""
@@ -236,8 +236,8 @@ def improving_point(
     """A point of the unit cube [d] that improves the model around `centre` [d].
 
     It lies within the radius along a missing direction [k, d], opposite to one, or along an axis towards the farther
-    face. The point with the largest component along the missing directions is chosen; in a corner, it may be one along
-    an axis.
+    face. The point with the largest component along the missing directions is chosen; in a corner, these may all lead
+    outside.
     """
     directions = np.vstack([missing, -missing, np.diag(np.where(centre <= 0.5, 1.0, -1.0))])
     edge = np.where(directions > 0, 1.0 - centre, centre)
@@ -256,7 +256,7 @@ class GaussNewton(Optimizer):
         seed: Seed of the random points at which searches restart.
         budget: Number of evaluations.
         step: Finite-difference step, as a share of the box.
-        tolerance: Relative decrease of the cost, or step as a share of the box, below which a search has converged.
+        tolerance: Relative decrease in cost, or step as a share of the box, below which a search has converged.
 
     Raises:
         InputError: An argument is out of range.

@@ -87,7 +87,7 @@ def damped_steps(starts: Starts) -> tuple[NDArray[np.float64], NDArray[np.float6
     step = np.zeros((count, dimension))
     free = np.ones((count, dimension), dtype=bool)
     for _ in range(dimension + 1):
-        # Fixed components keep their displacement: their rows become the identity.
+        # Fixed components keep their displacement: their rows become rows of the identity.
         matrix = np.where(free[:, :, None] & free[:, None, :], damped, np.eye(dimension))
         fixed = np.where(free, 0.0, step)
         side = np.where(free, -starts.gradient - np.einsum("sij,sj->si", damped, fixed), fixed)

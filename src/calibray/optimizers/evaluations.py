@@ -31,12 +31,12 @@ class Best:
 
 @dataclass(frozen=True)
 class Evaluations:
-    """Real evaluations; build them with `checked_evaluations`, which validates and copies.
+    """Real evaluations; build them with `checked_evaluations`, which validates and copies them.
 
     Attributes:
         x: Points [n, d].
         y: Values [n], +inf for a failed evaluation.
-        residuals: Residuals [n, m], whose mean square rises and falls with y, or None.
+        residuals: Residuals [n, m], or None; their mean square rises and falls with y.
         jacobian: Derivatives of the residuals with respect to the parameters [n, m, d], or None.
     """
 
@@ -191,7 +191,7 @@ def checked_evaluations(
     points, values = _array("x", x, (None, box.dimension)), _array("y", y, (None,))
     if len(points) != len(values) or len(values) == 0:
         raise InputError(
-            f"x has {len(points)} rows, y {len(values)}; pass one value for each of n >= 1 points"
+            f"x has {len(points)} rows and y {len(values)}; pass one value for each of n >= 1 points"
         )
     _finite("x", points)
     for row, column in np.argwhere((points < box.lower) | (points > box.upper)):

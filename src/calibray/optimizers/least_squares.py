@@ -62,8 +62,7 @@ HOPS = 8
 
 PATIENCE = 6
 """Number of successive rounds without a lower minimum after which basin hopping ends. In 24 development problems that
-use all starting points, 14 runs ended above the lowest known minimum without hopping, nine with a patience of three,
-two with six."""
+use all starting points, 14 runs ended above the lowest known minimum with a patience of 0, nine with 3, two with 6."""
 
 RETURNS = 10
 """Number of searches that must end in the best minimum before the method stops starting new ones."""
@@ -72,7 +71,7 @@ LEVEL = 1e-4
 """Relative difference in mean square below which two minima fit equally well, for example along a valley."""
 
 NOISELESS = 1e-9
-"""Addition relative to the largest mean square: without noise, the lowest mean squares are rounding errors."""
+"""Share of the largest mean square added to this difference: without noise, low mean squares are rounding errors."""
 
 APART = 0.01
 """Distance in the unit cube below which two searches count as having ended in the same minimum."""
@@ -89,8 +88,8 @@ class LeastSquares(Optimizer):
             again. The best point passed to `tell` before the first `ask`, if any, is a further starting point.
         x0: Further starting points, [d] or [k, d].
         iterations: Largest number of steps of each search.
-        tolerance: A search has converged if its model predicts a relative decrease of the mean square below this
-            tolerance, or a step shorter than this in the unit cube.
+        tolerance: A search has converged if its model predicts a relative decrease in mean square below this tolerance,
+            or a step shorter than this in the unit cube.
         catch_up: A search is abandoned if its cost exceeds the lowest one by more than this multiple of its predicted
             decrease. Use a smaller number if some starting points are already minima and the others only need to show
             whether they lead to a better one.

@@ -121,7 +121,7 @@ class CMAES(Optimizer):
             "verbose": -9,
         }
         if len(start) == 1:
-            options["maxstd_boundrange"] = np.inf  # its limit fails in one dimension, as of cma 4.5
+            options["maxstd_boundrange"] = np.inf  # the limit of cma 4.5 fails in one dimension
         while True:
             strategy = self._cma.CMAEvolutionStrategy(start, 0.3, options)
             while not strategy.stop():
@@ -200,7 +200,7 @@ def _minimise_residuals(
             rhoend=radii[1],
             maxfun=budget + d + 2,  # `limited` enforces the budget, and DFO-LS warns if it is small
             do_logging=False,
-            # Coordinate directions, because random ones are drawn from NumPy's global generator.
+            # Coordinate directions are used, because random ones are drawn from NumPy's global generator.
             user_params={"init.random_initial_directions": False},
         )
         if len(archive) == before:

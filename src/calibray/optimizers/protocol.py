@@ -157,7 +157,7 @@ AS_GIVEN: Final = Schedule(lambda budget: {"budget": budget})
 
 
 class Optimizer(ABC):
-    """Minimises a value over a box; the caller owns the loop.
+    """Minimises a value over a box; the caller runs the loop.
 
     `while not opt.done: x = opt.ask(); opt.tell(x, *evaluate(x))` is a complete run. A final class receives its
     settings in the constructor, passes its algorithm to a `Session`, sets the attributes below whose defaults do not

@@ -3,8 +3,8 @@
     K(x, x') = v_0 + v_1 h(x).h(x') + v_2 M(x, x') + nugget [x = x']
 
 M is the Matern-5/2 kernel with one rate (inverse length scale) per coordinate of the unit cube. h(x) is the response of
-a cheap model at x, if there is one. v_0 thus allows for an offset, v_1 for a change in the response and v_2 for a
-smooth remainder. All residuals share K, so one factorization serves any number of residuals. With a linear trend, the
+a cheap model at x, if there is one. v_0 allows for an offset, v_1 for a change in response and v_2 for a smooth
+remainder. All residuals share K, so one factorization serves any number of residuals. With a linear trend, the
 coefficients of 1 and x are unknown and have no prior (universal kriging).
 
 One derivation covers regression with and without a trend. The columns of C [n, f] are orthonormal combinations of the
@@ -16,7 +16,7 @@ C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, MIT
 
 `Kriging` interpolates all residuals with length scales learned from them: every residual is a linear trend plus a
 weighted sum of Matern-5/2 functions centred at the evaluated points. All residuals share the input scales (one per
-parameter, so a parameter without influence drops out). The scales maximise the log restricted likelihood summed over
+parameter, so a parameter without influence drops out). The scales maximise the restricted log likelihood summed over
 all residuals: with tens of links, a dozen points determine them well. Each residual's own variance is profiled out.
 """
 
@@ -343,7 +343,7 @@ def _precision(free: int, square: NDArray[np.float64], freedom: float) -> NDArra
 
 
 NUGGET = 1e-8
-"""Nugget that keeps the matrix regular, as a share of the prior variance; below the precision of any engine."""
+"""Nugget that keeps the matrix regular, as a share of the prior variance; negligible for any engine."""
 
 LENGTH = 0.3
 """Prior median of a length scale, as a share of the unit cube; its logarithm has a standard deviation of 1."""

@@ -5,8 +5,8 @@ information than that sum. Residuals are smoother than the objective, and tens o
 parameters (`regression.py`).
 
 A run begins with a maximin Latin hypercube. The design needs few points even for many parameters, because residuals can
-be modelled as soon as the points determine a plane. After the design, three kinds of step alternate on a model that is
-updated after every batch:
+be modelled as soon as the points determine a linear trend. After the design, three kinds of step alternate on a model
+that is updated after every batch:
 
 - *exploration*: the point with the largest expected improvement in the mean square of the residuals, over draws from
   the model (R. Astudillo, P. Frazier, ICML 2019). Assuming a normal distribution of the mean square instead (D. R.

@@ -150,7 +150,7 @@ def stated_chunk_size(study: OpenedStudy) -> int | None:
 
 
 def cut(links: Measurements, size: int) -> list[NDArray[np.int64]]:
-    """Divide links into chunks of about equal size up to `size`, each with few launching positions of rays.
+    """Divide links into chunks of about equal size, at most `size`; rays start at few positions in each chunk.
 
     Returns the indices of every chunk's links, in ascending order.
 
@@ -224,7 +224,7 @@ Open = Callable[[OpenedStudy, Mapping[str, Material]], Differentiable]
 """Opens the engine of a chunk, given the opened study of its links and the materials for the trace."""
 
 _TRACING: Final = Lock()
-"""A process traces one chunk at a time."""
+"""Makes a process trace only one chunk at a time."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -83,8 +83,8 @@ class Workers(Protocol):
 class InProcess:
     """Runs the work in this process, one chunk at a time.
 
-    At most `at_most` chunks are kept; others are made again for each question. If None, chunks are kept until they use
-    a third of the memory that was free at the start, because objects derived from them need as much again.
+    At most `at_most` chunks are kept; others are made again for each question. If None, all are kept without a cache
+    folder, and else as many as fit into a third of the memory free at the start: derived objects need as much again.
     """
 
     def __init__(self, at_most: int | None = None) -> None:
@@ -376,7 +376,7 @@ def _sendable(error: Exception) -> Exception:
     """An error that can be sent to the main process."""
     try:
         pickle.loads(pickle.dumps(error))
-    except Exception:  # a foreign class may raise anything
+    except Exception:  # an error class of another library may raise anything
         return EngineError(f"{type(error).__name__}: {error}")
     return error
 

@@ -2,9 +2,8 @@
 
 This is a separate script, `python -I -S guard.py LIBRARIES TIMEOUT FOLDER WORD...`, that imports no part of Calibray.
 It is a process between Calibray and the program for two reasons. First, on Linux it adopts orphans
-(PR_SET_CHILD_SUBREAPER), so that it finds processes that left the program's group and session. Second, it outlives
-Calibray: when its standard input ends, Calibray has ended or stopped the call; the guard kills the program and removes
-the folder.
+(PR_SET_CHILD_SUBREAPER), so it finds processes that left the program's group and session. Second, it outlives Calibray:
+when its standard input ends because Calibray ended or stopped the call, it kills the program and removes the folder.
 
 It prints one JSON object: `ended` ("status", "timeout", "stopped" or "unstarted"), `status` and `output`.
 """
@@ -134,7 +133,7 @@ def _kill_tree(process: subprocess.Popen) -> None:
         _kill_group(process)
         if process.returncode is not None and not _has_child():
             return
-    import psutil  # takes half of the guard's processor time, and few programs leave processes behind
+    import psutil  # the import takes half of the guard's time, and few programs leave processes behind
 
     guard, deadline = psutil.Process(), time.monotonic() + KILL_TIME
     descendants = guard.children(recursive=True)

@@ -73,7 +73,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class ExternalProgram:
-    """How to call an external program; it can be sent to other processes and machines.
+    """How to call an external program; picklable, for calls in other processes and on other machines.
 
     Attributes:
         words: The program and its arguments. The files' paths replace `{request}` and `{response}`, and are appended if

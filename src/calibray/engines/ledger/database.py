@@ -71,7 +71,7 @@ def _is_valid(claimed: tuple[str, bytes, str], owner: object, expires: object, n
     """Whether a claim of another run is still valid.
 
     A claim is invalid if its process has ended, or has not renewed it for `EXPIRY`. `expires` and `now` are times [s
-    since 1970], by the clock of the claim's machine and of this machine.
+    since 1970] by the clocks of the claim's machine and of this machine.
     """
     # A clock may be wrong by `SKEW`; a claim further away from now is damaged or was left behind.
     if not isinstance(expires, float) or not abs(expires - now) <= SKEW + EXPIRY:
@@ -175,7 +175,7 @@ class LedgerEntry:
 def read_entry(
     problem: str, candidate: bytes, columns: tuple[object, ...], num_links: int | None = None
 ) -> LedgerEntry | str:
-    """Read an entry from a ledger row (path loss as bytes, seconds, failure, digest, rays); a text if damaged."""
+    """Read a ledger row (path loss as bytes, seconds, failure, digest, rays); a description of the damage if any."""
     blob, seconds, failure, digest, rays = columns
     if not (isinstance(problem, str) and isinstance(candidate, bytes) and isinstance(blob, bytes)):
         return "a value of the wrong type"
@@ -347,7 +347,7 @@ _LOG: Final = logging.getLogger(__name__)
 
 
 def write_rescue_file(ledger: Path, fill: Callable[[sqlite3.Connection], None]) -> Path | None:
-    """Write a ledger's rescue file in the first folder that can be written; None if there is none."""
+    """Write a ledger's rescue file to the first writable folder, and return its path; None if no folder is writable."""
     for folder, prefix in _folders(ledger):
         file = folder / f"{prefix}{uuid.uuid4().hex}{SUFFIX}"
         partial = file.with_suffix(".part")

@@ -27,7 +27,7 @@ LONGEST_WAIT: Final = 1.0
 
 @final
 class Recorded:
-    """An engine with a ledger; it does not run candidates again that any run has completed.
+    """An engine with a ledger; candidates that any run has completed are not run again.
 
     Args:
         engine: The engine.

@@ -33,7 +33,7 @@ from calibray.tracing.settings import Antenna
 _LOG: Final = logging.getLogger(__name__)
 
 UNKNOWN: Final = Antenna("iso", "VH")
-"""Antenna assumed at an end whose real antenna is unknown: its two ports receive every polarization, and the correction
+"""Antenna assumed at an end whose real antenna is unknown: its two ports cover every polarization, and the correction
 accounts for the rest."""
 
 FREE_SPACE_DB: Final = 1.0
@@ -316,7 +316,7 @@ def _check_repeats(table: RayTable, link: NDArray[np.int64]) -> None:
 
 
 def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], known: bool) -> None:
-    """Refuse a direct path whose power no antenna can explain."""
+    """Refuse a direct path whose power is not plausible for its antennas."""
     direct = np.diff(paths.first) == 0
     free_space = _free_space(paths)
     replayed, least = powers(paths) if known else free_space, ROUNDING * free_space

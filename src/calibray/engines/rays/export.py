@@ -23,7 +23,7 @@ RESPONSE: Final = "its response"
 """Name of the response in messages."""
 
 FAINT: Final = 0.1
-"""Constant added to every path's share of its link's power, so that paths without power keep a small weight."""
+"""Constant added to every path's share of its link's power, so that weak paths keep a small weight."""
 
 
 @dataclass(frozen=True, eq=False)

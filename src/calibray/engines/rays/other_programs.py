@@ -38,7 +38,7 @@ class Polyline(NamedTuple):
 
 
 def rows_of(paths: Iterable[Polyline], source: str) -> SourceTable:
-    """The ray table of paths, in their order.
+    """A ray table of the given paths, in the given order.
 
     Raises:
         InputError: The list is empty, a power is NaN, or the numbers of points, interactions and ends of a path do not
@@ -271,7 +271,7 @@ def _aodt_numbers(source: str, name: str, values: Any) -> NDArray[np.float64]:
 
 
 def _aodt_element(element: Any) -> Any:
-    """A hashable antenna element; exports state a number, a list or a dictionary, such as row, column and port."""
+    """A hashable antenna element; exports contain a number, a list or a dictionary, such as row, column and port."""
     if isinstance(element, dict):
         return tuple(element.values())
     return tuple(element) if np.ndim(element) else element

@@ -217,7 +217,7 @@ def find_edge(surfaces: Surfaces, hits: Hits, number: int) -> Edge:
             f"{hits.label[number]}: no edge of the scene diffracts the wave in the direction of the path there; "
             "check the vertex, or remove the path"
         )
-    # Of pairs with the same error, the 0-face is the one that the wave meets most directly.
+    # Of pairs with the same error, the one whose 0-face the wave meets most directly is used.
     return min(usable, key=lambda edge: (round(edge.error, 6), np.dot(hits.incident[number], edge.normal_0)))
 
 

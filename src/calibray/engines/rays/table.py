@@ -36,7 +36,7 @@ TYPES: Final = {
 """Kinds of interaction by their names in the column `type`."""
 
 ENDS: Final = ("transmitter", "receiver")
-"""Values of `type` of the first and the last point of a path."""
+"""Values of `type` at the first and the last point of a path."""
 
 REQUIRED: Final = ("path", "point", "type", "x", "y", "z")
 POWERS: Final = ("power_db", "gain_real", "gain_imag")

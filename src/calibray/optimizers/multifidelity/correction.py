@@ -14,9 +14,9 @@ round descends from the likeliest sets and fits the kernel to the best results. 
 answers more probable.
 
 A few answers do not determine the constants of a cheap model. Several sets of constants explain the answers equally
-well and predict minima at different points, and the lowest of these predictions is the most optimistic one. A corrected
-model is therefore averaged over members drawn from the posterior of the constants. Each member is corrected until it
-passes through all answers; where the members agree, the uncertainty is small. Members are drawn by randomised maximum
+well and predict minima at different points; the lowest of these predictions would be too optimistic. A corrected model
+is therefore averaged over members drawn from the posterior of the constants. Each member is corrected until it passes
+through all answers; where the members agree, the uncertainty is small. Members are drawn by randomised maximum
 likelihood: each is fitted from a different starting point, to answers and a prior that are both perturbed according to
 their uncertainties (D. S. Oliver, N. He, A. C. Reynolds, ECMOR V, 1996). The predicted variance is compared with the
 errors of earlier predictions at points not yet used in a fit, and scaled accordingly.
@@ -112,7 +112,7 @@ class Response:
         return Inputs(unit, self.scaled(residuals - self.centre))
 
     def scaled(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Select the r predicted columns of [k, m, ...]; one factor gives responses a mean squared norm of 1."""
+        """The r predicted columns of `rows` [k, m, ...], scaled so that responses have a mean squared norm of 1."""
         return rows[:, self.known] / (self.scale * np.sqrt(max(int(self.known.sum()), 1)))
 
 

@@ -9,12 +9,12 @@ affect the others.
 
 M. C. Kennedy, A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, sec. 4.
 
-A process gives the uncertainty at each point, but errors at two nearby points are nearly equal. Locating the possible
-minima of an uncertain function requires samples of whole functions. A function is drawn from the prior as a sum of the
-kernel's features with normal weights. A process through the differences between the answers and that function at the
-evaluated points is then added (J. T. Wilson et al., Efficiently sampling functions from Gaussian process posteriors,
-ICML 2020, eq. 10). Features of the Matern kernel are cosines whose frequencies follow a t distribution with 5 degrees
-of freedom (A. Rahimi, B. Recht, Random features for large-scale kernel machines, NIPS 2007).
+The predictive variance describes each point separately, but errors at nearby points are nearly equal. Locating the
+possible minima of an uncertain function requires samples of whole functions. A function is drawn from the prior as a
+sum of the kernel's features with normal weights. A process through the differences between the answers and this
+function is then added (J. T. Wilson et al., Efficiently sampling functions from Gaussian process posteriors, ICML 2020,
+eq. 10). Features of the Matern kernel are cosines whose frequencies follow a t distribution with 5 degrees of freedom
+(A. Rahimi, B. Recht, Random features for large-scale kernel machines, NIPS 2007).
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ COSINES: Final = 256
 """Number of features of the Matern kernel."""
 
 SMOOTHNESS: Final = 5.0
-"""Degrees of freedom of the frequencies: twice the smoothness of the kernel."""
+"""Degrees of freedom of the distribution of frequencies: twice the smoothness of the kernel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +178,7 @@ class SampledFunction:
 
 
 def sample_function(process: Process, random: np.random.Generator, stretch: float = 1.0) -> SampledFunction:
-    """Draw a function; `stretch` multiplies its deviations from the mean; 0 gives the mean."""
+    """Draw a function; `stretch` multiplies its deviations from the mean, so that 0 gives the mean."""
     inputs, kernel = process.inputs, process.kernel
     (count, d), residuals = inputs.unit.shape, process.values.shape[1]
     size = stretch * np.sqrt(kernel.variances)

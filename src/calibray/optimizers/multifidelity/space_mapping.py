@@ -20,7 +20,7 @@ and once by the same process without a cheap model; `error_ratio` compares the s
 first two checks, after three and four calls, fail if the ratio exceeds `HELPFUL`; later ones fail if it exceeds
 `MISLED`. After two failed checks in a row, the vector surrogate continues with all evaluations so far. It also runs
 from the first call if there is no cheap model. The median link decides, because a few links dominate the sum over all
-links. In twelve synthetic problems, eight had their own cheap model, and four had random sinusoids instead. After four
+links. Of twelve synthetic problems, eight had their own cheap model, and four had random sinusoids instead. After four
 calls, the ratio was at most 0.66 with the right model (once 1.9 after three), and at least 1.01 with sinusoids.
 
 J. W. Bandler et al., "Space mapping: the state of the art", IEEE Trans. Microw. Theory Tech. 52 (2004) 337.
@@ -201,7 +201,7 @@ class SpaceMapping(Optimizer):
             surrogate.tell(answers.x, answers.y, residuals=answers.residuals)
 
     def _first(self, model: CheapModel, count: int, turn: int) -> NDArray[np.float64]:
-        """The lowest minima [count, d] of the uncorrected cheap model, without the first `turn`; else random points."""
+        """The lowest minima [count, d] of the uncorrected cheap model, without the first `turn`; then random points."""
         d = self.box.dimension
 
         def evaluate(unit: NDArray[np.float64]) -> Residuals:
