@@ -33,7 +33,7 @@ BATCH: Final = 10_000
 """Number of links that are traced and evaluated together."""
 
 DIFFUSE_BATCH: Final = 50
-"""Number of such links with diffuse reflection, which produces tens of thousands of paths per link."""
+"""The same number with diffuse reflection, which produces tens of thousands of paths per link."""
 
 CHUNKS_PER_BATCH: Final = 100
 """Number of chunks that are sent to the workers together."""
@@ -67,8 +67,8 @@ def predict_links(
 ) -> pd.DataFrame:
     """Predict path loss, intervals and remarks, in this process or on workers.
 
-    The result is the table of `interval` with a column `remark`, empty if there is none or links are not checked.
-    The stage of `progress` is "tracing".
+    The result is the table of `interval` with a column `remark`, which is empty for links without a remark, and for all
+    links without `with_remarks`. The stage of `progress` is "tracing".
 
     Raises:
         InputError: `interval` refuses the input.
@@ -100,7 +100,7 @@ def predict_batches(
 ) -> Iterator[tuple[Measurements, pd.DataFrame]]:
     """Predict the links of a table batch by batch, so that memory does not grow with their number.
 
-    All rows are checked before the first is traced. The table has the columns that `predict` reads. The stages of
+    All rows are checked before the first one is traced. The table has the columns that `predict` reads. The stages of
     `progress` are "checking" and "tracing".
 
     Yields:
@@ -182,7 +182,7 @@ def announce(result: Record, links: int, what: str = "links") -> None:
 def _seconds(result: Record, links: int) -> float:
     """Estimated duration of a trace [s].
 
-    The calibration may have read its trace from the cache, so the estimate from the number of rays is a lower limit.
+    The calibration may have read its trace from the cache, so the estimate is at least that from the number of rays.
     """
     settings = result.study.trace
     lanes = 0 if settings.adaptive else settings.rays * max(settings.max_depth, 1) * links

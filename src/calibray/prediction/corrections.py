@@ -1,11 +1,11 @@
 """Corrections of the modelled path loss of new links: nuisance, residual field, and the fallback for a missing path.
 
-The nuisance is uncertain for groups without measurements. A link without a path gets the log-distance model with its
-own interval, and its prediction is marked.
+The nuisance is uncertain for groups without measurements. A link without a path is predicted by the log-distance model,
+with the interval of that model, and the prediction is marked.
 
 The residual field is the correlated part of the calibration residuals, kriged to nearby links. Clutter that the scene
 lacks affects neighbouring links in the same way, so the residual near a measured link is partly known. The correlated
-part has an exponential covariance whose range and size maximize the restricted likelihood
+part has an exponential covariance whose range and variance maximize the restricted likelihood
 (`uncertainty.residual_correlation.fit_correlation`). Far from all measured links, the field is zero and explains
 nothing.
 """
@@ -34,8 +34,8 @@ from calibray.validation.held_out_statistics import interval_half_width
 from calibray.validation.models import without_scene
 
 MOST_EXACT: Final = 1000
-"""Number of measured links up to which all of them are used at every new link; if there are more, only the nearest
-ones are used."""
+"""Largest number of measured links of which all are used at every new link; if there are more, only the nearest ones
+are used."""
 
 NEAREST: Final = 50
 """Number of nearest measured links used at each new link."""
@@ -49,11 +49,11 @@ class TermAtLinks:
     """A fitted nuisance term at new links.
 
     Attributes:
-        name: Its name.
-        column: Its column [links].
+        name: Name of the term.
+        column: Values of the term's column, minus its centre [links].
         labels: Labels of the links' groups [links]; None for a term without groups.
         coefficients: Coefficient by group, [dB] per unit of the column.
-        spread_db: Standard deviation between groups in the same unit; that of the coefficients if None.
+        spread_db: Standard deviation between groups, in the same unit; if None, that of the coefficients is used.
     """
 
     name: str
@@ -67,8 +67,8 @@ class Shift(NamedTuple):
     """The contribution of the nuisance to path loss.
 
     Attributes:
-        value_db: Its value for the best coefficients, then for each draw [1 + draws, links], [dB].
-        spread_db: Standard deviation at links of groups without a coefficient, otherwise 0 [links], [dB].
+        value_db: Contribution with the best coefficients, then with each draw [1 + draws, links], [dB].
+        spread_db: Standard deviation at links whose group has no coefficient, 0 at other links [links], [dB].
     """
 
     value_db: NDArray[np.float64]
@@ -76,10 +76,10 @@ class Shift(NamedTuple):
 
 
 def model_terms(model: PredictionModel, links: Measurements) -> Iterator[TermAtLinks]:
-    """Terms of the prediction model.
+    """Terms of the prediction model at new links.
 
     Yields:
-        The terms.
+        The terms, each with its column and the groups of the links.
 
     Raises:
         InputError: The links lack a column.
@@ -103,11 +103,11 @@ def nuisance_shift(
     *,
     new_groups: bool = False,
 ) -> Shift:
-    """The contribution of nuisance terms to the path loss of new links, with draws from the posterior by coefficient.
+    """The contribution of nuisance terms to the path loss of new links; `draws` has posterior draws by coefficient.
 
-    A group without a coefficient gets the mean of the other coefficients. Its spread is their standard deviation s,
-    enlarged by the uncertainty of a mean of n values: s sqrt(1 + 1 / n). With `new_groups`, such groups are also
-    allowed in terms whose spread is not estimated; new transmitters, which no column names, are always allowed.
+    A group without a coefficient gets the mean of the n coefficients. Its spread is the standard deviation s between
+    groups, enlarged by the uncertainty of the mean: s sqrt(1 + 1 / n). With `new_groups`, such groups are also allowed
+    in terms whose spread is not estimated; new transmitters, which no column names, are always allowed.
 
     Raises:
         InputError: A group has no coefficient, and `new_groups` is False.
@@ -134,7 +134,7 @@ def nuisance_shift(
             new_label = str(labels[int(np.argmax(group < 0))])
             raise InputError(
                 f"{links.source}: group {new_label!r} has no calibrated {term.name}; the calibrated groups are "
-                f"{', '.join(term.coefficients)}; with an interval (--level, predict_interval), others get the mean"
+                f"{', '.join(term.coefficients)}; with an interval (--level, predict_interval), new groups get the mean"
             )
         mean = coefficients.mean(axis=1, keepdims=True)
         value += term.column * np.where(group >= 0, coefficients[:, group], mean)
@@ -153,10 +153,10 @@ def fill_missing(
     level: float | None = None,
     least_db: NDArray[np.float64] | float = 0.0,
 ) -> pd.DataFrame:
-    """Predict the links without a path by the fallback, in a table of the predictions of all links.
+    """Fill a table of predictions with those of the fallback for links without a path.
 
-    The columns are path_loss_db, infinite without a path, basis and, with a level, lower_db and upper_db. The interval
-    is at least as wide as that of the prediction model, which is twice `least_db` [links], [dB].
+    The columns are path_loss_db (infinite without a path), basis and, with a level, lower_db and upper_db. `least_db`
+    is half the width of the prediction model's interval [links], [dB]; the fallback's interval is at least as wide.
     """
     missing = ~np.isfinite(table["path_loss_db"].to_numpy(float))
     if not missing.any():
@@ -191,16 +191,16 @@ def krige_residuals(
     residuals: NDArray[np.float64],
     position: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Krige the residual field from measured links to new ones, whose ends have positions [m, 6] and [n, 6], [m].
+    """Krige the residual field from measured links to new links, given the positions of both ends [m, 6], [n, 6], [m].
 
     Residuals are measured minus modelled path loss [m], [dB]. The results are the correction of the modelled path loss
-    [n], [dB], and the share of the field's variance that the measured links explain, which is 0 far from all of them
-    and below 1 near one [n].
+    [n], [dB], and the share of the field's variance that the measured links explain [n]. This share is 0 far from all
+    measured links, and less than 1 near a measured link.
     """
     if len(measured) <= MOST_EXACT:
         return _krige(field, measured, residuals, position)
     correction, share = np.zeros(len(position)), np.zeros(len(position))
-    # One small system of equations for each new link.
+    # A small system of equations is solved for each new link.
     neighbours = np.asarray(KDTree(measured).query(position, k=NEAREST)[1])
     variance = field.shared_db**2
     for first in range(0, len(position), TOGETHER):

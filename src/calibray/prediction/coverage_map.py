@@ -1,8 +1,8 @@
-"""Coverage maps: path loss over an area with the calibrated scene, and its interval.
+"""Coverage maps: path loss over an area, predicted with the calibrated scene, and its interval.
 
-Each cell is a link to its centre, which is predicted like any other link. Sionna's radio map solver instead averages
-over a cell, from the rays that cross it. In the demo district the two differ by more than 0.05 dB in 70 % of the cells,
-and by more than 0.7 dB in 10 % (`python benchmarks/coverage_map.py --solver`).
+The link to the centre of each cell is predicted like any other link. Sionna's radio map solver instead averages over
+each cell, from the rays that cross it. In the demo district, the two differ by more than 0.05 dB in 70 % of the cells,
+and by more than 0.7 dB in 10 % of them (`python benchmarks/coverage_map.py --solver`).
 """
 
 from __future__ import annotations
@@ -61,18 +61,18 @@ def coverage_map(
 
     Args:
         result: The calibration.
-        tx: Position of the transmitter [3], [m]; if None, that of the calibration, which must have only one.
+        tx: Position of the transmitter [3], [m]; if None, that of the only transmitter of the calibration.
         height: Height of the receivers above the ground or, where there is no ground, above the scene's lowest point
             [m].
         cell: Width of the cells [m]; the receivers are at their centres.
-        bounds: West, south, east and north of the area [4], [m]; those of the scene if None.
+        bounds: West, south, east and north bounds of the area [4], [m]; those of the scene if None.
         level: Probability that the interval contains a measurement; None for no interval.
-        power_dbm: Transmitted power for a map of received power [dBm]; a map of path loss if None. After a calibration
-            on RSRP, the default is 0, because the offset contains the power.
-        samples: Number of rays; that of the study if None. Time is proportional to it, and too few rays miss paths.
-            "auto" adds rays until path loss has converged, which takes less time than a large number.
-        columns: Values of the study's columns of groups, carriers or nuisances for this transmitter, by name. The group
-            of an offset comes from the links measured at this transmitter, if they share one.
+        power_dbm: Transmitted power for a map of received power [dBm]; if None, the map shows path loss. After a
+            calibration on RSRP, the default is 0, because the offset contains the power.
+        samples: Number of rays; that of the study if None. Too few rays miss paths, and the time taken is proportional
+            to the number of rays. "auto" adds rays until path loss has converged, which takes less time than many rays.
+        columns: Values of the study's columns of groups, carriers or nuisances for this transmitter, by column name.
+            The group of an offset comes from the links measured at this transmitter, if they share a group.
         progress: Called with the stage "tracing" after every launch.
         workers: Workers that trace and predict chunks of cells (`engines.open_workers`); this process if None.
         allow_changed_inputs: Predict even if a file of the scene or an antenna has changed since the calibration.
@@ -101,7 +101,7 @@ def coverage_map(
             "from RSRP by %+g dB; leave the power out for RSRP", power_dbm, power_dbm,
         )  # fmt: skip
     frame = known_frame(study)
-    # The study is opened with one link, 1 m above the transmitter, before the grid is known.
+    # Before the grid is known, the study is opened with one link: to a receiver 1 m above the transmitter.
     one_link = pd.DataFrame({**position_columns(transmitter, transmitter[None] + np.eye(3)[2]), **constants})
     setup = open_for_links(result, as_links(result, one_link), allow_changed_inputs=allow_changed_inputs)
     triangles = read_triangles(setup.scene)
@@ -176,7 +176,7 @@ def _transmitter(result: Record, tx: Sequence[float] | None) -> NDArray[np.float
 def _column_values(
     result: Record, tx: NDArray[np.float64], columns: Mapping[str, object]
 ) -> dict[str, object]:
-    """Values of the study's columns, the same at every link from this transmitter."""
+    """Values of the study's columns by name; they are the same for every link from this transmitter."""
     if not isinstance(columns, Mapping):
         raise InputError(f"columns = {columns!r}: must be a dictionary with a value for each column")
     study, values = result.study, dict(columns)
@@ -212,7 +212,7 @@ def _column_values(
 def _measured_values(
     study: Study, tx: NDArray[np.float64], columns: Sequence[str], stated: Mapping[str, object]
 ) -> dict[str, object]:
-    """Values of columns, such as those of antennas and carriers, that all links measured at this transmitter share."""
+    """Values of columns, such as antennas and carriers, where all links measured at this transmitter have one value."""
     if not set(columns) - set(stated):
         return {}
     links = study.measurements()
@@ -250,7 +250,7 @@ def _grid(
     count = np.maximum(np.ceil((ends[2:] - ends[:2]) / cell - 1e-6), 1.0)
     if count.prod() > MOST_CELLS:
         raise InputError(
-            f"cell = {cell:g} m: gives {count.prod():.0f} cells of {np.ptp(ends[::2]):.0f} m x "
+            f"cell = {cell:g} m: gives {count.prod():.0f} cells in {np.ptp(ends[::2]):.0f} m x "
             f"{np.ptp(ends[1::2]):.0f} m, must be at most {MOST_CELLS}; use wider cells, or a smaller area (--bounds)"
         )
     eastings, northings = (

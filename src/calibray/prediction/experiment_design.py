@@ -11,15 +11,16 @@ standard deviations are computed in two ways, and their logarithms are added:
 - by curvature at each draw: this shows how much a single minimum narrows.
 
 Scatter shows little if a range of a parameter contains few draws. If separate ranges of a parameter fit, the
-probability of ruling out all but one is therefore added to the rank. Each range has values that explain the links so
-far, each with its excess sum of squares over the best. At a candidate, the squared difference from the truth is added
-to this excess. The smallest sum in a range is the value that a fit would reach there with all other parameters free. A
-range is ruled out if its smallest sum exceeds that of the true range by the quantile of an interval. For two models,
-this is the T-optimal design of A. C. Atkinson and V. V. Fedorov, The design of experiments for discriminating between
-two rival models, Biometrika 62, 1975, with the expectation over the truth of G. E. P. Box and W. J. Hill,
-Discrimination among mechanistic models, Technometrics 9, 1967.
+probability of ruling out all but one is therefore added to the rank. In each range, there are values that explain the
+links measured so far. The excess of a value is its sum of squares minus that of the best value. At a candidate, the
+squared difference from the truth is added to this excess. The smallest total in a range is the sum of squares that a
+fit would reach there with all other parameters free. A range is ruled out if its smallest total exceeds that of the
+true range by the quantile of an interval. For two models, this is the T-optimal design of A. C. Atkinson and V. V.
+Fedorov, The design of experiments for discriminating between two rival models, Biometrika 62, 1975, with the
+expectation over the truth of G. E. P. Box and W. J. Hill, Discrimination among mechanistic models, Technometrics 9,
+1967.
 
-Candidates are chosen one at a time. They share part of their errors, caused by an unknown offset or by common clutter.
+Candidates are chosen one at a time. Part of their errors is common, caused by an unknown offset or by common clutter.
 Conditioning after each choice removes this part, so that a second measurement at the same point gains less.
 """
 
@@ -37,7 +38,7 @@ UNIFORM_INFORMATION: Final = 12.0
 """Inverse variance of the uniform distribution over the unit interval: the information before any link."""
 
 LEAST_VARIANCE: Final = 1e-5
-"""Variance in the unit cube below the resolution of the scatter of about a hundred draws."""
+"""Variance in the unit cube that the scatter of about a hundred draws cannot resolve."""
 
 SEPARATION_WEIGHT: Final = 8.0
 """Weight of ruling out all ranges of a parameter but one, compared with narrowing it by a factor e."""
@@ -46,7 +47,7 @@ RULED_OUT: Final = 4.3
 """Excess of the sum of squares, in noise variances, above which a range is ruled out: F(0.95; 1, about 20)."""
 
 EXCESS_DEVIATION: Final = 3.0
-"""Standard deviation of the excess that the noise of the candidates causes, in noise variances."""
+"""Standard deviation of the excess due to the noise of the candidates' measurements, in noise variances."""
 
 BATCH: Final = 4_000_000
 """Largest number of values per batch (draws times values times candidates), which limits the memory."""
@@ -58,10 +59,10 @@ class Errors:
 
     Attributes:
         own_db: Standard deviation of each candidate's uncorrelated part [dB].
-        common: Effect of each common unknown times its standard deviation [candidates, unknowns], [dB].
+        common: Effect of one standard deviation of each common unknown [candidates, unknowns], [dB].
         position: Positions of the receivers, or of both ends [candidates, k], [m].
-        shared_db: Standard deviation of the part that neighbours share [dB]; 0 for none.
-        range_m: Distance at which its correlation has fallen to 1/e [m].
+        shared_db: Standard deviation of the part that neighbouring candidates share [dB]; 0 for none.
+        range_m: Distance at which the correlation of this part has fallen to 1/e [m].
     """
 
     own_db: float
@@ -76,7 +77,7 @@ class Errors:
         return self.own_db**2 + self.shared_db**2 + np.sum(self.common**2, axis=1)
 
     def covariance(self, index: int) -> NDArray[np.float64]:
-        """Covariance of one candidate's error with those of all [candidates], [dB^2]."""
+        """Covariance of one candidate's error with the errors of all candidates [candidates], [dB^2]."""
         covariance = self.common @ self.common[index]
         if self.shared_db:
             distance = cdist(self.position, self.position[index : index + 1])[:, 0]
@@ -92,7 +93,7 @@ class Outlook:
     Attributes:
         index: The candidate.
         narrowed: Standard deviation of every parameter relative to its value before any candidate [d]; at most 1.
-        range_probability: Probability of knowing in which of its separate ranges a parameter lies [d]; 1 for one range.
+        range_probability: Probability that the separate range in which a parameter lies is known [d]; 1 for one range.
         information: Information matrix of all links measured by then, at every draw [n, d, d].
     """
 
@@ -109,9 +110,9 @@ class Beliefs:
     Attributes:
         point: Draws from the posterior in the unit cube [n, d].
         information: Information matrix of the links measured so far, at every draw [n, d, d].
-        piece: Index of the separate range that each parameter lies in [m, d]: first for the draws, then for further
-            values that explain the links so far, in ranges with few draws.
-        excess: Sum of squares of each of these values minus the smallest one, in noise variances [m].
+        piece: Index of the separate range in which each parameter lies [m, d]: first for the draws, then for further
+            values that explain the links measured so far.
+        excess: Sum of squares of each draw and further value minus the smallest sum, in noise variances [m].
     """
 
     point: NDArray[np.float64]
@@ -128,13 +129,14 @@ def choose_candidates(
     Args:
         beliefs: The state of the calibration.
         predicted: Path loss of the candidates for every draw and further value [m, candidates], [dB].
-        slope: Its derivatives with respect to the coordinates of the unit cube, for the draws [n, candidates, d], [dB].
+        slope: Derivatives of path loss with respect to the unit cube's coordinates, for the draws [n, candidates, d],
+            [dB].
         errors: Expected errors of the measurements.
         count: Number of candidates to choose.
 
     Returns:
-        The candidates in the order of their choice, each with the expected uncertainty after measuring it and the
-        earlier ones.
+        The candidates in the order of their choice, each with the uncertainty expected after measuring this candidate
+        and the earlier ones.
     """
     prior_information = UNIFORM_INFORMATION * np.eye(beliefs.point.shape[1])
     beliefs = replace(beliefs, information=beliefs.information + prior_information)
@@ -145,7 +147,7 @@ def choose_candidates(
     taken = np.zeros(len(variance), dtype=bool)
     conditioned, outlooks = np.zeros((0, len(variance))), []
     before = np.maximum(np.std(beliefs.point, axis=0), np.sqrt(LEAST_VARIANCE))
-    # Draws that scatter less than the curvature implies follow a prior that the information does not contain.
+    # If draws scatter less than the curvature implies, a prior that the information does not contain narrows them.
     scale = np.minimum(before / _by_curvature(beliefs.information), 1.0)
     narrowed = np.ones(len(before))
     for _ in range(min(count, len(variance))):
@@ -169,11 +171,11 @@ def choose_candidates(
         slope -= best_slope[:, None, :] * share[:, None]
         variance = np.maximum(variance - share**2, 1e-6 * errors.own_db**2)
         conditioned = np.vstack([conditioned, share])
-        # Where only the true draw keeps its weight, scatter is too small, and curvature gives what is left.
+        # Where only the true draw keeps its weight, scatter is too small, and curvature gives the remaining deviation.
         left = np.maximum(
             _scatter(beliefs.point, squares[:, :draws]), scale * _by_curvature(beliefs.information)
         )
-        # A measurement removes no information, but the scatter of a hundred draws can still grow.
+        # A measurement removes no information, but the computed scatter of a hundred draws can still grow.
         narrowed = np.minimum(left / before, narrowed)
         probability = _range_probability(beliefs.piece[:draws], squares[:, :draws])
         outlooks.append(Outlook(best, narrowed, probability, beliefs.information))
@@ -196,11 +198,11 @@ def separation_probability(
 ) -> NDArray[np.float64]:
     """Probability of ruling out all ranges of a parameter but one, after a candidate is measured [candidates].
 
-    It is averaged over draws and parameters; a parameter with one range adds nothing. `excess` is every value's sum of
-    squares minus the smallest one, in noise variances [m]; the first n values are the draws. `piece` is the range of
-    each parameter [m, d]. `squares` are squared differences between draws and values at the candidates chosen so far
-    [n, m]. `predicted` is the candidates' path loss for every value, in standard deviations of their errors
-    [m, candidates].
+    The probability is averaged over draws and parameters; a parameter with one range adds nothing. `excess` is the sum
+    of squares of every value minus the smallest sum, in noise variances [m]; the first n values are the draws. `piece`
+    is the range of each parameter [m, d]. `squares` are squared differences between draws and values at the candidates
+    chosen so far [n, m]. `predicted` is the candidates' path loss for every value, in standard deviations of their
+    errors [m, candidates].
     """
     draws, candidates = len(squares), predicted.shape[1]
     ambiguous = [column for column in piece.T if np.ptp(column)]
@@ -216,7 +218,7 @@ def separation_probability(
 
 
 def _others_ruled_out(total: NDArray[np.float64], piece: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Probability that all ranges but the true draw's are ruled out [n, c], from sums of squares [n, m, c]."""
+    """Probability that all ranges are ruled out except that of the true draw [n, c], from sums of squares [n, m, c]."""
     ranges, value_range = np.unique(piece, return_inverse=True)
     # The sum of squares of the best fit in each range.
     least = np.stack([total[:, value_range == k].min(axis=1) for k in range(len(ranges))])

@@ -32,7 +32,7 @@ GEOTIFF, PICTURE, TABLE = FILES
 LOSS_COLORS: Final = "viridis_r"
 POWER_COLORS: Final = "viridis"
 WIDTH_COLORS: Final = "cividis"
-"""Matplotlib's colour scales that keep their order for colour-blind readers and in grey; strong signals are bright."""
+"""Matplotlib colour scales whose order remains clear to colour-blind readers and in grey; strong signals are bright."""
 
 QUANTILES: Final = (0.02, 0.98)
 """Quantiles of the cells' values at which the colour scale ends, so that a few extreme values do not compress it."""
@@ -50,8 +50,8 @@ class CoverageMap:
         x: Eastings of the cells' centres, ascending [nx], [m].
         y: Northings of the cells' centres, ascending [ny], [m].
         z: Heights of the receivers [ny, nx], [m].
-        path_loss_db: Path loss with nuisances [ny, nx], [dB]; for cells without a path, that of the log-distance model.
-            NaN at the transmitter, and inside buildings for cells without a path.
+        path_loss_db: Path loss with nuisances [ny, nx], [dB]; for cells without a path, from the log-distance model.
+            NaN at the transmitter and, in an outdoor study, for cells inside buildings that have no path.
         lower_db: Lower end of the interval [ny, nx], [dB]; NaN without a prediction or without a level.
         upper_db: Upper end of the interval [ny, nx], [dB].
         no_path: Cells predicted by the log-distance model, because they have no path [ny, nx].
@@ -59,7 +59,7 @@ class CoverageMap:
         power_dbm: Transmitted power of a map of received power [dBm]; None for a map of path loss.
         frame: Geographic frame of the scene; None if unknown.
         triangles: The scene, for drawing.
-        observables: Further observables of the study by name and unit, such as spread_ns [ny, nx].
+        observables: Further observables of the study [ny, nx], by name with unit, such as spread_ns.
     """
 
     tx: NDArray[np.float64]
@@ -114,7 +114,7 @@ class CoverageMap:
 
         Args:
             folder: Folder to write `map.tif`, `map.png` and `map.csv` into; created if absent.
-            inputs: Files that the calculation reads; none of them is ever replaced.
+            inputs: Files that the calculation reads; these are never replaced.
             overwrite: Replace files that Calibray did not write.
 
         Returns:
@@ -139,7 +139,7 @@ class CoverageMap:
 
 
 def geotiff(coverage: CoverageMap, path: Path) -> None:
-    """Write a map as a GeoTIFF, north up: one band per layer and observable, then 1 for cells without a path, else 0.
+    """Write a map as a GeoTIFF, north up: a band per layer and observable, and one that is 1 for cells without a path.
 
     Args:
         coverage: The map. Without a frame, coordinates are those of the scene, and no reference system is declared.
@@ -214,14 +214,14 @@ def _panel(axes: Axes, coverage: CoverageMap, values: NDArray[np.float64], label
     south, north = coverage.y[0] - half, coverage.y[-1] + half
     finite = np.where(np.isfinite(values), values, np.nan)
     low, high = _range(finite)
-    label = f"{label}\ncolours: {low:.3g} to {high:.3g} (2 to 98 % of the cells);\nvalues outside have the end colour"
+    label = f"{label}\ncolours: {low:.3g} to {high:.3g} (2 % to 98 % quantile);\nvalues outside have the end colour"
     axes.set_facecolor(LINE)
     image = axes.imshow(
         finite, extent=(west, east, south, north), origin="lower", cmap=colors, vmin=low, vmax=high,
         interpolation="nearest", zorder=1,
     )  # fmt: skip
     if coverage.no_path.any():
-        # Two points per cell, so that the hatched area ends near the edges of cells.
+        # With two points per cell, the hatched area ends near the edges of cells.
         cells = np.kron(coverage.no_path, np.ones((2, 2)))
         ends = [
             (middle[:, None] + np.array([-half, half]) / 2).ravel() for middle in (coverage.x, coverage.y)

@@ -26,8 +26,8 @@ from calibray.study.mounting import PORT_POWER, states_port_power
 from calibray.uncertainty.draws import evenly_spaced
 
 MOST_DRAWS: Final = 64
-"""Largest number of posterior draws for the width of an interval and the errors of biases; the error of a standard
-deviation from them is 9 %."""
+"""Largest number of posterior draws for the width of an interval and the errors of biases. A standard deviation from 64
+draws has an error of 9 %."""
 
 
 class Replayed(NamedTuple):
@@ -55,10 +55,10 @@ def observable_columns(study: Study, level: float | None) -> tuple[str, ...]:
 def further_observables(
     result: Record, replayed: Replayed | None, level: float | None = None
 ) -> dict[str, NDArray[np.float64]]:
-    """Further observables at opened links [links] by column name; without the biases of devices.
+    """Further observables at opened links [links], without device biases, by column name.
 
     The interval has two parts: the errors of single values, from held-out links if there are any, and the scatter of
-    the draws. The result is empty without further observables, or if the prediction model uses no scene.
+    the draws. The result is empty if the study has no further observables, or if the prediction model uses no scene.
     """
     sections = result.study.observables
     if not sections or replayed is None or not isinstance(replayed.engine, Observing):
@@ -86,10 +86,10 @@ def further_observables(
 
 
 CHOICES: Final = (DELAY_SPREAD, EXCESS_DELAY, K_FACTOR, DEPARTURE_SPREAD, ARRIVAL_SPREAD)
-"""Observables that depend on materials and have no bias of devices."""
+"""Observables that depend on materials and have no device bias."""
 
 RELATIVE_ERROR: Final = 0.1
-"""Expected error of a spread or an excess delay that the study does not contain, relative to its root mean square. In
+"""Expected error of a spread or an excess delay that the study does not contain, relative to the RMS of its values. In
 downtown Boulder, delay spreads vary by 3 % in sight and by 15 % out of sight when the receiving array turns."""
 
 ERROR_DB: Final = 1.0
@@ -97,9 +97,9 @@ ERROR_DB: Final = 1.0
 
 
 class Worth(NamedTuple):
-    """The observable worth measuring at a suggestion and those above it.
+    """The observable most worth measuring at a suggestion and at those above it.
 
-    `narrowed` is the expected standard deviation of every parameter, relative to that with path loss alone [d].
+    `narrowed` is the standard deviation expected for every parameter, relative to that with path loss alone [d].
     """
 
     kind: str
@@ -113,7 +113,7 @@ def worth_measuring(
     index: NDArray[np.int64],
     information: NDArray[np.float64],
 ) -> list[Worth]:
-    """The best observable at every suggested link [suggestions], the best link first.
+    """The most informative observable at every suggested link [suggestions], the best link first.
 
     Draws of the parameters, and their derivatives with respect to the coordinates of the unit cube, are [n, d].
     Information matrices include the path loss of each suggestion and of those above it [suggestions, n, d, d].
@@ -151,7 +151,7 @@ def _deviation(information: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
-    """Predictions of path_loss_db and its interval in the measured quantity of the study's links, by column name.
+    """Predicted path loss and its interval, converted to the quantity that the study measures, by column name.
 
     The quantity is path gain [dB], received power or RSRP [dBm]. The columns are, for example, `received_power_dbm`,
     `received_power_lower_dbm` and `received_power_upper_dbm` [links]. The result is empty if path loss was measured, or

@@ -46,7 +46,7 @@ from calibray.validation.models import without_scene
 _LOG: Final = logging.getLogger(__name__)
 
 NEIGHBOURS: Final = (0.125, 0.5)
-"""Distances of the displaced antennas that are traced, as shares of the largest displacement: 1 and 4 m of 8 m."""
+"""Displacements at which antennas are traced, as shares of the largest displacement: 1 m and 4 m of 8 m."""
 
 NEAR_SHARE: Final = 0.1
 """Share of the residual field's variance explained by measured links above which a link counts as near them."""
@@ -84,12 +84,13 @@ def predict_interval(
 ) -> pd.DataFrame:
     """Predict path loss at new links, with an interval for a measurement there; see `Result.predict_interval`.
 
-    The width of the interval has three parts: the residuals of single links, from held-out links if the calibration has
-    any; the draws of parameters and nuisances; and for groups without measurements, the spread between groups.
+    The width of the interval has three parts: the residuals of single links, on held-out links if the calibration has
+    any; the scatter of the draws, unless blocks were held out, whose residuals include it; and for groups without
+    measurements, the spread between groups.
 
     Raises:
-        InputError: `predict` would refuse the input, except for unknown groups; the level is not between 0 and 1; or
-            the calibration had too few links to estimate the size of residuals.
+        InputError: `predict` would refuse the input for another reason than unknown groups; the level is not between 0
+            and 1; or the calibration had too few links to estimate the size of residuals.
     """
     setup = open_for_links(result, as_links(result, links), allow_changed_inputs=allow_changed_inputs)
     refuse_far_links(result, setup.links, read_triangles(setup.scene))
@@ -98,7 +99,7 @@ def predict_interval(
 
 
 def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -> Measurements:
-    """New links, with the groups and carriers of the study's columns, from a table or from rows of a file.
+    """New links from a table or from rows of a file, with the groups and carriers in the columns that the study names.
 
     Raises:
         InputError: The links are not a table, a column is missing, or a position is not finite.
@@ -119,7 +120,7 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
 
 
 def _with_measured_spellings(model: PredictionModel, links: Measurements) -> Measurements:
-    """The links with the measured spelling of labels such as 007, which a purely numeric column reads as 7."""
+    """The links with labels spelled as measured: 007, for example, which is read as 7 in a purely numeric column."""
     for term in model.terms:
         spelling: dict[str, set[str]] = {}
         for label in term.coefficients:
@@ -177,18 +178,18 @@ def warn_of_carriers(result: Record, links: Measurements) -> None:
         if beyond.any():
             where = f"other than {hertz(low)}" if low == high else f"outside {hertz(low)} to {hertz(high)}"
             _LOG.warning(
-                "%s: %d of %d links have carriers %s, where links were measured; materials are extrapolated, which "
-                "the intervals do not account for", links.source, beyond.sum(), len(links), where,
+                "%s: %d of %d links have carriers %s, the measured carriers; materials are extrapolated, which the "
+                "intervals do not account for", links.source, beyond.sum(), len(links), where,
             )  # fmt: skip
 
 
 def refuse_far_links(result: Record, links: Measurements, triangles: Triangles) -> None:
-    """Refuse links whose receivers are all far from a scene, given its triangles.
+    """Refuse links whose receivers are all far from the scene, given the triangles of the scene.
 
     Nothing is refused if some triangles are unknown, because the size of the scene is then unknown.
 
     Raises:
-        InputError: All receivers are far.
+        InputError: All receivers are far from the scene.
     """
     if triangles.left_out or not len(triangles.face):
         return
@@ -220,7 +221,7 @@ def check_groups(result: Record, links: Measurements) -> None:
 
 
 def _with_columns(result: Record, setup: Setup) -> Setup:
-    """The study with the columns that follow from the scene, if terms of the prediction model need them."""
+    """The opened study with the columns computed from the scene, if the prediction model or its errors need them."""
     model = result.prediction.model
     used = any({term.by, term.per} & {*OBSTRUCTION, CLUSTER} for term in model.terms)
     differ = model.blocks is not None and model.blocks.out_of_sight > 1
@@ -230,7 +231,7 @@ def _with_columns(result: Record, setup: Setup) -> Setup:
 def interval(
     result: Record, setup: Setup, level: float | None, progress: Progress | None = None
 ) -> pd.DataFrame:
-    """Predict path loss and its interval at links for which the study was opened.
+    """Predict path loss and its interval at the links of an opened study.
 
     There is one row per link: path_loss_db, basis and, with a level, lower_db and upper_db.
 
@@ -266,16 +267,16 @@ def interval(
     replayed = _replay(result, setup, draws, progress)
     modelled = _modelled(result, links, replayed) + shift.value_db
     best, reached = modelled[0], np.isfinite(modelled).all(axis=0)
-    # Deviations are from the best value instead of the draws' mean, so that their difference counts as an error.
+    # Deviations are measured from the best value, so the difference between it and the mean of the draws is included.
     deviation = np.where(reached, modelled[1:] - np.where(reached, best, 0.0), 0.0)
     factor, between = _quantiles(model, level)
-    # `factor` multiplies everything below; the spread of groups needs the quantile of blocks instead.
+    # `factor` multiplies everything below, but the spread of groups needs the quantile of blocks, `between` times it.
     variance = (between * shift.spread_db) ** 2 + (np.mean(deviation**2, axis=0) if draws else 0.0)
     best = np.where(reached, best, np.inf)
     basis = model.basis
     if not by_blocks and model.parameters is not None and not draws:
         basis += ", without uncertainty of the parameters"
-    # Near measured links the residual field is known, and only the uncorrelated part of the residual is left.
+    # Near measured links, the residual field is known, and only the uncorrelated part of the residual remains.
     far_db = _residual_db(result, links, between)
     near_db = far_db if field is None else np.minimum(field.own_db, far_db)
     total_db = np.sqrt((1.0 - known_share) * far_db**2 + known_share * near_db**2 + variance)
@@ -298,7 +299,7 @@ def interval(
 
 
 def _quantiles(model: PredictionModel, level: float) -> tuple[float, float]:
-    """Quantile of Student's t for errors of links, and the quantile for errors of blocks relative to it.
+    """Quantile of Student's t for errors of links, and the ratio of the quantile for errors of blocks to it.
 
     Both variances are estimates with their own degrees of freedom. Blocks have as many degrees of freedom as there are
     blocks, because their mean errors are deviations from zero.
@@ -309,9 +310,9 @@ def _quantiles(model: PredictionModel, level: float) -> tuple[float, float]:
 
 
 def _residual_db(result: Record, links: Measurements, ratio: float) -> NDArray[np.float64]:
-    """Standard deviation of the prediction model's errors at new links [links], [dB]; `ratio` scales that of blocks.
+    """Standard deviation of the prediction model's errors at new links [links], [dB]; `ratio` scales the blocks' part.
 
-    Beyond the distance that held-out links had from the others, the variance between blocks is raised by a factor of
+    Farther than `BlockErrors.reach_m` from all calibration links, the variance between blocks is raised by a factor of
     up to two: a place that far away differs from the blocks as these differ from each other. The contribution of random
     effects to these errors is subtracted, because `nuisance_shift` adds their spread where a link's group is new.
     """
@@ -329,11 +330,11 @@ def _residual_db(result: Record, links: Measurements, ratio: float) -> NDArray[n
 
 
 def with_constants(result: Record, setup: Setup) -> Setup:
-    """The study with the constants of its scene that vary in the draws as further parameters.
+    """Add the constants of the scene that vary in the draws to the parameters of an opened study.
 
     Returns:
         The study with these parameters after its own; unchanged for a program that returns rays, because only the
-        constants of that program vary in the draws. A constant that differs between the links' carriers keeps its law.
+        constants of that program vary in the draws. A constant that differs between carriers is not added.
     """
     if result.study.engine.exports_rays:
         return setup
@@ -350,10 +351,10 @@ def with_constants(result: Record, setup: Setup) -> Setup:
 def _replay(
     result: Record, setup: Setup, draws: dict[str, list[float]], progress: Progress | None
 ) -> Replayed | None:
-    """The paths of opened links, with the values of the prediction model and of every draw; None without a scene.
+    """The engine for opened links, with the values of the prediction model and of every draw; None without a scene.
 
     A program that returns path loss is called for the values of the prediction model, because the replay of another ray
-    tracer has different antennas and physics. The replay gives the change of path loss from draw to draw.
+    tracer has different antennas and physics. The replay gives the change in path loss for each draw.
     """
     prediction, names = result.prediction, setup.parameters.names
     if prediction.model.parameters is None:
@@ -403,7 +404,7 @@ def _modelled(result: Record, links: Measurements, replayed: Replayed | None) ->
 
 
 def _path_loss(replayed: Replayed) -> NDArray[np.float64]:
-    """Path loss for all values [n, links], [dB]; for a program, its answers plus the changes of the replay."""
+    """Path loss for all values [n, links], [dB]; for a program, its answers plus the changes that replay computes."""
     if (answers := replayed.answers) is None:
         return replayed.engine.path_loss(replayed.values)
     if len(replayed.values) == len(answers):
@@ -415,7 +416,7 @@ def _path_loss(replayed: Replayed) -> NDArray[np.float64]:
 
 
 def _residual_field(result: Record, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The residual field kriged to links [links], [dB], and the share of its variance that is known [links]."""
+    """The residual field kriged to links [links], [dB], and the known share of its variance [links]."""
     field, ends = result.prediction.residual_field, result.ends
     if field is None or links.frequency is not None or ends is None:
         return np.zeros(len(links)), np.zeros(len(links))
@@ -424,14 +425,14 @@ def _residual_field(result: Record, links: Measurements) -> tuple[NDArray[np.flo
 
 
 def check_inputs(result: Record, setup: Setup, allow_changed: bool) -> None:
-    """Refuse a scene or an antenna that differs from the calibrated one.
+    """Refuse a scene or an antenna whose file has changed since the calibration.
 
     Raises:
-        InputError: A file changed since the calibration.
+        InputError: A file has changed.
     """
     if allow_changed or not result.provenance.files:
         return
-    # Files are compared by name and content, since the whole folder may have moved.
+    # Files are compared by name and content, because the whole folder may have moved.
     calibrated, current = (
         sorted((Path(file).name, digest) for file, digest in files.items())
         for files in (result.provenance.files, setup.files)
@@ -445,7 +446,7 @@ def check_inputs(result: Record, setup: Setup, allow_changed: bool) -> None:
 
 
 def add_remarks(result: Record, setup: Setup, predictions: pd.DataFrame) -> pd.DataFrame:
-    """Predictions with a column of remarks on the ends of a link, or else on its path loss; empty without a remark.
+    """Predictions with a column of remarks on the ends of each link, or otherwise on its path loss; empty if none.
 
     If most calibrated receivers are inside a building, remarks on ends inside a building are omitted.
     """

@@ -51,10 +51,10 @@ MOST_DRAWS: Final = 96
 """Largest number of posterior draws by which the candidates are ranked."""
 
 VALUES_PER_RANGE: Final = 24
-"""Number of further values in each separate range of a parameter, because few draws lie in some ranges."""
+"""Number of further values in each separate range of a parameter, because some ranges contain few draws."""
 
 LEAST_GAIN: Final = 0.02
-"""Smallest narrowing of an interval, relative to its width, or gain in probability that is reported as text."""
+"""Smallest relative narrowing of an interval, and smallest gain in probability, that is reported as text."""
 
 
 def suggest(
@@ -69,12 +69,12 @@ def suggest(
     """Suggest where to measure next, by the expected narrowing of the parameters' intervals.
 
     Each candidate is traced and replayed for draws from the posterior. If the draws predict the same path loss, a
-    measurement adds nothing; if they differ by more than the error of a link, it rules out some of them. Candidates are
-    chosen one at a time, each as the best addition to the earlier ones. Candidates whose mean predicted power is
-    not above the study's noise floor are left out; a warning in the log counts them.
+    measurement adds nothing; if they differ by more than the error of a link, it rules out some draws. Candidates are
+    chosen one at a time, each as the best addition to the earlier ones. Candidates whose mean predicted power is not
+    above the study's noise floor are left out, and a warning in the log states their number.
 
     Args:
-        result: The calibration, on the engine "replay" or "retrace", with draws from the posterior.
+        result: The calibration, with the engine "replay" or "retrace" and with draws from the posterior.
         candidates: Possible measurements: links, or a table, as for `Result.predict`.
         count: Number of suggestions.
         progress: Called with the stage "tracing" after every launch.
@@ -90,8 +90,8 @@ def suggest(
         candidate and those above, and observable_gain, a summary as text.
 
     Raises:
-        InputError: `Result.predict` would refuse the input, except for unknown groups; the calibration has no draws; or
-            no candidate has a path and a predicted power above the study's noise floor.
+        InputError: `Result.predict` would refuse the input for another reason than unknown groups; the calibration has
+            no draws; or no candidate has a path and a predicted power above the study's noise floor.
     """
     if isinstance(count, bool) or not (isinstance(count, Integral) and count >= 1):
         raise InputError(f"count = {count!r}: must be a whole number of at least 1")
@@ -109,7 +109,7 @@ def suggest(
     links = as_links(result, candidates)
     warn_of_carriers(result, links)
     calibrated = Setup.open(study).placed_at(result.parameters, NEIGHBOURS)
-    # Both share one loaded tracer.
+    # The calibration links and the candidates share one loaded tracer.
     setup = calibrated.at(links)
     check_inputs(result, setup, allow_changed_inputs)
     refuse_far_links(result, links, read_triangles(setup.scene))
@@ -143,12 +143,12 @@ def suggest(
 def _received(
     result: Record, links: Measurements, path_loss_db: NDArray[np.float64], reached: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """The candidates among those reached whose predicted power is above the study's noise floor.
+    """The candidates with a path, `reached`, whose predicted power is above the study's noise floor.
 
-    All remain if the study has no noise floor, or the transmitted power of the candidates is unknown.
+    All remain if the study has no noise floor, or if the transmitted power of the candidates is unknown.
 
     Raises:
-        InputError: No candidate is above it.
+        InputError: No candidate has a predicted power above the noise floor.
     """
     floor = result.study.links.noise_floor_dbm
     powers = as_measured(result.study, links, pd.DataFrame({"path_loss_db": path_loss_db}))
@@ -171,11 +171,11 @@ def _received(
 
 
 class _ReplayedDraws:
-    """A calibration's draws, replayed at its own links and at candidates.
+    """The draws of a calibration, replayed at the calibration's own links and at candidates.
 
     Args:
         result: The calibration.
-        setup: Its study, opened.
+        setup: The opened study of the calibration.
         progress: Called with the stage "tracing" after every launch.
     """
 
@@ -184,7 +184,7 @@ class _ReplayedDraws:
         self.engine = self._engine(setup)
         problem = _as_calibrated(result, Problem.of(setup, self.engine))
         parameters, objective = problem.parameters, problem.objective
-        # Constants of the scene have tight priors, and take no degrees of freedom from the residuals.
+        # Constants of the scene have tight priors, so they take no degrees of freedom from the residuals.
         freedom = problem.freedom + len(parameters) - len(result.study.parameters)
         if freedom < 1:
             raise InputError(
@@ -213,8 +213,8 @@ class _ReplayedDraws:
     def at(self, setup: Setup) -> tuple[NDArray[np.float64], NDArray[np.float64], Errors]:
         """Predict the candidates.
 
-        The results are path loss for every value [m, candidates], [dB]; its derivatives with respect to the coordinates
-        of the unit cube for the draws [n, candidates, d], [dB]; and the expected errors of measurements.
+        The results are path loss for every draw and further value [m, candidates], [dB]; its derivatives with respect
+        to the unit cube's coordinates, for the draws [n, candidates, d], [dB]; and the expected errors of measurements.
         """
         objective, links = self.problem.objective, setup.links
         loss, slope = self._replay(self._engine(setup))
@@ -251,7 +251,7 @@ class _ReplayedDraws:
         return replay(setup, setup.trace(materials, self.progress), compress_db)
 
     def _replay(self, engine: Differentiable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss for every value [m, links] and its derivatives in the unit cube [m, links, d], [dB]."""
+        """Path loss for every draw and further value [m, links], and unit-cube derivatives [m, links, d], [dB]."""
         loss, slope = engine.path_loss_and_jacobian(self.values)
         return loss, slope * (self.problem.parameters.search_slope(self.values) * self.width)[:, None, :]
 
@@ -261,7 +261,7 @@ class _ReplayedDraws:
         return np.einsum("nmi,nmj->nij", slopes, slopes)
 
     def _further_values(self, draws: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values around the draws in every separate range, with the scatter that the curvature implies [k, d]."""
+        """Values around the draws of every separate range, with the scatter that the curvature implies [k, d]."""
         parameters, piece = self.problem.parameters, self._pieces(draws)
         members = [
             np.flatnonzero(piece[:, k] == number)
@@ -291,10 +291,10 @@ class _ReplayedDraws:
         return piece
 
     def _nuisance(self, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Design of the nuisance at candidates [candidates, q], and its uncertainty there.
+        """Design matrix of the nuisance at candidates [candidates, q], and the uncertainty of the nuisance there.
 
-        The uncertainty [candidates, unknowns], [dB] has a column for each coefficient, from its posterior given the
-        calibration links, and one for each group without measurements.
+        The uncertainty [candidates, unknowns], [dB], has a column for each coefficient, from the posterior given the
+        calibration links, and a column for each group without measurements.
         """
         objective, nuisance = self.problem.objective, self.problem.objective.nuisance
         if not nuisance.terms:
@@ -306,7 +306,7 @@ class _ReplayedDraws:
         )
 
     def _term(self, term: Term, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Columns of a term at candidates, and a column for each group without measurements."""
+        """Design columns of a term at candidates, and a column of uncertainty for each group without measurements."""
         study = self.result.study
         if term.name == OFFSET:
             labels = links.group if study.offset is not None and study.offset.per is not None else None
@@ -315,7 +315,7 @@ class _ReplayedDraws:
             labels = None if per is None or term.labels == ("",) else links.table.labels(per)
         coefficients = self.result.nuisance.coefficients.get(term.name, {})
         at_links = term.at(links, labels)
-        # A group without measurements gets the mean of the others, or deviates from it as they do.
+        # A group without measurements gets the mean of the other groups; a random effect's deviation from it is 0.
         others = 0.0 if term.around else 1.0 / len(term.labels)
         share = np.where(at_links.group[:, None] < 0, others, np.eye(len(term.labels))[at_links.group])
         new = np.flatnonzero(at_links.group < 0)
@@ -327,9 +327,9 @@ class _ReplayedDraws:
         return share * at_links.value[:, None], unknown
 
     def _errors(self, candidates: Measurements, common: NDArray[np.float64]) -> Errors:
-        """Expected errors of candidates. These have no weights, so calibration links count equally.
+        """Expected errors of candidates. Candidates have no weights, so all calibration links count equally.
 
-        `common` is as for `Errors`. Residuals of neighbouring links may be correlated, unless the study rules this out.
+        `common` is as in `Errors`. Residuals of neighbouring links may be correlated, unless the study rules this out.
         """
         problem, objective, links = self.problem, self.problem.objective, self.problem.setup.links
         counted, point = objective.weight > 0, _calibrated_point(self.result, problem)
@@ -345,7 +345,7 @@ class _ReplayedDraws:
 
 
 def _as_calibrated(result: Record, problem: Problem) -> Problem:
-    """The problem of the calibration: its links, its spreads and errors, and priors of the drawn constants.
+    """The problem as calibrated: with the estimated spreads and errors, and priors of the constants in the draws.
 
     Links near the noise floor are excluded.
     """
@@ -415,10 +415,10 @@ def _gain(result: Record, narrowed: NDArray[np.float64]) -> str:
 
 
 def _width(result: Record, name: str, narrowed: float) -> float:
-    """Width of a parameter's interval after the draws are narrowed by a factor, on the scale of the search.
+    """Width of a parameter's interval if the draws are narrowed by a factor, on the scale of the search.
 
-    The draws refer to the buildings that the links meet. A measurement does not show how much other buildings differ,
-    so this part of the width remains.
+    The draws refer to the buildings that the links' paths meet. A measurement does not show how much other buildings
+    differ, so this part of the width remains.
     """
     section, interval = result.study.parameters[name], result.intervals.get(name)
     ends = np.array(section.bounds if interval is None else (interval.lower, interval.upper), dtype=float)
@@ -428,7 +428,7 @@ def _width(result: Record, name: str, narrowed: float) -> float:
         (np.log(ends) if log else ends).mean(),
         *(np.ptp(np.log(bounds) if log else bounds) / 2 for bounds in (ends, seen)),
     )
-    # Squares add: the differences of other buildings, and the rest, which the measurement narrows.
+    # Squared widths add: one part is due to other buildings, and the measurement narrows the other part.
     half = min(float(np.hypot(np.sqrt(max(half**2 - seen_half**2, 0.0)), narrowed * seen_half)), half)
     after = np.array([middle - half, middle + half])
     return float(np.ptp(np.exp(after) if log else after))

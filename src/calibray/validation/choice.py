@@ -33,7 +33,7 @@ from calibray.study.model import StudyModel
 from calibray.validation import models
 
 SEARCHES: Final = 16
-"""Number of local searches for the model's optimum, in addition to the one from the calibrated optimum."""
+"""Number of local searches for the model's optimum, in addition to the search from the calibrated optimum."""
 
 MOST_ERRORS: Final = 400
 """Largest number of absolute errors that are stored with the model; if there are more, quantiles are stored."""
@@ -44,11 +44,11 @@ class HeldOutResiduals:
     """The residuals from which the intervals of predictions are computed.
 
     Attributes:
-        rms_db: Their root mean square [dB]; None if there are too few links.
-        basis: Description of the links to which they belong.
+        rms_db: RMS of the residuals [dB]; None if there are too few links.
+        basis: Description of the links to which the residuals belong.
         links: Number of these links, or degrees of freedom if they are calibration links.
-        errors_db: The residuals on held-out links [n], [dB]; empty if they belong to calibration links.
-        blocks: The same residuals on two levels; None if no blocks were held out.
+        errors_db: The residuals on held-out links [n], [dB]; empty if the residuals belong to calibration links.
+        blocks: Standard deviations within and between blocks; None if no links or too few were held out.
     """
 
     rms_db: float | None
@@ -60,13 +60,13 @@ class HeldOutResiduals:
 
 @dataclass(frozen=True, eq=False)
 class FittedModel:
-    """The prediction model with its values at the study's links.
+    """The prediction model with its path loss at the study's links.
 
     Attributes:
         model: The model.
-        materials: Materials of the scene with the model's parameters; None if it uses no scene.
-        path_loss_db: Its path loss, with nuisances [links], [dB].
-        scene_db: Path loss of its scene alone; of the calibrated scene if it uses none [links], [dB].
+        materials: Materials of the scene with the model's parameters; None if the model uses no scene.
+        path_loss_db: Path loss of the model, with nuisances [links], [dB].
+        scene_db: Path loss of the model's scene alone, or of the calibrated scene if it uses none [links], [dB].
     """
 
     model: PredictionModel
@@ -88,11 +88,11 @@ def fit_prediction_model(
 
     Args:
         problem: The problem.
-        trail: Its search.
-        name: The model; see `Model`.
-        residuals: Its residuals on new links.
-        retrace_gap_db: Change of every link's path loss from the search's paths to those traced with its optimum [L],
-            [dB]; None if not traced again.
+        trail: The search that solved the problem.
+        name: Name of the model; see `Model`.
+        residuals: Residuals of the model on new links.
+        retrace_gap_db: Change in path loss of every link when the paths of the search are replaced by paths traced with
+            the calibrated materials [L], [dB]; None if not traced again.
 
     Returns:
         The fitted model. Predictions and exports trace with its materials, so its values contain this change.
@@ -124,8 +124,8 @@ def fit_prediction_model(
         parameters.named(others[0].candidate) if others else None,
     )
     materials = parameters.materials(candidate, problem.setup.scene.materials) if uses_scene else None
-    # In an exported scene, each mesh has one material, facades have that of their walls, and links are at the stated
-    # positions.
+    # In an exported scene, each mesh has one material, facades have the material of their walls, and links are at the
+    # stated positions.
     walls = {name: section.of for name, section in setup.study.facades.items()}
     displaced = [name for name in parameters.names if displaces(name)]
     extra = len(parameters.of_effects) or setup.study.regions or setup.study.roughness_mm
@@ -170,8 +170,8 @@ def fit_variant(problem: Problem, trail: Trail, name: Model) -> FittedVariant:
 def averaged_terms(few: tuple[FittedTerm, ...], more: tuple[FittedTerm, ...]) -> tuple[FittedTerm, ...]:
     """The mean of the terms of two models, of which the second has all terms of the first.
 
-    A term that the first lacks gets half its coefficients. A group without a coefficient in one model gets that of the
-    other model.
+    The coefficients of a term that the first model lacks are halved. A group without a coefficient in one model gets
+    that of the other model.
     """
     known, averaged = {term.name: term for term in few}, []
     for term in more:
@@ -223,15 +223,15 @@ def fitted_terms(
     """Nuisance terms with their best-fit coefficients.
 
     Args:
-        objective: The objective, which has the terms.
+        objective: The objective with the terms.
         path_loss_db: Modelled path loss without nuisance [links], [dB].
         study: The study.
 
     Returns:
-        The terms. Groups without links are left out.
+        The terms. Groups without fitted links are left out.
     """
     coefficients = objective.completed(path_loss_db[None])[0]
-    # Links of a group that do not determine its coefficient are still fitted with one.
+    # A group whose links do not determine its coefficient is still fitted with one.
     has_links = np.asarray(abs(objective.nuisance.design[objective.weight > 0]).sum(axis=0)).ravel() > 0
     used = objective.determined | has_links & (coefficients != 0)
     by_term, terms = objective.nuisance.by_term(coefficients, used), []

@@ -1,14 +1,14 @@
 """Statistics of held-out errors: spatial blocks, comparison of two models, and width of a prediction interval.
 
-The interval is conformal: among n + 1 exchangeable errors, a new one has any rank with the same probability. It
-therefore lies within the ((n + 1) p)-th smallest of the n observed absolute errors with probability p, whatever their
-distribution (V. Vovk, A. Gammerman, G. Shafer, Algorithmic Learning in a Random World, 2005; R. J. Barber et al., Ann.
-Statist. 49, 2021, for held-out links). Errors of links have heavier tails than a Gaussian, so an interval from their
-root mean square would be too wide at 90 %. With few errors, the largest are too uncertain, and Student's t is used
-instead.
+The interval is conformal: among n + 1 exchangeable errors, a new one has any rank with the same probability. The
+absolute value of a new error is therefore at most the ((n + 1) p)-th smallest of the n observed absolute errors with
+probability p, whatever their distribution (V. Vovk, A. Gammerman, G. Shafer, Algorithmic Learning in a Random World,
+2005; R. J. Barber et al., Ann. Statist. 49, 2021, for held-out links). Errors of links have heavier tails than a
+Gaussian, so an interval from their root mean square would be too wide at 90 %. If there are few errors, the largest
+ones are too uncertain, and Student's t is used instead.
 
-For further observables, a baseline is linear in distance for times of flight, and otherwise linear in its logarithm.
-Models and baselines have biases of devices, which are fitted to the links that are not held out.
+For further observables, one baseline is linear in distance for times of flight, and otherwise in the logarithm of
+distance. Models and baselines include device biases, which are fitted to the links that are not held out.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ CLUSTER_LINKS: Final = 4
 """Number of neighbouring links that are resampled together, because they share part of their noise."""
 
 MOST_CLUSTERS: Final = 1000
-"""Largest number of clusters; with more links, clusters are larger."""
+"""Largest number of clusters; if there are more links, clusters are larger."""
 
 RESAMPLES: Final = 2000
 
@@ -52,20 +52,20 @@ LEAST_GAIN: Final = 0.05
 block, and the fitted model lost up to 3 dB in clusters kept apart; with planted misfits, no decrease was this small."""
 
 REACHED: Final = 0.9
-"""Share of the held-out links that lie within the reach of the others."""
+"""Share of the held-out links that are at most `BlockErrors.reach_m` from a link outside their block."""
 
 AVERAGE_LINKS: Final = 8
-"""Weight of all links' mean square error in the estimate for links out of sight, as a number of links. A few links out
-of sight contain little information about errors."""
+"""Weight of the mean square error of all links in the estimate for links out of sight, as a number of links. A few
+links out of sight contain little information about their errors."""
 
 FEWEST_FOR_RANKS: Final = 40
-"""Number of errors from which an interval is read off their ranks; with fewer, Student's t is assumed."""
+"""Smallest number of errors whose ranks give an interval; for fewer errors, Student's t distribution is assumed."""
 
 
 def spatial_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]:
     """Divide positions [n, 2 or 3], [m], into compact blocks of about equal size, numbered from 0 [n].
 
-    The largest block is halved across its longer side until there are enough; at most n are made.
+    The largest block is halved across its longer side until there are enough blocks, at most n.
 
     Example:
         >>> spatial_blocks(np.array([[0.0, 0.0], [9.0, 0.0], [1.0, 0.0], [8.0, 0.0]]), 2).tolist()
@@ -88,7 +88,7 @@ def moving_end(links: Measurements) -> NDArray[np.float64]:
 
 
 def place_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Divide links by horizontal position [n, 3], [m], like `spatial_blocks`, but never divide a place [n].
+    """Divide links by horizontal position [n, 3], [m], like `spatial_blocks`, but keep each place in one block [n].
 
     Example:
         >>> place_blocks(np.array([[0.0, 0, 1], [0.0, 0, 4], [0.0, 0, 7], [9.0, 0, 1]]), 2).tolist()
@@ -105,7 +105,7 @@ def place_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]
 def compare(errors: NDArray[np.float64], baselines: Errors, position: NDArray[np.float64]) -> Judgement:
     """Compare a model with its best baseline, by residuals on the same held-out links [n], [dB].
 
-    The error of the difference comes from resampling clusters of links whose receivers [n, 3], [m], are neighbours,
+    The error of the difference comes from resampling clusters of links whose positions [n, 3], [m], are close together,
     with the same clusters for both models. Links with a non-finite residual are left out.
     """
     table = np.stack([errors, *baselines.values()])
@@ -121,9 +121,9 @@ def compare(errors: NDArray[np.float64], baselines: Errors, position: NDArray[np
     size = np.bincount(cluster)
     total = np.stack([np.bincount(cluster, weights=square[row]) for row in (0, best)])
     resampled = np.random.default_rng(0).integers(len(size), size=(RESAMPLES, len(size)))
-    # Clusters differ in size, so total squares are divided by the total number of links.
+    # Clusters differ in size, so total sums of squares are divided by the total number of links.
     model_rmse, baseline_rmse = np.sqrt(total[:, resampled].sum(axis=2) / size[resampled].sum(axis=1))
-    # Resampling k clusters underestimates the variance over new clusters by (k - 1) / k.
+    # Resampling k clusters underestimates the variance over new clusters by the factor (k - 1) / k.
     error = None
     if len(size) > 1:
         error = float(np.std(baseline_rmse - model_rmse) * np.sqrt(len(size) / (len(size) - 1)))
@@ -153,7 +153,7 @@ def choose(errors: Errors, position: NDArray[np.float64]) -> str:
 
 
 def predicting(errors: Errors, position: NDArray[np.float64]) -> str:
-    """The prediction model chosen by held-out residuals: the average that belongs to the chosen model, if any."""
+    """The prediction model chosen by held-out residuals: the average that replaces the chosen model, if any."""
     name = choose(errors, position)
     average = AVERAGE_OF.get(name, name)
     return average if average in errors else name
@@ -172,9 +172,10 @@ def two_levels(
 ) -> BlockErrors | None:
     """Variance of held-out errors [n], [dB], within and between blocks (analysis of variance of random effects).
 
-    A new street has its own error, so a few blocks contain less information than their many links. `position` [n, k],
-    [m], is that of the links' ends; `fitted` [m, k] is that of the links the models were fitted to, the other blocks if
-    None. The result is None with fewer than two blocks, or if there are no more links than blocks.
+    Each new street has its own error, so a few blocks contain less information than their number of links suggests.
+    `position` [n, k], [m], has the positions of the links' ends, and `fitted` [m, k] those of the links to which the
+    models were fitted: the other blocks if None. The result is None if there are fewer than two blocks, or no more
+    links than blocks.
 
     Example:
         >>> blocks = two_levels(np.array([3.0, 4, -4, -3, 1, 0]), np.array([0, 0, 1, 1, 2, 2]), np.eye(6))
@@ -199,9 +200,10 @@ def two_levels(
 
 
 def out_of_sight_ratio(errors: NDArray[np.float64], blocked: NDArray[np.bool_]) -> float:
-    """Root mean square error of links out of sight relative to that of all links, from residuals [n], [dB].
+    """Root mean square error of links out of sight divided by that of all links, from residuals [n], [dB].
 
-    It is at least 1, so that links in sight keep the interval of all links.
+    The ratio is at least 1, so that links in sight keep the interval of all links. With few links out of sight, it is
+    drawn towards 1 (`AVERAGE_LINKS`).
 
     Example:
         >>> errors, blocked = np.array([1.0, -1, 1, 5, -5, 5, 5, -5, 5, -5, 5]), np.arange(11) > 2
@@ -228,7 +230,7 @@ def interval_half_width(absolute_errors: NDArray[np.float64], level: float) -> f
     student_t = float(stdtrit(count, (1 + level) / 2)) * rms
     if count < FEWEST_FOR_RANKS:
         return student_t
-    # No observed error is an upper limit at this level.
+    # The observed errors are too few for an upper limit at this level.
     if rank > count:
         return max(student_t, float(absolute_errors[-1]))
     return float(np.interp(rank, np.arange(1, count + 1), absolute_errors))
@@ -241,9 +243,10 @@ MODELS: Final = ("calibrated", "mean", "law of distance")
 def held_out_gaps(
     problem: Problem, best: NDArray[np.float64], held_out: NDArray[np.bool_]
 ) -> dict[str, NDArray[np.float64]]:
-    """Predicted minus measured values of every observable on held-out links: `MODELS` [3, L], in its unit.
+    """Predicted minus measured values of every observable on held-out links, by `MODELS` [3, L], in its unit.
 
-    Biases are fitted to the other links. The optimum is in the fields' units [d]. A link that is not judged gets NaN.
+    Biases are fitted to the other links. The optimum `best` [d] is in the parameters' units. A link that is not judged
+    gets NaN.
     """
     if not problem.observed:
         return {}
@@ -263,7 +266,7 @@ def held_out_gaps(
 def observable_errors(
     gaps: Mapping[str, NDArray[np.float64]], study: StudyModel
 ) -> dict[str, ObservableErrors]:
-    """Root mean squares of gaps [3, L] by name of the observable; observables without a judged link are left out."""
+    """RMS errors of the models by observable, from gaps [3, L]; observables without a judged link are left out."""
     errors = {}
     for name, gap in gaps.items():
         judged = gap[:, np.isfinite(gap).all(axis=0)]
@@ -283,7 +286,7 @@ def _law(observable: Observed, links: Measurements) -> NDArray[np.float64]:
 def _with_biases(
     observable: Observed, feature: NDArray[np.float64], weight: NDArray[np.float64], *, slope: bool
 ) -> NDArray[np.float64]:
-    """The feature, or its best multiple, plus the biases of the links with a weight; a new group gets their mean."""
+    """The feature, or a fitted multiple of it, plus fitted biases; other groups get the mean bias."""
     used = observable.used(weight)
     used = used[np.isfinite(feature[used])]
     # The model has a bias only where the study states one; the mean and the law always have a constant.

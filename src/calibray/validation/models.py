@@ -1,12 +1,12 @@
 """The models that validation compares: baselines without paths, and variants of the study's model that use the scene.
 
-The baselines are the log-distance model, also with the obstruction of the direct line, and kriging.
+The baselines are the log-distance model, the same model with the obstruction of the direct line, and kriging.
 
-The variants are the study's own model, its initial materials, a prior around the initial values, and, with this prior,
-offsets per transmitter and out of sight: models that an engineer would try by hand. The best variant differs between
-campaigns, so held-out links decide (`validate.py`). Both offsets have a prior around zero, which keeps them small where
-the links do not need them. One variant therefore has both. Further variants make the choice worse
-(docs/measurements/predictions.md).
+The variants are the study's own model, the initial materials, the model with a prior around the initial values, and the
+model with this prior and offsets per transmitter and out of sight. An engineer would try these models by hand. The best
+variant differs between campaigns, so held-out links decide (`validate.py`). Both offsets have a prior around zero,
+which keeps them small where the links do not need them. One variant therefore has both. Further variants make the
+choice worse (docs/measurements/predictions.md).
 """
 
 from __future__ import annotations
@@ -51,23 +51,23 @@ OUT_OF_SIGHT_DB: Final = (10.0, 10.0)
 
 WALL_DB: Final = 2.0
 """Standard deviation of the prior of the loss per wall crossed, around zero [dB]. Indoors, walls dominate with any
-prior. Outdoors, waves go around buildings; with 5 dB, the error on one cluster of Boulder kept apart was 17 dB."""
+prior. Outdoors, waves go around buildings; with 5 dB, the error on one held-out cluster of Boulder was 17 dB."""
 
 ROUNDS: Final = 4
-"""Number of rounds in which the errors and the losses under their priors are fitted; more change results by 0.01 dB."""
+"""Rounds in which the errors, and then the losses with their priors, are fitted; more change results by 0.01 dB."""
 
 LEAST_NOISE_DB: Final = 1.0
 """Smallest error of the log-distance model against which priors are weighed [dB]."""
 
 MOST_KRIGED: Final = 1000
-"""Largest number of links for kriging: fitting the correlation factors their covariance a few hundred times."""
+"""Largest number of links for kriging: fitting the correlation factorizes their covariance a few hundred times."""
 
 
 def without_scene(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
-    """The part of path loss [links], [dB], that needs no scene: the rise over carriers, minus the antennas' gain.
+    """The part of path loss [links], [dB], that needs no scene: its increase with the carrier, minus antenna gains.
 
-    Path loss rises by 20 log10(f / f0) from the study's carrier f0, as in free space. The gain is that of the stated
-    antennas, with the columns of the links, along the straight line.
+    Path loss increases by 20 log10(f / f0) from the study's carrier f0, as in free space. The gains are those of the
+    stated antennas along the straight line, in the directions that the columns of the links state.
 
     Raises:
         InputError: A column of the antennas is missing or malformed.
@@ -82,7 +82,7 @@ class Baseline(NamedTuple):
 
     Attributes:
         objective: The model as an objective.
-        known_db: Known part of its path loss [links], [dB].
+        known_db: Known part of the path loss [links], [dB].
     """
 
     objective: Objective
@@ -96,7 +96,7 @@ class Baseline(NamedTuple):
 def log_distance(links: Measurements, objective: Objective, known_db: NDArray[np.float64]) -> Baseline:
     """The log-distance model with the study's nuisances; an offset per group becomes an intercept per group.
 
-    The weights of the study's objective select the fitted links; `known_db` is the part of path loss from
+    The weights of `objective`, the study's objective, select the fitted links; `known_db` is the result of
     `without_scene` [links], [dB].
 
     Raises:
@@ -122,15 +122,15 @@ def log_distance(links: Measurements, objective: Objective, known_db: NDArray[np
 
 
 def has_obstruction(links: Measurements) -> bool:
-    """Whether the links have the columns that follow from a scene, and the direct line of any link is blocked."""
+    """Whether the links have the columns computed from a scene, and the direct line of at least one link is blocked."""
     return OUT_OF_SIGHT in links.frame and bool(links.table.numbers(OUT_OF_SIGHT).any())
 
 
 def obstructed(links: Measurements, objective: Objective, known_db: NDArray[np.float64]) -> Baseline:
-    """The log-distance model with a loss out of sight and a loss per wall, by the columns that follow from the scene.
+    """The log-distance model with a loss out of sight and a loss per wall, using the columns computed from the scene.
 
-    The loss out of sight has a prior around a mean. The mean is part of the known path loss, and the rest is a
-    coefficient. Arguments are those of `log_distance`.
+    The loss out of sight has a prior around a mean. The mean is part of the known path loss, and the deviation from it
+    is a coefficient. The arguments are those of `log_distance`.
 
     Raises:
         EngineError: Fewer than two links have a weight.
@@ -151,14 +151,14 @@ def obstructed(links: Measurements, objective: Objective, known_db: NDArray[np.f
 
 
 def _free_name(by: str, terms: Sequence[Term]) -> str:
-    """A name, unused by the other terms, for a term by a column."""
+    """A name for a term of the column `by` that no other term has."""
     names = {term.name for term in terms}
     plain = by.replace("_", " ") if by in (OUT_OF_SIGHT, WALLS) else by
     return next(name for name in (plain, f"{plain} of all", f"{plain} of all links") if name not in names)
 
 
 def kriging(links: Measurements, objective: Objective, trend_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Path loss of a model at all links [links], [dB], plus its residuals, kriged from the links with a weight.
+    """Path loss of a model at all links [links], [dB], plus its residuals kriged from the links with a weight.
 
     The model was fitted to these links; its path loss is `trend_db` [links], [dB].
 
@@ -189,7 +189,7 @@ def kriged(
 ) -> dict[Model, NDArray[np.float64]]:
     """The result of `kriging` under a name; empty if kriging is impossible.
 
-    This is so with too few or too many links, or if all have the same position or no residual.
+    It is impossible if there are too few or too many links, if all have one position, or if all residuals are zero.
     """
     try:
         return {name: kriging(links, objective, trend_db)}
@@ -198,7 +198,7 @@ def kriged(
 
 
 def without_paths(setup: Setup, objective: Objective) -> dict[Model, NDArray[np.float64]]:
-    """Path loss at all links by each baseline without paths [links], [dB], fitted to the links with weight."""
+    """Path loss at all links by each baseline without paths [links], [dB], fitted to the links with a weight."""
     links, known_db = setup.links, without_scene(setup.study, setup.links)
     path_loss_db = {Model.LOG_DISTANCE: log_distance(links, objective, known_db).path_loss_db()}
     if has_obstruction(links):
@@ -210,8 +210,8 @@ PRIOR_SPREAD: Final = 0.3
 """Standard deviation of a parameter's logarithm around its initial value, in the variants with a prior."""
 
 OFFSET_PRIOR_DB: Final = 10.0
-"""Standard deviation of the prior, around zero, of a transmitter's offset from that of all links, and of the offset of
-links out of sight [dB]; in downtown Boulder, links out of sight lack 11.7 dB."""
+"""Standard deviation of the priors around zero of a transmitter's offset, relative to the offset of all links, and of
+the offset of links out of sight [dB]; in downtown Boulder, the latter is 11.7 dB."""
 
 MOST_STARTS: Final = 4
 """Number of known minima from which a search starts."""
@@ -231,15 +231,15 @@ NO_MINIMA: Final[Mapping[Model, NDArray[np.float64]]] = {}
 def fit_variants(
     part: Problem, known_minima: Mapping[Model, NDArray[np.float64]] = NO_MINIMA
 ) -> dict[Model, tuple[Problem, NDArray[np.float64]]]:
-    """Fit every variant to the links with weight.
+    """Fit every variant to the links with a weight.
 
     Args:
         part: The problem; held-out links have weight 0.
-        known_minima: Minima over more links by variant [k, d], as starting points. Without the minima of the study's
-            own model, the whole ranges of its parameters are searched.
+        known_minima: Minima of fits to more links, by variant [k, d], as starting points. Without the minima of the
+            study's own model, the whole ranges of its parameters are searched.
 
     Returns:
-        Each variant's problem and its minima, the best first [k, d], by name.
+        Problem and minima of each variant by name; the best minimum is the first [k, d].
     """
     if Model.CALIBRATED in known_minima:
         calibrated = find_minima(part, known_minima[Model.CALIBRATED], _new_starts(part))
@@ -264,7 +264,7 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
 
     Args:
         part: The problem; held-out links have weight 0.
-        best: Its optimum [d]; the residuals there give the noise that scales the priors.
+        best: The optimum of the problem [d]; its residuals give the noise that scales the priors.
 
     Returns:
         The problems by name. For `Model.INITIAL`, only the nuisance is fitted.
@@ -288,8 +288,8 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
 
 
 def find_minima(problem: Problem, starts: NDArray[np.float64], new_starts: int) -> NDArray[np.float64]:
-    """Find minima of a problem [m, d] by local searches from starting points [k, d] and new ones, the best first."""
-    # If minima are known, other searches only have to show whether they lead to a lower one.
+    """Find minima of a problem [m, d], the best first, by local searches from given and new starting points [k, d]."""
+    # If minima are known, the other searches only have to show whether they lead to a lower minimum.
     catch_up = NEARER if len(starts) else CATCH_UP
     return least_squares(
         problem, new_starts, starts[:MOST_STARTS], tolerance=TOLERANCE, catch_up=catch_up
@@ -306,7 +306,7 @@ def averages(path_loss_db: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArr
 
 
 def _searches(problem: Problem) -> int:
-    """Number of local searches that find the minima of a problem without any known minimum."""
+    """Number of local searches needed to find the minima of a problem without a known minimum."""
     interactions = problem.engine.interactions if isinstance(problem.engine, Differentiable) else 1
     return local_searches(interactions)
 
@@ -314,21 +314,21 @@ def _searches(problem: Problem) -> int:
 def _new_starts(problem: Problem) -> int:
     """Number of additional starting points, if minima of the same variant over more links are known.
 
-    A large program has fewer, as its calibration has fewer searches. With one instead of four, errors of held-out links
-    in Auckland are the same to 0.001 dB; in small programs, more points often find a lower minimum.
+    A large program has fewer points, because its calibration has fewer searches. With one point instead of four, errors
+    on held-out links in Auckland are the same to 0.001 dB; in small programs, more points often find a lower minimum.
     """
     return min(max(_searches(problem) // STARTS[0], 1), NEW_STARTS)
 
 
 def initial_objective(objective: Objective, setup: Setup) -> Objective:
-    """The objective of the initial materials: with a common offset of all links, unless the study declares one."""
+    """The objective for the initial materials: with a common offset of all links, unless the study declares one."""
     return _with_term(objective, CONSTANT, setup.links)
 
 
 def with_offsets(objective: Objective, links: Measurements) -> Objective | None:
-    """The objective with offsets per transmitter and out of sight that have a prior; None if neither is possible.
+    """The objective with offsets per transmitter and out of sight, both with a prior; None if neither is possible.
 
-    There are no offsets per transmitter if there is only one transmitter, or if a term already has groups.
+    There are no offsets per transmitter if there is only one transmitter, or if another term already has groups.
     """
     changed, labels = objective, transmitters(links)
     if len(np.unique(labels)) > 1 and all(len(term.labels) == 1 for term in objective.nuisance.terms):
@@ -343,7 +343,7 @@ def with_offsets(objective: Objective, links: Measurements) -> Objective | None:
 def _with_term(
     objective: Objective, by: str, links: Measurements, prior_db: float | None = None
 ) -> Objective:
-    """The objective with one coefficient of a kind for all links, unless it has a term of that kind."""
+    """The objective with one coefficient for all links of the column `by`, unless a term already has this column."""
     if any(term.by == by for term in objective.nuisance.terms):
         return objective
     term = make_term(links, f"{by}{OF_ALL_LINKS}", by, prior=prior_db)
@@ -352,7 +352,7 @@ def _with_term(
 
 
 def _priors_around_start(problem: Problem) -> LogNormal:
-    """The study's priors, and one around the initial value of every other positive parameter."""
+    """The priors of the study, and a prior around the initial value of every other positive parameter."""
     parameters, priors = problem.parameters, problem.priors
     added = [
         index

@@ -41,7 +41,7 @@ from calibray.validation.validation import Validation
 _LOG: Final = logging.getLogger(__name__)
 
 TX: Final = "tx"
-"""Name of the transmitter's position as a label, if the table has no such column."""
+"""Label that stands for the transmitter's position, unless the table has a column of this name."""
 
 
 def validate(
@@ -56,7 +56,7 @@ def validate(
     """Compare models on held-out links: each block of links is left out in turn and predicted.
 
     Args:
-        study: The study, opened or not; on the engine "replay".
+        study: The study, opened or not, with the engine "replay".
         blocks: Number of spatial blocks, each held out in turn; if None and `by` is None, the study's number, or 4.
         by: Column whose labels are held out in turn; "tx" for the position of the transmitter.
         workers: Workers that trace and replay chunks of links (`engines.open_workers`); this process if None.
@@ -67,11 +67,11 @@ def validate(
         Held-out errors of every model, with a table and a conclusion.
 
     Raises:
-        InputError: The study runs on another engine, or its links cannot be divided into these blocks.
+        InputError: The study has another engine, or its links cannot be divided into these blocks.
         EngineError: The engine failed.
     """
     if by is not None and isinstance(study, Study):
-        # Rows of one link with different labels stay separate links.
+        # Rows that measure the same link but have different labels stay separate links.
         study = Study.from_content(study.content() | {"holdout": {"by": by}}, study.path)
     setup = study if isinstance(study, Setup) else Setup.open(study, tracer)
     if blocks is not None and by is not None:
@@ -93,7 +93,7 @@ def validate(
 
 
 def check_engine(study: StudyModel) -> None:
-    """Refuse an engine on which a dozen calibrations would be too expensive.
+    """Refuse an engine with which a dozen calibrations would be too expensive.
 
     Raises:
         InputError: The engine is not "replay".
@@ -114,9 +114,9 @@ def validate_problem(
 ) -> Validation:
     """Compare models on all links of a problem, each block held out in turn.
 
-    Blocks are spatial, as many as stated or as in the study, or the labels of the column `by`. `known_minima` has
-    minima over all links by model [k, d]; those of the study's own model are searched if absent. The stage of
-    `progress` is "validating".
+    There are `blocks` spatial blocks, or one block for each label of the column `by`; the study states the blocks if
+    both are None. `known_minima` has minima of fits to all links, by model [k, d]; minima of the study's own model are
+    searched if absent. The stage of `progress` is "validating".
 
     Raises:
         InputError: The links cannot be divided into these blocks.
@@ -151,7 +151,7 @@ def validate_problem(
 
 
 def _announce_new_groups(problem: Problem, block: NDArray[np.int64]) -> None:
-    """Warn which offsets are unknown for held-out links, because all links of their group are in the same block [n]."""
+    """Warn of offsets that are unknown for held-out links because all links of their group are in one block [n]."""
     counted = np.flatnonzero(block >= 0)
     stated = problem.setup.study.nuisance_terms
     for term in problem.objective.nuisance.terms:
@@ -169,7 +169,7 @@ def _announce_new_groups(problem: Problem, block: NDArray[np.int64]) -> None:
 
 
 def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:
-    """Block of every link, -1 for a link of weight 0, and the blocks' labels."""
+    """Block of every link, -1 for a link of weight 0, and the labels of the blocks."""
     links, holdout = problem.setup.links, problem.setup.study.holdout
     if count is None and by is None and holdout is not None:
         count, by = holdout.blocks, holdout.by
@@ -186,7 +186,7 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
             link_labels = links.table.labels(by)
         names, block[counted] = np.unique(link_labels[counted], return_inverse=True)
         labels = tuple(map(str, names))
-    # The links that are left when the largest block is held out, and the unknowns that are fitted to them.
+    # Number of links that are left when the largest block is held out, and number of unknowns fitted to them.
     fewest = int(counted.sum()) - int(np.bincount(block[counted]).max())
     unknowns = counted.sum() - problem.freedom
     if len(labels) < 2 or counted.sum() < len(labels) or fewest <= unknowns:
@@ -200,12 +200,12 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
 def fit_models(
     part: Problem, fits: Mapping[Model, tuple[Problem, NDArray[np.float64]]]
 ) -> dict[str, NDArray[np.float64]]:
-    """Path loss at all links by model [links], [dB], fitted to the links with weight.
+    """Path loss at all links by model [links], [dB]; the models are fitted to the links with a weight.
 
-    Kriging is left out if it is impossible. `fits` are the fitted variants that use the scene, from `fit_variants`.
+    Kriging is left out if it is impossible. `fits` has the fitted variants that use the scene, from `fit_variants`.
     """
     setup, objective = part.setup, part.objective
-    # A trace around calibrated positions interpolates path loss at the stated ones.
+    # If paths are traced around calibrated positions, replay only interpolates path loss at the stated positions.
     path_loss_db: dict[str, NDArray[np.float64]] = {
         name: variant.objective.with_nuisance(
             part.before if name == Model.INITIAL else variant.modelled(minima[:1])[0]

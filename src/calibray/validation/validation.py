@@ -60,9 +60,9 @@ def observables_table(observables: Mapping[str, ObservableErrors]) -> Table:
 @final
 @dataclass(frozen=True, eq=False, repr=False)
 class Validation(HeldOutErrors):
-    """Held-out errors of several models on the same links, and the conclusions from them.
+    """Held-out errors of several models on the same links, and the conclusions from these errors.
 
-    The error expected in a block is estimated on the other blocks, so that no block contributes to its own estimate.
+    The error expected in a block is estimated from the other blocks, so that no block contributes to its own estimate.
     """
 
     @classmethod
@@ -83,7 +83,7 @@ class Validation(HeldOutErrors):
 
     @cached_property
     def judged(self) -> NDArray[np.bool_]:
-        """Which links are judged [links]."""
+        """Mask of the links that are judged [links]."""
         return self.block >= 0
 
     @cached_property
@@ -102,7 +102,7 @@ class Validation(HeldOutErrors):
 
     @cached_property
     def chosen(self) -> str:
-        """The prediction model; never kriging or the residual field, which help only near measured links."""
+        """The prediction model; never kriging or the residual field, which only help near measured links."""
         return predicting(self._on(self.judged), self.position[self.judged])
 
     @cached_property
@@ -116,18 +116,18 @@ class Validation(HeldOutErrors):
 
     @cached_property
     def judgement(self) -> Judgement:
-        """The study's calibrated model compared with its best baseline."""
+        """Comparison of the study's calibrated model with its best baseline."""
         baselines = {name: self.errors[name][self.judged] for name in BASELINES if name in self.errors}
         return compare(self.errors[Model.CALIBRATED][self.judged], baselines, self.position[self.judged])
 
     @property
     def sentence(self) -> str:
-        """Whether calibration helped on held-out blocks, compared with which baseline, by how much, how certainly."""
+        """Whether calibration improved on the best baseline on held-out blocks, by how much, and how certainly."""
         return judgement_text(self.judgement)
 
     @property
     def choice(self) -> str:
-        """Which model the blocks choose for predictions, with the reason."""
+        """Which model is chosen for predictions on the blocks, with the reason."""
         errors = self._on(self.judged)
         best = least(errors, (Model.INITIAL, *FITTED, *WITHOUT_MATERIALS))
         chosen = choose(errors, self.position[self.judged])
@@ -135,11 +135,11 @@ class Validation(HeldOutErrors):
         return choice_text(chosen, best, partner)
 
     def scale(self, name: str) -> float:
-        """Standard deviation of a model's residuals on new links [dB]: the root mean square of the held-out ones."""
+        """Standard deviation expected for a model's residuals on new links [dB]: the RMS of its held-out residuals."""
         return float(np.sqrt(np.nanmean(self.errors[name][self.judged] ** 2)))
 
     def levels(self, name: str, links: Measurements) -> BlockErrors | None:
-        """Scatter of a model's held-out residuals within and between blocks; None if there are too few links."""
+        """Standard deviations of a model's held-out residuals within and between blocks; None if links are too few."""
         position = np.hstack([links.tx, links.rx])[self.judged]
         return two_levels(self.errors[name][self.judged], self.block[self.judged], position)
 
@@ -192,7 +192,7 @@ class Validation(HeldOutErrors):
     def _figures(self, name: str) -> dict[str, float]:
         errors, log_density, inside = self.errors[name], [], []
         for block in self._blocks():
-            # The other blocks give the error that is expected in this one.
+            # The other blocks give the error that is expected in this block.
             others = errors[self.judged & ~block]
             rms = float(np.sqrt(np.mean(others**2)))
             log_density.append(-0.5 * (errors[block] / rms) ** 2 - np.log(rms * np.sqrt(2 * np.pi)))
