@@ -195,7 +195,7 @@ def test_the_colours_of_a_map_end_at_quantiles(shadowed: Result) -> None:
     low, high = picture.axes[0].images[0].get_clim()
     assert (low, high) == pytest.approx(np.quantile(loss, [0.02, 0.98]), abs=0.01)
     (bar,) = picture.axes[1:]
-    assert f"colours: {low:.3g} to {high:.3g} (2 to 98 % of the cells)" in bar.get_ylabel()
+    assert f"colours: {low:.3g} to {high:.3g} (2 % to 98 % quantile)" in bar.get_ylabel()
     assert "values outside have the end colour" in bar.get_ylabel()
     # Neither end of the label is cut off.
     bar.figure.draw_without_rendering()
