@@ -39,8 +39,7 @@ CHECK_SHARE: Final = 0.5
 """Largest error at new candidates as a share of the tolerance; the rest allows for candidates that are not checked."""
 
 TRAINING: Final = 16
-"""With d parameters, the first fit uses TRAINING * (d + 1) random training candidates, in addition to corners of the
-bounds."""
+"""The first fit uses TRAINING * (d + 1) random candidates for d parameters, in addition to corners of the bounds."""
 
 CORNER_PARAMETERS: Final = 5
 """Largest number of parameters whose bounds define the corners; other parameters have their middle value there."""
@@ -125,8 +124,7 @@ def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
     """A program without the weakest paths, which together carry at most `share` of a link's total power.
 
     The shares are summed over candidates spread over the parameters' bounds, so the omitted paths carry even less at a
-    single one. The program is meant for sums of powers. Raises InputError if a parameter's material is not in the
-    paths.
+    single one. Valid for sums of powers. Raises InputError if a parameter's material is not in the paths.
     """
     from scipy.stats import qmc  # the import takes 0.4 s
 
@@ -249,8 +247,7 @@ def sparse_weights(
 ) -> NDArray[np.float64]:
     """Sparse weights w >= 0 [P] with sum_p w_p share_p = 1 in every row of `share` [n, P].
 
-    Each row's residual is within the bound, unless non-negative weights cannot meet it. The search starts with the
-    paths `first`.
+    Each row's residual is within the bound, unless non-negative weights cannot meet it. The search starts with `first`.
     """
     norm = np.linalg.norm(share, axis=0)
     unit = share / np.where(norm > 0, norm, 1.0)

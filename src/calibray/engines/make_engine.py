@@ -41,8 +41,7 @@ def make(
         study: The study, opened or not.
         name: "replay", "retrace" or "command"; if None, the study's engine.
         progress: Called after every launch of a trace ("tracing"), or every RT call of a batch ("running").
-        ledger: SQLite file that stores RT calls. Replay does not use it, because computing an answer is faster than
-            reading one.
+        ledger: SQLite file that stores RT calls. Replay does not use it, because computing is faster than reading.
         workers: Workers that run the calls of a batch for "command", or keep chunks of links for "replay".
         paths: Paths of the study's links for "replay"; if None, they are traced or read from the cache.
 

@@ -127,8 +127,7 @@ def make(
         lower: Lower bounds [d].
         upper: Upper bounds [d].
         seed: Seed.
-        budget: Number of evaluations; the method's default if None. The budget is ignored if the method stops by
-            itself.
+        budget: Number of evaluations; the method's default if None. Methods that stop by themselves ignore it.
         start: Starting points, [d] or [k, d], for methods that use them.
         starts: Number of starting points that such a method adds to `start`; the method's default if None.
         objective: Function from residuals to the value, for methods that use residuals; root mean square if None.

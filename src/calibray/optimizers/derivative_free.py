@@ -8,8 +8,8 @@ in Optimization with Engineering Applications, SIAM (2017), ch. 40. It is implem
 IBCDFO needs a solver (MINQ) that no package index offers. Each residual is modelled by the quadratic of least curvature
 through evaluated points near the best one. The sum of squares of these models, to second order, is minimised in a
 box-shaped trust region. Points that span all directions within the region are chosen first, because they make the
-models fully linear. If a direction is missing and the step failed, a point along this direction is evaluated before the
-region shrinks.
+models fully linear. If a direction is missing and the step failed, a point along it is evaluated before the region
+shrinks.
 
 Gauss-Newton represents a user who has a least squares solver but no derivatives. Every accepted point requires one
 further evaluation per parameter, all in one batch. `descent.py` computes the steps.
@@ -236,7 +236,7 @@ def improving_point(
     """A point of the unit cube [d] that improves the model around `centre` [d].
 
     It lies within the radius along a missing direction [k, d], opposite to one, or along an axis towards the farther
-    face. The point with the largest component along the missing directions is chosen; in a corner, these may all lead
+    face. The point with the largest component along missing directions is chosen; in a corner, these may all lead
     outside.
     """
     directions = np.vstack([missing, -missing, np.diag(np.where(centre <= 0.5, 1.0, -1.0))])

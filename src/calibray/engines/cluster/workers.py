@@ -83,8 +83,9 @@ class Workers(Protocol):
 class InProcess:
     """Runs the work in this process, one chunk at a time.
 
-    At most `at_most` chunks are kept; others are made again for each question. If None, all are kept without a cache
-    folder, and else as many as fit into a third of the memory free at the start: derived objects need as much again.
+    At most `at_most` chunks are kept; others are made again for each question. If None, all are kept if there is no
+    cache folder. Otherwise, chunks are kept until they use a third of the memory that was free at the start, because
+    objects derived from them need as much again.
     """
 
     def __init__(self, at_most: int | None = None) -> None:
@@ -405,8 +406,7 @@ def open_workers(workers: int | None = None, scheduler: str | None = None) -> It
         The workers; None if neither is given.
 
     Raises:
-        InputError: Both arguments are given, the number is not positive, Dask is not installed, or no scheduler
-            answers.
+        InputError: Both arguments are given, the number is below 1, Dask is not installed, or no scheduler answers.
     """
     if workers is not None and scheduler is not None:
         raise InputError("--workers and --scheduler: give only one of them; a cluster has its own workers")

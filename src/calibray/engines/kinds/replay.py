@@ -35,8 +35,7 @@ class ReplaySection(EngineSection):
 
     Attributes:
         name: "replay".
-        compress_db: Largest error in path loss if a few weighted paths replace all paths [dB]; if None, all paths are
-            replayed.
+        compress_db: Largest error in path loss if a few weighted paths replace all paths [dB]; None replays all paths.
         chunk_links: Largest number of links that are traced and replayed together. If None, all links; with workers,
             `chunks.CHUNK_LINKS`, or more if there would be over `chunks.MOST_CHUNKS` chunks.
         rays: Ray table with the paths of another engine, instead of a trace.

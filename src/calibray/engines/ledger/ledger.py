@@ -43,8 +43,8 @@ class Ledger:
         read_only: Whether the file cannot be written.
 
     Raises:
-        InputError: The file cannot be opened, is not a ledger, is a link or has other names, is damaged, or has another
-            version.
+        InputError: The file cannot be opened, is not a ledger of this version, is a link, has other names, or is
+            damaged.
     """
 
     def __init__(self, path: str | Path) -> None:

@@ -34,8 +34,7 @@ class Recorded:
         ledger: The ledger.
         problem: Fingerprint of everything that determines the engine's answers apart from the candidate.
         name: Name of the engine.
-        progress: Called with "waiting", the number of answers received from another run and the number of answers
-            awaited.
+        progress: Called with "waiting", the number of answers that other runs have given and the number awaited.
 
     Attributes:
         hits: Number of candidates answered by the ledger so far; they are not RT calls.

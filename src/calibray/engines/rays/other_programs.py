@@ -41,8 +41,7 @@ def rows_of(paths: Iterable[Polyline], source: str) -> SourceTable:
     """A ray table of the given paths, in the given order.
 
     Raises:
-        InputError: The list is empty, a power is NaN, or the numbers of points, interactions and ends of a path do not
-            match.
+        InputError: The list is empty, a power is NaN, or a path does not have two more points than interactions.
     """
     paths = list(paths)
     if not paths:

@@ -191,8 +191,7 @@ class Edge:
         face: The 0-face, which the wave illuminates.
         normal_0: Outward normal of the 0-face [3].
         normal_n: Outward normal of the other face [3].
-        direction: Unit vector along the edge [3]; its cross product with the normal of the 0-face points into that
-            face.
+        direction: Unit vector e along the edge [3]; the cross product normal_0 x e points into the 0-face.
         error: Distance by which the path violates Keller's law [m].
     """
 

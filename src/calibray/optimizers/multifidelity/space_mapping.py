@@ -4,16 +4,17 @@ If you know the physics, you already have a cheap approximation of the expensive
 The first call is at its minimum. After every call, the cheap model is corrected until it agrees with all answers
 (`correction.py`). Many local searches then find its minima in all basins. Steps are of two kinds:
 
-- *exploitation*: the engine is called at one of the minima of the corrected model within a trust region, the one with
-  the lowest expected mean square, uncertainty included. The trust region is a box around the best point. It is halved
-  after a step that does not improve and doubled after one that does;
-- *exploration*: the engine is called at the point with the largest expected improvement over the whole box, computed
-  from draws of the discrepancy as in `vector_surrogate.py`. Minima of the corrected model in other basins are among the
-  candidates. An exploration follows an exploitation that gained almost nothing, and replaces one without a new minimum.
+- *exploitation*: of the minima of the corrected model within a trust region, the one with the lowest expected mean
+  square is evaluated; the expectation includes the uncertainty. The trust region is a box around the best point. It is
+  halved after a step that does not improve and doubled after one that does;
+- *exploration*: the point with the largest expected improvement over the whole box is evaluated. The improvement is
+  computed from draws of the discrepancy, as in `vector_surrogate.py`. Minima of the corrected model in other basins are
+  among the candidates. An exploration follows an exploitation that gained almost nothing, and replaces one without a
+  new minimum.
 
 Both account for constants that a few answers cannot determine, and for the errors of earlier predictions
-(`correction.py`). Otherwise, steps jump across half the box to predicted minima that do not exist, as seen on synthetic
-districts.
+(`correction.py`). Otherwise, on synthetic districts, steps jump across half the box to predicted minima that do not
+exist.
 
 The cheap model is used only while it helps. Each point is predicted from all other points, once by the corrected model
 and once by the same process without a cheap model; `error_ratio` compares the squared errors of the median link. The
