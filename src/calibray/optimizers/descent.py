@@ -160,7 +160,7 @@ def descend(
 
     Each search takes at most `iterations` steps. It has converged if its model predicts a relative decrease in cost, or
     a step, below `tolerance`. A search is abandoned if its cost exceeds the lowest one by more than `catch_up` times
-    its predicted decrease. Searches that come close to the end of an `earlier` one are merged with it. Only the
+    its predicted decrease. Searches that come close to the end of a better `earlier` one are merged with it. Only the
     `followed` starting points with the lowest cost are used; all if None. Yields points to evaluate [s, d]. Returns the
     earlier searches, then those that converged or were still moving at the end, then the abandoned ones.
     """

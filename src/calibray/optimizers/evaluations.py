@@ -53,7 +53,7 @@ class Evaluations:
         """The residuals [n, m], for algorithms that use them."""
         if self.residuals is None:
             raise InputError(
-                "residuals = None; this optimizer uses them: call tell(x, y, residuals=..., ...)"
+                "residuals = None; this optimizer needs them: call tell(x, y, residuals=..., ...)"
             )
         return self.residuals
 
@@ -61,7 +61,7 @@ class Evaluations:
     def slopes(self) -> NDArray[np.float64]:
         """The derivatives of the residuals [n, m, d], for algorithms that use them."""
         if self.jacobian is None:
-            raise InputError("jacobian = None; this optimizer uses them: call tell(x, y, jacobian=..., ...)")
+            raise InputError("jacobian = None; this optimizer needs it: call tell(x, y, jacobian=..., ...)")
         return self.jacobian
 
     def rows(self, rows: NDArray[np.intp]) -> Evaluations:
@@ -205,7 +205,7 @@ def checked_evaluations(
     residuals, jacobian = parts["residuals"], parts["jacobian"]
     for name in sorted(uses & parts.keys()):
         if parts[name] is None:
-            raise InputError(f"{name} = None; this optimizer uses them: call tell(x, y, residuals=..., ...)")
+            raise InputError(f"{name} = None; this optimizer needs it: call tell(x, y, residuals=..., ...)")
     good = np.isfinite(values)
     errors = None if residuals is None else _array("residuals", residuals, (len(values), None))
     slopes = None

@@ -237,7 +237,7 @@ def hops(best: NDArray[np.float64], number: int, random: np.random.Generator) ->
 
 
 def _new(points: NDArray[np.float64], minima: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points inside the unit cube that are far from every minimum."""
+    """Points inside the unit cube that are farther than `SPACE` from every minimum."""
     inside = ((points >= 0.0) & (points <= 1.0)).all(axis=1)
     return points[inside & (cdist(points, minima) > SPACE).all(axis=1)]
 

@@ -45,7 +45,7 @@ Content = TypeVar("Content")
 Answer = TypeVar("Answer")
 
 CHUNK_LINKS: Final = 1000
-"""Number of links per chunk if the study states none, unless `MOST_CHUNKS` requires more."""
+"""Largest number of links per chunk if the study states none, unless `MOST_CHUNKS` requires more."""
 
 MOST_CHUNKS: Final = 64
 """Largest number of chunks if the study states no number of links, because every chunk compiles its own program."""
@@ -183,11 +183,11 @@ def trace_in_chunks(
 ) -> tuple[Paths, Convergence | None]:
     """Trace a study's links in the same chunks as a calibration, or read their paths from the cache.
 
-    With `check`, every chunk is traced again with twice the samples, unless samples are added in rounds. Returns the
-    path program of all links and, with `check`, the changes in path loss.
+    With `check`, every chunk is traced again with twice the samples. Returns the path program of all links and, with
+    `check`, the changes in path loss.
 
     Raises:
-        InputError: The links cannot be traced.
+        InputError: The links cannot be traced, or `check` is set and the study adds samples in rounds.
         EngineError: The paths do not fit into memory, or workers die repeatedly.
     """
     links, size = study.links, chunk_size(stated_chunk_size(study), len(study.links))

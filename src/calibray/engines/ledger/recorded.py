@@ -37,7 +37,7 @@ class Recorded:
         progress: Called with "waiting", the number of answers that other runs have given and the number awaited.
 
     Attributes:
-        hits: Number of candidates answered by the ledger so far; they are not RT calls.
+        hits: Number of candidates so far that needed no RT call: answered by the ledger, or repeated in a batch.
     """
 
     def __init__(

@@ -77,7 +77,7 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
     """Compile the paths of a table; paths of power 0 are left out, but not their links.
 
     Raises:
-        InputError: The table does not agree with the scene, the links or itself, or has neither links nor power.
+        InputError: The table does not agree with the scene, the links or itself, or has no power without `links`.
     """
     scene = setting.scene
     absent = np.zeros(len(table.path), dtype=bool) if table.power is None else table.power == 0

@@ -121,7 +121,8 @@ class Hits:
 def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.int64], float]:
     """Index of every interaction's face [n], and the largest distance between them [m]; `names` are the materials.
 
-    A reflection gets the nearest face that obeys the law of reflection, and any other interaction the nearest face.
+    A reflection gets the nearest face that obeys the law of reflection, any other interaction the nearest face. Except
+    for diffractions, the face must have the stated material.
 
     Raises:
         InputError: A point is on no surface (of its material), faces of different materials coincide there, or no

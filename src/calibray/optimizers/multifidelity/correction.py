@@ -389,7 +389,7 @@ class ErrorRecord:
     """Ratios of squared errors to predicted variances for all steps so far.
 
     Attributes:
-        ratios: Ratio of mean square error to predicted variance for every step.
+        ratios: Ratio of mean square error to predicted variance for every step, at most `CAPPED`.
     """
 
     ratios: list[float] = field(default_factory=list)
