@@ -1,6 +1,6 @@
 """Engines compute the path loss of candidates.
 
-- `Replay` evaluates stored paths, with derivatives, in microseconds per candidate.
+- `Replay` evaluates stored paths, with derivatives, in microseconds to milliseconds per candidate.
 - `ReplayCarriers` does the same at several carriers.
 - `ChunkedReplay` replays chunks of links in this process or on workers, which can return only sums over links.
 - `Retrace` runs the ray tracer again for every candidate, as the paper does.

@@ -47,7 +47,7 @@ XP: Final = SimpleNamespace(
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class PoseError:
-    """Transmit antennas whose direction or gain differs from the stated one; P paths, M poses, e parameters.
+    """Transmit antennas whose direction or gain differs from the stated one; P paths, M poses, T transmitters.
 
     Attributes:
         basis: Directions of departure with their basis vectors [3, 3, P], see `wave_basis`.
@@ -55,9 +55,9 @@ class PoseError:
         pose: Stated directions, each shared by several paths [M].
         mounted: Index of every path's pose [P].
         of_antenna: Indices of the paths of each antenna.
-        transmitter: Transmitter of every pose [M].
-        weights: The changes of yaw [rad], downtilt [rad] and gain [dB] of a transmitter, per unit of each effect
-            parameter [3, T, e].
+        transmitter: Index of every pose's transmitter [M].
+        weights: The changes of yaw [rad], downtilt [rad] and gain [dB] of a transmitter, per unit of each of e
+            effect parameters [3, T, e].
         antennas: The distinct antennas.
         gains: Content of the antennas, so that the program is compiled again if a gain file changes but keeps its name.
     """
@@ -121,7 +121,7 @@ def pose_error(
     Args:
         paths: The paths, with the fields of the stated antennas.
         mounting: The stated transmit antennas.
-        labels: Transmitter of every link [L].
+        labels: Name of every link's transmitter [L].
         effect_parameters: The parameters of all effects, in the order of their values.
         from_north: Whether azimuths are compass bearings.
     """

@@ -248,7 +248,7 @@ class Replay:
         """
         tables = np.repeat(base[None], size, axis=0)
         tables[: len(batch), self._rows, self._columns] = batch[:, self.parameters.of_materials]
-        # Rows beyond the batch repeat its values; their answers are dropped.
+        # Unused rows of the effects repeat values of the batch; answers for unused rows are dropped.
         of_effects = np.resize(batch[:, self.parameters.of_effects], (size, len(self.parameters.of_effects)))
         return tables, of_effects
 

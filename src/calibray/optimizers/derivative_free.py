@@ -11,7 +11,7 @@ box-shaped trust region. Points that span all directions within the region are c
 models fully linear. If a direction is missing and the step failed, a point along it is evaluated before the region
 shrinks.
 
-Gauss-Newton represents a user who has a least squares solver but no derivatives. Every accepted point requires one
+Gauss-Newton is what a user with a least squares solver but no derivatives would run. Every accepted point requires one
 further evaluation per parameter, all in one batch. `descent.py` computes the steps.
 """
 

@@ -42,8 +42,8 @@ class Request:
 
     Attributes:
         radio: Carrier, bandwidth, combining and antennas.
-        tx: Transmitter of every link [L, 3], [m].
-        rx: Receiver of every link [L, 3], [m].
+        tx: Transmitter position of every link [L, 3], [m].
+        rx: Receiver position of every link [L, 3], [m].
         materials: All materials of the scene with the candidate's values at the study's carrier, by name.
         parameters: The candidate's values by parameter name, in the fields' units.
         link_frequency: Carrier of every link [L], [Hz]; None if all links have the study's carrier.

@@ -121,8 +121,8 @@ class Hits:
 def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.int64], float]:
     """Index of every interaction's face [n], and the largest distance between them [m]; `names` are the materials.
 
-    A reflection gets the nearest face that obeys the law of reflection, any other interaction the nearest face. Except
-    for diffractions, the face must have the stated material.
+    A reflection gets the nearest face with which it obeys the law of reflection, any other interaction the nearest
+    face. Except for diffractions, the face must have the stated material.
 
     Raises:
         InputError: A point is on no surface (of its material), faces of different materials coincide there, or no
@@ -135,7 +135,7 @@ def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.
     error = hits.mirror_error(index, surfaces.normal[face])
     # A point displaced by the tolerance changes the directions of both segments.
     bent = hits.reflects[index] & (error > 4 * TOLERANCE)
-    # For each point, faces that obey the law of reflection come first, in order of distance.
+    # For each point, faces that satisfy the law of reflection come first, in order of distance.
     order = np.lexsort((distance, bent, index))
     index, face, distance, bent = index[order], face[order], distance[order], bent[order]
     matched, first = np.unique(index, return_index=True)
@@ -204,7 +204,7 @@ class Edge:
 
 
 def find_edge(surfaces: Surfaces, hits: Hits, number: int) -> Edge:
-    """The edge of a diffraction: of all pairs of faces at the point, the one that obeys Keller's law best.
+    """The edge of a diffraction: of all pairs of faces at the point, the one that satisfies Keller's law best.
 
     Raises:
         InputError: No two faces form an edge there that diffracts the wave in the direction of the path.

@@ -69,8 +69,8 @@ class RayTable:
         source: Name of the table, for messages.
         path: Number or label of every path [P].
         link: Number or label of every path's link [P]; None if the ends of the paths distinguish the links.
-        tx: Transmitter of every path [P, 3], [m].
-        rx: Receiver of every path [P, 3], [m].
+        tx: Transmitter position of every path [P, 3], [m].
+        rx: Receiver position of every path [P, 3], [m].
         vertex: Interaction points [P, D, 3], [m].
         kind: Kinds of interaction, 0 beyond the last one [P, D].
         material: Names of materials, empty where not stated [P, D].
