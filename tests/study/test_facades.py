@@ -19,7 +19,7 @@ from calibray.paths import Kind
 from calibray.reporting.wording import scene_alone_text
 from calibray.scenes.checks import SceneSurfaces
 from calibray.study import Setup, Study
-from calibray.study.facades import FacadeSection, with_facades
+from calibray.study.facades import FacadeSection, _applies, with_facades
 from calibray.study.regions import Place
 from calibray.uncertainty.joint_model import joint_model
 from link_tables import links_from_frame
@@ -183,6 +183,15 @@ def test_rules_apply_together_and_polygons_name_a_facade(tmp_path):
     file.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
     with pytest.raises(InputError, match="no polygon has 'part'"):
         applied(place, point, file, **rules)
+
+
+def test_a_whole_number_names_a_facade(tmp_path):
+    place, point = wall_points()
+    shape, file = json.loads(shapely.to_geojson(shapely.box(0, 0.2, 12, 10))), tmp_path / "houses.geojson"
+    feature = {"type": "Feature", "properties": {"house": 12}, "geometry": shape}
+    file.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    section = FacadeSection(of="brick", file="houses.geojson", column="house", position="scene")
+    assert _applies("12", section, file, place, place.surfaces(), point).all()
 
 
 def test_a_planted_ground_floor_is_found_and_used_for_predictions(tmp_path):

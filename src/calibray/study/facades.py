@@ -188,7 +188,9 @@ def _applies(
             if section.column not in columns:
                 remedy = did_you_mean(section.column, columns)
                 raise InputError(f"{file}: no column {shortened(section.column)!r}; {remedy}")
-            outline = outline[columns[section.column].astype(str) == name]
+            # In a column of numbers, 12 is stored as 12.0.
+            labels = [str(label).removesuffix(".0") for label in columns[section.column]]
+            outline = outline[np.array(labels) == name.removesuffix(".0")]
             if not len(outline):
                 raise InputError(f"{file}: no polygon has {name!r} in its column {section.column!r}")
         # Walls are on the outline itself, where a point may lie just outside.
