@@ -282,6 +282,13 @@ def test_impossible_suggestions_are_refused(result, table):
         cb.suggest(changed(result, files={name: "0" * 64 for name in result.provenance.files}), table)
 
 
+def test_fewer_candidates_than_requested_are_counted_in_a_warning(result, table, caplog):
+    assert len(cb.suggest(result, table.iloc[:2], 2)) == 2
+    assert "suggestions instead" not in caplog.text
+    assert len(cb.suggest(result, table.iloc[:2], 10)) == 2
+    assert "2 suggestions instead of 10: only 2 of 2 candidates have a path and enough power" in caplog.text
+
+
 def test_candidates_below_the_noise_floor_are_left_out(folder, result, table, caplog):
     measured = pd.read_csv(folder / "links.csv")
     measured.assign(rsrp_dbm=-measured.path_loss_db).to_csv(folder / "powers.csv", index=False)

@@ -185,7 +185,7 @@ def _renamed_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) 
 class SuggestOptions:
     """Options for the suggestions and their output."""
 
-    count: Annotated[int, option("N", "Number of links to suggest.", min=1)] = 5
+    count: Annotated[int, option("N", "Largest number of links to suggest.", min=1)] = 5
     out: Annotated[
         Path | None, option("FILE", "Also write the table to this CSV or Parquet file.", "--out", "-o")
     ] = None

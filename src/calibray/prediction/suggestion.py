@@ -76,7 +76,7 @@ def suggest(
     Args:
         result: The calibration, with the engine "replay" or "retrace" and with draws from the posterior.
         candidates: Possible measurements: links, or a table, as for `Result.predict`.
-        count: Number of suggestions.
+        count: Largest number of suggestions; a warning in the log says if there are fewer.
         progress: Called with the stage "tracing" after every launch.
         allow_changed_inputs: Continue even if a file of the scene or an antenna has changed since the calibration.
         observables: Also report which further observable is worth measuring at each suggestion.
@@ -126,6 +126,11 @@ def suggest(
     errors = replace(errors, common=errors.common[reached], position=errors.position[reached])
     beliefs = model.beliefs()
     outlooks = choose_candidates(beliefs, predicted[:, reached], slope[:, reached], errors, count)
+    if len(outlooks) < count:
+        LOG.warning(
+            "%d suggestions instead of %d: only %d of %s candidates have a path and enough power",
+            len(outlooks), count, len(reached), f"{len(links):,}",
+        )  # fmt: skip
     outlooks = [replace(outlook, index=int(reached[outlook.index])) for outlook in outlooks]
     draws = len(beliefs.point)
     before = initial_range_probability(beliefs.piece[:draws])
