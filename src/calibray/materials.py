@@ -24,8 +24,8 @@ FREQUENCIES: Final = (1e6, 1e12)
 """Range of valid carrier frequencies [Hz]; a value outside it was probably stated in MHz or GHz."""
 
 
-def check_frequency(frequency: object) -> float:
-    """Check a carrier frequency [Hz] and convert it to a float.
+def check_frequency(frequency: object, name: str = "frequency") -> float:
+    """Check a carrier frequency [Hz] and convert it to a float; messages call it `name`.
 
     Raises:
         InputError: It is not a number within `FREQUENCIES`.
@@ -39,7 +39,7 @@ def check_frequency(frequency: object) -> float:
         isinstance(frequency, Real) and lowest <= float(frequency) <= highest
     ):
         raise InputError(
-            f"frequency = {frequency!r}: must be in {lowest:g} to {highest:g} Hz; write 28.5 GHz as 28.5e9"
+            f"{name} = {frequency!r}: must be in {lowest:g} to {highest:g} Hz; write 28.5 GHz as 28.5e9"
         )
     return float(frequency)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -133,6 +135,27 @@ def test_links_to_predict_at_are_placed_like_measured_ones(log):
     np.testing.assert_allclose(links.tx[0], [0.0, 0.0, 10.0], atol=1e-3)
     assert links.group_names == ("a",)
     assert not links.measured
+
+
+def test_a_missing_height_of_a_transmitter_is_named_in_its_own_table(log):
+    sites = SourceTable(pd.DataFrame({"site": ["a", "b"], "up": [525.0, np.nan]}), source="sites.csv")
+    steps = Preparation(frame=FRAME, transmitters=sites, transmitter="site")
+    placed = (11.5755, 48.1374, "up")
+    message = r"^sites\.csv: column 'up' is missing or not finite for site b \(1 of 2 rows of log\.csv\)"
+    with pytest.raises(InputError, match=message):
+        links_from_table(
+            log.assign(site=["a", "b"]), "site", steps=steps, tx=placed, rx=("lon", "lat", "alt")
+        )
+
+
+def test_a_group_without_a_usable_row_is_named(log):
+    rows = log.assign(cell=["east", "west"], rsrp=[-80.0, -130.0])
+    steps = Preparation(frame=FRAME, noise_floor_dbm=-120.0)
+    links = measured_links(rows, columns(group="cell"), steps)
+    assert links.prepared["rows of cell west, none of which is used"] == 1
+    # Rows that the user's filter leaves out are not missed.
+    wanted = measured_links(rows, columns(group="cell"), replace(steps, where="cell == 'east'"))
+    assert not any("none of which is used" in change for change in wanted.prepared)
 
 
 @pytest.mark.parametrize("year", ["0001", "1500", "2500", "9999"])

@@ -566,6 +566,17 @@ def test_the_origin_of_a_scene_without_a_frame_places_degrees(scene, tmp_path):
     )
     assert code == 2
     assert "--origin 9.99: must be longitude and latitude in degrees" in " ".join(errors.split())
+    for option, value in (
+        ("--origin", "nan,48"),
+        ("--origin", "11,91"),
+        ("--frequency", 0),
+        ("--frequency", "nan"),
+    ):
+        given = {"--frequency": 3.5e9, "--origin": "9.99,50", option: value}
+        words = (word for pair in given.items() for word in pair)
+        status, _, errors = typed("init", scene, links, *words, "--out", "other.toml")
+        assert status == 2
+        assert errors.startswith(f"Error: {option}"), errors
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:3857", "EPSG:31467"])

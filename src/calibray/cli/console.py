@@ -111,14 +111,16 @@ def read_origin(text: str) -> tuple[float, float]:
     """Read the longitude and latitude [deg] of ``--origin``.
 
     Raises:
-        InputError: The text is not two numbers.
+        InputError: The text is not a longitude and a latitude.
     """
     try:
         longitude, latitude = (float(part) for part in text.split(","))
     except ValueError:
+        longitude = latitude = float("nan")
+    if not (abs(longitude) <= 180 and abs(latitude) <= 90):
         raise InputError(
             f"--origin {text}: must be longitude and latitude in degrees, such as 11.5755,48.1374"
-        ) from None
+        )
     return longitude, latitude
 
 

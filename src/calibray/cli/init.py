@@ -60,6 +60,7 @@ def init(
     inputs = [links, *(file for file in (known.transmitters, known.track) if file)]
     check_file(out, inputs)
     with progress_bars(log()) as progress:
+        from calibray.materials import check_frequency
         from calibray.reporting.link_map import save_positions
         from calibray.reporting.scene_tables import assumptions, warning_lines
         from calibray.study.draft import Given, schema_text
@@ -71,6 +72,8 @@ def init(
         progress("reading scene and links", 0, None)
         tx = None if known.tx is None else _position(known.tx)
         origin = None if known.origin is None else read_origin(known.origin)
+        if known.frequency is not None:
+            check_frequency(known.frequency, "--frequency")
         given = Given(known.transmitters, known.track, known.antennas, tx, known.frequency, origin)
         draft = draft_study(scene, links, out, given)
         measured = draft.study.measurements()

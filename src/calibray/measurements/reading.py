@@ -26,7 +26,7 @@ from calibray.measurements import column_names
 from calibray.measurements.links import FEW, Measurements
 from calibray.measurements.placement import RX_COLUMNS, TX_COLUMNS, clear_buildings, place_rows, read_times
 from calibray.measurements.preparation import Averaging, LinkColumns, Preparation, Quantity
-from calibray.measurements.selection import select_rows
+from calibray.measurements.selection import choose_rows, complete_rows, select_rows
 from calibray.measurements.source_table import Coordinates, SourceTable
 from calibray.measurements.table_files import read_table
 from calibray.support.messages import shortened
@@ -85,13 +85,33 @@ def measured_links(
             no row remains.
     """
     steps = steps or Preparation()
-    table = select_rows(table, steps, columns.value)
+    chosen = choose_rows(table, steps, columns.value)
+    table = complete_rows(chosen, steps, columns.value)
     table, tx, rx = place_rows(table, steps, columns.tx, columns.rx)
     columns = replace(columns, tx=tx, rx=rx)
     table = average_samples(table, steps, columns)
     table = merge_repeats(table, steps, columns)
     table = clear_buildings(table, steps, columns.rx)
-    return make_links(table, columns, steps)
+    return make_links(_note_unused(table, chosen, steps, columns), columns, steps)
+
+
+def _note_unused(
+    table: SourceTable, chosen: SourceTable, steps: Preparation, columns: LinkColumns
+) -> SourceTable:
+    """Note the transmitters and groups that have chosen rows, but none in the table."""
+    groups = [columns.group] if isinstance(columns.group, str) else columns.group or ()
+    for name in dict.fromkeys([*groups, steps.transmitter]):
+        if name not in table.frame or name not in chosen.frame:
+            continue
+        unused = ~chosen.frame[name].isin(table.frame[name])
+        labels = chosen.frame[name][unused].dropna().unique().tolist()
+        if labels:
+            listed = ", ".join(shortened(str(label)) for label in labels[:5]) + (
+                ", ..." if labels[5:] else ""
+            )
+            number = int((unused & chosen.frame[name].notna()).sum())
+            table = table.note(f"rows of {shortened(name)} {listed}, none of which is used", number)
+    return table
 
 
 def links_from_table(

@@ -38,6 +38,11 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
         1  0.0        AP 2 -61.0
         2  5.0        AP 1 -52.0
     """
+    return complete_rows(choose_rows(table, steps, value), steps, value)
+
+
+def choose_rows(table: SourceTable, steps: Preparation, value: str) -> SourceTable:
+    """The first steps of `select_rows`, which choose rows: `wide`, `track` and `where`."""
     if steps.wide:
         table, _ = mask_codes(table, list(steps.wide), steps.missing)
         table = melt(table, steps.wide, value, steps.transmitter)
@@ -51,6 +56,11 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
                 "change the filter"
             )
         table = table.select(mask)
+    return table
+
+
+def complete_rows(table: SourceTable, steps: Preparation, value: str) -> SourceTable:
+    """The other steps of `select_rows`, which complete rows and leave out those without a usable value."""
     if value in table.frame:
         table, coded = mask_codes(table, [value], steps.missing)
         # With a noise floor, a missing power was too weak to measure; without one, it carries no information.
@@ -170,9 +180,11 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
         )
     joined = transmitters.frame.drop(columns=name).iloc[[index_of_label[label] for label in compared_of_link]]
     # Columns of the links keep their names, because filters and positions refer to them.
-    joined = joined.rename(columns={name: f"{key}_{name}" for name in joined if name in table.frame})
+    renamed = {name: f"{key}_{name}" if name in table.frame else str(name) for name in joined}
+    joined = joined.rename(columns=renamed)
+    origin = {new: (transmitters.source, str(name), key) for name, new in renamed.items()}
     frame = pd.concat([table.frame.reset_index(drop=True), joined.reset_index(drop=True)], axis=1)
-    return replace(table, frame=frame)
+    return replace(table, frame=frame, joined=origin)
 
 
 def _apply_noise_floor(table: SourceTable, steps: Preparation, floor: float, value: str) -> SourceTable:

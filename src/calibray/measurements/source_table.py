@@ -31,12 +31,15 @@ class SourceTable:
             numbers from 1 [rows].
         source: Name of the file, or another name for messages.
         changes: Changes by earlier steps, such as rows left out or averaged, each with the number of rows affected.
+        joined: For each column from another table: that table's name, the column's name there, and the column of labels
+            that found its rows.
     """
 
     frame: pd.DataFrame
     row: NDArray[np.int64] = field(default=None)  # type: ignore[assignment]
     source: str = "table"
     changes: Mapping[str, int] = field(default_factory=dict)
+    joined: Mapping[str, tuple[str, str, str]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.row is None:
@@ -125,10 +128,18 @@ class SourceTable:
         numbers = parsed.to_numpy(dtype=np.float64, na_value=np.nan)
         unusable = np.isinf(numbers) if gaps else ~np.isfinite(numbers)
         if unusable.any():
+            if source in self.joined:
+                file, name, key = self.joined[source]
+                labels = self.frame[key][unusable].unique()
+                listed = ", ".join(map(str, labels[:5])) + (", ..." if len(labels) > 5 else "")
+                raise InputError(
+                    f"{file}: column {name!r} is missing or not finite for {key} {listed} ({unusable.sum()} of "
+                    f"{len(self)} rows of {self.source}); correct it, or remove these rows"
+                )
             rows = ", ".join(map(str, self.row[unusable][:5])) + (", ..." if unusable.sum() > 5 else "")
             raise InputError(
                 f"{self.source}: column {source!r} is missing or not finite in {unusable.sum()} of {len(self)} "
-                f"rows (row {rows}); correct them, or remove them with a where filter"
+                f"rows (row {rows}); correct them, or remove these rows"
             )
         return numbers
 
@@ -175,4 +186,7 @@ class SourceTable:
 
     def cell(self, index: int, column: str) -> str:
         """The file, row and column of a cell, as text for messages."""
+        if column in self.joined:
+            file, name, key = self.joined[column]
+            return f"{file}, {key} {self.frame[key].iloc[index]}, column {name!r}"
         return f"{self.source}, row {self.row[index]}, column {column!r}"

@@ -111,21 +111,18 @@ def scene_alone_text(record: Record) -> str:
         *([] if model.averaged is None else ["the average with other materials"]),
     ]
     cause = " or ".join(filter(None, (", ".join(missing[:-1]), *missing[-1:]))) or "its ceiling"
-    rms = f"{rms_db:.2f} dB (RMS over {counted(len(difference), 'link')}"
-    if model.parameters is None:
-        return (
-            f"Predictions use the model {str(model.name)!r}, which uses {_unused(record)}. The exported scene has the "
-            f"calibrated materials; its path loss differs from the predictions by {rms}).{near}"
-        )
     group, mean = np.zeros(len(difference)), "their mean"
     if "group" in links:
         group, mean = links["group"].to_numpy()[both], "the mean of each group"
     means = pd.Series(difference).groupby(group, dropna=False).transform("mean").to_numpy()
     spread_db = float(np.sqrt(np.mean((difference - means) ** 2)))
-    return (
-        f"The exported scene alone differs from the predictions by {rms}; {spread_db:.2f} dB after subtracting "
-        f"{mean}): a scene cannot contain {cause}.{near}"
-    )
+    rms = f"{rms_db:.2f} dB (RMS over {counted(len(difference), 'link')}; {spread_db:.2f} dB after subtracting {mean})"
+    if model.parameters is None:
+        return (
+            f"Predictions use the model {str(model.name)!r}, which uses {_unused(record)}. The exported scene has the "
+            f"calibrated materials; its path loss differs from the predictions by {rms}.{near}"
+        )
+    return f"The exported scene alone differs from the predictions by {rms}: a scene cannot contain {cause}.{near}"
 
 
 def method_text(record: Record, name: str) -> str:

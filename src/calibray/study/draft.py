@@ -216,7 +216,7 @@ def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
     draft.section["average"] = {"by": "cell", "size": size, "unbiased": True}
     reason = f"{AVERAGING_WAVELENGTHS} wavelengths average out fading"
     if size < fading:
-        reason = f"{CELL_SHARE:.0%} of the scene, less than {AVERAGING_WAVELENGTHS} wavelengths"
+        reason = f"{100 * CELL_SHARE:.0f} % of the scene, less than {AVERAGING_WAVELENGTHS} wavelengths"
     draft.assume("links.average", f"cells of {size:g} m", f"{rows}; {reason}")
 
 
@@ -320,7 +320,7 @@ def _indoors(links: LinksDraft) -> bool:
     """Whether most receivers are below a ceiling."""
     share = float(links.overhead.under_roof(links.measurements().rx).mean())
     indoors = share > 0.5
-    reason = f"{share:.0%} of the receivers are below a ceiling or roof"
+    reason = f"{100 * share:.0f} % of the receivers are below a ceiling or roof"
     links.assume("trace", "through walls" if indoors else "around buildings", reason)
     return indoors
 
