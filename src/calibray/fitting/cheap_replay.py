@@ -87,7 +87,7 @@ class Rows(Protocol):
         ...
 
     def known(self, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Mask of the residuals that depend on the links with a path [m]; `reached` marks these links [L]."""
+        """Mask of the residuals that depend on links with a path [m]; `reached` marks these links [L]."""
         ...
 
 
@@ -97,7 +97,7 @@ class ReplayedModel:
     """A replay as a cheap model, with the constants that the study does not calibrate.
 
     Attributes:
-        engine: The replay, over the study's parameters followed by the constants.
+        engine: The replay; its parameters are those of the study, followed by the constants.
         count: Number of the study's parameters.
         rows: Converts path loss to residuals.
         calls: Number of candidates evaluated so far.
@@ -241,7 +241,7 @@ def make_cheap_replay(
 ) -> CheapReplay:
     """Trace a problem's scene for a cheap model, if its method uses one; give the reason if this fails.
 
-    `scene` is another study of the same links, traced instead. The stage of `progress` is "tracing".
+    `scene` is another study of the same links, which is traced instead. The stage of `progress` is "tracing".
     """
     setup = problem.setup
     section = setup.study.method
@@ -269,7 +269,7 @@ def _no_model(cause: str) -> Remark:
 def with_constants(
     parameters: Parameters, materials: dict[str, Material], one_carrier: bool = True
 ) -> Parameters:
-    """Append the material constants that are not calibrated to the parameters, on a logarithmic scale.
+    """Append to the parameters the material constants that are not calibrated, on a logarithmic scale.
 
     If the links have several carriers, constants that depend on frequency stay fixed.
     """

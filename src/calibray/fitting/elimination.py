@@ -29,7 +29,7 @@ from calibray.errors import EngineError
 from calibray.fitting.nuisance import Nuisance
 
 DENSE: Final = 2**18
-"""Entries of a design up to which one dense product over all candidates is faster than sparse products."""
+"""Largest number of entries of a design for which a dense product over all candidates is faster than sparse ones."""
 
 DEPENDENT: Final = 1e-10
 """A column is linearly dependent if the columns before it leave at most this share of its squared norm. Rounding leaves
@@ -83,7 +83,7 @@ class Elimination:
     def of(cls, nuisance: Nuisance, weight: NDArray[np.float64], ridge: NDArray[np.float64]) -> Elimination:
         """Set up the normal equations with the weights of all links [L]; a weight of 0 leaves a link out.
 
-        `ridge` is the square root of the prior's term on their diagonal [q].
+        `ridge` is the square root of the priors' contribution to their diagonal [q].
         """
         counted = weight > 0
         design = nuisance.design if counted.all() else nuisance.design[counted]
@@ -119,7 +119,7 @@ class Elimination:
         return self.minimum((self.weighted @ gap.T).T)
 
     def minimum(self, side: NDArray[np.float64]) -> NDArray[np.float64]:
-        """`coefficients` [n, q] from sums over the links, the right-hand side Z' W gap [n, q].
+        """Like `coefficients` [n, q], but from sums over the links: the right-hand side Z' W gap [n, q].
 
         Raises:
             EngineError: No minimum within the bounds was found.
@@ -150,7 +150,7 @@ class Elimination:
     def projection_from_sums(
         self, side: NDArray[np.float64], coefficients: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """`projection` [n, q, d] from sums over the links, Z' W times the derivatives [n, q, d]."""
+        """Like `projection` [n, q, d], but from sums over the links: Z' W times the derivatives [n, q, d]."""
         # A coefficient at its bound does not depend on the parameters.
         free = ((coefficients > self.lower) & (coefficients < self.upper))[:, self.order]
         projection = np.empty_like(side)
@@ -176,7 +176,7 @@ class Arrowhead:
         border: Products of the block columns with the p border columns [g, b, p].
         corner: Products of the border columns with each other [p, p].
         dependent: Components whose column is zero or a combination of the columns before it, blocks before border [q].
-            The matrix has a small prior on them: they are zero unless bounds keep the others from the minimum.
+            The matrix includes a small prior on them: they are zero unless bounds keep the others from the minimum.
     """
 
     scale: NDArray[np.float64]

@@ -19,8 +19,8 @@ from calibray.study.displacement import displaces
 from calibray.support.progress import Progress, with_stage
 
 AROUND: Final = (0.0625, 0.125, 0.25, 0.5, 1.0)
-"""Traced displacements on each side of calibrated positions, as shares of the largest one: 0.5 to 8 m of 8 m. The inner
-ones are equidistant, so that the error of interpolation can be estimated."""
+"""Traced displacements on each side of calibrated positions, as shares of the largest displacement: 0.5 to 8 m if it is
+8 m. The five inner positions are equidistant, so that the error of interpolation can be estimated."""
 
 
 def retrace(
@@ -29,7 +29,7 @@ def retrace(
     """Trace with the calibrated materials, and calibrate again while the path loss changes by more than the tolerance.
 
     The tracer samples refraction and diffuse reflection according to the materials, so the set of paths can depend on
-    them. Path loss at displaced antennas is interpolated. A trace with none of these needs no check. Only the method
+    them. Path loss at displaced antennas is interpolated. If none of this applies, no check is needed. Only the method
     `auto` calibrates again; other methods have a fixed budget of RT calls. The stage of `progress` is "checking".
 
     Returns:
@@ -63,7 +63,7 @@ def retrace(
         gap = path_loss_change(engine.path_loss(best[None])[0], trail.best_modelled)
         objective = problem.objective
         settled = np.abs(gap[objective.weight > 0]).max() <= study.fidelity.tolerance_db
-        # Closer to the traced position than the nearest displacement, a further trace gains nothing.
+        # If all positions moved by at most the smallest traced displacement, a further trace gains nothing.
         settled |= displaced and bool((np.abs(best - before) <= near).all())
         if settled or study.method.name != AUTO or turn == rounds - 1:
             break
@@ -73,7 +73,7 @@ def retrace(
         if displaced and paths is not None:
             setup = setup.placed_at(parameters.named(best), AROUND)
             engine, before = replay(setup, paths), best
-            # Start from the stated weights, because errors of earlier positions no longer apply.
+            # Start from the stated weights, because interpolation errors around earlier positions no longer apply.
             weight, error_db = np.where(objective.weight > 0, stated.weight, 0.0), gap
             for effect in getattr(engine, "effects", ()):
                 if isinstance(effect, DisplacementLoss):
@@ -87,7 +87,7 @@ def retrace(
 def with_interpolation_error(
     objective: Objective, modelled: NDArray[np.float64], error_db: NDArray[np.float64]
 ) -> Objective:
-    """The objective with weights of the links that include errors of interpolated path loss [L], [dB].
+    """The objective with weights that include the errors of the links' interpolated path loss [L], [dB].
 
     Interpolation errors are largest where paths appear or vanish between the traced positions. `error_db` is a standard
     deviation in addition to that of a link's other errors, and infinite for links that are left out. The other errors
@@ -100,7 +100,7 @@ def with_interpolation_error(
     variance = np.median(residual**2 * relative) / chdtri(1, 0.5) / relative
     weight = objective.weight.copy()
     weight[counted] *= variance / (variance + error_db[counted] ** 2)
-    # The mean weight has changed, and with it the standard deviation that it stands for.
+    # The mean weight has changed, and with it the standard deviation that it represents.
     noise_db = objective.noise_db * np.sqrt(objective.weight[counted].mean() / weight[counted].mean())
     return replace(objective, weight=weight, noise_db=float(noise_db))
 

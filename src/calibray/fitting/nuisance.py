@@ -27,8 +27,8 @@ CONSTANT: Final = "constant"
 LOG_DISTANCE: Final = "log_distance"
 
 UNKNOWN_DB: Final = 10.0
-"""Assumed standard deviation between groups if only one is measured [dB per unit of the column]; it is large, because
-one group contains no information about the spread."""
+"""Assumed standard deviation between groups if only one group is measured [dB per unit of the column]; it is large,
+because one group contains no information about the spread."""
 
 START_SPREAD: Final = 6.0
 """Standard deviation between the groups of a random effect before it is estimated [dB per unit of the column]."""
@@ -149,7 +149,7 @@ def random_effect(links: Measurements, name: str, by: str, labels: ArrayLike) ->
     """The two terms of a random effect: a shared coefficient, and the deviation of each group from it.
 
     The column is as in `make_term`, and `labels` are those of the links' groups [L]. `estimate_noise` replaces the
-    prior of the deviations by the estimated spread.
+    prior of the deviations with the estimated spread.
     """
     deviations = make_term(links, deviations_of(name), by, labels=labels, prior=START_SPREAD)
     return make_term(links, name, by), replace(deviations, around=name)
@@ -267,7 +267,7 @@ class Nuisance:
         return (self.design @ coefficients.T).T
 
     def filled(self, coefficients: NDArray[np.float64], determined: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Coefficients [n, q]; those not determined [q] have the mean of the determined ones of their term.
+        """Coefficients [n, q]; one that is not determined [q] is the mean of the determined ones of its term.
 
         Undetermined deviations of a random effect keep their value, 0.
         """

@@ -40,7 +40,7 @@ class Sums:
     """Sums over links for n candidates and k columns: the derivatives, if requested, then the gap.
 
     Attributes:
-        square: Columns' products A'wA [n, k, k]; infinite for the gap if a link has no path.
+        square: Products A'wA of the columns [n, k, k]; the square of the gap is infinite if a link has no path.
         side: Products with the design Z'wA [n, q, k].
     """
 
@@ -128,9 +128,9 @@ class Objective:
         return self._fitted(self.measured - self.capped(path_loss))
 
     def completed(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The `coefficients` for the prediction of other links [n, q], for path loss [n, L], [dB].
+        """The `coefficients` for the prediction of other links [n, q], from path loss [n, L], [dB].
 
-        One that is not `determined` is the mean of the determined ones of its term, which are then fitted again.
+        One that is not `determined` is the mean of the determined ones of its term; these are then fitted again.
         """
         gap = self.measured - self.capped(path_loss)
         coefficients = self._fitted(gap)
@@ -186,7 +186,7 @@ class Objective:
 
     @property
     def fitted(self) -> float:
-        """Number of coefficients that links determine; one with a prior counts by the links' share of its precision.
+        """Number of coefficients that links determine; one with a prior counts as the links' share of its precision.
 
         Coefficients that their priors keep at zero explain no residuals, however many groups there are.
         """
@@ -212,8 +212,7 @@ class Objective:
     def residuals(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """Residuals [n, links with weight + priors], [dB], whose root mean square is `value`, for path loss [n, L].
 
-        They are model minus measurement times the square root of the weights, then one row per coefficient with a
-        prior.
+        They are (model - measurement) times the square root of the weights, then one row per coefficient with a prior.
         """
         coefficients = self.coefficients(path_loss)
         links = (self._model(path_loss, coefficients) - self.measured)[:, self._counted] * self._scale
@@ -398,7 +397,7 @@ def total(parts: Sequence[Sums], shares: Sequence[Share], columns: int) -> Sums:
 
 
 def rows(products: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrices R [n, k, k] with R'R = products, which are positive semidefinite [n, k, k].
+    """Matrices R [n, k, k] with R'R = products, for positive semidefinite products [n, k, k].
 
     Example:
         >>> root = rows(np.array([[[4.0, 2.0], [2.0, 1.0]]]))
@@ -407,7 +406,7 @@ def rows(products: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     size = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), 0.0))
     size = np.where(size > 0, size, 1.0)
-    # Scale to a unit diagonal first: otherwise rounding errors of large columns exceed the small ones.
+    # Scale to a unit diagonal first: otherwise rounding errors of large columns exceed the small columns.
     values, vectors = np.linalg.eigh(products / (size[:, :, None] * size[:, None, :]))
     root = np.sqrt(np.maximum(values, 0.0))
     return root[:, :, None] * vectors.transpose(0, 2, 1) * size[:, None, :]

@@ -1,8 +1,8 @@
 """Observables in addition to path loss in the objective: rows of residuals that follow those of the links.
 
-Their rows are weighted by the ratio of the standard deviations of the errors, like those of priors. A sum of squares is
-therefore minus twice the log likelihood in units of the noise variance of path loss. An unknown bias is eliminated: it
-is the mean residual of its group.
+Their rows are weighted by the ratio of the standard deviations of the errors, as rows of priors are. A sum of squares
+is therefore minus twice the log likelihood in units of the noise variance of path loss. An unknown bias is eliminated:
+it is the mean residual of its group.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ NOISE_ESTIMATES: Final = 5
 """Largest number of noise estimates; each uses priors weighted by the previous estimate."""
 
 TOLERANCE: Final = 0.02
-"""Relative change of the noise estimate at which the iteration ends."""
+"""Relative change of the estimates at which the iteration ends."""
 
 LEAST_NOISE_DB: Final = 1e-3
 """Lower limit of the noise estimate, so that data without noise keep a finite weight of the priors [dB]."""
@@ -113,7 +113,7 @@ def _far_from(
     objective: Objective,
     weight: NDArray[np.float64],
 ) -> Objective:
-    """The objective with the weights [links] of the links whose predicted path loss is at most `largest_db` [links]."""
+    """The objective with the weights [L] of only the links whose predicted path loss is at most `largest_db` [L]."""
     return objective.reweighted(np.where(predicted_db <= largest_db, weight, 0.0))
 
 
@@ -263,7 +263,7 @@ class GroupSpread(NamedTuple):
     Attributes:
         between: Between groups, in the unit of the residuals per unit of the column; 0 if the groups do not differ, and
             `UNKNOWN_DB` if the links do not determine it.
-        within: Of a single link, in the unit of the residuals.
+        within: Within a group, for a single link, in the unit of the residuals.
     """
 
     between: float
@@ -321,7 +321,7 @@ def group_spread(
 
 
 ROUNDS: Final = 20
-"""Largest number of estimates; if links determine most transmitters well, three suffice."""
+"""Largest number of estimates; three suffice if the links determine the values of most transmitters well."""
 
 LEAST: Final = 1e-3
 """Lower limit of a spread, as a share of the width of the bounds, so that priors stay finite."""
@@ -330,7 +330,7 @@ LEAST: Final = 1e-3
 def estimate_spreads(problem: Problem, progress: Progress | None = None) -> Problem:
     """Estimate the spread of every population of transmitters for which the study states none.
 
-    The returned problem has them in its study and its priors. The stage of `progress` is "estimating spreads".
+    The returned problem has the spreads in its study and its priors. The stage of `progress` is "estimating spreads".
     """
     fields, parameters = estimated_fields(problem.setup.study), problem.parameters
     if not fields or not problem.differentiable:

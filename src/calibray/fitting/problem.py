@@ -172,7 +172,7 @@ class Problem:
         return self.evaluate_candidates(self.parameters.from_search(points), derivatives)
 
     def evaluate_candidates(self, candidates: NDArray[np.float64], derivatives: bool = False) -> Evaluation:
-        """`evaluate` for candidates in the fields' units [n, d], without the rounding of a conversion."""
+        """Like `evaluate`, for candidates in the fields' units [n, d], without the rounding of a conversion."""
         parameters, objective, jacobian = self.parameters, self.objective, None
         with_slopes = derivatives and self.differentiable
         answer = self.respond(candidates, with_slopes)

@@ -2,10 +2,10 @@
 
 Materials are added one at a time. Each is scanned (`ray_scan.py`) on paths without materials that are added later. The
 best points, with several polarizations, are refined together with the values so far, by least squares with exact
-derivatives on all these paths. The best few are kept. The study's constants are refined as well, with the polarizations
-that fit best with them. If a misfit remains at the end, linear polarizations are searched with the materials fixed, and
-then each material is scanned again on all its paths. The last step is basin hopping (Wales and Doye, 1997): it refines
-explanations in which one or two materials are at different resonances.
+derivatives on all these paths. The best few explanations are kept. The study's constants are a further starting point,
+with the polarizations that fit best for them. If a misfit remains at the end, linear polarizations are searched with
+the materials fixed, and then each material is scanned again on all its paths. The last step is basin hopping (Wales and
+Doye, 1997): it refines explanations in which one or two materials are at different resonances.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ KNOWN_DB: Final = 0.02
 at least 0.1 dB."""
 
 EVALUATIONS: Final = (6, 12, 30)
-"""Number of evaluations per loss of a trial, of a refinement between scans, and of the last refinement."""
+"""Number of evaluations with each loss function: in a trial, between scans, and in the last refinement."""
 
 TRIALS: Final = 300
 """Largest number of trials of basin hopping; with 150 in a row without improvement, misfits were about the same."""
@@ -47,7 +47,7 @@ TRIED_PATHS: Final = 500_000
 """Target for the product of trials and paths on a large program, which bounds the time of basin hopping."""
 
 PROMISING: Final = 3.0
-"""Largest ratio of a trial's misfit to the worst one that is kept at which the trial is refined further."""
+"""A trial is refined further if its misfit is less than this multiple of the worst misfit that is kept."""
 
 MOST_HOPS: Final = 30
 """Largest change of a thickness in a trial [half wavelengths in the slab]."""
@@ -85,7 +85,7 @@ class Ratio(NamedTuple):
         here: Indices of the paths in the last call, ascending [n].
         weight: Weights of the paths, whose sum over all ratios is 1 [n].
         level_db: Power in the last call [n], [dB].
-        observed: Power in the last call over that in the earlier one [n], [dB].
+        observed: Power in the last call relative to that in the earlier one [n], [dB].
     """
 
     call: Call
@@ -105,8 +105,8 @@ def understand(
 ) -> Understanding:
     """Find the assumptions that explain the ratios of all calls.
 
-    The search starts from `before`, the assumptions for the earlier calls, if given. The last call is modelled. `known`
-    states whether the program's antennas are those of the engine.
+    The search starts from `before`, the assumptions for the earlier calls, if given. The paths of the last call are
+    modelled. `known` states whether the program's antennas are those of the engine.
     """
     last, ratios = calls[-1], ratios_of(calls)
     model = RayModel.of(parameters, last.export.paths, known)
@@ -150,7 +150,7 @@ def _search(
 
 
 def _hopped(fits: list[Understanding], ratios: list[Ratio], last: Call) -> Understanding:
-    """The best explanation of basin hopping, which refines perturbed explanations until one is exact."""
+    """The best explanation from basin hopping, which refines perturbed explanations until one is exact."""
     random, model = np.random.default_rng(len(ratios)), fits[0].model
     for _ in range(min(TRIALS, TRIED_PATHS // model.paths.num_paths) if model.assumed else 0):
         if fits[0].misfit_db <= EXACT_DB:
@@ -210,7 +210,7 @@ def _best(fits: list[Understanding]) -> list[Understanding]:
 
 
 def _meetings(model: RayModel) -> tuple[NDArray[np.bool_], list[int]]:
-    """The materials on each path [P, M], and those with a parameter, most often the only one on a path first."""
+    """Materials on each path [P, M]; and materials with a parameter, those most often alone on a path first."""
     paths, names = model.paths, list(model.paths.materials)
     meets = np.zeros((paths.num_paths, len(names)), dtype=bool)
     meets[np.repeat(np.arange(paths.num_paths), np.diff(paths.first)), paths.material] = True
@@ -334,8 +334,8 @@ def _errors(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weighted errors of the ratios [m], [dB], and their derivatives with respect to the values [m, k].
 
-    If a path has power in the engine but none in the model, no correction can restore it. Its error is the model's
-    power relative to the engine's.
+    If a path has power in the engine but none in the model, no correction can restore it. Its error is `LEAST_DB` minus
+    the power in the engine.
 
     `tables` are the constants of the last call and of each ratio's call, see `_tables`.
     """

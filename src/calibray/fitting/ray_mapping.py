@@ -1,13 +1,13 @@
-"""Ray mapping identifies the assumptions of an expensive engine that exports its rays, and replaces it by a replay.
+"""Ray mapping identifies the assumptions of an expensive engine that exports its rays, and replaces it with a replay.
 
 A few calls are enough. Each call returns the power of each path. The ratio of a path's powers at two sets of constants
 does not depend on antenna gains or units. The ratios therefore show what the engine assumes: thickness, conductivity,
 slabs or half-spaces, and the polarization of its antennas. We fit these to all ratios of the calls so far
 (`ray_fit.py`). The last call then corrects the power of every path. The next call is at the minimum of the replay of
-this corrected program, and checks it.
+this corrected program, and checks this replay.
 
 The first call is at the start values. The second call is where the ratios are most informative about the assumed
-constants: of `PROBES` random points, the one with the largest mean log determinant of the information.
+constants: of `PROBES` random points, the one where the mean log determinant of the information is largest.
 """
 
 from __future__ import annotations
@@ -50,25 +50,25 @@ SIGMA_DB: Final = 0.1
 """Standard deviation of a ratio's error for the information [dB]."""
 
 LEFT_DB: Final = 0.05
-"""Largest difference of the RMSE, and of path loss, between the best call and the minimum of the replay, if the optimum
+"""Largest difference in RMSE, and in path loss, between the best call and the minimum of the replay for an optimum that
 counts as reached [dB]."""
 
 GAP_DB: Final = 0.2
-"""Largest gap at the last call if the optimum counts as reached [dB]. After six calls, the excess RMSE was at most
+"""Largest gap at the last call for an optimum that counts as reached [dB]. After six calls, the excess RMSE was at most
 0.016 dB in six runs with gaps of 0.06 to 0.17 dB, and 0.020 to 0.15 dB in eight runs with gaps above 0.36 dB."""
 
 MISFIT_DB: Final = 0.2
-"""Largest misfit of the ratios if an engine counts as understood [dB]. Wrong minima had misfits of at least 0.8 dB.
-With 0.07 to 0.19 dB, the optimum was reached within 0.006 dB (docs/measurements/expensive-engines.md)."""
+"""Largest misfit of the ratios of an engine that counts as understood [dB]. Wrong minima had misfits of at least 0.8
+dB. At 0.07 to 0.19 dB, the optimum was reached within 0.006 dB (docs/measurements/expensive-engines.md)."""
 
 CHANGED_DB: Final = 0.5
-"""Largest change of a link's path loss without the paths that another call lacks, if an engine counts as understood
+"""An engine counts as understood only if paths that another call lacks change no link's path loss by more than this
 [dB]. Paths that appear between calls may be missing at the minimum of the replay."""
 
 SEARCHES: Final = 4
 """Ratio of the number of local searches to that of a calibration on replay; a call costs more than many searches. In a
-district with 557 interactions, 512 and 1,024 searches missed a minimum that is 0.076 dB lower with two of five seeds,
-2,048 searches with none."""
+district with 557 interactions, 512 and 1,024 searches missed a minimum that is 0.076 dB lower with two of five seeds;
+2,048 searches missed it with none."""
 
 LEAST_CALLS: Final = 3
 """Smallest number of calls of ray mapping: two that show the assumptions, and one at the minimum."""
@@ -93,7 +93,7 @@ class RayMap:
         lost: Number of links that keep no path, or have none in the replay at the best call.
         minima: Minima of the replay that replaces the engine, the lowest first, as points of the search space [k, d].
         remaining_db: RMSE at the best call minus that at the lowest of these minima [dB].
-        moved_db: RMS over the links of the replay's path loss there minus that at the best call [dB].
+        moved_db: RMS over the links of the replay's path loss at that minimum minus that at the best call [dB].
     """
 
     engine: Replay

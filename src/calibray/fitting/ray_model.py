@@ -3,7 +3,7 @@
 An engine assumes antennas, and the thickness, conductivity and permittivity of materials if they are not calibrated.
 The gain of an antenna cancels in ratios of powers, but its polarization does not. An unpolarized antenna receives both
 components of a wave. Any other antenna is linearly polarized at a slant angle in the frame of its axis (3GPP TR 38.901,
-eq. 7.3-4/5), which may be tilted.
+eq. 7.3-4/5); the axis may be tilted.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ from calibray.paths import Paths
 from calibray.tracing.antennas import wave_basis
 
 HALF_SPACE: Final = 1e4
-"""Thickness of a half-space [m]: a wave decays within it unless the conductivity is below 1e-6 S/m."""
+"""Thickness that represents a half-space [m]: a wave decays within it unless the conductivity is below 1e-6 S/m."""
 
 DECAYED: Final = 4.0
-"""Attenuation within a slab [Np] above which it acts as a half-space: the returning wave has e^-8 of its amplitude."""
+"""Attenuation in a slab [Np] above which the slab acts as a half-space: the wave returns with e^-8 of its amplitude."""
 
 RANGES: Final = {"thickness": (5e-4, HALF_SPACE), "conductivity": (1e-7, 1e3)}
 """Ranges of the assumed constants, in the fields' units."""
 
 PERMITTIVITY_FACTOR: Final = 2.0
-"""Largest ratio between a permittivity that is not calibrated and the engine's."""
+"""Largest factor between the study's value of a permittivity that is not calibrated and the engine's."""
 
 TILT: Final = 0.3
 """Largest tangent of the tilt of an antenna's axis along x or y, 17 degrees: more than the tilt of base stations."""
@@ -231,7 +231,7 @@ class RayModel:
     def _by_path(self) -> tuple[GroupedProgram, Polarized]:
         """The program with one link per path, and the polarization of its antennas."""
         count = self.paths.num_paths
-        # Path loss of such a link is minus the power of its path, whatever the phase.
+        # Path loss of such a link is minus the power of its path in dB, whatever the phase.
         nowhere = np.zeros((count, 3))
         plan = layout(
             replace(self.paths, link=np.arange(count), tx_position=nowhere, rx_position=nowhere), phases=False

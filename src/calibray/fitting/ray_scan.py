@@ -2,7 +2,7 @@
 
 A slab resonates: the power of a ray oscillates with a period of half a wavelength of thickness, so a local search ends
 in a wrong minimum. A scan evaluates a fine grid of thicknesses up to the depth where the wave has decayed, for several
-conductivities, with several polarizations at both ends. It evaluates only reflections and transmissions.
+conductivities, with several polarizations at both ends. It uses only paths of reflections and transmissions.
 
 An antenna receives almost nothing from a direction orthogonal to its polarization. Every path near such a null adds a
 minimum of the misfit. These minima are about 0.02 rad apart, so that a local search from upright antennas ends in a
@@ -51,7 +51,7 @@ SCANNED: Final = 48
 """Number of paths of a scan."""
 
 KEPT: Final = 3
-"""Number of local minima that are kept of each scan of a material, and of a search over antennas."""
+"""Number of local minima that are kept from each scan of a material, and from a search over antennas."""
 
 BATCH: Final = 512
 """Number of points that are evaluated at once."""
@@ -65,7 +65,7 @@ POLARIZATIONS: Final = [(tx, rx) for tx in (None, *SLANTS) for rx in (None, *SLA
 """Slants at both ends; None for an unpolarized antenna."""
 
 STARTS: Final = 6
-"""Number of points of each scan from which local searches start; of the best six, four found the true angles."""
+"""Number of points of each scan from which local searches start; from the best six, four found the true angles."""
 
 TILTS: Final = np.linspace(-TILT, TILT, 15)
 """Tilts of a scan along x and along y: 0.04 rad apart, twice the distance between minima."""
@@ -201,7 +201,7 @@ class _Scanned(NamedTuple):
         constants: Permittivity, conductivity and thickness at every call, the last one first [C + 1, 3, D, P].
         tx: Fields at the transmitter [T, 2, P].
         rx: Conjugate fields at the receiver [R, 2, P].
-        wavelength: [m].
+        wavelength: Wavelength [m].
         weight: Weights of the ratios [C, P]; their sum is 1.
         change_db: The ratios [C, P], [dB].
     """
@@ -351,7 +351,7 @@ def antennas(parts: list[Gains], angles: NDArray[np.float64]) -> list[NDArray[np
 
 
 def errors(parts: list[Gains], angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Errors of the ratios [m], [dB], times the roots of weights with mean 1."""
+    """Errors of the ratios [m], [dB], times the square roots of the weights, whose mean is set to 1."""
     errors, weights = [], np.concatenate([part.weight for part in parts])
     for part in parts:
         tx, rx = (
@@ -365,7 +365,7 @@ def errors(parts: list[Gains], angles: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def _scan_angles(parts: list[Gains], end: int, other: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """The angles [3] of one end with the smallest loss, for given angles of the other end."""
+    """Sets of angles [3] of one end with the smallest losses, for given angles of the other end."""
     x, y = (each.ravel() for each in np.meshgrid(TILTS, TILTS))
     axis, loss = np.stack([x, y, np.ones_like(x)], axis=1), 0.0
     cos, sin = np.cos(FINE_SLANTS)[:, None], np.sin(FINE_SLANTS)[:, None]

@@ -110,13 +110,14 @@ Evaluate = Callable[[NDArray[np.float64], bool], Evaluation]
 """Evaluates points of the search space [n, d]; the flag requests derivatives."""
 
 SEARCHES: Final = 64
-"""Number of local searches for further minima if the method kept only its best one, and on a corrected program."""
+"""Number of local searches for further minima if the method kept only its best one."""
 
 BASINS: Final = 24
-"""Smallest number of minima from which posterior sampling starts."""
+"""Largest number of known minima from which local searches of a changed problem start."""
 
 RELEVANT: Final = 20.0
-"""Largest excess of the sum of squares for a relevant minimum, in noise variances; a likelihood ratio of exp(-10)."""
+"""Largest excess of a relevant minimum over the lowest sum of squares, in noise variances: a likelihood ratio of
+e^-10."""
 
 
 def rounds(optimizer: Optimizer, evaluate: Evaluate) -> Iterator[tuple[NDArray[np.float64], Evaluation]]:
@@ -153,8 +154,8 @@ class Trail:
         candidates: The candidates in the fields' units, each [d].
         rmse_db: RMSE of each candidate [dB].
         best_db: RMSE of the best candidate up to each call [dB].
-        iteration: Round of each call.
-        seconds: Time of each call since the start [s].
+        iteration: Number of the round of each call, from 1.
+        seconds: Time from the start to each call [s].
         best: The best candidate [d].
         best_modelled: The engine's values for the best candidate [L].
         best_rmse_db: RMSE of the best candidate [dB].
