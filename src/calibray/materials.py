@@ -1,8 +1,8 @@
 """Radio materials: the constants of a surface, and the laws of ITU-R P.2040 from which named materials take them.
 
-Below 100 GHz, P.2040-1 differs from the later revisions (concrete has 5.31 instead of 5.24, glass 6.27 instead of
-6.31). P.2040-2 and -3 have the same Table 3. P.2040-4 keeps its rows and adds rows above 100 GHz and new materials.
-Sionna RT 2.2 follows P.2040-4; below 100 GHz, the default "P.2040-3" gives the same values.
+Below 100 GHz, P.2040-1 differs from the later revisions (relative permittivity 5.31 instead of 5.24 for concrete, 6.27
+instead of 6.31 for glass). P.2040-2 and -3 have the same Table 3. P.2040-4 keeps its rows and adds rows above 100 GHz
+and new materials. Sionna RT 2.2 follows P.2040-4; below 100 GHz, the default "P.2040-3" gives the same values.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ class Share:
     """The objective's data of one chunk of links; called with the path loss of the chunk, it returns its sums.
 
     Attributes:
-        links: Indices within the chunk of its m links with weight [m].
+        links: Indices within the chunk of its m links with nonzero weight [m].
         measured: Their measured path loss [m], [dB].
         weight: Their weights, normalised as in the objective [m].
         design: The c columns of the nuisance with entries at these links [m, c].
@@ -294,7 +294,7 @@ class Objective:
 
     @property
     def num_counted(self) -> int:
-        """Number of links with weight; later rows of the residuals belong to priors."""
+        """Number of links with nonzero weight; later rows of the residuals belong to priors."""
         return len(self._scale)
 
     def capped(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:

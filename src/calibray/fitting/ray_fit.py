@@ -1,8 +1,8 @@
 """Identifies an engine's assumptions from ratios of its rays' powers: a global search over constants and polarizations.
 
-Materials are added one at a time. Each is scanned (`ray_scan.py`) on paths without materials that are added later. The
-best points, with several polarizations, are refined together with the values so far, by least squares with exact
-derivatives on all these paths. The best few explanations are kept. The study's constants are a further starting point,
+Materials are added one at a time. Each is scanned (`ray_scan.py`) on paths without materials that are added later.
+Least squares with exact derivatives on all these paths then refines the best points, for several polarizations, jointly
+with the values already found. The best few explanations are kept. The study's constants are a further starting point,
 with the polarizations that fit best for them. If a misfit remains at the end, linear polarizations are searched with
 the materials fixed, and then each material is scanned again on all its paths. The last step is basin hopping (Wales and
 Doye, 1997): it refines explanations in which one or two materials are at different resonances.

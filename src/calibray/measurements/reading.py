@@ -488,7 +488,7 @@ def _note_steps(
 
 
 def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkColumns) -> list[str]:
-    """Columns that distinguish links at the same positions; samples with different values are not averaged."""
+    """Columns that distinguish links at the same positions; samples that differ in one are not averaged."""
     groups: Sequence[str] = [columns.group] if isinstance(columns.group, str) else columns.group or ()
     names = [*groups, *steps.keep]
     names += [name for name in (columns.frequency, columns.tx_power_dbm) if isinstance(name, str)]

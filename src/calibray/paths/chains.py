@@ -312,7 +312,7 @@ def _compose(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray
 def _in_path_order(
     parts: list[tuple[NDArray[Any], ...]], empty: Diffuse | Diffraction
 ) -> list[NDArray[np.float64]]:
-    """Columns of a table that was collected step by step, in the order of the interactions."""
+    """Sort the columns of a table collected step by step into the order of the interactions."""
     if not parts:
         return list(vars(empty).values())
     path, step, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))

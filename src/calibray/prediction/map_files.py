@@ -110,7 +110,7 @@ class CoverageMap:
     def save(
         self, folder: str | Path, inputs: Iterable[Path] = (), overwrite: bool = False
     ) -> tuple[str, ...]:
-        """Write the map as GeoTIFF, picture and table.
+        """Write the map as a GeoTIFF, a picture and a table.
 
         Args:
             folder: Folder to write `map.tif`, `map.png` and `map.csv` into; created if absent.

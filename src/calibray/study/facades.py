@@ -37,7 +37,7 @@ BESIDE: Final = 0.1
 
 
 class FacadeSection(Section):
-    """``[facades.NAME]``: a material of the parts of walls to which all stated rules apply.
+    """``[facades.NAME]``: a separate material for those parts of walls that meet all the stated criteria.
 
     Attributes:
         of: Material of the scene whose surfaces are divided; the new one has its constants unless ``[materials]``

@@ -25,10 +25,10 @@ from calibray.tracing.gain_table import read_gain_table
 from calibray.tracing.settings import Antenna
 
 BELOW_FREE_SPACE_DB: Final = 6.0
-"""Largest plausible margin of path loss below free-space loss [dB]; a ground reflection alone gains up to 6 dB."""
+"""Largest plausible margin of path loss below free-space loss [dB]; one ground reflection adds up to 6 dB."""
 
 GUIDED_DB: Final = 12.0
-"""The same margin under a roof [dB]: in a corridor of 40 m by 2.4 m, four reflections gain up to 11 dB at 60 GHz."""
+"""The same margin under a roof [dB]: in a corridor of 40 m by 2.4 m, four reflections add up to 11 dB at 60 GHz."""
 
 FAR: Final = 10.0
 """Distance from the scene, in scene sizes, at which links cannot belong to it."""

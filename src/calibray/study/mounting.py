@@ -41,7 +41,7 @@ def mounting_columns(study: StudyModel) -> tuple[str, ...]:
 
 
 def link_mountings(study: StudyModel, links: Measurements) -> dict[str, Mounting]:
-    """The antennas at the ends, "tx" or "rx", if they differ between links.
+    """The mounting at each end of the links ("tx", "rx") where it differs between links.
 
     Raises:
         InputError: A column is missing or malformed, or names an unknown antenna.

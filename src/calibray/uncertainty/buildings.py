@@ -295,7 +295,7 @@ def _chunk_materials(chunk: Chunk) -> list[dict[str, Material]]:
 
 
 def _split_chunk(chunk: Chunk, splitting: _Splitting) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
-    """Parameter and building of each constant of a chunk [c, 2], the buildings met, and the number of interactions."""
+    """Parameter and building of each constant in a chunk [c, 2], buildings that paths hit, number of interactions."""
     split = chunk.derived(splitting)
     return np.stack([split.parameter_of, split.building_of], axis=1), split.met, split.interactions
 

@@ -89,7 +89,7 @@ class ResponseRows:
 
     Attributes:
         problem: The problem.
-        links: Indices of the m links with weight [m].
+        links: Indices of the m links with nonzero weight [m].
     """
 
     problem: Problem

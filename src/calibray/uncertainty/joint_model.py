@@ -51,8 +51,8 @@ class QuadraticForms:
         marginal: The density.
         group: Group of each model; models of one group are evaluated together [models]. It is the model's own index for
             a Gaussian model, -1 for Student's t, -2 for gross errors.
-        square: Matrix [m, m], constant and exponent of each Gaussian model's form, None for other models. Empty if
-            there are too many links, or censored ones.
+        square: For each Gaussian model, the matrix [m, m], constant and exponent of its quadratic form; None for other
+            models. Empty if there are too many links, or censored ones.
     """
 
     marginal: Marginal

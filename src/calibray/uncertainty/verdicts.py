@@ -27,7 +27,7 @@ from calibray.uncertainty.draws import Draws, systematic_resampling
 def local_intervals(problem: Problem, trail: Trail, optimum: Evaluation) -> dict[str, Interval]:
     """Intervals by parameter from linear theory in the search space, where a parameter over decades is logarithmic.
 
-    `optimum` is the evaluation of the optimum, with derivatives.
+    `optimum` is the evaluation at the optimum, with derivatives.
     """
     parameters = problem.parameters
     # Compressed residuals are scaled so that their sum of squares is that of the full residuals.
@@ -143,9 +143,9 @@ KERNEL_SHARE: Final = 0.08
 
 MOST_INDEPENDENT: Final = 1000
 """Largest number of draws that count as independent; further draws are mostly later states of the same members. In four
-districts, 90 % sets then contain 0.88 to 0.90 of a reference posterior. The sets of window constants have 1.5 pieces on
-average, those of the reference 1.1. If all draws count, the sets contain 0.87 to 0.90, and those of window constants
-have 2.0 pieces (`benchmarks/simulation_based.py --reference`)."""
+districts, 90 % sets then contain 0.88 to 0.90 of a reference posterior. The sets for the
+constants of window glass have 1.5 pieces on average, those of the reference 1.1. If all draws count as independent, the
+sets contain 0.87 to 0.90, and those for window glass have 2.0 pieces (`benchmarks/simulation_based.py --reference`)."""
 
 LEAST_SHARE: Final = 0.005
 """Smallest share of the posterior in a piece; smaller shares count as chance."""

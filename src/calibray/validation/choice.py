@@ -82,7 +82,7 @@ def fit_prediction_model(
     residuals: HeldOutResiduals,
     retrace_gap_db: NDArray[np.float64] | None = None,
 ) -> FittedModel:
-    """Fit the chosen model to all links that have a weight.
+    """Fit the chosen model to all links that have a nonzero weight.
 
     An average uses the scene of its first model, and also stores the parameters of the second.
 

@@ -153,7 +153,7 @@ def choose(errors: Errors, position: NDArray[np.float64]) -> str:
 
 
 def predicting(errors: Errors, position: NDArray[np.float64]) -> str:
-    """The prediction model chosen by held-out residuals: the average that replaces the chosen model, if any."""
+    """The prediction model: the model chosen by held-out residuals, or the average that replaces it, if any."""
     name = choose(errors, position)
     average = AVERAGE_OF.get(name, name)
     return average if average in errors else name

@@ -100,7 +100,7 @@ def log_distance(links: Measurements, objective: Objective, known_db: NDArray[np
     `without_scene` [links], [dB].
 
     Raises:
-        EngineError: Fewer than two links have a weight.
+        EngineError: Fewer than two links have a nonzero weight.
     """
     if np.count_nonzero(objective.weight) < 2:
         raise EngineError("the log-distance model needs at least two calibration links")
@@ -133,7 +133,7 @@ def obstructed(links: Measurements, objective: Objective, known_db: NDArray[np.f
     is a coefficient. The arguments are those of `log_distance`.
 
     Raises:
-        EngineError: Fewer than two links have a weight.
+        EngineError: Fewer than two links have a nonzero weight.
     """
     model, known_db = log_distance(links, objective, known_db)
     terms, present = list(model.nuisance.terms), {term.by for term in model.nuisance.terms}

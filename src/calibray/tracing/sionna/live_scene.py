@@ -1,4 +1,4 @@
-"""Scenes in the memory of plain Sionna RT: reads them, sets their materials, and compares them with an export."""
+"""Reads scenes loaded in plain Sionna RT, sets their materials, and compares them with an export."""
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false
