@@ -189,4 +189,7 @@ def test_a_road_in_the_plane_of_the_ground_is_named(tmp_path):
     finding = next(item for item in check_scene(write_scene(tmp_path, plane, materials)).findings if not item.subject
                    and "parallel" in item.problem)  # fmt: skip
     assert finding.severity == "warning"
-    assert "(such as 'mesh-road' and 'mesh-ground'), 2 of them to one of another material" in finding.problem
+    assert (
+        "(such as 'mesh-road' and 'mesh-ground'), 2 of them to a face of a different material"
+        in finding.problem
+    )

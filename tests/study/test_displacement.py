@@ -235,7 +235,7 @@ def test_impossible_displacements_are_refused(folder: Path, change: dict[str, ob
 
 def test_heights_are_calibrated_in_one_process(folder: Path) -> None:
     setup = Setup.open(study(folder, "stated.csv"), tracer=TwoRay)
-    with pytest.raises(InputError, match=r"'tx:A.height': .* without --workers"):
+    with pytest.raises(InputError, match=r"'tx:A.height': .* without workers \(--workers"):
         engines.make(setup, workers=engines.InProcess())
 
 
