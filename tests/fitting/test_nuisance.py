@@ -280,10 +280,10 @@ def test_terms_at_other_links_keep_centre_and_columns():
 @pytest.mark.parametrize(
     ("options", "fault"),
     [
-        ({"bounds": (2.0, 1.0)}, r"'x': bounds = \[2, 1\]; the lower must be less"),
+        ({"bounds": (2.0, 1.0)}, r"'x': bounds = \[2, 1\]; the lower bound must be less"),
         ({"bounds": (np.nan, 1.0)}, r"'x': bounds"),
         ({"prior": 0.0}, "'x': prior = 0; a standard deviation must be greater than 0"),
-        ({"labels": ["a"]}, r"'x': labels of shape \(1,\), must be \(5,\)"),
+        ({"labels": ["a"]}, r"'x': labels have shape \(1,\), but must have \(5,\)"),
         ({"by": "tree_m"}, "no column 'tree_m'; did you mean 'trees_m'"),
     ],
 )

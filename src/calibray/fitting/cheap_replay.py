@@ -1,8 +1,8 @@
 """The replay of a study's scene as a cheap model of an engine without derivatives.
 
-We trace the study's scene once; evaluating a candidate on its paths then takes microseconds. The constants of the cheap
-model are the material constants that the study does not calibrate: above all thickness, then conductivity and
-permittivity. Space mapping adjusts them.
+We trace the study's scene once. Evaluating a candidate on the stored paths then takes microseconds. The constants of
+the cheap model are the material constants that the study does not calibrate: thickness, conductivity and permittivity,
+in order of importance. Space mapping adjusts these constants.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ BOUND: Final = 3.0
 """Distance of a constant's bounds from its declared value, in standard deviations."""
 
 METAL: Final = 1e4
-"""Conductivity above which a material reflects almost all power, whatever its other constants [S/m]."""
+"""Conductivity [S/m] above which a material reflects almost all power, regardless of its other constants."""
 
 
 class StoredPaths(Protocol):
@@ -53,7 +53,7 @@ class StoredPaths(Protocol):
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss, and its derivatives with respect to the parameters [n, L, d]."""
+        """Path loss [n, L], [dB], and its derivatives with respect to the parameters [n, L, d]."""
         ...
 
 
@@ -188,7 +188,7 @@ class ProblemRows:
 
     @property
     def filling(self) -> NDArray[np.float64]:
-        """The ceiling, or without a ceiling the measured path loss [L], [dB]."""
+        """The ceiling if there is one, otherwise the measured path loss [L], [dB]."""
         objective = self.problem.objective
         if objective.ceiling_db is not None:
             return np.full(len(objective.measured), objective.ceiling_db)
@@ -228,8 +228,8 @@ class CheapReplay:
     """The cheap model of a calibration, if any.
 
     Attributes:
-        model: The model; None if the study requests none or it cannot be made.
-        remark: The reason why it cannot be made.
+        model: The model; None if the study does not request one or if it cannot be made.
+        remark: The reason why the model cannot be made.
     """
 
     model: ReplayedModel | None = None
@@ -239,9 +239,9 @@ class CheapReplay:
 def make_cheap_replay(
     problem: Problem, progress: Progress | None = None, scene: Setup | None = None
 ) -> CheapReplay:
-    """Trace a problem's scene for a cheap model, if its method uses one; give the reason if this fails.
+    """Trace a problem's scene for a cheap model if its method uses one; report the reason if this fails.
 
-    `scene` is another study of the same links, which is traced instead. The stage of `progress` is "tracing".
+    If `scene`, another study of the same links, is given, it is traced instead. The stage of `progress` is "tracing".
     """
     setup = problem.setup
     section = setup.study.method
@@ -269,7 +269,7 @@ def _no_model(cause: str) -> Remark:
 def with_constants(
     parameters: Parameters, materials: dict[str, Material], one_carrier: bool = True
 ) -> Parameters:
-    """Append to the parameters the material constants that are not calibrated, on a logarithmic scale.
+    """Append the material constants that are not calibrated to the parameters, on a logarithmic scale.
 
     If the links have several carriers, constants that depend on frequency stay fixed.
     """

@@ -1,4 +1,4 @@
-"""Eliminates the nuisance: best coefficients and projected derivatives, for all candidates at once.
+"""Elimination of the nuisance: the best coefficients and the projected derivatives of all candidates together.
 
 Variable projection (G. H. Golub and V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973): the coefficients b
 minimise sum_i w_i (gap_i - z_i.b)^2 + sum_j (ridge_j b_j)^2 within their bounds. With one column per link, each
@@ -8,12 +8,12 @@ Otherwise the normal equations have an arrowhead matrix: diagonal blocks bordere
 groups share no link, so they form separate blocks. Columns over all links overlap with every block and form the border.
 Block elimination solves the system in about the time needed to read the matrix, for any number of groups.
 
-Block principal pivoting enforces the bounds (L. F. Portugal, J. J. Judice and L. N. Vicente, A comparison of block
-pivoting and interior-point algorithms for linear least squares problems with nonnegative variables, Mathematics of
-Computation 63, 1994), in all problems of a batch at once. Each iteration fixes the components that leave their bounds,
-releases the fixed components whose gradient points inwards, and solves again. If the number of infeasible components
-stops decreasing, only the last one is exchanged (Murty's rule), which guarantees termination. The result meets the
-optimality conditions exactly, without a step length or a convergence tolerance.
+Block principal pivoting (L. F. Portugal, J. J. Judice and L. N. Vicente, A comparison of block pivoting and
+interior-point algorithms for linear least squares problems with nonnegative variables, Mathematics of Computation 63,
+1994) enforces the bounds in all problems of a batch simultaneously. Each iteration fixes the components that leave
+their bounds, releases the fixed components whose gradient points inwards, and solves again. If the number of infeasible
+components stops decreasing, only the last of them is exchanged (Murty's rule), which guarantees termination. The result
+meets the optimality conditions exactly, without a step length or a convergence tolerance.
 """
 
 from __future__ import annotations
@@ -29,25 +29,26 @@ from calibray.errors import EngineError
 from calibray.fitting.nuisance import Nuisance
 
 DENSE: Final = 2**18
-"""Largest number of entries of a design for which a dense product over all candidates is faster than sparse ones."""
+"""Largest number of entries of a design for which a dense product over all candidates is faster than sparse
+products."""
 
 DEPENDENT: Final = 1e-10
-"""A column is linearly dependent if the columns before it leave at most this share of its squared norm. Rounding leaves
-about 1e-16 per column."""
+"""A column counts as linearly dependent if at most this share of its squared norm remains after projection onto the
+preceding columns. Rounding leaves about 1e-16 per column."""
 
 PRIOR: Final = 1e-6
 """Weight of the prior on a linearly dependent column, relative to its squared norm. In 600 random problems with bounds,
-three sums of squares are then 3e-5 to 4e-4 above the minimum; with 1e-7, coefficients lose a digit."""
+three sums of squares are then 3e-5 to 4e-4 above the minimum. With 1e-7, the coefficients lose a digit."""
 
 ROUNDING: Final = 1e-11
-"""Tolerance for a bound violation or a gradient, relative to the size of the right-hand side: rounding of double
-precision."""
+"""Tolerance for rounding errors of bound violations and gradients in double precision, relative to the size of the
+right-hand side."""
 
 PATIENCE: Final = 3
 """Number of full exchanges without progress before single exchanges start."""
 
 MAX_EXCHANGES: Final = 1000
-"""Largest number of exchanges; tested problems need far fewer."""
+"""Largest allowed number of exchanges; the tested problems required far fewer."""
 
 Matrix = NDArray[np.float64] | sparse.csr_array
 
@@ -60,13 +61,13 @@ class Elimination:
         design: Columns Z of the nuisance at the m links with weight [m, q].
         weighted: Z' W, with the diagonal matrix W of the weights [q, m].
         data: Z' W Z, the normal equations without priors [q, q].
-        normal: The normal equations with priors, columns in the order of `order`.
+        normal: The normal equations with priors; `order` states the order of their columns.
         order: Index in the design of each column of `normal` [q].
         lower: Lower bounds [q].
         upper: Upper bounds [q].
-        separable: Whether no link has more than one column.
-        determined: Mask of the columns that the links determine [q]. Of linearly dependent columns, those of the finest
-            grouping are kept.
+        separable: Whether each link has at most one column.
+        determined: Mask of the columns that the links determine [q]. Among linearly dependent columns, those of the
+            finest grouping count as determined.
     """
 
     design: Matrix
@@ -83,7 +84,7 @@ class Elimination:
     def of(cls, nuisance: Nuisance, weight: NDArray[np.float64], ridge: NDArray[np.float64]) -> Elimination:
         """Set up the normal equations with the weights of all links [L]; a weight of 0 leaves a link out.
 
-        `ridge` is the square root of the priors' contribution to their diagonal [q].
+        `ridge` is the square root of the priors' contribution to the diagonal of these equations [q].
         """
         counted = weight > 0
         design = nuisance.design if counted.all() else nuisance.design[counted]
@@ -111,7 +112,8 @@ class Elimination:
         """The best coefficients [n, q], [dB] per unit of the column.
 
         The gap is measured minus modelled path loss at the links with weight [n, m], [dB]. An undetermined coefficient
-        is the value within its bounds nearest to 0, unless bounds prevent the others from reaching the minimum.
+        has the value nearest to 0 within its bounds, unless the bounds prevent the other coefficients from reaching the
+        minimum.
 
         Raises:
             EngineError: No minimum within the bounds was found.
@@ -136,10 +138,10 @@ class Elimination:
     def projection(
         self, slope: NDArray[np.float64], coefficients: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Least-squares coefficients [n, q, d] of the derivatives on the design; 0 for a coefficient at its bound.
+        """Coefficients [n, q, d] of a least-squares fit of the design to the derivatives; 0 for those at a bound.
 
-        These are minus the derivatives of the best coefficients [n, q] with respect to the parameters. `slope` has the
-        derivatives of the modelled path loss at the links with weight [n, m, d].
+        They are the negative derivatives of the best coefficients [n, q] with respect to the parameters. `slope`
+        contains the derivatives of the modelled path loss at the links with weight [n, m, d].
         """
         if isinstance(self.weighted, np.ndarray):
             side = self.weighted @ slope
@@ -175,8 +177,9 @@ class Arrowhead:
         blocks: The g diagonal blocks [g, b, b].
         border: Products of the block columns with the p border columns [g, b, p].
         corner: Products of the border columns with each other [p, p].
-        dependent: Components whose column is zero or a combination of the columns before it, blocks before border [q].
-            The matrix includes a small prior on them: they are zero unless bounds keep the others from the minimum.
+        dependent: Components with a column that is zero or a linear combination of the preceding columns [q]; the
+            blocks precede the border. The matrix includes a small prior on these components. They are therefore zero
+            unless the bounds prevent the other components from reaching the minimum.
     """
 
     scale: NDArray[np.float64]
@@ -273,7 +276,7 @@ class Arrowhead:
         return self._solve(free, rest[..., None])[..., 0]
 
     def _solve(self, free: NDArray[np.bool_], side: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Block elimination; fixed components have a row of the identity."""
+        """Solution by block elimination; fixed components have rows of the identity."""
         groups, width, edge = self.border.shape
         split = groups * width
         blocks, border, corner = self._restricted(free)
@@ -326,10 +329,11 @@ def _to_exchange(
     patience: NDArray[np.int64],
     pending: NDArray[np.intp],
 ) -> NDArray[np.bool_]:
-    """Components to exchange [r, q]: all infeasible ones while their number decreases, else only the last of each part.
+    """Components to exchange [r, q]: all infeasible ones while their number decreases, then the last one of each part.
 
-    Infeasible components [r, q] belong to the unsolved problems `pending` [r]. For each independent part [m, i], the
-    smallest number so far and the remaining full exchanges without progress are updated in place.
+    `infeasible` is the mask of the infeasible components [r, q] of the unsolved problems `pending` [r]. For each
+    independent part [m, i], the function updates `fewest`, the smallest number so far, and `patience`, the remaining
+    full exchanges without progress, in place.
     """
     parts = infeasible.reshape(len(infeasible), fewest.shape[1], -1)
     count = parts.sum(axis=2)

@@ -19,22 +19,24 @@ from calibray.study.displacement import displaces
 from calibray.support.progress import Progress, with_stage
 
 AROUND: Final = (0.0625, 0.125, 0.25, 0.5, 1.0)
-"""Traced displacements on each side of calibrated positions, as shares of the largest displacement: 0.5 to 8 m if it is
-8 m. The five inner positions are equidistant, so that the error of interpolation can be estimated."""
+"""Traced displacements on each side of a calibrated position, as shares of the largest displacement: 0.5 to 8 m if the
+largest is 8 m. The five inner positions are equidistant, so that the interpolation error can be estimated."""
 
 
 def retrace(
     problem: Problem, trail: Trail, progress: Progress | None = None
 ) -> tuple[Problem, Trail, NDArray[np.float64] | None]:
-    """Trace with the calibrated materials, and calibrate again while the path loss changes by more than the tolerance.
+    """Trace with the calibrated materials, and calibrate again as long as path loss changes by more than the tolerance.
 
     The tracer samples refraction and diffuse reflection according to the materials, so the set of paths can depend on
-    them. Path loss at displaced antennas is interpolated. If none of this applies, no check is needed. Only the method
-    `auto` calibrates again; other methods have a fixed budget of RT calls. The stage of `progress` is "checking".
+    them. Path loss at displaced antennas is interpolated. If none of these applies, the paths are not traced again.
+    Only the method `auto` calibrates again; other methods have a fixed budget of RT calls. The stage of `progress` is
+    "checking".
 
     Returns:
-        The problem of the last calibration, its search, and the gap of every link: path loss on paths traced with the
-        calibrated materials minus path loss on the paths of the calibration [L], [dB]; None if not checked.
+        The problem of the last calibration, its search, and the gap of every link [L], [dB]; the gap is None if not
+        checked. It is the path loss on paths traced with the calibrated materials minus that on the paths of the
+        calibration.
     """
     study, parameters = problem.setup.study, problem.parameters
     section = study.engine
@@ -89,9 +91,9 @@ def with_interpolation_error(
 ) -> Objective:
     """The objective with weights that include the errors of the links' interpolated path loss [L], [dB].
 
-    Interpolation errors are largest where paths appear or vanish between the traced positions. `error_db` is a standard
-    deviation in addition to that of a link's other errors, and infinite for links that are left out. The other errors
-    are estimated from the residuals at the modelled path loss [L], [dB].
+    Interpolation errors are largest where paths appear or vanish between the traced positions. `error_db` is the
+    standard deviation of the interpolation error, in addition to a link's other errors. It is infinite for links that
+    are left out. The other errors are estimated from the residuals at the modelled path loss [L], [dB].
     """
     counted = (objective.weight > 0) & np.isfinite(error_db)
     residual = (objective.model(modelled[None])[0] - objective.measured)[counted]
@@ -106,18 +108,18 @@ def with_interpolation_error(
 
 
 def path_loss_change(after: NDArray[np.float64], before: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Change of path loss [L], [dB]; 0 for a link without a path in both, infinite for one without a path in one."""
+    """Change of path loss [L], [dB]; 0 for a link without a path in either trace, infinite if only one has a path."""
     lost = np.isinf(after) & np.isinf(before)
     return np.where(lost, 0.0, after - np.where(lost, 0.0, before))
 
 
 def traced_again(path_loss_db: NDArray[np.float64], gap: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Path loss [L], [dB], on the paths of the new trace; unchanged for links that had no path before."""
+    """Path loss [L], [dB], on the paths of the new trace; unchanged for links without a path in the earlier trace."""
     return np.where(np.isneginf(gap), path_loss_db, path_loss_db + np.where(np.isneginf(gap), 0.0, gap))
 
 
 def largest_gap(gap: NDArray[np.float64] | None, counted: NDArray[np.bool_]) -> float | None:
-    """Largest gap of the links with weight and a path on both traces [dB]; None if not checked."""
+    """Largest gap of the links with weight and a path in both traces [dB]; None if not checked."""
     if gap is None:
         return None
     return float(np.abs(gap[counted & np.isfinite(gap)]).max(initial=0.0))

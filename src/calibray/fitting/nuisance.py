@@ -2,7 +2,7 @@
 
 A term is one column of the links: a constant (an offset), the logarithm of the distance (a slope per decade), or any
 numeric column of the table. It has one coefficient for all links or one per group. Several terms form one design
-[links, q]. The design is sparse: a link has one entry per term, for any number of groups.
+[links, q]. The design is sparse: a link has one entry per term, regardless of the number of groups.
 
 The model is linear in the coefficients. For every candidate, the best coefficients follow in closed form (variable
 projection), within their bounds and with Gaussian priors; see `elimination.py`.
@@ -27,8 +27,8 @@ CONSTANT: Final = "constant"
 LOG_DISTANCE: Final = "log_distance"
 
 UNKNOWN_DB: Final = 10.0
-"""Assumed standard deviation between groups if only one group is measured [dB per unit of the column]; it is large,
-because one group contains no information about the spread."""
+"""Assumed standard deviation between groups if only one group is measured [dB per unit of the column]. It is large
+because a single group contains no information about the spread."""
 
 START_SPREAD: Final = 6.0
 """Standard deviation between the groups of a random effect before it is estimated [dB per unit of the column]."""
@@ -51,10 +51,11 @@ class Term:
         group: Index of each link's group in `labels` [L]; -1 for a link in none of these groups.
         labels: Labels of the groups; one empty label if all links share one coefficient.
         bounds: Lower and upper bound of every coefficient, [dB] per unit of the column.
-        prior: Standard deviation of the coefficients' Gaussian prior around zero, in the same unit; +inf for none.
+        prior: Standard deviation of the coefficients' Gaussian prior around zero, in the unit of the bounds; +inf if
+            flat.
         centre: Value subtracted from the column: the mean of log10(distance / 1 m) over the links for which the term
             was made, otherwise 0.
-        around: For a random effect, name of the term with the mean from which these coefficients deviate; otherwise "".
+        around: For the deviations of a random effect, the name of the term with their mean; otherwise "".
     """
 
     name: str
@@ -69,7 +70,7 @@ class Term:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of its columns: the term's name, with the group in brackets if there are groups."""
+        """Names of the term's columns: its own name, with the group in brackets if there are groups."""
         return tuple(f"{self.name}[{label}]" if label else self.name for label in self.labels)
 
     def at(self, links: Measurements, labels: ArrayLike | None = None) -> Term:
@@ -128,7 +129,7 @@ def make_term(
     lower, upper = UNBOUNDED if bounds is None else bounds
     if not lower < upper:
         raise InputError(
-            f"nuisance {name!r}: bounds = [{lower:g}, {upper:g}]; the lower must be less than the upper"
+            f"nuisance {name!r}: bounds = [{lower:g}, {upper:g}]; the lower bound must be less than the upper bound"
         )
     if prior is not None and not prior > 0:
         raise InputError(f"nuisance {name!r}: prior = {prior:g}; a standard deviation must be greater than 0")
@@ -148,8 +149,8 @@ def make_term(
 def random_effect(links: Measurements, name: str, by: str, labels: ArrayLike) -> tuple[Term, Term]:
     """The two terms of a random effect: a shared coefficient, and the deviation of each group from it.
 
-    The column is as in `make_term`, and `labels` are those of the links' groups [L]. `estimate_noise` replaces the
-    prior of the deviations with the estimated spread.
+    `by` is as in `make_term`, and `labels` are the labels of the links' groups [L]. `estimate_noise` replaces the prior
+    of the deviations with the estimated spread.
     """
     deviations = make_term(links, deviations_of(name), by, labels=labels, prior=START_SPREAD)
     return make_term(links, name, by), replace(deviations, around=name)
@@ -180,7 +181,7 @@ def _labels(name: str, links: Measurements, labels: ArrayLike) -> NDArray[np.str
     array = np.asarray(labels, dtype=np.str_)
     if array.shape != (len(links),):
         raise InputError(
-            f"nuisance {name!r}: labels of shape {array.shape}, must be ({len(links)},), one per link"
+            f"nuisance {name!r}: labels have shape {array.shape}, but must have ({len(links)},), one label per link"
         )
     return array
 
@@ -267,9 +268,10 @@ class Nuisance:
         return (self.design @ coefficients.T).T
 
     def filled(self, coefficients: NDArray[np.float64], determined: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Coefficients [n, q]; one that is not determined [q] is the mean of the determined ones of its term.
+        """Coefficients [n, q]; undetermined ones are replaced by the mean of the determined ones of their term.
 
-        Undetermined deviations of a random effect keep their value, 0.
+        Undetermined deviations of a random effect keep their value of 0. `determined` is the mask of the determined
+        coefficients [q].
         """
         filled, first = coefficients.copy(), 0
         for term in self.terms:
@@ -281,9 +283,9 @@ class Nuisance:
         return filled
 
     def new_group_spread(self, block: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Standard deviation of those random effects of each link that no other block determines [L], [dB].
+        """Standard deviation of each link's random effects that no other block determines [L], [dB].
 
-        `block` is the block of each link, and -1 for a link that is not used [L].
+        `block` is the index of each link's block, or -1 for a link that is not used [L].
         """
         variance = np.zeros(self.num_links)
         for term in self.terms:
@@ -298,7 +300,7 @@ class Nuisance:
     def by_term(
         self, coefficients: NDArray[np.float64], determined: NDArray[np.bool_]
     ) -> dict[str, dict[str, float]]:
-        """Determined coefficients [q] by term and group; a random effect is one term, mean plus deviation."""
+        """Determined coefficients [q] by term and group; those of a random effect are the mean plus the deviation."""
         coefficient: dict[str, dict[str, float]] = {}
         first = 0
         for term in self.terms:

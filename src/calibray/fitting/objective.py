@@ -4,9 +4,9 @@ It is the paper's weighted RMSE (eq. 1) over the links with nonzero weight. Nuis
 linear design) enter the model as path loss + design x coefficients. For every candidate, the best coefficients follow
 in closed form (variable projection), so optimizers search only the parameters.
 
-A Gaussian prior of a coefficient adds the row (noise / prior) x coefficient to the residuals. Up to constants, the sum
-of squares is then minus twice the log posterior, in units of the noise variance. `value` includes these rows, `rmse` is
-the paper's RMSE of the links only. Without priors, both numbers are the same.
+A Gaussian prior on a coefficient adds the row (noise / prior) x coefficient to the residuals. Up to constants, the sum
+of squares is then minus twice the log posterior, in units of the noise variance. `value` includes these rows; `rmse` is
+the paper's RMSE over the links only. Without priors, the two are equal.
 
 The objective of many links is summed over chunks. For gaps g (measured minus modelled path loss), derivatives J,
 weights w and a nuisance's design Z, a chunk returns [J g]' w [J g] and Z' w [J g]. Their sums over all chunks give the
@@ -14,8 +14,8 @@ normal equations with the nuisance eliminated. With A = [J g] and the best coeff
 
     (A - Z X)' w (A - Z X) = A'wA - X'Z'wA - A'wZ X + X'Z'wZ X.
 
-From these products we build a few rows with the same squares and products as the residuals of all links, for methods
-that use only these squares and products.
+From these products we build a few rows with the same squares and products as the residuals of all links. Methods that
+use only squares and products work with these rows.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Sums:
 @final
 @dataclass(frozen=True, eq=False)
 class Share:
-    """The objective's data of one chunk of links; called with the path loss of the chunk, it returns its sums.
+    """The objective's data for one chunk of links; a call with the chunk's path loss returns the chunk's sums.
 
     Attributes:
         links: Indices within the chunk of its m links with nonzero weight [m].
@@ -59,7 +59,7 @@ class Share:
         weight: Their weights, normalised as in the objective [m].
         design: The c columns of the nuisance with entries at these links [m, c].
         columns: Indices of these columns in the nuisance [c].
-        ceiling_db: Path loss of a link without a path [dB]; None if there is no ceiling.
+        ceiling_db: Path loss assigned to a link without a path [dB]; None if there is no ceiling.
     """
 
     links: NDArray[np.int64]
@@ -72,7 +72,7 @@ class Share:
     def __call__(self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64] | None = None) -> Sums:
         """Sums over the links of the chunk, from path loss [n, l], [dB], and its derivatives [n, l, d].
 
-        `side` has only the columns of the chunk [n, c, k].
+        `side` contains only the columns of the chunk [n, c, k].
         """
         loss = path_loss[:, self.links]
         at_ceiling = loss >= (np.inf if self.ceiling_db is None else self.ceiling_db)
@@ -110,7 +110,7 @@ class Objective:
     noise_db: float = 1.0
 
     def reweighted(self, weight: NDArray[np.float64]) -> Objective:
-        """The objective with other weights [L]; the noise is rescaled, so that the errors of links do not change."""
+        """The objective with other weights [L]; the noise is rescaled so that the links' errors do not change."""
         if not (weight > 0).any():
             return replace(self, weight=weight)
         before, after = (float(each[each > 0].mean()) for each in (self.weight, weight))
@@ -119,8 +119,8 @@ class Objective:
     def coefficients(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """The best coefficients of the nuisance [n, q], [dB] per unit of their columns, for path loss [n, L], [dB].
 
-        A candidate's links without a path are left out of its fit. A coefficient that is not `determined` has the value
-        within the bounds that is nearest to 0.
+        Links without a path for a candidate are left out of its fit. A coefficient that is not `determined` has the
+        value nearest to 0 within its bounds.
 
         Raises:
             EngineError: No minimum within the bounds was found.
@@ -130,7 +130,8 @@ class Objective:
     def completed(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """The `coefficients` for the prediction of other links [n, q], from path loss [n, L], [dB].
 
-        One that is not `determined` is the mean of the determined ones of its term; these are then fitted again.
+        A coefficient that is not `determined` is the mean of the determined ones of its term. The determined
+        coefficients are then fitted again.
         """
         gap = self.measured - self.capped(path_loss)
         coefficients = self._fitted(gap)
@@ -168,7 +169,7 @@ class Objective:
         return -self._elimination.projection(slope, self.coefficients(path_loss))
 
     def coefficient_root(self) -> NDArray[np.float64]:
-        """Root R of the covariance R R' of the coefficients given path loss [q, q]; large if not `determined`."""
+        """Root R of the covariance R R' of the coefficients at given path loss [q, q]; large if not `determined`."""
         wide_prior = np.where(self.determined, np.inf, UNKNOWN_DB)
         gram = self._elimination.data.toarray() + np.diag(self._ridge**2 + (self.noise_db / wide_prior) ** 2)
         return self.noise_db * np.linalg.cholesky(np.linalg.inv(gram))
@@ -186,9 +187,9 @@ class Objective:
 
     @property
     def fitted(self) -> float:
-        """Number of coefficients that links determine; one with a prior counts as the links' share of its precision.
+        """Number of coefficients that the links determine; one with a prior counts as their share of its precision.
 
-        Coefficients that their priors keep at zero explain no residuals, however many groups there are.
+        Coefficients that their priors hold at zero explain no residuals, regardless of the number of groups.
         """
         if not self.nuisance.terms:
             return 0.0
@@ -212,7 +213,8 @@ class Objective:
     def residuals(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """Residuals [n, links with weight + priors], [dB], whose root mean square is `value`, for path loss [n, L].
 
-        They are (model - measurement) times the square root of the weights, then one row per coefficient with a prior.
+        They are (model - measurement) times the square root of the weights, followed by one row per coefficient with a
+        prior.
         """
         coefficients = self.coefficients(path_loss)
         links = (self._model(path_loss, coefficients) - self.measured)[:, self._counted] * self._scale
@@ -236,7 +238,7 @@ class Objective:
     def value(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """The minimised value [n], [dB]: the root mean square of all residuals, including the rows of priors.
 
-        It is the RMSE if no coefficient has a prior, and +inf if a link with weight has no path.
+        It equals the RMSE if no coefficient has a prior. It is +inf if a link with weight has no path.
         """
         return np.sqrt(np.mean(self.residuals(path_loss) ** 2, axis=1))
 
@@ -246,7 +248,7 @@ class Objective:
         return np.sqrt(np.mean(links**2, axis=1))
 
     def shares(self, chunks: Sequence[NDArray[np.int64]]) -> list[Share]:
-        """The objective's share of each chunk of links, which can be summed separately."""
+        """The objective's shares for the chunks of links, which can be summed separately."""
         weight, shares = np.zeros(len(self.weight)), []
         weight[self._counted] = self._scale**2
         for chunk in chunks:
@@ -268,8 +270,8 @@ class Objective:
     def products(self, sums: Sums) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Squares and products of residuals and their derivatives, from sums over all links.
 
-        They are the products of the k columns [derivatives, -residuals], with rows of priors [n, k, k], and the sum
-        of squares of the links only [n], [dB^2].
+        They are the products of the k columns [derivatives, -residuals], including rows of priors [n, k, k], and the
+        sum of squares of the links only [n], [dB^2].
 
         Raises:
             EngineError: No minimum of the nuisance within its bounds was found.
@@ -294,7 +296,7 @@ class Objective:
 
     @property
     def num_counted(self) -> int:
-        """Number of links with nonzero weight; later rows of the residuals belong to priors."""
+        """Number of links with nonzero weight; the remaining rows of the residuals belong to priors."""
         return len(self._scale)
 
     def capped(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -302,7 +304,7 @@ class Objective:
         return path_loss if self.ceiling_db is None else np.minimum(path_loss, self.ceiling_db)
 
     def with_nuisance(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss [L], [dB], plus the nuisance fitted to links with weight; a group without them gets the mean."""
+        """Path loss [L], [dB], plus the nuisance fitted to links with weight; groups without them have the mean."""
         return self.capped(path_loss) + self.nuisance.contribution(self.completed(path_loss[None]))[0]
 
     def _model(

@@ -1,8 +1,8 @@
-"""Observables in addition to path loss in the objective: rows of residuals that follow those of the links.
+"""Further observables in the objective; the rows of their residuals follow those of path loss.
 
-Their rows are weighted by the ratio of the standard deviations of the errors, as rows of priors are. A sum of squares
-is therefore minus twice the log likelihood in units of the noise variance of path loss. An unknown bias is eliminated:
-it is the mean residual of its group.
+Like the rows of priors, these rows are weighted by the ratio of the standard deviations of the errors. Up to constants,
+the sum of squares is therefore minus twice the log likelihood, in units of the noise variance of path loss. An unknown
+bias is eliminated: it is the mean residual of its group.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Observed:
         statistic: The modelled quantity.
         measured: Measured values [L], in the study's unit; NaN for a link without a value.
         scale: The study's unit, in SI units.
-        group: Group of each link's bias, from 0 [L]; -1 without a bias.
+        group: Index of the group of each link's bias [L]; -1 without a bias.
         labels: Labels of the groups; empty without a bias.
         std: Standard deviation of a value's error, in the study's unit.
         stated: Whether the study states `std`.
@@ -61,7 +61,7 @@ class Observed:
         return np.flatnonzero(np.isfinite(self.measured) & (weight > 0))
 
     def freedom(self, weight: NDArray[np.float64]) -> int:
-        """Number of values minus number of biases."""
+        """Number of values minus the number of biases."""
         used = self.used(weight)
         return len(used) - (len(np.unique(self.group[used])) if self.labels else 0)
 
@@ -98,7 +98,7 @@ class Observed:
     def _means(
         self, values: NDArray[np.float64], found: NDArray[np.bool_], used: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Mean of the values found [..., m] over the links of each group [..., groups]; 0 for an empty group."""
+        """Mean of the finite values [..., m] over the links of each group [..., groups]; 0 for an empty group."""
         member = (self.group[used][:, None] == np.arange(len(self.labels))).astype(np.float64)
         return values @ member / np.maximum(found @ member, 1.0)
 
@@ -143,8 +143,8 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
         count = int(np.isfinite(measured[~setup.held_out]).sum())
         if count < 2:
             raise InputError(
-                f"{links.source}: {place} of [observables.{name}] has {count} values at calibration links; at least "
-                "two links need one: measure more, or change [holdout]"
+                f"{links.source}: {place} of [observables.{name}] has {count} values at calibration links; values at "
+                "two or more links are required: add measurements, or change [holdout]"
             )
         group, labels = _groups(links, section.bias)
         # Equal values have no deviation; the error is estimated from the residuals later.

@@ -1,18 +1,18 @@
-"""Fits before the calibration: which links to leave out near the noise floor, and the noise level for priors.
+"""Fits before the calibration: selection of links near the noise floor, and estimates of the noise and of spreads.
 
-Among links with equal expected power, those near the noise floor are received only if their error is favourable.
-A selection by measured values keeps these links and biases the fit. A selection by predicted values does not, because
-the prediction is independent of the link's error (selection on the explanatory variables: J. M. Wooldridge, Econometric
-Analysis of Cross Section and Panel Data, 2nd ed., MIT Press 2010, chapter 19). We fit the model to all links above the
-floor, then to the links predicted well above it, until the selection is stable.
+Near the noise floor, a link is received only if its error is favourable. A selection by measured values keeps these
+links and biases the fit. A selection by predicted values does not, because the prediction is independent of the link's
+error (selection on the explanatory variables: J. M. Wooldridge, Econometric Analysis of Cross Section and Panel Data,
+2nd ed., MIT Press 2010, chapter 19). We first fit the model to all links above the floor. We then refit it to the links
+that are predicted well above the floor, until the selection is stable.
 
-Residuals follow y = X b + Z u + e with u ~ N(0, lambda sigma^2) per group and e ~ N(0, sigma^2). X has the columns of
-all other fitted terms. The restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971) accounts for
-the scatter that the fit of b removes; maximum likelihood does not, and underestimates the spread.
+Residuals follow y = X b + Z u + e with u ~ N(0, lambda sigma^2) per group and e ~ N(0, sigma^2). X contains the columns
+of all other fitted terms. The restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971) accounts for
+the scatter that the fit of b removes; maximum likelihood does not and therefore underestimates the spread.
 
-Spreads of transmitters follow by expectation maximization with a Gaussian approximation at the optimum (D. Bates and
-S. DebRoy, J. Multivariate Analysis 91, 2004, section 5): the squared spread is the mean over the transmitters of the
-squared value plus its variance.
+Spreads of transmitters are estimated by expectation maximization with a Gaussian approximation at the optimum (D. Bates
+and S. DebRoy, J. Multivariate Analysis 91, 2004, section 5): the squared spread is the mean over the transmitters of
+the squared value plus its variance.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ _LOG: Final = logging.getLogger(__name__)
 
 MARGIN: Final = 8.0
 """Required distance of a predicted path loss from the noise floor, in standard deviations of the links' errors.
-Position errors make paths appear and vanish, which gives the errors heavy tails: a margin of four leaves some bias."""
+Position errors make paths appear and vanish, which gives the errors heavy tails; a margin of four leaves some bias."""
 
 SMALL_MARGIN: Final = 4.0
 """Margin used if `MARGIN` leaves fewer links per unknown than `LINKS_PER_UNKNOWN`, or an offset without links. With
-errors of 5.5 dB over a range of 35 dB, a slope is 12 % too low if all links stay, and 2 % too high (standard error 2 %)
-with this margin."""
+errors of 5.5 dB over a range of 35 dB, a slope is 12 % too low if all links are kept, and 2 % too high (standard error
+2 %) with this margin."""
 
 SELECTIONS: Final = 4
 """Largest number of selections."""
@@ -58,10 +58,10 @@ TOLERANCE: Final = 0.02
 """Relative change of the estimates at which the iteration ends."""
 
 LEAST_NOISE_DB: Final = 1e-3
-"""Lower limit of the noise estimate, so that data without noise keep a finite weight of the priors [dB]."""
+"""Lower limit of the noise estimate [dB], so that priors keep a nonzero weight for data without noise."""
 
 LEAST_SPREAD_DB: Final = 0.05
-"""Lower limit of the spread between groups, so that the prior stays finite [dB per unit of the column]."""
+"""Lower limit of the spread between groups [dB per unit of the column], so that the prior's weight stays finite."""
 
 SEARCHES: Final = 32
 """Number of local searches of the first fit; later fits continue from its minima."""
@@ -70,9 +70,9 @@ SEARCHES: Final = 32
 def leave_out_near_floor(problem: Problem, progress: Progress | None = None) -> Problem:
     """Set the weight of links whose predicted power is near the noise floor to 0, and mark them in `faint`.
 
-    The problem is unchanged without a noise floor, and on an engine without derivatives, because its calls are
-    expensive. It is also unchanged, with a warning, if the remaining links determine fewer unknowns. The stage of
-    `progress` is "choosing links".
+    The problem is unchanged if there is no noise floor. It is also unchanged on an engine without derivatives, because
+    its calls are expensive. If the remaining links determine fewer unknowns, the problem is unchanged and a warning is
+    logged. The stage of `progress` is "choosing links".
     """
     limit, objective = problem.setup.links.limit_db, problem.objective
     if limit is None or not problem.differentiable:
@@ -113,7 +113,7 @@ def _far_from(
     objective: Objective,
     weight: NDArray[np.float64],
 ) -> Objective:
-    """The objective with the weights [L] of only the links whose predicted path loss is at most `largest_db` [L]."""
+    """The objective with weights [L] only for the links with a predicted path loss of at most `largest_db` [L]."""
     return objective.reweighted(np.where(predicted_db <= largest_db, weight, 0.0))
 
 
@@ -131,16 +131,16 @@ def _warn_of_bias(problem: Problem, selected: Objective, faint: NDArray[np.bool_
     lost = np.flatnonzero(problem.objective.determined & ~determined)
     names = ", ".join(problem.objective.nuisance.columns[column] for column in lost[:MAX_LISTED])
     _LOG.warning(
-        "%s: %s of %s links are expected near the noise floor, but are kept, because the others do not determine %s; "
-        "weak links are received only if their errors are favourable, so fitted offsets and path loss are too low; "
-        "measure closer links",
+        "%s: %s of %s links are expected near the noise floor, but are kept because the others do not determine %s; "
+        "weak links are received only if their errors are favourable, so the fitted offsets and path loss are too low; "
+        "measure at shorter distances",
         problem.setup.links.source, f"{faint.sum():,}", f"{problem.objective.num_counted:,}",
         names or "all unknowns",
     )  # fmt: skip
 
 
 def estimate_noise(problem: Problem, progress: Progress | None = None) -> Problem:
-    """Estimate the noise level that scales the priors, unless the study declares it, and the spread of random effects.
+    """Estimate the noise level that scales the priors (unless the study declares it) and the spread of random effects.
 
     The problem is unchanged without priors. On an engine without derivatives, whose calls are expensive, the spread is
     estimated at the initial values. The stage of `progress` is "estimating noise".
@@ -155,9 +155,8 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
     if not problem.has_priors or (stated and not unstated and not random_effects):
         return problem
     if not stated and (not problem.differentiable or problem.freedom < 1):
-        cause = (
-            "there are too few links" if problem.differentiable else f"the engine is {study.engine.name!r}"
-        )
+        engine = f"calls of the engine {study.engine.name!r} are too expensive"
+        cause = "there are too few links" if problem.differentiable else engine
         raise InputError(
             f"{study.path}: noise.std_db: is required, because the study has a prior and {cause} to estimate the "
             "noise; give the standard deviation of a link's error [dB]"
@@ -198,7 +197,7 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
 
 
 def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tuple[Problem, float]:
-    """The problem with the spreads of its random effects, estimated at a point of the search space [d].
+    """The problem with the spreads of its random effects estimated at a point of the search space [d].
 
     The second result is the standard deviation of a link's error within the groups of the last effect [dB]. On an
     engine without derivatives, both are estimated at the initial values, whose path loss is known.
@@ -238,7 +237,7 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
 
 
 def with_estimated_errors(problem: Problem, point: NDArray[np.float64]) -> Problem:
-    """The problem with errors of its further observables, estimated at a point of the search space [d]."""
+    """The problem with the errors of its further observables estimated at a point of the search space [d]."""
     if not problem.observed:
         return problem
     candidate = problem.parameters.from_search(point[None])
@@ -261,9 +260,9 @@ class GroupSpread(NamedTuple):
     """Standard deviations between and within groups.
 
     Attributes:
-        between: Between groups, in the unit of the residuals per unit of the column; 0 if the groups do not differ, and
-            `UNKNOWN_DB` if the links do not determine it.
-        within: Within a group, for a single link, in the unit of the residuals.
+        between: Standard deviation between groups, in the unit of the residuals per unit of the column; 0 if the groups
+            do not differ, and `UNKNOWN_DB` if the links do not determine it.
+        within: Standard deviation of single links within a group, in the unit of the residuals.
     """
 
     between: float
@@ -324,13 +323,14 @@ ROUNDS: Final = 20
 """Largest number of estimates; three suffice if the links determine the values of most transmitters well."""
 
 LEAST: Final = 1e-3
-"""Lower limit of a spread, as a share of the width of the bounds, so that priors stay finite."""
+"""Lower limit of a spread, as a share of the width of the bounds, so that the weights of the priors stay finite."""
 
 
 def estimate_spreads(problem: Problem, progress: Progress | None = None) -> Problem:
     """Estimate the spread of every population of transmitters for which the study states none.
 
-    The returned problem has the spreads in its study and its priors. The stage of `progress` is "estimating spreads".
+    The study and the priors of the returned problem contain the spreads. The stage of `progress` is "estimating
+    spreads".
     """
     fields, parameters = estimated_fields(problem.setup.study), problem.parameters
     if not fields or not problem.differentiable:

@@ -39,8 +39,8 @@ class Evaluation(NamedTuple):
         jacobian: Their derivatives with respect to the search coordinates [n, m, d]; None if not requested.
         modelled: The engine's values [n, L]; [n, 0] if it returned only sums.
         rmse_db: The RMSE of the links only (paper eq. 1) [n].
-        represents: Number of full residuals that the m compressed ones represent, with the same mean squares and
-            products; None if the residuals are the full ones.
+        represents: Number of full residuals that the m compressed ones represent; both have the same mean squares and
+            products. None if the residuals are not compressed.
         observed: Further observables [n, K, L], in SI units; empty if the engine returned only sums.
     """
 
@@ -81,7 +81,7 @@ class Problem:
 
     Attributes:
         setup: The opened study.
-        engine: The engine over all its links.
+        engine: The engine for all links of the study.
         objective: The objective over the calibration links.
         before: The engine's values for the initial parameters [L].
         observable: The quantity that is measured and modelled.
@@ -172,7 +172,7 @@ class Problem:
         return self.evaluate_candidates(self.parameters.from_search(points), derivatives)
 
     def evaluate_candidates(self, candidates: NDArray[np.float64], derivatives: bool = False) -> Evaluation:
-        """Like `evaluate`, for candidates in the fields' units [n, d], without the rounding of a conversion."""
+        """Like `evaluate`, but for candidates in the fields' units [n, d], without rounding errors of a conversion."""
         parameters, objective, jacobian = self.parameters, self.objective, None
         with_slopes = derivatives and self.differentiable
         answer = self.respond(candidates, with_slopes)
@@ -259,7 +259,7 @@ class Problem:
 
     @cached_property
     def _chunks(self) -> tuple[Reduced, list[Share]] | None:
-        """The engine reduced to sums of its chunks, and their shares of the objective; None if it has no chunks."""
+        """The engine reduced to sums over its chunks, and the objective's shares for them; None without chunks."""
         if not isinstance(self.engine, Chunked) or self.observable is not PATH_LOSS:
             return None
         shares = self.objective.shares(self.engine.chunks)
@@ -289,7 +289,7 @@ class Problem:
         slope: NDArray[np.float64],
         observed_slope: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
-        """Derivatives of `residuals` [n, m, k] with respect to k variables: the d search coordinates, then others.
+        """Derivatives of `residuals` [n, m, k] with respect to k variables: the d search coordinates, then any others.
 
         They follow from the derivatives of the modelled values [n, L, k] and of further observables [n, K, L, k].
         """
@@ -349,7 +349,7 @@ def _noise(study: StudyModel, weight: NDArray[np.float64]) -> float:
 
 
 def _check_groups(links: Measurements, objective: Objective, judged: NDArray[np.bool_]) -> None:
-    """Reject held-out links that need a coefficient of the nuisance that no calibration link determines."""
+    """Reject held-out links that depend on a coefficient of the nuisance that no calibration link determines."""
     unknown = np.flatnonzero(judged & ~objective.supported)
     if len(unknown):
         needed = objective.nuisance.design[unknown[:1]].toarray()[0] != 0

@@ -1,11 +1,11 @@
 """Identifies an engine's assumptions from ratios of its rays' powers: a global search over constants and polarizations.
 
-Materials are added one at a time. Each is scanned (`ray_scan.py`) on paths without materials that are added later.
-Least squares with exact derivatives on all these paths then refines the best points, for several polarizations, jointly
-with the values already found. The best few explanations are kept. The study's constants are a further starting point,
-with the polarizations that fit best for them. If a misfit remains at the end, linear polarizations are searched with
-the materials fixed, and then each material is scanned again on all its paths. The last step is basin hopping (Wales and
-Doye, 1997): it refines explanations in which one or two materials are at different resonances.
+Materials are added one at a time. Each material is scanned (`ray_scan.py`) on paths without materials that are added
+later. Least squares with exact derivatives on all these paths then refines the best points, for several polarizations,
+jointly with the values already found. The best few explanations are kept. The study's constants are a further starting
+point, with the polarizations that fit best with them. If a misfit remains, linear polarizations are searched with the
+materials fixed, and then each material is scanned again on all its paths. The last step is basin hopping (Wales and
+Doye, 1997): it moves one or two materials to other resonances and refines the result.
 """
 
 from __future__ import annotations
@@ -38,16 +38,18 @@ KNOWN_DB: Final = 0.02
 at least 0.1 dB."""
 
 EVALUATIONS: Final = (6, 12, 30)
-"""Number of evaluations with each loss function: in a trial, between scans, and in the last refinement."""
+"""Largest number of evaluations with each loss function: in a trial, between scans, and in the last refinement."""
 
 TRIALS: Final = 300
-"""Largest number of trials of basin hopping; with 150 in a row without improvement, misfits were about the same."""
+"""Largest number of trials of basin hopping. A stop after 150 trials without improvement gave about the same
+misfits."""
 
 TRIED_PATHS: Final = 500_000
-"""Target for the product of trials and paths on a large program, which bounds the time of basin hopping."""
+"""Largest product of the number of trials and the number of paths, which limits the time of basin hopping."""
 
 PROMISING: Final = 3.0
-"""A trial is refined further if its misfit is less than this multiple of the worst misfit that is kept."""
+"""A trial is refined further if its misfit is less than this multiple of the largest misfit among the explanations that
+are kept."""
 
 MOST_HOPS: Final = 30
 """Largest change of a thickness in a trial [half wavelengths in the slab]."""
@@ -55,7 +57,7 @@ MOST_HOPS: Final = 30
 
 @dataclass(frozen=True, eq=False)
 class Understanding:
-    """The assumed values that explain an engine's ratios best.
+    """The assumed values that best explain the ratios of an engine's ray powers.
 
     Attributes:
         model: The model of the last export's paths.
@@ -95,7 +97,7 @@ class Ratio(NamedTuple):
     observed: NDArray[np.float64]
 
     def on(self, kept: NDArray[np.bool_]) -> Ratio:
-        """The ratios of those paths that `kept` selects among the paths of the last call [P]."""
+        """The ratios of the paths selected by `kept`, a mask of the paths of the last call [P]."""
         mine = kept[self.here]
         return Ratio(self.call, self.here[mine], self.weight[mine], self.level_db[mine], self.observed[mine])
 
@@ -105,8 +107,8 @@ def understand(
 ) -> Understanding:
     """Find the assumptions that explain the ratios of all calls.
 
-    The search starts from `before`, the assumptions for the earlier calls, if given. The paths of the last call are
-    modelled. `known` states whether the program's antennas are those of the engine.
+    If `before`, the assumptions for the earlier calls, is given, the search starts from it. The paths of the last call
+    are modelled. `known` states whether the program's antennas are those of the engine.
     """
     last, ratios = calls[-1], ratios_of(calls)
     model = RayModel.of(parameters, last.export.paths, known)
@@ -167,9 +169,9 @@ def _hopped(fits: list[Understanding], ratios: list[Ratio], last: Call) -> Under
 def _perturbed(fit: Understanding, last: Call, random: np.random.Generator) -> Understanding:
     """An explanation with different constants of one or two materials.
 
-    A thickness changes by a number of half wavelengths in the slab, after which the slab resonates again. The
-    conductivity keeps its value, keeps the attenuation through the slab, or changes at random. One trial in three also
-    has different tilts of the antennas.
+    A thickness changes by a whole number of half wavelengths in the slab, which leads to another resonance. The
+    conductivity stays the same, preserves the attenuation through the slab, or changes at random. One trial in three
+    also changes the tilts of unknown antennas.
     """
     model, values = fit.model, fit.values.copy()
     materials = model.materials(last.candidate, fit.values)
@@ -192,7 +194,7 @@ def _perturbed(fit: Understanding, last: Call, random: np.random.Generator) -> U
 
 
 def _with_the_constants_of(fit: Understanding, ratios: list[Ratio], last: Call) -> list[Understanding]:
-    """Explanations with the same constants and the best polarizations of upright antennas, if these are unknown.
+    """Explanations with the same constants and the best polarizations of upright antennas; none if antennas are known.
 
     Many engines differ from the study only in their antennas.
     """
@@ -210,7 +212,7 @@ def _best(fits: list[Understanding]) -> list[Understanding]:
 
 
 def _meetings(model: RayModel) -> tuple[NDArray[np.bool_], list[int]]:
-    """Materials on each path [P, M]; and materials with a parameter, those most often alone on a path first."""
+    """Materials on each path [P, M]; and materials with a parameter, those alone on most paths first."""
     paths, names = model.paths, list(model.paths.materials)
     meets = np.zeros((paths.num_paths, len(names)), dtype=bool)
     meets[np.repeat(np.arange(paths.num_paths), np.diff(paths.first)), paths.material] = True
@@ -222,7 +224,7 @@ def _meetings(model: RayModel) -> tuple[NDArray[np.bool_], list[int]]:
 def _scanned(
     fits: list[Understanding], ratios: list[Ratio], last: Call, material: int, wanted: NDArray[np.bool_]
 ) -> list[Understanding]:
-    """Explanations with different constants of one material, from scans on the wanted paths [P].
+    """Explanations with different constants of one material, from scans on the paths in the mask `wanted` [P].
 
     A scan with upright antennas of all polarizations starts from the first explanation. Other scans use the antennas of
     each explanation and so account for tilts.
@@ -268,7 +270,7 @@ def _scanned(
 
 
 def _turned(fit: Understanding, ratios: list[Ratio], last: Call) -> list[Understanding]:
-    """Explanations with different angles of the antennas, and the same materials."""
+    """Explanations with different antenna angles and the same materials."""
     model, count = fit.model, len(fit.model.assumed)
     gains = model.gains(last.candidate, fit.values)
     parts = [
@@ -337,7 +339,7 @@ def _errors(
     If a path has power in the engine but none in the model, no correction can restore it. Its error is `LEAST_DB` minus
     the power in the engine.
 
-    `tables` are the constants of the last call and of each ratio's call, see `_tables`.
+    `tables` contains the constants of the last call and of each ratio's call; see `_tables`.
     """
     (level, *others), (slope, *other_slopes) = fit.model.levels_and_slopes(tables, fit.values, fit.linear)
     residuals, slopes = [], []
@@ -351,7 +353,7 @@ def _errors(
 
 
 def ratios_of(calls: list[Call]) -> list[Ratio]:
-    """The ratios of the last call to every earlier one that shares a path with it."""
+    """The ratios of the last call to every earlier call that shares a path with it."""
     last = calls[-1].export
     pairs = [(call, *common(last.paths, call.export.paths)) for call in calls[:-1]]
     total = sum(last.weight[here].sum() for _, here, _ in pairs)
@@ -369,7 +371,7 @@ def ratios_of(calls: list[Call]) -> list[Ratio]:
 
 
 def common(one: Paths, other: Paths) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices, in each of two programs, of the paths that they share: same link, kinds and points."""
+    """Indices, in each of two programs, of the paths with the same link, kinds and points."""
     rows, pairs = _by_kinds(other), []
     for key, members in _by_kinds(one).items():
         for index, points in members:

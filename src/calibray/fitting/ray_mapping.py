@@ -1,13 +1,14 @@
-"""Ray mapping identifies the assumptions of an expensive engine that exports its rays, and replaces it with a replay.
+"""Ray mapping identifies the assumptions of an expensive engine from its rays, and replaces the engine with a replay.
 
-A few calls are enough. Each call returns the power of each path. The ratio of a path's powers at two sets of constants
-does not depend on antenna gains or units. The ratios therefore show what the engine assumes: thickness, conductivity,
-slabs or half-spaces, and the polarization of its antennas. We fit these to all ratios of the calls so far
-(`ray_fit.py`). The last call then corrects the power of every path. The next call is at the minimum of the replay of
-this corrected program, and checks this replay.
+A few calls are enough. Each call returns the power of each path. The ratio of a path's powers for two sets of constants
+does not depend on antenna gains or units. The ratios therefore reveal the engine's assumptions: thickness,
+conductivity, slabs or half-spaces, and the polarization of its antennas. We fit these assumptions to all ratios of the
+calls so far (`ray_fit.py`). The power of every path is then corrected to match the last call. The next call is at the
+minimum of the replay of this corrected program, and tests this replay.
 
-The first call is at the start values. The second call is where the ratios are most informative about the assumed
-constants: of `PROBES` random points, the one where the mean log determinant of the information is largest.
+The first call is at the start values. The second call is at the point where the ratios are most informative about the
+assumed constants: among `PROBES` random points, the one with the largest mean log determinant of the information
+matrix.
 """
 
 from __future__ import annotations
@@ -47,19 +48,21 @@ DRAWN: Final = 3.0
 """Largest factor between an assumed constant of such a set and the study's value."""
 
 SIGMA_DB: Final = 0.1
-"""Standard deviation of a ratio's error for the information [dB]."""
+"""Standard deviation of a ratio's error assumed in the information matrix [dB]."""
 
 LEFT_DB: Final = 0.05
-"""Largest difference in RMSE, and in path loss, between the best call and the minimum of the replay for an optimum that
-counts as reached [dB]."""
+"""An optimum counts as reached only if the best call and the minimum of the replay differ by at most this much, in RMSE
+and in path loss [dB]."""
 
 GAP_DB: Final = 0.2
-"""Largest gap at the last call for an optimum that counts as reached [dB]. After six calls, the excess RMSE was at most
-0.016 dB in six runs with gaps of 0.06 to 0.17 dB, and 0.020 to 0.15 dB in eight runs with gaps above 0.36 dB."""
+"""An optimum counts as reached only if the gap at the last call is at most this large [dB]. After six calls, the excess
+RMSE was at most 0.016 dB in six runs with gaps of 0.06 to 0.17 dB, and 0.020 to 0.15 dB in eight runs with gaps above
+0.36 dB."""
 
 MISFIT_DB: Final = 0.2
-"""Largest misfit of the ratios of an engine that counts as understood [dB]. Wrong minima had misfits of at least 0.8
-dB. At 0.07 to 0.19 dB, the optimum was reached within 0.006 dB (docs/measurements/expensive-engines.md)."""
+"""An engine counts as understood only if the misfit of its ratios is at most this large [dB]. Wrong minima had misfits
+of at least 0.8 dB. At 0.07 to 0.19 dB, the optimum was reached within 0.006 dB
+(docs/measurements/expensive-engines.md)."""
 
 CHANGED_DB: Final = 0.5
 """An engine counts as understood only if paths that another call lacks change no link's path loss by more than this
@@ -68,10 +71,10 @@ CHANGED_DB: Final = 0.5
 SEARCHES: Final = 4
 """Ratio of the number of local searches to that of a calibration on replay; a call costs more than many searches. In a
 district with 557 interactions, 512 and 1,024 searches missed a minimum that is 0.076 dB lower with two of five seeds;
-2,048 searches missed it with none."""
+2,048 searches found it with all five."""
 
 LEAST_CALLS: Final = 3
-"""Smallest number of calls of ray mapping: two that show the assumptions, and one at the minimum."""
+"""Smallest number of calls of ray mapping: two to identify the assumptions, and one at the minimum."""
 
 MOST_CALLS: Final = 10
 """Largest number of calls of ray mapping."""
@@ -83,15 +86,15 @@ class RayMap:
 
     Attributes:
         engine: Replay that agrees with the engine at the best call.
-        calls: The calls; from the third on, each is at the minimum of the program corrected by the earlier ones.
+        calls: The calls; from the third on, each is at the minimum of the replay that was fitted to the earlier calls.
         best: The call with the lowest objective.
         understanding: The assumptions that explain the engine.
         gap_db: RMS over the links of the difference between the engine's and the predicted path loss at the last call
             [dB].
         changed: Largest number of paths that occur in the best call but not in another call, or vice versa.
-        changed_db: Largest change of a link's path loss without these paths, over links that keep a path [dB].
-        lost: Number of links that keep no path, or have none in the replay at the best call.
-        minima: Minima of the replay that replaces the engine, the lowest first, as points of the search space [k, d].
+        changed_db: Largest change of a link's path loss if these paths are left out, over links that keep a path [dB].
+        lost: Number of links that keep no path, or that have no path in the replay at the best call.
+        minima: Minima of the replay that replaces the engine, lowest first, as points of the search space [k, d].
         remaining_db: RMSE at the best call minus that at the lowest of these minima [dB].
         moved_db: RMS over the links of the replay's path loss at that minimum minus that at the best call [dB].
     """
@@ -110,7 +113,7 @@ class RayMap:
 
     @property
     def reached(self) -> bool:
-        """Whether the last call was predicted, and the replay has no better minimum than the best call.
+        """Whether the last call was predicted accurately and the replay has no minimum better than the best call.
 
         The optimum is then probably reached, even if the engine's assumptions are not identified.
         """
@@ -119,7 +122,7 @@ class RayMap:
 
     @property
     def understood(self) -> bool:
-        """Whether the model also explains all calls, and these share their strong paths.
+        """Whether, in addition, the model explains all calls and the calls share their strong paths.
 
         Its replay then represents the engine at other candidates as well.
         """
@@ -128,7 +131,7 @@ class RayMap:
 
 
 def maps_rays(setup: Setup) -> bool:
-    """Whether a study is calibrated by ray mapping: the method `auto` on a program that returns its rays."""
+    """Whether a study is calibrated by ray mapping: its method is `auto`, and its program returns rays."""
     return setup.study.engine.exports_rays and setup.study.method.name == AUTO
 
 
@@ -169,11 +172,11 @@ def search_rays(
 def map_rays(
     problem: Problem, ask: Ask, *, tolerance_db: float = 0.01, most_calls: int = MOST_CALLS, seed: int = 0
 ) -> RayMap:
-    """Call an engine until the path loss at the minimum is predicted within the tolerance, or `most_calls` are made.
+    """Call an engine until path loss at the minimum is predicted within the tolerance or `most_calls` calls are made.
 
-    The result is the replay that replaces the engine, and its accuracy. If the minimum is not at the best call, calls
-    continue: after a short step, the last call does not show how well the model predicts. Calls go
-    through `ask`, not through the engine of the problem.
+    The result contains the replay that replaces the engine, and its accuracy. Calls also continue if the minimum of the
+    replay is not at the best call, because an accurate prediction of a short step does not show that the model is
+    accurate elsewhere. The engine is called through `ask`; the engine of `problem` is not called.
     """
     parameters, known = problem.parameters, problem.setup.known_antennas is not None
     understanding: Understanding | None = None
@@ -209,9 +212,9 @@ def map_rays(
 
 
 def _search_replay(problem: Problem, replay: Replay, starts: NDArray[np.float64], calls: int) -> LeastSquares:
-    """Search the replay from many random points, which differ after each call, and from given ones [k, d].
+    """Search the replay from given points [k, d] and from many random points, which differ after each call.
 
-    A search can miss the lowest minimum. The search after the last call, from different points, can then find it.
+    A search can miss the lowest minimum. The next search starts from different points and can then find it.
     """
     searches = SEARCHES * local_searches(replay.interactions)
     return least_squares(with_engine(problem, replay), searches, starts, seed=calls)
@@ -243,7 +246,7 @@ def _best_last(problem: Problem, calls: list[Call]) -> list[Call]:
 
 
 def with_engine(problem: Problem, replay: Replay) -> Problem:
-    """The problem on a replay; links without a path in it are left out unless they are censored."""
+    """The problem on a replay; links without a path in it are left out unless the objective has a ceiling."""
     objective = problem.objective
     if objective.ceiling_db is None:
         reached = np.isfinite(replay.path_loss(problem.parameters.start[None])[0])
@@ -289,8 +292,8 @@ def _most_informative(problem: Problem, call: Call, random: np.random.Generator)
 def _changes(calls: list[Call]) -> tuple[int, float, int]:
     """Largest number of paths that occur in the last call but not in another one, or vice versa, and their effect.
 
-    The second result is the largest change of path loss without these paths [dB], the third the number of links that
-    lose all paths.
+    The second result is the largest change of path loss if these paths are left out [dB]. The third is the largest
+    number of links that lose all paths.
     """
     last, changed, change_db, lost = calls[-1].export, 0, 0.0, 0
     for call in calls[:-1]:

@@ -1,9 +1,9 @@
 """The powers of an engine's rays as a function of the parameters and of the engine's assumptions.
 
-An engine assumes antennas, and the thickness, conductivity and permittivity of materials if they are not calibrated.
-The gain of an antenna cancels in ratios of powers, but its polarization does not. An unpolarized antenna receives both
-components of a wave. Any other antenna is linearly polarized at a slant angle in the frame of its axis (3GPP TR 38.901,
-eq. 7.3-4/5); the axis may be tilted.
+An engine makes assumptions about antennas and about material constants (thickness, conductivity and permittivity) that
+are not calibrated. The gain of an antenna cancels in ratios of powers, but its polarization does not. An unpolarized
+antenna receives both components of a wave. Any other antenna is linearly polarized at a slant angle in the frame of its
+axis (3GPP TR 38.901, eq. 7.3-4/5); the axis may be tilted.
 """
 
 from __future__ import annotations
@@ -48,16 +48,17 @@ RANGES: Final = {"thickness": (5e-4, HALF_SPACE), "conductivity": (1e-7, 1e3)}
 """Ranges of the assumed constants, in the fields' units."""
 
 PERMITTIVITY_FACTOR: Final = 2.0
-"""Largest factor between the study's value of a permittivity that is not calibrated and the engine's."""
+"""Largest factor between the study's value and the engine's value of a permittivity that is not calibrated."""
 
 TILT: Final = 0.3
-"""Largest tangent of the tilt of an antenna's axis along x or y, 17 degrees: more than the tilt of base stations."""
+"""Largest tangent of the tilt of an antenna's axis along x or y. It corresponds to 17 degrees, which exceeds the tilt
+of base stations."""
 
 ANGLES: Final = 3
 """Number of angles of an end: the slant and two tilts."""
 
 BATCH: Final = 8
-"""Number of candidates that are evaluated at once; the program is compiled for this number."""
+"""Number of candidates that are evaluated together; the program is compiled for this number."""
 
 LEAST_DB: Final = -300.0
 """Lower limit of the power of a path [dB]."""
@@ -99,7 +100,7 @@ class RayModel:
 
     @cached_property
     def assumed(self) -> tuple[tuple[str, str], ...]:
-        """Material and field of every assumed constant: not calibrated, of a material that a path meets."""
+        """Material and field of every assumed constant: not calibrated, and of a material on at least one path."""
         calibrated = {(item.material, item.constant) for item in self.parameters}
         met = set(np.unique(self.paths.material).tolist())
         return tuple(
@@ -129,7 +130,7 @@ class RayModel:
         return np.minimum(lower, self.start), np.maximum(upper, self.start)
 
     def tables(self, candidates: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Constants of the materials [n, M, 8], with the parameters of n candidates [d]."""
+        """Constants of the materials [n, M, 8] for n candidates, each [d]."""
         return np.stack([self.paths.material_table(self.materials(each)) for each in candidates])
 
     def levels_and_slopes(
@@ -167,7 +168,7 @@ class RayModel:
         return np.concatenate(levels), np.concatenate(slopes)
 
     def gains(self, candidate: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Gain of every path between the ports [P, R, T], with the assumed constants in the values [k]."""
+        """Gain of every path between the ports [P, R, T], at a candidate [d] with the assumed values [k]."""
         with jax_settings():
             table = self.paths.material_table(self.materials(candidate, values))
             real, imaginary = map(np.asarray, program_gains(self._layout.program, jnp.asarray(table)))
@@ -176,7 +177,7 @@ class RayModel:
     def materials(
         self, candidate: NDArray[np.float64], values: NDArray[np.float64] | None = None
     ) -> dict[str, Material]:
-        """The materials with parameters [d] and, if given, values [k]."""
+        """The materials at a candidate [d], with the assumed values [k] if given."""
         materials = self.parameters.materials(candidate, self.paths.materials)
         for (name, field), value in zip(self.assumed, [] if values is None else np.exp(values), strict=False):
             materials[name] = replace(materials[name], **{field: float(value)})
@@ -185,7 +186,7 @@ class RayModel:
     def replay_paths(
         self, candidate: NDArray[np.float64], values: NDArray[np.float64], linear: Ends
     ) -> Paths:
-        """The program with values [k]: its materials, and its assumed antennas."""
+        """The program with the materials and antennas of a candidate [d] and the assumed values [k]."""
         fields = [self.paths.tx_field, self.paths.rx_field]
         angles = values[len(self.assumed) :].reshape(-1, ANGLES)
         for end in np.flatnonzero(linear).tolist() if not self.known else []:
@@ -205,7 +206,7 @@ class RayModel:
                 yield f"{name}.{field}", value
 
     def half_spaces(self, candidate: NDArray[np.float64], values: NDArray[np.float64]) -> list[str]:
-        """Materials of assumed thickness whose far face reflects no wave back, at a candidate [d] with values [k]."""
+        """Materials of assumed thickness without a reflection from the far face, at a candidate [d] with values [k]."""
         materials = self.materials(candidate, values)
         assumed = [name for name, field in self.assumed if field == "thickness"]
         return [name for name in assumed if _is_half_space(materials[name], self.paths.frequency)]
@@ -291,7 +292,7 @@ def _is_half_space(material: Material, frequency: float) -> bool:
 def tilted_theta(basis: Any, axis: Any, xp: Any = np) -> Any:
     """Unit vector theta of antennas with axes [..., 3], as components [..., P, 2] along those of the fields [P, 2, 3].
 
-    It points away from the pole: it is -axis without its component along the direction.
+    It points away from the pole: it is the normalised component of -axis orthogonal to the direction.
     """
     theta = -xp.einsum("pac,...c->...pa", basis, axis)
     return theta / xp.sqrt(xp.maximum(xp.sum(theta**2, axis=-1, keepdims=True), 1e-12))

@@ -1,14 +1,15 @@
 """Scans of one material's constants, and of antennas, for starting points of a fit to ratios of path powers.
 
-A slab resonates: the power of a ray oscillates with a period of half a wavelength of thickness, so a local search ends
+A slab resonates: the power of a ray varies with thickness with a period of half a wavelength, so a local search can end
 in a wrong minimum. A scan evaluates a fine grid of thicknesses up to the depth where the wave has decayed, for several
-conductivities, with several polarizations at both ends. It uses only paths of reflections and transmissions.
+conductivities, with several polarizations at both ends. It uses only paths that consist of reflections and
+transmissions.
 
 An antenna receives almost nothing from a direction orthogonal to its polarization. Every path near such a null adds a
-minimum of the misfit. These minima are about 0.02 rad apart, so that a local search from upright antennas ends in a
-wrong one. With the materials fixed, the gain of a path is bilinear in the polarizations of both ends. A scan therefore
-evaluates a grid of slants and tilts of one end, with the other end as fitted and upright. Local searches over all
-angles start from its best points.
+minimum of the misfit. These minima are about 0.02 rad apart, so a local search from upright antennas ends in a wrong
+minimum. With the materials fixed, the gain of a path is bilinear in the polarizations of both ends. A scan therefore
+evaluates a grid of slants and tilts of one end, with the other end first as fitted and then upright. Local searches
+over all angles start from the best points of this grid.
 """
 
 from __future__ import annotations
@@ -48,13 +49,13 @@ ROBUST_DB: Final = 1.5
 of a scan changes the ratio by tens of dB."""
 
 SCANNED: Final = 48
-"""Number of paths of a scan."""
+"""Largest number of paths evaluated in a scan."""
 
 KEPT: Final = 3
 """Number of local minima that are kept from each scan of a material, and from a search over antennas."""
 
 BATCH: Final = 512
-"""Number of points that are evaluated at once."""
+"""Number of points that are evaluated together."""
 
 _COLUMNS: Final = ("relative_permittivity", "conductivity", "thickness")
 
@@ -65,7 +66,7 @@ POLARIZATIONS: Final = [(tx, rx) for tx in (None, *SLANTS) for rx in (None, *SLA
 """Slants at both ends; None for an unpolarized antenna."""
 
 STARTS: Final = 6
-"""Number of points of each scan from which local searches start; from the best six, four found the true angles."""
+"""Number of points of each scan from which local searches start; four of the six best starts found the true angles."""
 
 TILTS: Final = np.linspace(-TILT, TILT, 15)
 """Tilts of a scan along x and along y: 0.04 rad apart, twice the distance between minima."""
@@ -85,7 +86,7 @@ class Observed(NamedTuple):
     Attributes:
         materials: The materials of the earlier call; the scanned constants are replaced.
         weight: Weights of the paths [n].
-        change_db: Power at the last call over that at the earlier one [n], [dB].
+        change_db: Power at the last call relative to that at the earlier one [n], [dB].
     """
 
     materials: dict[str, Material]
@@ -95,11 +96,11 @@ class Observed(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """The best points of a scan for every pair of polarizations, lowest first.
+    """The best points of a scan for every pair of polarizations, lowest misfit first.
 
     Attributes:
         values: Logarithms of the scanned constants [H, K, c].
-        misfit: Mean loss of the ratios [H, K]; inf where a pair has fewer minima.
+        misfit: Mean loss of the ratios [H, K]; inf where a pair has fewer than K minima.
     """
 
     values: NDArray[np.float64]
@@ -116,7 +117,8 @@ def scan(
     """Scan the constants of one material.
 
     Args:
-        paths: Paths of only reflections and transmissions, with the ports V and H unless the antennas are known.
+        paths: Paths with only reflections and transmissions; their antennas have the ports V and H unless they are
+            known.
         name: The material.
         fields: The scanned constants: thickness, conductivity, or both.
         last: The materials of the last call.
@@ -148,7 +150,7 @@ def chosen(paths: Paths, subset: NDArray[np.int64]) -> NDArray[np.int64]:
 def _grid(
     fields: list[str], materials: list[Material], declared: float, frequency: float
 ) -> NDArray[np.float64]:
-    """Logarithms of the scanned constants [n, c], around the thickness that the study declares [m]."""
+    """Logarithms of the scanned constants [n, c]; `declared` is the study's thickness [m]."""
     root = np.sqrt(max(item.relative_permittivity for item in materials))
     conductivities = CONDUCTIVITIES
     if "conductivity" not in fields:
@@ -168,7 +170,7 @@ def _grid(
 def _minima(
     grid: NDArray[np.float64], square: NDArray[np.float64], fields: list[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The lowest local minima over the thickness, each with the best conductivity: [H, K, c], and losses [H, K]."""
+    """The lowest local minima over thickness, each at the best conductivity [H, K, c], and their losses [H, K]."""
     pairs = square.shape[1]
     values, misfit = np.zeros((pairs, KEPT, grid.shape[1])), np.full((pairs, KEPT), np.inf)
     _, group = np.unique(
@@ -193,7 +195,7 @@ class _Scanned(NamedTuple):
     P is always `SCANNED`, so that few functions are compiled. Missing paths have weight 0.
 
     Attributes:
-        exists: Whether a path has an interaction of this index [D, P].
+        exists: Whether a path has an interaction with this index [D, P].
         here: Whether an interaction is on the scanned material [D, P].
         cosine: Cosine of the angle of incidence [D, P].
         through: Whether the interaction is a transmission [D, P].
@@ -248,7 +250,7 @@ def _scanned(paths: Paths, name: str, last: dict[str, Material], calls: list[Obs
 
 @partial(jax.jit, static_argnums=(2, 3))
 def _losses(program: _Scanned, points: jax.Array, columns: tuple[int, ...], known: bool) -> jax.Array:
-    """Mean loss of the ratios [n, H] with constants `columns` of one material [n, c]."""
+    """Mean loss of the ratios [n, H] for values [n, c] of the constants `columns` of one material."""
     last, *earlier = (_powers(program, each, points, columns, known) for each in program.constants)
     total = jnp.zeros(last.shape[:2])
     for power, weight, change_db in zip(earlier, program.weight, program.change_db, strict=True):
@@ -262,7 +264,7 @@ def _losses(program: _Scanned, points: jax.Array, columns: tuple[int, ...], know
 def _powers(
     program: _Scanned, constants: jax.Array, points: jax.Array, columns: tuple[int, ...], known: bool
 ) -> jax.Array:
-    """Powers [n, H, P], up to a factor per path, with constants at one call [3, D, P]."""
+    """Powers [n, H, P], up to a factor per path, with the constants [3, D, P] of one call."""
     values = list(jnp.broadcast_to(constants[:, None], (3, len(points), *constants.shape[1:])))
     for index, column in enumerate(columns):
         values[column] = jnp.where(program.here, points[:, index, None, None], values[column])
@@ -310,7 +312,7 @@ class Gains(NamedTuple):
         earlier: Gains at an earlier call [n, R, T].
         bases: Unit vectors theta and phi of the fields at both ends [n, 2, 3].
         weight: Weights of the paths [n].
-        observed: Power at the last call over that at the earlier one [n], [dB].
+        observed: Power at the last call relative to that at the earlier one [n], [dB].
     """
 
     last: NDArray[np.complex128]
@@ -351,7 +353,7 @@ def antennas(parts: list[Gains], angles: NDArray[np.float64]) -> list[NDArray[np
 
 
 def errors(parts: list[Gains], angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Errors of the ratios [m], [dB], times the square roots of the weights, whose mean is set to 1."""
+    """Errors of the ratios [m], [dB], times the square roots of the weights, which are scaled to a mean of 1."""
     errors, weights = [], np.concatenate([part.weight for part in parts])
     for part in parts:
         tx, rx = (

@@ -113,11 +113,11 @@ SEARCHES: Final = 64
 """Number of local searches for further minima if the method kept only its best one."""
 
 BASINS: Final = 24
-"""Largest number of known minima from which local searches of a changed problem start."""
+"""Largest number of known minima that serve as starting points for a changed problem."""
 
 RELEVANT: Final = 20.0
-"""Largest excess of a relevant minimum over the lowest sum of squares, in noise variances: a likelihood ratio of
-e^-10."""
+"""Largest excess of the sum of squares at a relevant minimum over that at the lowest one, in noise variances. It
+corresponds to a likelihood ratio of e^-10."""
 
 
 def rounds(optimizer: Optimizer, evaluate: Evaluate) -> Iterator[tuple[NDArray[np.float64], Evaluation]]:
@@ -160,9 +160,9 @@ class Trail:
         best_modelled: The engine's values for the best candidate [L].
         best_rmse_db: RMSE of the best candidate [dB].
         best_value: Objective of the best candidate, including priors [dB].
-        minima: Minima of the optimizer's searches, the best first, as points of the search space [k, d].
-        rt_calls: RT calls of the search, including calls of an earlier run that the ledger answered.
-        ledger_hits: Number of calls that the ledger answered.
+        minima: Minima of the optimizer's searches, best first, as points of the search space [k, d].
+        rt_calls: RT calls of the search, including calls of an earlier run that are answered from the ledger.
+        ledger_hits: Number of calls that are answered from the ledger.
         modelled: The engine's values for each candidate [L], only for an engine without derivatives.
         observed: Further observables for each candidate [K, L], only for an engine without derivatives.
     """
@@ -249,7 +249,7 @@ def _hits(engine: Engine) -> int:
 
 
 def find_minima(problem: Problem, trail: Trail) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Collect the known minima of a problem; search for more if the method kept only its best one.
+    """Collect the known minima of a problem; search for further minima if the method kept only its best one.
 
     Returns points of the search space, the calibrated one first [k, d], and their mean squares [k].
     """
@@ -263,7 +263,7 @@ def find_minima(problem: Problem, trail: Trail) -> tuple[NDArray[np.float64], ND
 def relevant_minima(
     minima: NDArray[np.float64], square: NDArray[np.float64], freedom: int
 ) -> NDArray[np.float64]:
-    """Select the minima [k, d] that can contribute to an interval, the lowest first [j, d].
+    """Select the minima [k, d] that can contribute to an interval, lowest first [j, d].
 
     Their mean squares are `square` [k]; `freedom` is the number of residuals minus that of unknowns.
     """
