@@ -360,6 +360,7 @@ def test_a_worker_that_dies_costs_its_candidate_alone(tmp_path):
         answers = {answer.index: answer for answer in engine.answers(CANDIDATES)}
     assert [bool(answers[k].failure) for k in range(3)] == [False, True, False]
     assert "lost with its worker (RuntimeError: worker was killed)" in answers[1].failure
+    assert [answers[k].lost for k in range(3)] == [False, True, False]
 
 
 @pytest.mark.parametrize(

@@ -178,6 +178,16 @@ def test_a_call_that_is_stopped_is_no_failure_of_the_program(tmp_path):
 
 
 @LINUX
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_call_whose_guard_is_ended_from_outside_is_lost(tmp_path, number):
+    """The program's parent is the guard."""
+    outcome = shell(tmp_path, f"kill -{int(number)} $PPID; sleep 30").run(request())
+    assert "was lost with its guard" in outcome.failure
+    assert outcome.lost
+    assert not shell(tmp_path, "exit 3").run(request()).lost
+
+
+@LINUX
 def test_real_time_signals_have_names(tmp_path):
     number = signal.SIGRTMIN + 1
     failure = shell(tmp_path, f"kill -{int(number)} $$").run(request()).failure

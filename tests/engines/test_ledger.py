@@ -40,18 +40,18 @@ def ledger(tmp_path):
 
 
 class Counting:
-    """An engine that counts, answers a sum, and fails where it is told to."""
+    """An engine that counts, answers a sum, and fails where it is told to, by its own fault unless `lost`."""
 
-    def __init__(self, fails: tuple[float, ...] = ()) -> None:
+    def __init__(self, fails: tuple[float, ...] = (), lost: bool = False) -> None:
         self.parameters, self.materials = PARAMETERS, {}
-        self.calls, self.num_links, self.fails = 0, 2, fails
+        self.calls, self.num_links, self.fails, self.lost = 0, 2, fails, lost
 
     def answers(self, candidates, stop=None):
         for index in reversed(range(len(candidates))):  # out of order, as a pool's are
             self.calls += 1
             total = candidates[index].sum()
             if total in self.fails:
-                yield Answer(index, np.full(2, np.inf), 0.5, "it failed")
+                yield Answer(index, np.full(2, np.inf), 0.5, "it failed", lost=self.lost)
             else:
                 yield Answer(index, np.array([total, np.inf]), 0.5)
 
@@ -105,6 +105,27 @@ def test_a_failure_is_kept_until_it_is_taken_out(ledger):
     assert ledger.forget_failures() == 1
     assert mended.path_loss(CANDIDATES)[:, 0].tolist() == [12.0, 12.5, 12.0]
     assert mended.calls == 1
+
+
+def test_a_call_that_was_lost_with_its_worker_is_repeated_by_the_next_run(ledger):
+    engine = Recorded(Counting(fails=(12.5,), lost=True), ledger, "r", "command")
+    assert np.isinf(engine.path_loss(CANDIDATES)[:, 0]).tolist() == [False, True, False]
+    assert ledger.table().status.tolist() == ["ok"]
+    again = Recorded(Counting(), ledger, "r", "command")
+    assert again.path_loss(CANDIDATES)[:, 0].tolist() == [12.0, 12.5, 12.0]
+    assert (again.calls, again.hits) == (1, 2)
+
+
+def test_the_first_failed_call_is_reported_with_its_reason_and_where_to_list_them(ledger, caplog):
+    engine = Recorded(Counting(fails=(12.5,)), ledger, "r", "command")
+    for _ in range(2):
+        engine.path_loss(CANDIDATES)
+    (message,) = [record.getMessage() for record in caplog.records]
+    assert message.startswith(
+        "an RT call failed, so all its links count as links without a path; list failed "
+    )
+    assert f"calibray ledger {ledger.path.parent}" in message
+    assert message.endswith("The call: it failed")
 
 
 def test_an_engine_that_never_worked_leaves_nothing_behind(ledger):

@@ -194,6 +194,8 @@ class Answer:
         failure: Error message with engine and candidate; empty if the call succeeded.
         rays: The response with the rays, as the program wrote it, or further observables [K, L] in SI units as
             little-endian doubles; empty from an engine with neither.
+        lost: Whether the call failed because its worker or guard ended, which is not the program's fault. The ledger
+            does not store such a failure.
     """
 
     index: int
@@ -201,6 +203,7 @@ class Answer:
     seconds: float
     failure: str = ""
     rays: bytes = b""
+    lost: bool = False
 
 
 @runtime_checkable

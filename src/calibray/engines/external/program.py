@@ -49,6 +49,10 @@ class Unstartable(Unusable):
     """The program does not exist or cannot be executed, so another attempt would fail too."""
 
 
+class Lost(Unusable):
+    """The program's guard ended, which is not the program's fault."""
+
+
 class Stopped(Exception):
     """The call was ended from outside before it answered."""
 
@@ -63,12 +67,14 @@ class Outcome:
         failure: Error of the last attempt; empty if it succeeded.
         rays: The response of a program that answers with rays; otherwise further observables [K, L] in SI units as
             little-endian doubles, or empty.
+        lost: Whether the last attempt failed because a worker or the guard ended, which is not the program's fault.
     """
 
     path_loss_db: NDArray[np.float64]
     seconds: float
     failure: str = ""
     rays: bytes = b""
+    lost: bool = False
 
 
 @dataclass(frozen=True)
@@ -114,7 +120,7 @@ class ExternalProgram:
             EngineError: The files cannot be written, which is not the program's fault.
         """
         num_links = len(request.tx)
-        started, failure, attempt = time.perf_counter(), "", 0
+        started, failure, lost, attempt = time.perf_counter(), "", False, 0
         no_path = np.full(num_links, np.inf)
         while attempt <= self.retries:
             if stop is not None and stop.is_set():
@@ -123,10 +129,10 @@ class ExternalProgram:
             try:
                 response = self._attempt(request, num_links, stop)
             except Unstartable as error:
-                failure = str(error)
+                failure, lost = str(error), False
                 break
             except Unusable as error:
-                failure = str(error)
+                failure, lost = str(error), isinstance(error, Lost)
             else:
                 seconds = time.perf_counter() - started
                 if isinstance(response, bytes):
@@ -134,7 +140,7 @@ class ExternalProgram:
                 loss, observed = response
                 return Outcome(loss, seconds, rays=observed.astype("<f8").tobytes())
         attempts = "" if attempt < 2 else f" (attempt {attempt} of {self.retries + 1})"
-        return Outcome(no_path, time.perf_counter() - started, failure + attempts)
+        return Outcome(no_path, time.perf_counter() - started, failure + attempts, lost=lost)
 
     def _attempt(self, request: Request, num_links: int, stop: Event | None) -> Response:
         ending = "json" if self.file_format == "json" else "h5"
@@ -149,9 +155,9 @@ class ExternalProgram:
                 raise Unstartable(f"cannot be started ({report['output']})")
             if report["ended"] == "stopped" and stop is not None and stop.is_set():
                 raise Stopped
+            if report["ended"] == "stopped":
+                raise Lost("was lost with its guard, which was stopped from outside")
             try:
-                if report["ended"] == "stopped":
-                    raise Unusable("was stopped from outside")
                 if report["ended"] == "timeout":
                     raise Unusable(f"gave no answer within timeout = {self.timeout:g} s and was killed")
                 if report["status"]:
@@ -208,7 +214,7 @@ class ExternalProgram:
         try:
             return json.loads(report)
         except ValueError:
-            raise Unusable(
+            raise Lost(
                 f"was lost with its guard, which ended with {_describe_status(process.returncode)}"
             ) from None
 

@@ -156,7 +156,7 @@ class Command:
             if self._progress is not None:
                 self._progress("running", done, len(requests))
             failure = self._describe(requests[index], outcome.failure) if outcome.failure else ""
-            yield Answer(index, outcome.path_loss_db, outcome.seconds, failure, outcome.rays)
+            yield Answer(index, outcome.path_loss_db, outcome.seconds, failure, outcome.rays, outcome.lost)
             # Counted after the answer was yielded, so that the caller can store it before the run ends.
             self._successive_failures = self._successive_failures + 1 if failure else 0
             if self._successive_failures >= self._give_up_after:
@@ -225,7 +225,8 @@ class Command:
             raise
         except Exception as error:  # if a worker dies, only its candidates are lost, not the whole batch
             no_path = np.full(self.num_links, np.inf)
-            return Outcome(no_path, 0.0, f"was lost with its worker ({type(error).__name__}: {error})")
+            failure = f"was lost with its worker ({type(error).__name__}: {error})"
+            return Outcome(no_path, 0.0, failure, lost=True)
 
     def _request(self, candidate: NDArray[np.float64]) -> Request:
         return replace(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from threading import Event
 from typing import Final, final
 
@@ -18,8 +20,10 @@ from calibray.errors import EngineError, InputError
 from calibray.materials import Material
 from calibray.measurements.observables import Statistic
 from calibray.parameters import Parameters
+from calibray.support.messages import command, printable
 from calibray.support.progress import Progress
 
+_LOG: Final = logging.getLogger(__name__)
 SHORTEST_WAIT: Final = 0.02
 LONGEST_WAIT: Final = 1.0
 """Shortest and longest interval between checks for the answers of another run [s]."""
@@ -45,7 +49,7 @@ class Recorded:
     ) -> None:
         self.hits = 0
         self._engine, self._ledger, self._problem, self._name = engine, ledger, problem, name
-        self._progress, self._described = progress, False
+        self._progress, self._described, self._warned = progress, False, False
 
     @property
     def calls(self) -> int:
@@ -91,8 +95,16 @@ class Recorded:
         """The answers to candidates, and whether these candidates are the first batch."""
         first = self.calls + self.hits == 0
         answers = list(self.answers(check_candidates(candidates, len(self.parameters))))
-        if first and all(answer.failure for answer in answers) and not self._ledger.read_only:
-            self._ledger.forget_failures(self._problem)
+        failures = [answer.failure for answer in answers if answer.failure]
+        if first and len(failures) == len(answers):  # the caller ends the run with the reason
+            if not self._ledger.read_only:
+                self._ledger.forget_failures(self._problem)
+        elif failures and not self._warned:
+            self._warned = True
+            _LOG.warning(
+                "an RT call failed, so all its links count as links without a path; list failed calls with %s. The "
+                "call: %s", command("ledger", self._ledger.path.parent), printable(failures[0], keep="\n\t"),
+            )  # fmt: skip
         return answers, first
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
@@ -140,6 +152,10 @@ class Recorded:
             answers = self._engine.answers(values[[indices[candidate][0] for candidate in keys]], stop)
             for answer in answers:
                 candidate, entry = keys[answer.index], _entry(answer)
+                if answer.lost:  # not stored, so that the next run repeats the call
+                    self.hits += len(indices[candidate]) - 1
+                    yield from (replace(answer, index=index) for index in indices[candidate])
+                    continue
                 try:
                     entry = self._ledger.commit(self._problem, candidate, entry)
                 except (EngineError, KeyboardInterrupt) as error:
@@ -148,7 +164,8 @@ class Recorded:
                     unsaved = [(candidate, entry)]
                     with suppress(EngineError):
                         for other in answers:  # one by one, because the engine may fail midway
-                            unsaved.append((keys[other.index], _entry(other)))
+                            if not other.lost:
+                                unsaved.append((keys[other.index], _entry(other)))
                     if isinstance(error, KeyboardInterrupt):
                         for paid in unsaved:
                             self._ledger.commit(self._problem, *paid)
