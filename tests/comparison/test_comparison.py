@@ -193,7 +193,7 @@ def test_failed_runs_are_repeated(small, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("kind", "workers", "message"),
     [
-        ("dies", 2, "a worker process died, perhaps for lack of memory; finished runs are kept in"),
+        ("dies", 2, "a worker process died, perhaps because memory ran out; run the comparison again"),
         ("raises", 1, r"street: no evaluation of any run succeeded \(RuntimeError: no engine\)"),
         ("is infinite", 1, r"no evaluation of any run succeeded \(the objective is infinite\)"),
     ],

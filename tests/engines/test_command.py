@@ -369,7 +369,7 @@ def test_a_worker_that_dies_costs_its_candidate_alone(tmp_path):
         (0, None, "must be at least 1"),
         (2, "tcp://here:1", "give only one of them"),
         *(
-            (None, address, "--scheduler .*: not an address; give host and port, for example tcp://")
+            (None, address, "--scheduler .*: not an address; give a host and a port, for example tcp://")
             for address in (
                 *("", "x", "127.0.0.1", "tcp://", "tcp://127.0.0.1:0", "tcp://127.0.0.1:99999", "tcp://[::1"),
                 *("tcp://127.0.0.1:abc", "http://127.0.0.1:80", "inproc://1", "ucx://a:1", "a:b:c:d"),

@@ -1,8 +1,8 @@
 """Comparison of methods at equal budgets: every method runs with many seeds on one problem.
 
-The result is the excess of every method versus RT calls, as numbers, tables, files and a figure. The excess is the best
-objective so far minus the global optimum of the same data. The optimum comes from least squares with many starts, or
-from another search that reached a lower value.
+The result is the excess of every method as a function of the number of RT calls, in the form of arrays, tables, files
+and a figure. The excess is the best objective so far minus the global optimum on the same data. The optimum comes from
+least squares with many starts, or from another search that reached a lower value.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Comparison:
     Attributes:
         name: Name of the problem.
         methods: The methods, in the order requested.
-        runs: The runs of each method by its name, one per seed.
+        runs: Runs by name of the method, one run per seed.
         optimum: Lowest known objective [dB].
         found_by: The search that found the optimum.
     """
@@ -72,9 +72,9 @@ class Comparison:
     found_by: str
 
     def excess(self, name: str, calls: int) -> NDArray[np.float64]:
-        """Excess [seeds], [dB], after a number of RT calls; a run that ended earlier keeps its last value.
+        """Excess of every run [seeds], [dB], after a number of RT calls.
 
-        The excess is +inf before the first evaluation.
+        A run that ended earlier keeps its final excess. The excess is +inf before the first evaluation.
         """
         return np.array([run.at(calls) for run in self.runs[name]]) - self.optimum
 
@@ -84,26 +84,27 @@ class Comparison:
         return quantile(excess, 0.25), quantile(excess, 0.5), quantile(excess, 0.75)
 
     def calls_to(self, name: str, excess_db: float) -> NDArray[np.float64]:
-        """RT calls until a method's runs reached an excess [seeds]; +inf for a run that never did."""
+        """Number of RT calls after which each run reached an excess [seeds]; +inf for runs that never reached it."""
         return np.array([run.first(self.optimum + excess_db) for run in self.runs[name]])
 
     def table(self) -> pd.DataFrame:
         """One row per method: the excess after given numbers of RT calls, and the RT calls needed for given excesses.
 
-        Columns: median, quartiles and worst excess after 30, 60 and 225 RT calls and at the end; the median number of
-        RT calls to reach an excess (empty if at least half of the runs did not reach it), and the number of runs that
-        reached it; the number of failed runs; the median seconds per run.
+        The table contains the median, the quartiles and the worst excess after 30, 60 and 225 RT calls and at the end.
+        For each given excess, it contains the median number of RT calls to reach it (empty if at least half of the runs
+        did not reach it) and the number of runs that reached it. Further columns contain the number of failed runs and
+        the median duration of a run [s].
         """
         return pd.DataFrame([self._row(method) for method in self.methods])
 
     def failures(self) -> list[tuple[str, int, str]]:
-        """Runs that ended in an error: method, seed and message of each."""
+        """The method, seed and error message of every run that ended in an error."""
         return [
             (name, run.seed, run.failure) for name, runs in self.runs.items() for run in runs if run.failure
         ]
 
     def history(self) -> pd.DataFrame:
-        """Every improvement of every run, and the run's last RT call: columns method, seed, call, best_db, failure."""
+        """One row per improvement and one for the last RT call of every run: method, seed, call, best_db, failure."""
         parts = [
             pd.DataFrame(
                 {
@@ -168,14 +169,14 @@ def quantile(values: NDArray[np.float64], share: float) -> float:
 
 
 def table(comparison: Comparison) -> Table:
-    """One row per method: median excesses, and RT calls to an excess with the number of runs that reached it."""
+    """One row per method: median excesses, RT calls needed for given excesses, and number of runs that reached them."""
     records = comparison.table().to_dict("records")
     rows = tuple(_cells({str(key): value for key, value in record.items()}) for record in records)
     return Table("", COLUMNS, rows)
 
 
 def optimum_text(comparison: Comparison) -> str:
-    """The optimum from which excesses are measured, as a line of text."""
+    """A line of text with the optimum and the search that found it."""
     return f"Optimum {comparison.optimum:.6g} dB, found by {comparison.found_by}"
 
 
@@ -210,13 +211,13 @@ def _summary(comparison: Comparison) -> tuple[Table | str, ...]:
         tuple(whole.columns[k] for k in columns),
         tuple(tuple(row[k] for k in columns) for row in whole.rows),
     )
-    heading = f"Methods on {comparison.name}, excess over the optimum after all RT calls"
+    heading = f"Methods on {comparison.name}: excess over the optimum after all RT calls"
     return heading, short, optimum_text(comparison)
 
 
 FILES: Final = ("compare.csv", "runs.csv", "compare.png")
 FLOOR_DB: Final = 1e-4
-"""Excesses below this value are drawn at this value [dB]."""
+"""Smaller excesses are drawn at this value [dB]."""
 
 
 def write(comparison: Comparison, folder: Path) -> None:
@@ -248,10 +249,10 @@ def figure(comparison: Comparison) -> Figure:
 
 
 ROUNDING_DB: Final = 1e-7
-"""Difference below which two objectives count as equal [dB]."""
+"""Difference below which two objectives are considered equal [dB]."""
 
 OPTIMUM: Final[RunKey] = ("optimum", 0, 0)
-"""Key of the reference search among the runs."""
+"""Key under which the reference search is stored among the runs."""
 
 REFERENCE: Final = "least-squares"
 """Method of the reference search."""
@@ -274,11 +275,12 @@ def compare(
 ) -> Comparison:
     """Run methods with seeds 0, 1, ... on one problem at equal budgets of RT calls.
 
-    Every finished run is appended to `runs.jsonl` in `out` at once. If the file contains a run of the same problem,
-    optimizer code, method, budget and seed that did not fail, that run is not repeated.
+    Every run is appended to `runs.jsonl` in `out` as soon as it ends. A run is not repeated if the file contains a
+    successful run with the same problem, optimizer code, method, budget and seed.
 
     Args:
-        open_problem: Function that makes the problem. Several workers receive it pickled, and each calls it once.
+        open_problem: Function that makes the problem. With several workers, it must be picklable, and each worker calls
+            it once.
         methods: Methods with their budgets (`parse_methods`).
         seeds: Number of runs of each method.
         out: Folder that keeps the runs.
@@ -287,7 +289,7 @@ def compare(
         announce: Called with the numbers of runs and RT calls, as text, before the first run.
 
     Raises:
-        InputError: A method, a number or the folder is invalid.
+        InputError: A method, the number of seeds or workers, or the folder is invalid.
         EngineError: A worker process died, or no evaluation of any run succeeded.
     """
     for name, value in (("seeds", seeds), ("workers", workers)):
@@ -311,8 +313,8 @@ def compare(
                 progress("comparing", done, len(tasks))
     except BrokenExecutor:
         raise EngineError(
-            f"a worker process died, perhaps for lack of memory; finished runs are kept in {out}: start again with "
-            "fewer --workers"
+            "a worker process died, perhaps because memory ran out; run the comparison again with fewer --workers "
+            f"(finished runs are kept in {out})"
         ) from None
     reference = file.find(OPTIMUM)
     if reference is None:
@@ -332,17 +334,17 @@ def compare(
 
 
 def _plan(methods: Sequence[BudgetedMethod], seeds: int, out: str | Path) -> str:
-    """The numbers of runs and RT calls, as text."""
+    """A text with the numbers of runs and RT calls."""
     calls = seeds * sum(method.budget for method in methods if not method.stops_by_itself)
     free = "".join(f", not counting {method.name}" for method in methods if method.stops_by_itself)
     return (
         f"{seeds * len(methods):,} runs with {calls:,} RT calls in total{free}; "
-        f"runs that are kept in {out} are not repeated"
+        f"runs that are already stored in {out} are not repeated"
     )
 
 
 def parse_methods(names: Sequence[str], budget: int) -> tuple[BudgetedMethod, ...]:
-    """Parse method names, such as "gwo@600"; `budget` applies to names that state none, and duplicates are left out.
+    """Parse method names such as "gwo@600" and omit duplicates; `budget` applies to names without a budget.
 
     Raises:
         InputError: The list is empty, a method is unknown, or a budget is invalid.
@@ -356,7 +358,7 @@ def parse_methods(names: Sequence[str], budget: int) -> tuple[BudgetedMethod, ..
 
 
 def _search_optimum(problem: ComparisonProblem) -> MethodRun:
-    """Least squares from enough starting points for its result to count as the global optimum."""
+    """Run least squares from so many starting points that its result can be taken as the global optimum."""
     starts = OPTIMUM_STARTS[problem.large]
 
     def make() -> Optimizer:
@@ -376,7 +378,7 @@ def _search_optimum(problem: ComparisonProblem) -> MethodRun:
 def _lowest(
     earlier: float, reference: MethodRun, runs: dict[str, tuple[MethodRun, ...]]
 ) -> tuple[float, str]:
-    """The lowest objective of all searches, and the first search that reached it within rounding."""
+    """The lowest objective of all searches, and the name of the first search that reached it to within rounding."""
     ends = [(reference.at(reference.evaluations), "many-start least squares"), (earlier, "earlier searches")]
     for name, finished in runs.items():
         ends += [(run.at(run.evaluations), f"{name}, seed {run.seed}") for run in finished]
@@ -409,7 +411,7 @@ def _finished(
 
 
 def _start(open_problem: OpenProblem) -> None:
-    """Open the problem of a worker process, once for all of its runs."""
+    """Open the problem in a worker process, once for all runs of the process."""
     global _opened
     _opened = open_problem()
 

@@ -1,6 +1,6 @@
-"""The experiment of the paper: the demo district calibrated by GWO, SGWO-IM, space mapping and `auto`.
+"""The paper's experiment: the demo district is calibrated with GWO, SGWO-IM, space mapping and `auto`.
 
-Space mapping runs on the ray tracer itself, which traces again for every candidate and so represents an engine without
+Space mapping runs with the engine "retrace", which traces again for every candidate. It represents engines without
 stored paths. The cheap model replays a trace with fewer interactions. `auto` runs on stored paths.
 """
 
@@ -31,13 +31,13 @@ FILES: Final = (RECORD, *FIGURES, page.FILE)
 """Files of the experiment, in addition to a folder for each method."""
 
 MAPPING_CALLS: Final = 8
-"""RT calls of space mapping; each is a trace."""
+"""Number of RT calls of space mapping; each RT call is a trace."""
 
 
 def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = None) -> Demo:
-    """Run the experiment; the paper's methods use the engine "replay" (trace once) or "retrace" (trace each RT call).
+    """Run the experiment, with the paper's methods on the engine "replay" (one trace) or "retrace" (one per RT call).
 
-    `progress` is called for every stage; the name of the method precedes the name of the stage.
+    `progress` is called for every stage, with the method's label in front of the name of the stage.
 
     Raises:
         InputError: The engine or the seed is invalid.
@@ -68,7 +68,7 @@ def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = 
 
 
 def write_demo(demo: Demo, out: Path) -> Path:
-    """Write the experiment: its record, figures, a folder for each method, and the report of `auto`.
+    """Write the experiment's record and figures, a folder for each method, and the report of `auto`.
 
     Returns the path of the report, an HTML file.
     """
@@ -88,7 +88,7 @@ def write_demo(demo: Demo, out: Path) -> Path:
 
 
 def _space_mapping(setup: Setup, seed: int, progress: Progress | None) -> Result:
-    """Space mapping on the engine "retrace", with a replay of fewer interactions as its cheap model."""
+    """Run space mapping on the engine "retrace"; its cheap model replays a trace with fewer interactions."""
     content = setup.study.content()
     method = {"name": MAPPING, "seed": seed, "options": {"budget": MAPPING_CALLS}}
     expensive, cheap = (
@@ -116,7 +116,7 @@ PAPER: Final = {
         "rt_calls": 225, "seconds": 336.51, "rmse_db": 2.97, "concrete": 5.82, "glass": 4.65, "soil": 4.21,
     },
 }  # fmt: skip
-"""The paper's results at its own site (tables III and IV and section IV-B of the paper)."""
+"""The paper's results for its own site (tables III and IV and section IV-B of the paper)."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -124,11 +124,11 @@ class Demo:
     """The finished experiment.
 
     Attributes:
-        results: Results by method, `auto` last; space mapping runs on the engine "retrace".
+        results: Results by method, with `auto` last; space mapping runs on the engine "retrace".
         optimum_db: RMSE of the global optimum [dB], found by `auto` on stored paths.
         truth: True mean permittivities by material.
         engine: Engine used by the paper's methods.
-        trace_seconds: Time to load and trace the district, which replay needs once [s].
+        trace_seconds: Time to load and trace the district [s], which replay requires only once.
     """
 
     results: dict[str, Result]
@@ -148,7 +148,7 @@ class Demo:
         return f"The paper's experiment, engine {self.engine}"
 
     def content(self) -> dict[str, Any]:
-        """The experiment as a dictionary, with the paper's results."""
+        """The experiment as a dictionary, including the paper's results."""
         return {
             "engine": self.engine,
             "optimum_db": self.optimum_db,
@@ -185,7 +185,7 @@ def cost(demo: Demo) -> Table:
 
 
 def permittivity(demo: Demo) -> Table:
-    """Permittivities from every method, the true values, and the paper's values at its own site."""
+    """Permittivities from every method, the true values, and the paper's values for its own site."""
     columns = (
         Column("material"),
         Column("before"),

@@ -1,4 +1,4 @@
-"""Runs of methods on one problem with equal budgets, their records, and a file that stores the records."""
+"""Runs of methods on one problem at equal budgets, and the file that stores their records."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ComparisonProblem:
         fingerprint: Digest of everything that determines an evaluation.
         lower: Lower bounds of the search space [d].
         upper: Upper bounds [d].
-        start: Starting point from the user [d]; None if there is none.
+        start: Starting point given by the user [d]; None if there is none.
         starts: Number of further starting points for methods that use several; None for their default.
         large: Whether evaluations are too expensive for a reference search with many starts.
         minimum: Lowest objective known in advance; +inf if unknown.
@@ -106,7 +106,7 @@ def study_problem(path: str | Path) -> ComparisonProblem:
 
 
 LIMITS: Final = {"seeds": 10_000, "workers": 1_000, "budget": 1_000_000}
-"""Largest accepted numbers; a comparison with larger ones would take impractically long."""
+"""Largest accepted values; a comparison with larger values would take impractically long."""
 
 RunKey = tuple[str, int, int]
 """Method, budget and seed, which identify a run on a problem."""
@@ -133,10 +133,11 @@ class BudgetedMethod:
 
     @staticmethod
     def parse(name: str, budget: int) -> BudgetedMethod:
-        """Parse a method name, such as "gwo@600"; `budget` [RT calls] applies if the name states none.
+        """Parse a method name such as "gwo@600"; `budget` [RT calls] applies if the name contains no budget.
 
         Raises:
-            InputError: The method is unknown or takes no budget, or the budget is not a whole number or is too small.
+            InputError: The method is unknown or has no budget, or the budget is not a whole number in the accepted
+                range.
 
         Example:
             >>> BudgetedMethod.parse("gwo@600", 225)
@@ -193,7 +194,7 @@ class MethodRun:
         budget: Largest number of RT calls; 0 if the method stops by itself.
         seed: Seed of the run.
         evaluations: Number of RT calls in the run.
-        calls: Numbers, from 1, of the RT calls that improved on all earlier ones.
+        calls: Numbers, counted from 1, of the RT calls that improved on all earlier calls.
         best: Objectives of these calls [dB].
         seconds: Duration [s].
         failure: The error that ended the run; empty if it finished.
@@ -244,8 +245,8 @@ class RunFile:
     """Finished runs of one problem, in a JSON Lines file that can also contain runs of other problems.
 
     Runs are appended one by one, so an interrupted comparison continues where it stopped. Failed runs in the file are
-    ignored, so that they are repeated. The file is created when the first run is added; `problem` is a digest of
-    everything that determines a run apart from method, budget and seed.
+    ignored and are therefore repeated. The file is created when the first run is added. `problem` is a digest of
+    everything that determines a run apart from the method, budget and seed.
 
     Raises:
         InputError: The file contains something other than runs.
@@ -291,7 +292,7 @@ class RunFile:
 
 @cache
 def code_fingerprint() -> str:
-    """Digest of the code of the optimizers; runs of different code are not comparable."""
+    """Digest of the optimizers' code; runs with different code are not comparable."""
     digest = hashlib.sha256()
     for path in sorted(Path(optimizers.__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())

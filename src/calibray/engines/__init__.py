@@ -1,14 +1,15 @@
 """Engines compute the path loss of candidates.
 
-- `Replay` evaluates stored paths, with derivatives, in microseconds to milliseconds per candidate.
+- `Replay` evaluates stored paths and their derivatives in microseconds to milliseconds per candidate.
 - `ReplayCarriers` does the same at several carriers.
-- `ChunkedReplay` replays chunks of links in this process or on workers, which can return only sums over links.
+- `ChunkedReplay` replays chunks of links in this process or on workers. It can return sums over links instead of one
+  value per link.
 - `Retrace` runs the ray tracer again for every candidate, as the paper does.
 - `Command` calls an external program.
-- `Recorded` adds a `Ledger` to the last two, so that no RT call is repeated.
+- `Recorded` adds a `Ledger` to `Retrace` or `Command`, so that no RT call is repeated.
 
 One RT call is one run of an engine for one candidate over all links. Every engine counts its own calls. `engines.kinds`
-defines the engine sections of a study file and is imported with the study; JAX is loaded on first use.
+defines the engine sections of a study file and is imported with the study. JAX is loaded on first use.
 """
 
 from typing import TYPE_CHECKING

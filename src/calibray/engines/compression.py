@@ -1,13 +1,15 @@
 """Compression replaces tens of thousands of paths with a few weighted paths, within a stated error in path loss.
 
 The power of a link is a sum over its paths, P(x) = sum_p p_p(x), where x is the candidate. Within the bounds of a few
-parameters, the p_p span a low-dimensional space, so a few paths with weights w >= 0 suffice: sum_p w_p p_p(x) is fitted
-to P(x) at training candidates by non-negative least squares. Paths are added greedily until the fit is good enough (C.
-Farhat, T. Chapman, P. Avery, Int. J. Numer. Methods Eng. 102 (2015) 1077).
+parameters, the functions p_p(x) span a low-dimensional space, so a few paths with weights w_p >= 0 suffice. The
+weighted sum sum_p w_p p_p(x) is fitted to P(x) at training candidates by non-negative least squares. Paths are added
+greedily until the fit is accurate enough (C. Farhat, T. Chapman, P. Avery, Int. J. Numer. Methods Eng. 102 (2015)
+1077).
 
 Weights are non-negative and the paths are physical, so a compressed link remains physically plausible between the
 training candidates. The error is nevertheless checked at new candidates, many of them on faces of the bounds. If a
-link's error there exceeds half the tolerance, it is fitted again to more candidates, or keeps all its paths.
+link's error there exceeds half the tolerance, the link is fitted again to more candidates. After several failed fits,
+it keeps all its paths.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths, take
 
 TOLERANCE_DB: Final = 0.01
-"""Default of the largest error in a link's path loss [dB]."""
+"""Default tolerance for the error in a link's path loss [dB]."""
 
 MIN_PATHS: Final = 64
 """A link with fewer paths is not compressed, because the gain would be small."""
@@ -54,7 +56,7 @@ RANKING: Final = 16
 """Number of candidates used to rank the paths by power."""
 
 POOL: Final = 2000
-"""Largest number of a link's strongest paths in the fit, and largest number of its other paths, chosen at random."""
+"""Largest number of a link's strongest paths in the fit, and also of its other paths, which are chosen at random."""
 
 BATCH_POWERS: Final = 400_000_000
 """Largest number of powers (paths times candidates) in memory at once."""
@@ -68,9 +70,10 @@ class Compressed:
     """A compressed program.
 
     Attributes:
-        paths: The program over the same links. The weights are part of the spreading factors of its paths, so the
-            program is valid only for the sum of powers, not for delays or sums of fields.
-        error_db: Largest difference in path loss from the full program at the checked candidates [L], [dB].
+        paths: The program over the same links. The weights are included in the spreading factors of its paths. The
+            program is therefore valid only for sums of powers, not for delays or sums of fields.
+        error_db: Largest difference in path loss between the compressed and the full program at the checked candidates
+            [L], [dB].
         candidates: Number of candidates, not used in the fit, at which every compressed link was checked.
     """
 
@@ -80,7 +83,7 @@ class Compressed:
 
 
 def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERANCE_DB) -> Compressed:
-    """Compress a program; it is valid for the given parameters within their bounds, and for power summed over paths.
+    """Compress a program; the result is valid for the parameters within their bounds and for power summed over paths.
 
     `tolerance_db` is the largest error in a link's path loss [dB]. Returns the compressed program and its error.
 
@@ -123,8 +126,9 @@ def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERAN
 def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
     """A program without the weakest paths, which together carry at most `share` of a link's total power.
 
-    The shares are summed over candidates spread over the parameters' bounds, so the omitted paths carry even less at a
-    single one. Valid for sums of powers. Raises InputError if a parameter's material is not in the paths.
+    The shares are summed over candidates spread over the parameters' bounds, so the omitted paths carry even less at
+    any one of these candidates. The result is valid for sums of powers. Raises InputError if a parameter's material is
+    not in the paths.
     """
     from scipy.stats import qmc  # the import takes 0.4 s
 
@@ -138,9 +142,9 @@ def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
 
 
 def _candidate_sets(parameters: Parameters) -> list[NDArray[np.float64]]:
-    """Training candidates with corners of the bounds, and then the candidates of every check [n, d].
+    """Training candidates, including corners of the bounds, followed by the candidates of each check [n, d].
 
-    A fit fails first where it extrapolates, so half of the candidates of a check are on faces of the bounds.
+    A fit is least accurate where it extrapolates, so half of the candidates of a check are on faces of the bounds.
     """
     from scipy.stats import qmc  # the import takes 0.4 s
 
@@ -161,8 +165,9 @@ def _evaluate_all(
 ) -> tuple[list[NDArray[np.float64]], NDArray[np.float64], float]:
     """Evaluate the whole program.
 
-    Returns the power of every link at each set of candidates [n, L], the share of every path in its link's power,
-    summed over the ranking candidates [P], and the largest error of a tabulated coefficient.
+    Returns the power of every link at each set of candidates [n, L], the strength of every path [P], and the largest
+    error of a tabulated coefficient. The strength of a path is its share of the link's power, summed over the ranking
+    candidates.
     """
     plan = layout(paths, np.float32, intervals, phases=False)
     totals, errors = [], []
@@ -180,7 +185,7 @@ def _evaluate_all(
 
 
 def _pool(paths: Paths, strength: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Ascending indices of paths that may be kept: for links with many paths, the strongest ones and random others."""
+    """Ascending indices of the paths in the fits: the strongest and random other paths of every link with many paths."""
     random, pool = np.random.default_rng(0), []
     for of_link in np.split(np.arange(paths.num_paths), np.flatnonzero(np.diff(paths.link)) + 1):
         if len(of_link) > MIN_PATHS:
@@ -192,7 +197,7 @@ def _pool(paths: Paths, strength: NDArray[np.float64]) -> NDArray[np.int64]:
 def _batches(
     links: NDArray[np.integer], size: NDArray[np.int64], candidates: int
 ) -> list[NDArray[np.integer]]:
-    """Batches of links; the powers of all paths in the pool of a batch fit into memory."""
+    """Batches of links, such that the powers of a batch's paths in the pool fit into memory."""
     batch = np.cumsum(size[links]) * candidates // BATCH_POWERS
     return [part for part in np.split(links, np.flatnonzero(np.diff(batch)) + 1) if len(part)]
 
@@ -220,9 +225,10 @@ class _Powers:
 def _fit_link(
     powers: _Powers, paths: slice, totals: list[NDArray[np.float64]], tolerance_db: float
 ) -> tuple[NDArray[np.float64], float] | None:
-    """Weights of a link's paths in the pool, and the largest error at new candidates; None if it stays too large.
+    """Weights of a link's paths in the pool, and the largest error at new candidates; None if the error is too large.
 
-    Candidates without power, for instance without scattering, are left out, because no weight changes a zero.
+    Candidates at which the link has no power, for instance because nothing scatters, are omitted, because weights
+    cannot change a zero.
     """
     # Largest relative error of a power, converted from decibels.
     bound = FIT_SHARE * tolerance_db * np.log(10) / 10
@@ -247,7 +253,8 @@ def sparse_weights(
 ) -> NDArray[np.float64]:
     """Sparse weights w >= 0 [P] with sum_p w_p share_p = 1 in every row of `share` [n, P].
 
-    Each row's residual is within the bound, unless non-negative weights cannot meet it. The search starts with `first`.
+    The residual of every row is within `bound` if non-negative weights can achieve this. The search starts with the
+    paths `first`.
     """
     norm = np.linalg.norm(share, axis=0)
     unit = share / np.where(norm > 0, norm, 1.0)

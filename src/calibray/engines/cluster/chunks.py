@@ -1,9 +1,9 @@
 """Division of links into chunks, work done once per chunk on the workers (tracing, prediction), and chunked replay.
 
-The division, and thus every result, depends only on the links and the study, never on the workers. A command can
-therefore read from the cache chunks that an earlier command traced. For replay, each chunk is traced and compiled on
-one worker, and stays there. Candidates are sent to the workers, which return the path loss of their chunks; with
-`reducing` they return only a few sums, however many links there are.
+The division, and thus every result, depends only on the links and the study, never on the workers. Chunks traced by one
+command can therefore be read from the cache by a later command. For replay, each chunk is traced and compiled on one
+worker, and stays there. Candidates are sent to the workers, which return the path loss of their chunks. With
+`reducing`, the workers return only a few sums, regardless of the number of links.
 """
 
 from __future__ import annotations
@@ -45,15 +45,17 @@ Content = TypeVar("Content")
 Answer = TypeVar("Answer")
 
 CHUNK_LINKS: Final = 1000
-"""Largest number of links per chunk if the study states none, unless `MOST_CHUNKS` requires more."""
+"""Default of the largest number of links per chunk; chunks are larger if there would be more than `MOST_CHUNKS`."""
 
 MOST_CHUNKS: Final = 64
-"""Largest number of chunks if the study states no number of links, because every chunk compiles its own program."""
+"""Largest number of chunks if the study does not set their size. The number is limited because every chunk compiles its
+own program.
+"""
 
 _SHARED: WeakValueDictionary[bytes, Shared[Any]] = WeakValueDictionary()
 
 _LATEST: Final[deque[Shared[Any]]] = deque(maxlen=1)
-"""Keeps the last unpacked content alive: between two chunks, there may be no other reference to it."""
+"""Reference to the content that was unpacked last; between two chunks, there might be no other reference to it."""
 
 
 @final
@@ -103,9 +105,9 @@ def for_each_chunk(
 ) -> list[tuple[NDArray[np.int64], Answer]]:
     """Call a picklable function once for every chunk, with the shared content and the chunk's links.
 
-    Objects that `work` loads into `content` stay on the worker; if a worker dies, its chunk is processed again. After
-    every chunk, `progress` is called with "tracing", the number of finished links and the number of all links. Returns
-    the indices of every chunk's links, and the results of `work`.
+    Objects that `work` stores in `content` stay on the worker. If a worker dies, its chunk is processed again. After
+    every chunk, `progress` is called with "tracing", the number of finished links and the total number of links.
+    Returns the indices of every chunk's links, and the results of `work`.
 
     Raises:
         EngineError: Workers die repeatedly, or none is left.
@@ -122,12 +124,12 @@ def _do_task(task: _Task[Any, Any]) -> Any:
 
 
 def identity(value: Content) -> Content:
-    """Return the argument, for objects that already are the answer of a chunk, or are sent unchanged."""
+    """Return the argument; used for objects that are already the answer of a chunk, or that are sent unchanged."""
     return value
 
 
 def count_links(chunks: Sequence[NDArray[np.int64]], progress: Progress | None) -> Callable[[int], None]:
-    """Make a function to call with each finished chunk's number; it reports the links done so far as "tracing"."""
+    """Make a function that accepts a finished chunk's number and reports the links done so far as "tracing"."""
     done, total = 0, sum(len(chunk) for chunk in chunks)
 
     def answered(index: int) -> None:
@@ -140,17 +142,17 @@ def count_links(chunks: Sequence[NDArray[np.int64]], progress: Progress | None) 
 
 
 def chunk_size(stated: int | None, count: int) -> int:
-    """Largest number of links per chunk, from the number that the study states and the number of all links."""
+    """Largest number of links per chunk, given the number stated in the study and the total number of links."""
     return stated or max(CHUNK_LINKS, -(-count // MOST_CHUNKS))
 
 
 def stated_chunk_size(study: OpenedStudy) -> int | None:
-    """The number of links per chunk that a study states; None if it states none."""
+    """The number of links per chunk stated in a study; None if there is none."""
     return getattr(study.engine, "chunk_links", None)
 
 
 def cut(links: Measurements, size: int) -> list[NDArray[np.int64]]:
-    """Divide links into chunks of about equal size, at most `size`; rays start at few positions in each chunk.
+    """Divide links into about equal chunks of at most `size` links, so that rays start at few positions in each chunk.
 
     Returns the indices of every chunk's links, in ascending order.
 
@@ -224,12 +226,12 @@ Open = Callable[[OpenedStudy, Mapping[str, Material]], Differentiable]
 """Opens the engine of a chunk, given the opened study of its links and the materials for the trace."""
 
 _TRACING: Final = Lock()
-"""Makes a process trace only one chunk at a time."""
+"""Lock that limits a process to tracing one chunk at a time."""
 
 
 @dataclass(frozen=True, eq=False)
 class ChunkRecipe:
-    """The content from which a chunk is made.
+    """Everything that is needed to make a chunk.
 
     Attributes:
         shared: The opened study.
@@ -261,7 +263,7 @@ class Chunk:
             self.engine = recipe.open(self.study, recipe.materials)
 
     def derived(self, make: Callable[[Chunk], Content]) -> Content:
-        """The result of `make` for this chunk; it is kept until another function is given."""
+        """The result of `make` for this chunk; it is kept until the method is called with another function."""
         if self._derived is None or self._derived[0] != make:
             self._derived = None  # frees the memory first
             self._derived = make, make(self)
@@ -359,7 +361,7 @@ class ChunkedReplay:
         return self._workers.ask(function, [self._kept], *arguments)
 
     def reducing(self, reductions: Sequence[Reduction]) -> Reduced:
-        """A function that reduces every chunk's path loss on its worker; see `Chunked.reducing`."""
+        """Make a function that reduces every chunk's path loss on its worker; see `Chunked.reducing`."""
         kept = self._workers.keep(identity, reductions)
 
         def reduced(candidates: NDArray[np.float64], derivatives: bool) -> list[Any]:
@@ -372,7 +374,7 @@ class ChunkedReplay:
     def traced_with(
         self, materials: Mapping[str, Material], progress: Progress | None = None
     ) -> ChunkedReplay:
-        """The same links on paths traced with other materials; see `Chunked.traced_with`."""
+        """A replay of the same links on paths traced with other materials; see `Chunked.traced_with`."""
         return ChunkedReplay(self._workers, self._study, self.chunks, self._open, materials, progress)
 
     def derived(self, parameters: Parameters, derive: Derive) -> ChunkedReplay:

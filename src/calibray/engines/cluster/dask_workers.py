@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 SCHEDULER_WAIT = 30.0
-"""Longest wait for the answer of a scheduler [s]."""
+"""Longest wait for an answer from a scheduler [s]."""
 
 POLL: Final = 0.5
 """Interval between checks for dead workers [s]."""
@@ -34,18 +34,19 @@ NO_WORKER_WAIT: Final = 600.0
 """Longest wait for a worker if none is left [s]."""
 
 MOST_DEATHS: Final = 4
-"""The run ends after this many workers have died on one chunk, which is then probably too large."""
+"""Number of worker deaths on one chunk after which the run ends; the chunk is then probably too large."""
 
 FETCH_WAIT: Final = POLL
-"""First wait for an answer that a worker holds [s]; the wait doubles with every further request, so that large answers
-arrive eventually. Between requests, dead workers are detected."""
+"""Initial wait for the transfer of a finished answer [s]. The wait doubles with every further request, so that large
+answers arrive eventually. Dead workers are detected between requests.
+"""
 
 Answered = Callable[[int], None]
 """Called with a chunk's number after its answer has arrived."""
 
 
 def count_death(deaths: Counter[int], chunk: int) -> None:
-    """Count a worker that died on a chunk.
+    """Count the death of a worker that was processing a chunk.
 
     Raises:
         EngineError: Too many workers died on this chunk.
@@ -66,7 +67,7 @@ _LOG: Final = logging.getLogger(__name__)
 
 @dataclass(eq=False)
 class _KeptRemotely:
-    """Objects on workers: for each chunk, the worker that last made its object, and Dask's reference to it."""
+    """Objects on workers: for each chunk, the worker that last made its object, and Dask's reference to that object."""
 
     make: Callable[[Any], Any]
     sources: list[Any]
@@ -80,9 +81,9 @@ class _KeptRemotely:
 class DaskWorkers:
     """The workers of a Dask cluster, opened on first use.
 
-    A chunk stays on one worker, its home. If that worker dies, its replacement, or another worker, gets the chunk and
-    makes its objects again. Paths then come from the cache if all workers share the cache folder. `connect` returns
-    Dask's client, and `open_executor` an executor for the calls of an external program.
+    A chunk stays on one worker, its home. If that worker dies, its replacement or another worker receives the chunk and
+    makes its objects again. The paths are then read from the cache if all workers share the cache folder. `connect`
+    returns Dask's client, and `open_executor` an executor for the calls of an external program.
     """
 
     def __init__(self, connect: Callable[[], Client], open_executor: Callable[[], Executor]) -> None:
@@ -155,7 +156,7 @@ class DaskWorkers:
             return
 
     def _fetch(self, future: Future, index: int, answers: dict[int, Any], patience: float) -> bool:
-        """Fetch an answer; False if it was lost with its worker, or takes longer than `patience` [s] to send."""
+        """Fetch an answer; return False if it was lost with its worker or if its transfer exceeds `patience` [s]."""
         from distributed import KilledWorker
 
         try:
@@ -177,7 +178,7 @@ class DaskWorkers:
         lost = [index for index in waiting if self._homes[index] not in living]
         if not lost:
             return []
-        _LOG.warning("%d of %d chunks lost their worker; they are opened again", len(lost), len(self._homes))
+        _LOG.warning("%d of %d chunks lost their worker and are opened again", len(lost), len(self._homes))
         living = self._living(at_least=self._most_workers)
         for index in lost:
             waiting[index].cancel()
@@ -199,7 +200,7 @@ class DaskWorkers:
                 load[self._homes[index]] += 1
 
     def _living(self, at_least: int = 0) -> list[str]:
-        """Addresses of the living workers; waits for more if there are too few.
+        """Return the addresses of the living workers; if there are too few, wait for more.
 
         Raises:
             EngineError: No worker appeared within `NO_WORKER_WAIT`.
@@ -219,7 +220,7 @@ class DaskWorkers:
 
 @contextmanager
 def scheduler_client(scheduler: str) -> Iterator[Client]:
-    """Connect to a Dask scheduler at an address such as "tcp://10.0.0.1:8786"; the client is closed at the end.
+    """Connect to a Dask scheduler at an address such as "tcp://10.0.0.1:8786"; the client is closed on exit.
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers.
@@ -243,7 +244,7 @@ def _require_dask(option: str) -> None:
 
 
 def _wait_for_scheduler(scheduler: str) -> None:
-    """Wait until a program answers at an address; otherwise Dask would log tracebacks.
+    """Wait until a program answers at an address; without the wait, Dask would log tracebacks.
 
     Raises:
         InputError: The address is malformed, or nothing answers there.
@@ -251,7 +252,7 @@ def _wait_for_scheduler(scheduler: str) -> None:
     match = _ADDRESS.fullmatch(scheduler)
     if match is None or not 1 <= int(match["port"]) <= 65_535:
         raise InputError(
-            f"--scheduler {shortened(scheduler)}: not an address; give host and port, for example tcp://10.0.0.1:8786"
+            f"--scheduler {shortened(scheduler)}: not an address; give a host and a port, for example tcp://10.0.0.1:8786"
         )
     host, end = match["host"].strip("[]"), time.monotonic() + SCHEDULER_WAIT
     while True:
@@ -269,6 +270,6 @@ def _wait_for_scheduler(scheduler: str) -> None:
 
 def _refuse(scheduler: str, fault: str) -> NoReturn:
     raise InputError(
-        f"--scheduler {shortened(scheduler)}: no Dask scheduler answers there ({shortened(fault, 200)}); start one, "
+        f"--scheduler {shortened(scheduler)}: no Dask scheduler answers there ({shortened(fault, 200)}); start one "
         "or correct the address"
     ) from None

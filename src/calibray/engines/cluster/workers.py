@@ -1,8 +1,8 @@
 """Workers keep chunks of links for replay, and run the calls of an external program.
 
 Objects that are kept with a chunk are made on one worker and stay there. Functions are sent to the worker, which
-returns only their results. Chunks are numbered and results are returned in this order, so sums over chunks do not
-depend on the workers.
+returns only their results. Results are returned in the order of the chunk numbers, so sums over chunks do not depend on
+the workers.
 
 Workers on this machine are processes that communicate only through pipes, which they inherit. No port is open, so no
 other user of the machine can send code to a worker or to the main process.
@@ -48,7 +48,7 @@ ObjectKey = tuple[int, int]
 
 @runtime_checkable
 class Workers(Protocol):
-    """Runs the work of an engine: this process, processes on this machine, or a Dask cluster."""
+    """Runs the work of an engine in this process, in processes on this machine, or on a Dask cluster."""
 
     def executor(self) -> Executor | None:
         """An executor for the calls of an external program; None to run them sequentially."""
@@ -83,9 +83,10 @@ class Workers(Protocol):
 class InProcess:
     """Runs the work in this process, one chunk at a time.
 
-    At most `at_most` chunks are kept; others are made again for each question. If None, all are kept if there is no
-    cache folder. Otherwise, chunks are kept until they use a third of the memory that was free at the start, because
-    objects derived from them need as much again.
+    If `at_most` is given, at most this number of chunks is kept; other chunks are made again for each call. If
+    `at_most` is None and there is no cache folder, all chunks are kept. If there is a cache folder, chunks are kept
+    until they use a third of the memory that was free at the start, because objects derived from them need about as
+    much memory.
     """
 
     def __init__(self, at_most: int | None = None) -> None:
@@ -151,7 +152,7 @@ class _Question:
         function: The function to call.
         arguments: Its arguments after the objects.
         keys: Keys of the objects that are its first arguments.
-        recipes: How to make objects that the worker does not have yet.
+        recipes: Functions and sources from which the worker makes the objects that it does not have yet.
         handles: Handles that are still in use; objects of other handles are dropped.
     """
 
@@ -281,8 +282,8 @@ class LocalWorkers:
         most = max(os.cpu_count() or 1, ALWAYS_ALLOWED)
         if self._count > most:
             raise InputError(
-                f"--workers {self._count}: must be at most {most}, because each is a process that keeps a core busy; "
-                "use more machines and --scheduler"
+                f"--workers {self._count}: must be at most {most}, because each worker process keeps a core busy; "
+                "for more workers, use several machines and --scheduler"
             )
         while len(self._workers) < self._count:
             self._workers.append(self._start(len(self._workers)))
@@ -385,7 +386,7 @@ def _sendable(error: Exception) -> Exception:
 def _pin(home: int, count: int) -> None:
     """Assign a process its share of the cores, before any library that counts cores is loaded.
 
-    Otherwise, the thread pools of Dr.Jit and XLA in every process use all cores and slow each other down.
+    Otherwise, the thread pools of Dr.Jit and XLA in every process would use all cores and slow each other down.
     """
     if _CAN_PIN:
         cores = sorted(os.sched_getaffinity(0))
@@ -399,8 +400,8 @@ def open_workers(workers: int | None = None, scheduler: str | None = None) -> It
     Args:
         workers: Number of workers on this machine: processes that keep chunks of links, or external programs that run
             in parallel.
-        scheduler: Address of a Dask scheduler, for instance "tcp://10.0.0.1:8786". Its workers need Calibray and must
-            see the study's folder under the same path.
+        scheduler: Address of a Dask scheduler, for instance "tcp://10.0.0.1:8786". Its workers need Calibray and access
+            to the study's folder under the same path.
 
     Yields:
         The workers; None if neither is given.
