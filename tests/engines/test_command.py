@@ -249,7 +249,7 @@ def test_a_program_that_breaks_down_ends_the_run_and_loses_nothing(tmp_path):
     study = Study.from_content(content | {"method": method}, tmp_path / "study.toml")
     out = tmp_path / "out"
     with pytest.raises(
-        EngineError, match=r"the licence ran out.*the 3 calls before it failed too.*--forget-failed"
+        EngineError, match=r"the licence ran out.*the 3 calls before it also failed.*--forget-failed"
     ):
         calibrate(study, out=out)
     assert len(programs.calls(tmp_path)) == 12
@@ -396,10 +396,10 @@ def test_retrace_takes_no_workers(tmp_path):
 
 def test_a_study_without_a_program_is_refused(tmp_path):
     content = programs.content(tmp_path)
-    with pytest.raises(InputError, match="'command' needs command, the program"):
+    with pytest.raises(InputError, match="'command' requires command, the program"):
         Study.from_content(content | {"engine": {"name": "command"}})
     with pytest.raises(InputError, match="must not be empty"):
         Study.from_content(content | {"engine": {"command": []}})
     replay = Study.from_content(content | {"engine": {"name": "replay"}}, tmp_path / "study.toml")
-    with pytest.raises(InputError, match="needs command, the program"):
+    with pytest.raises(InputError, match="requires command, the program"):
         engines.make(replay, "command")

@@ -104,7 +104,7 @@ grep VmHWM /proc/$PPID/status > peak; du -sk "$(dirname $1)" | cut -f1 > disk; e
     failure = shell(tmp_path, script).run(request()).failure
     assert failure.startswith("ended with exit status 3; its output:\nfirst\nxxx")
     assert failure.endswith("xxxlast")
-    assert "bytes left out" in failure
+    assert "bytes omitted" in failure
     assert len(failure) < 2500
     assert int((tmp_path / "peak").read_text().split()[1]) < 60_000  # kB
     assert int((tmp_path / "disk").read_text()) < 100  # kB
@@ -209,10 +209,13 @@ def test_a_program_is_told_apart_from_its_absence(tmp_path):
 @pytest.mark.parametrize(
     ("script", "message"),
     [
-        ('mkfifo "$2"', "is not a file but a folder, a FIFO or a device"),
-        ('mkdir "$2"', "is not a file but a folder, a FIFO or a device"),
-        ('ln -s /dev/zero "$2"', "must be a file, not a link to one"),
-        ('echo \'{"path_loss_db": [70, 80]}\' > elsewhere; ln -s "$PWD/elsewhere" "$2"', "not a link to one"),
+        ('mkfifo "$2"', "is a folder, a FIFO or a device; it must be"),
+        ('mkdir "$2"', "is a folder, a FIFO or a device; it must be"),
+        ('ln -s /dev/zero "$2"', "must be a regular file, not a link"),
+        (
+            'echo \'{"path_loss_db": [70, 80]}\' > elsewhere; ln -s "$PWD/elsewhere" "$2"',
+            "must be a regular file, not a link",
+        ),
         ('truncate -s 20G "$2"', "has 21,474,836,480 bytes; it must have 16,785,408 or fewer"),
         (f'{sys.executable} -c \'print("[" * 1000000)\' > "$2"', "nests lists or objects too deeply"),
     ],
@@ -227,12 +230,12 @@ def test_responses_that_are_no_files_of_a_sensible_size(tmp_path, script, messag
     [
         (
             "-85.2",
-            r"path_loss_db\[1\] = -85.2; it must be a number between 20 and 300 dB.*answer with gains\?",
+            r"path_loss_db\[1\] = -85.2; it must be a number between 20 and 300 dB.*return gains\?",
         ),
-        ("19.9", r"= 19.9; it must be a number between 20 and 300 dB, or infinite without a path$"),
+        ("19.9", r"= 19.9; it must be a number between 20 and 300 dB, or infinite if the link has no path$"),
         ("300.1", "= 300.1; it must be a number between 20 and 300 dB"),
         ("1e308", r"= 1e\+308; it must"),
-        ("-1e4", "= -10000; it must be a number between 20 and 300 dB, or infinite without a path$"),
+        ("-1e4", "= -10000; it must be a number between 20 and 300 dB, or infinite if the link has no path$"),
     ],
 )
 def test_path_loss_out_of_range_is_refused_with_a_hint_at_the_sign(tmp_path, value, message):

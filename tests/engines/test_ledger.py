@@ -291,7 +291,7 @@ def test_the_command_lists_exports_and_takes_out(tmp_path):
 
 
 def test_a_file_that_is_no_ledger_is_refused(tmp_path):
-    with pytest.raises(InputError, match="no such ledger; name a folder"):
+    with pytest.raises(InputError, match="no such ledger; give a folder"):
         engines.open_ledger(tmp_path)
     (tmp_path / "text").write_text("not a database, but long enough to be taken for one" * 50)
     with pytest.raises(InputError, match="cannot be used as a ledger"):

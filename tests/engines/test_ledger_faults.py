@@ -122,13 +122,13 @@ def test_damaged_entries_are_left_out_of_the_table(path, caplog):
 @pytest.mark.parametrize(
     ("script", "message"),
     [
-        ("CREATE TABLE bookmarks (url TEXT)", "not a ledger but a database with a table 'bookmarks'"),
+        ("CREATE TABLE bookmarks (url TEXT)", "is a database with a table 'bookmarks', not a ledger"),
         (
             "CREATE TABLE answers (id, text)",
             "its table 'answers' has the columns id, text; it must have",
         ),
         ("CREATE TABLE claims (who)", "its table 'claims' has the columns who; it must have"),
-        ("PRAGMA user_version = 3", "ledger of version 3, but this Calibray uses version 2"),
+        ("PRAGMA user_version = 3", "ledger of version 3, but Calibray uses version 2"),
     ],
 )
 def test_another_database_is_refused_and_left_as_it_is(tmp_path, script, message):
@@ -160,7 +160,7 @@ def test_a_ledger_that_leads_to_another_file_is_refused(tmp_path, foreign, endin
         pass
     before = mine.read_bytes()
     FOREIGN[foreign](tmp_path / f"ledger.sqlite{ending}", mine)
-    with pytest.raises(InputError, match=rf"ledger.sqlite{ending}: must be .* or name another folder"):
+    with pytest.raises(InputError, match=rf"ledger.sqlite{ending}: must be .* or choose another folder"):
         Ledger(tmp_path / "ledger.sqlite")
     assert mine.read_bytes() == before
     assert not (tmp_path / "new").exists()

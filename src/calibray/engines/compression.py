@@ -185,7 +185,7 @@ def _evaluate_all(
 
 
 def _pool(paths: Paths, strength: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Ascending indices of the paths in the fits: the strongest and random other paths of every link with many paths."""
+    """Ascending indices of the paths in the fits: the strongest and some other paths of every link with many paths."""
     random, pool = np.random.default_rng(0), []
     for of_link in np.split(np.arange(paths.num_paths), np.flatnonzero(np.diff(paths.link)) + 1):
         if len(of_link) > MIN_PATHS:

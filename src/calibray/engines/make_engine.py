@@ -40,8 +40,9 @@ def make(
     Args:
         study: The study, opened or not.
         name: "replay", "retrace" or "command"; if None, the study's engine.
-        progress: Called after every launch of a trace ("tracing"), or every RT call of a batch ("running").
-        ledger: SQLite file that stores RT calls. Replay does not use it, because computing is faster than reading.
+        progress: Called after every launch of a trace ("tracing") or after every RT call of a batch ("running").
+        ledger: SQLite file that stores RT calls. Replay does not use it, because replaying is faster than reading the
+            file.
         workers: Workers that run the calls of a batch for "command", or keep chunks of links for "replay".
         paths: Paths of the study's links for "replay"; if None, they are traced or read from the cache.
 
@@ -58,7 +59,7 @@ def make(
         raise InputError(f"engine {name!r}: must be one of {', '.join(KINDS)}")
     if workers is not None and not (KINDS[name].external or KINDS[name].chunked):
         raise InputError(
-            f"engine {name!r} runs in this process; --workers and --scheduler need engine 'command' or 'replay'"
+            f"engine {name!r} runs in this process; --workers and --scheduler need the engine 'command' or 'replay'"
         )
     if name != opened.engine.name:
         opened = opened.replace(engine=name)
@@ -72,9 +73,9 @@ def make(
 def fingerprint(study: OpenedStudy) -> str:
     """Fingerprint (SHA-256, in hexadecimal) of the problem that an engine solves for each candidate.
 
-    Method, seed, measured values, bounds and start values are left out: studies that differ only in these share their
-    calls. For re-tracing, the fingerprint includes the tracer's versions. An external program's version is unknown, so
-    its command line is included instead.
+    The method, seed, measured values, bounds and start values are excluded, so studies that differ only in these share
+    their calls. For re-tracing, the fingerprint includes the tracer's versions. An external program's version is
+    unknown, so its command line is included instead.
     """
     links, parameters, radio = study.links, study.parameters, study.radio
     # Calibrated constants are part of the candidate.

@@ -41,13 +41,13 @@ XP: Final = SimpleNamespace(
         "power": lambda base, exponent: jnp.exp(np.log(base) * exponent),
     }
 )
-"""`jax.numpy` with functions that XLA vectorizes on CPU."""
+"""`jax.numpy` with sine, cosine and power in forms that XLA vectorizes on CPUs."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class PoseError:
-    """Transmit antennas whose direction or gain differs from the stated one; P paths, M poses, T transmitters.
+    """Deviations of T transmit antennas from their stated directions and gains, for P paths and M poses.
 
     Attributes:
         basis: Directions of departure with their basis vectors [3, 3, P], see `wave_basis`.
@@ -56,10 +56,10 @@ class PoseError:
         mounted: Index of every path's pose [P].
         of_antenna: Indices of the paths of each antenna.
         transmitter: Index of every pose's transmitter [M].
-        weights: The changes of yaw [rad], downtilt [rad] and gain [dB] of a transmitter, per unit of each of e
+        weights: Changes in the yaw [rad], downtilt [rad] and gain [dB] of every transmitter per unit of each of e
             effect parameters [3, T, e].
         antennas: The distinct antennas.
-        gains: Content of the antennas, so that the program is compiled again if a gain file changes but keeps its name.
+        gains: Content of the antennas as text. It causes a new compilation if a gain file changes but keeps its name.
     """
 
     basis: Any
@@ -116,7 +116,7 @@ def pose_error(
     effect_parameters: Sequence[Parameter],
     from_north: bool,
 ) -> PoseError | None:
-    """The errors described by parameters such as "tx:CELL.azimuth"; None if there are none.
+    """The errors described by parameters such as "tx:CELL.azimuth"; None if there are no such parameters.
 
     Args:
         paths: The paths, with the fields of the stated antennas.

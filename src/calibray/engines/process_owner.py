@@ -12,10 +12,10 @@ from typing import Final
 import psutil
 
 CLOCK_TOLERANCE: Final = 2.0
-"""Largest accepted difference between two readings of a process's start time [s]: a time since 1970 changes if the
-system clock is corrected between the readings.
+"""Largest accepted difference between two readings of a process's start time [s].
 
-The system does not reuse a process number within this time, because it first uses all other numbers.
+A time since 1970 changes if the system clock is corrected between the readings. The system does not reuse a process
+number within this time, because it first uses all other numbers.
 """
 
 
@@ -27,9 +27,9 @@ class ProcessOwner:
         host: The machine.
         namespace: The process namespace, in which a container numbers its own processes; empty if unknown.
         pid: The process number.
-        started: Start time of the process [s since boot, or since 1970 if the boot time is unknown]; process numbers
+        started: Start time of the process [s since boot, or since 1970 if `boot` is unknown], because process numbers
             are reused.
-        boot: Boot identifier; after another boot, the same numbers refer to other processes. Empty if unknown.
+        boot: Boot identifier, because the same numbers refer to other processes after a reboot. Empty if unknown.
     """
 
     host: str
@@ -44,7 +44,7 @@ class ProcessOwner:
         return cls(*_machine(), os.getpid(), _start_time(os.getpid()), _boot())
 
     def record(self) -> dict[str, str | int | float]:
-        """The owner as plain values."""
+        """The owner as a dictionary of plain values."""
         return asdict(self)
 
     @classmethod
@@ -70,7 +70,7 @@ class ProcessOwner:
 
     @property
     def is_gone(self) -> bool:
-        """Whether the process has certainly ended; processes of other machines and containers cannot be checked."""
+        """Whether the process is known to have ended; processes on other machines or in containers are not checked."""
         if (self.host, self.namespace) != _machine():
             return False
         if self.boot != _boot():
@@ -90,7 +90,8 @@ def _start_time(pid: int) -> float:
     """Start time of a process [s]. On Linux it is measured from boot, so it does not depend on the system clock.
 
     Raises:
-        FileNotFoundError: The process does not exist; may also be `ProcessLookupError` or `psutil.NoSuchProcess`.
+        FileNotFoundError: The process does not exist. The error can also be `ProcessLookupError` or
+            `psutil.NoSuchProcess`.
     """
     if not _boot():
         return psutil.Process(pid).create_time()

@@ -38,10 +38,10 @@ class Engine(Protocol):
         ...
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss [n, L], [dB], for candidates [n, d] in the fields' units; +inf for a link without a path.
+        """Path loss [n, L], [dB], for candidates [n, d] in the parameters' units; +inf for a link without a path.
 
         Raises:
-            InputError: The candidates have the wrong width, or a value is not finite or unphysical.
+            InputError: The candidates have the wrong width, or a value is infinite, NaN or unphysical.
         """
         ...
 
@@ -57,7 +57,7 @@ class Differentiable(Engine, Protocol):
 
     @property
     def interactions(self) -> int:
-        """Number of interactions that are evaluated for a candidate."""
+        """Number of interactions that are evaluated for each candidate."""
         ...
 
     def path_loss_and_jacobian(
@@ -66,7 +66,7 @@ class Differentiable(Engine, Protocol):
         """Path loss [n, L], [dB], and its derivatives with respect to the parameters [n, L, d], [dB] per unit.
 
         Raises:
-            InputError: The candidates have the wrong width, or a value is not finite or unphysical.
+            InputError: The candidates have the wrong width, or a value is infinite, NaN or unphysical.
         """
         ...
 
@@ -101,7 +101,7 @@ def joined(parts: Sequence[Responses]) -> Responses:
 
 
 def of_links(parts: Sequence[Responses], links: Sequence[NDArray[np.intp]]) -> Responses:
-    """Combine the responses of subsets of the links; `links` are the indices [l] of each subset's links."""
+    """Combine the responses of subsets of the links; `links` contains the indices [l] of each subset's links."""
     count, arrays = sum(map(len, links)), []
     # Axis of the links in path loss, in observables, and in the derivatives of both.
     for column, axis in zip(zip(*(part.arrays() for part in parts), strict=True), (1, 2, 1, 2), strict=False):
@@ -124,7 +124,7 @@ class Observing(Engine, Protocol):
         """Path loss and the statistics `wanted` of every link for candidates [n, d]; each candidate is one RT call.
 
         Raises:
-            InputError: The candidates have the wrong width, or a value is not finite or unphysical.
+            InputError: The candidates have the wrong width, or a value is infinite, NaN or unphysical.
         """
         ...
 
@@ -133,12 +133,12 @@ Reduction = Callable[[NDArray[np.float64], NDArray[np.float64] | None], Any]
 """Reduces the path loss of a chunk's links [n, l], [dB], and its derivatives [n, l, d] or None, to a few sums."""
 
 Reduced = Callable[[NDArray[np.float64], bool], list[Any]]
-"""Maps candidates [n, d], and whether derivatives are requested, to the result of every chunk's reduction."""
+"""Maps candidates [n, d] and a flag that requests derivatives to the results of all chunks' reductions."""
 
 
 @runtime_checkable
 class Chunked(Differentiable, Protocol):
-    """An engine whose links are split into chunks, which may be on other machines."""
+    """An engine whose links are split into chunks, which can be on other machines."""
 
     @property
     def chunks(self) -> Sequence[NDArray[np.int64]]:
@@ -146,7 +146,7 @@ class Chunked(Differentiable, Protocol):
         ...
 
     def reducing(self, reductions: Sequence[Reduction]) -> Reduced:
-        """A function of candidates that reduces every chunk's path loss on its worker, which then returns little data.
+        """Make a function of candidates that reduces every chunk's path loss on its worker, to return little data.
 
         Every chunk has one reduction, which is sent to its worker once.
         """
@@ -160,7 +160,7 @@ class Chunked(Differentiable, Protocol):
         ...
 
     def derived(self, parameters: Parameters, derive: Callable[[Any], Differentiable]) -> Chunked:
-        """The same chunks with engines for other parameters, which a picklable function derives from every chunk."""
+        """The same chunks with engines for other parameters, which the picklable function `derive` makes."""
         ...
 
     def traced_with(self, materials: Mapping[str, Material], progress: Progress | None = None) -> Chunked:
@@ -170,14 +170,14 @@ class Chunked(Differentiable, Protocol):
 
 @runtime_checkable
 class ReplaysScene(Protocol):
-    """An engine on stored paths, which can leave out what an exported scene does not contain."""
+    """An engine on stored paths that can omit the effects that an exported scene does not contain."""
 
     def scene_path_loss(
         self, candidates: NDArray[np.float64], walls: Mapping[str, str]
     ) -> NDArray[np.float64]:
-        """Path loss [n, L], [dB], of the scene alone for candidates [n, d], in the fields' units.
+        """Path loss [n, L], [dB], of the scene alone for candidates [n, d] in the parameters' units.
 
-        Effects on paths, such as the loss in regions, are left out. `walls` maps the name of every facade to the scene
+        Effects on paths, such as the loss in regions, are omitted. `walls` maps the name of every facade to the scene
         material of its wall.
         """
         ...
@@ -192,8 +192,8 @@ class Answer:
         path_loss_db: Path loss [L], [dB]; +inf for a link without a path, and for all links of a failed call.
         seconds: Duration of the call [s].
         failure: Error message with engine and candidate; empty if the call succeeded.
-        rays: The response with the rays, as the program wrote it, or further observables [K, L] in SI units as
-            little-endian doubles; empty from an engine with neither.
+        rays: The unchanged response of a program that returns rays, or further observables [K, L] in SI units as
+            little-endian doubles; empty if there are neither rays nor observables.
         lost: Whether the call failed because its worker or guard ended, which is not the program's fault. The ledger
             does not store such a failure.
     """
@@ -220,9 +220,9 @@ class Answering(Engine, Protocol):
         ...
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
-        """Answer candidates [n, d], in the fields' units, each as soon as its call ends.
+        """Yield the answer to each of the candidates [n, d], in the parameters' units, as soon as its call ends.
 
-        After another thread sets `stop`, no further call starts, and running calls are stopped if possible; answers
+        After another thread sets `stop`, no further call starts, and running calls are stopped if possible. Answers
         that have already arrived are still returned.
 
         Raises:
@@ -236,7 +236,7 @@ class Answering(Engine, Protocol):
 def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> NDArray[np.float64]:
     """Collect the path loss [n, L], [dB], of a batch of answers; +inf for all links of a failed candidate.
 
-    If the whole first batch fails, the engine itself must be at fault.
+    If the whole first batch fails, the fault is assumed to be in the engine.
 
     Raises:
         EngineError: Every candidate of the first batch failed.
@@ -255,7 +255,7 @@ def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> ND
 def gather_responses(
     answers: Iterable[Answer], shape: tuple[int, int], num_observables: int, first: bool
 ) -> Responses:
-    """Collect path loss and further observables of a batch of answers; the latter are NaN for a failed candidate.
+    """Collect path loss and further observables of a batch of answers; observables are NaN for a failed candidate.
 
     Raises:
         EngineError: Every candidate of the first batch failed.
@@ -312,4 +312,4 @@ PATH_LOSS: Final = Observable(
     modelled=lambda engine, candidates: engine.path_loss(candidates),
     derivatives=lambda engine, candidates: engine.path_loss_and_jacobian(candidates),
 )
-"""Path loss [dB], the observable to which the paper calibrates."""
+"""Path loss [dB], the observable that the paper uses for calibration."""

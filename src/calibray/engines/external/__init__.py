@@ -1,1 +1,1 @@
-"""External programs as engines: the files exchanged with them, and how they are run."""
+"""External programs as engines: the files exchanged with them, and the calls of the programs."""

@@ -1,4 +1,4 @@
-"""The files exchanged with an external program: the request of one RT call and its response, in JSON or HDF5.
+"""The files exchanged with an external program: the request of one RT call and the response, in JSON or HDF5.
 
 `docs/reference/program-files.md` documents the formats for authors of programs.
 """
@@ -45,7 +45,7 @@ class Request:
         tx: Transmitter position of every link [L, 3], [m].
         rx: Receiver position of every link [L, 3], [m].
         materials: All materials of the scene with the candidate's values at the study's carrier, by name.
-        parameters: The candidate's values by parameter name, in the fields' units.
+        parameters: The candidate's values by parameter name, in the parameters' units.
         link_frequency: Carrier of every link [L], [Hz]; None if all links have the study's carrier.
         carriers: The materials at each carrier of the links [Hz]; empty if all links have the study's carrier.
     """
@@ -157,14 +157,10 @@ def read_answer(
     wrong = ~((values >= lower) & (values <= upper) | np.isposinf(values))
     if wrong.any():
         link = int(np.argmax(wrong))
-        hint = (
-            "; path loss is positive; does the program answer with gains?"
-            if -upper <= values[link] < 0
-            else ""
-        )
+        hint = "; path loss is positive; does the program return gains?" if -upper <= values[link] < 0 else ""
         raise Unusable(
             f"its response contains {ANSWER}[{link}] = {values[link]:g}; it must be a number between {lower:g} and "
-            f"{upper:g} dB, or infinite without a path{hint}"
+            f"{upper:g} dB, or infinite if the link has no path{hint}"
         )
     shape = num_observables, num_links
     if not num_observables:
@@ -181,7 +177,7 @@ def read_answer(
 
 
 def read_rays(path: Path, num_links: int) -> bytes:
-    """The response of a program that answers with a ray table.
+    """The response of a program that returns a ray table.
 
     Raises:
         Unusable: The file is missing, not a regular file, or too large.
@@ -190,7 +186,7 @@ def read_rays(path: Path, num_links: int) -> bytes:
 
 
 def _read_bytes(path: Path, limit: int) -> bytes:
-    """The bytes of a response. Only a regular file is read, because a program may leave anything at this path."""
+    """The bytes of a response. Only a regular file is read, because a program can leave anything at this path."""
     try:
         # O_NOFOLLOW does not follow a link; O_NONBLOCK does not wait for the writer of a FIFO.
         handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
@@ -198,12 +194,12 @@ def _read_bytes(path: Path, limit: int) -> bytes:
         raise Unusable("it wrote no response file") from None
     except OSError as error:
         raise Unusable(
-            f"its response cannot be read ({error.strerror}); it must be a file, not a link to one"
+            f"its response cannot be read ({error.strerror}); it must be a regular file, not a link"
         ) from None
     status = os.fstat(handle)
     if not stat.S_ISREG(status.st_mode):
         os.close(handle)
-        raise Unusable("its response is not a file but a folder, a FIFO or a device")
+        raise Unusable("its response is a folder, a FIFO or a device; it must be a regular file")
     with os.fdopen(handle, "rb") as file:
         if status.st_size > limit:
             raise Unusable(f"its response has {status.st_size:,} bytes; it must have {limit:,} or fewer")
@@ -251,12 +247,16 @@ def _read_hdf5(response: bytes, name: str, size: int) -> NDArray[np.float64]:
             if link is None:
                 raise Unusable(f"its response has no dataset {name!r}")
             if not isinstance(link, h5py.HardLink):
-                raise Unusable(f"its response links {name!r} to another object; write the numbers themselves")
+                raise Unusable(
+                    f"its response links {name!r} to another object; write the numbers instead of the link"
+                )
             dataset = file[name]
             if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "iuf":
                 raise Unusable(f"its response has {name!r}, which is not a dataset of numbers")
             if dataset.is_virtual or dataset.external:
-                raise Unusable(f"its response has {name!r} in other files; write the numbers themselves")
+                raise Unusable(
+                    f"its response stores {name!r} in other files; write the numbers into the response file"
+                )
             # Checked before it is read, because a small compressed file may unpack to any size.
             if dataset.size != size:
                 raise Unusable(
@@ -266,4 +266,6 @@ def _read_hdf5(response: bytes, name: str, size: int) -> NDArray[np.float64]:
     except Unusable:
         raise
     except (OSError, KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-        raise Unusable(f"its response is not an HDF5 file with the numbers {name!r} ({error})") from None
+        raise Unusable(
+            f"its response is not an HDF5 file with a numeric dataset {name!r} ({error})"
+        ) from None

@@ -1,11 +1,12 @@
-"""The guard runs an external program to its end, limits its output, and kills all processes that the program started.
+"""The guard runs an external program, limits its output, and finally kills all processes that the program started.
 
 This is a separate script, `python -I -S guard.py LIBRARIES TIMEOUT FOLDER WORD...`, that imports no part of Calibray.
-It is a process between Calibray and the program for two reasons. First, on Linux it adopts orphans
-(PR_SET_CHILD_SUBREAPER), so it finds processes that left the program's group and session. Second, it outlives Calibray:
-when its standard input ends because Calibray ended or stopped the call, it kills the program and removes the folder.
+It runs as a process between Calibray and the program for two reasons. First, on Linux it adopts orphans
+(PR_SET_CHILD_SUBREAPER), so it finds processes that left the program's process group and session. Second, it outlives
+Calibray: when its standard input ends because Calibray ended or stopped the call, it kills the program and removes the
+folder.
 
-It prints one JSON object: `ended` ("status", "timeout", "stopped" or "unstarted"), `status` and `output`.
+It prints one JSON object with the keys `ended` ("status", "timeout", "stopped" or "unstarted"), `status` and `output`.
 """
 
 from __future__ import annotations
@@ -44,15 +45,15 @@ class Output:
         self.tail = (self.tail + part[-TAIL:])[-TAIL:]
 
     def text(self) -> str:
-        """The output as text; control characters (harmful to terminals) are replaced, and a long middle is omitted."""
+        """The output as text, without a long middle; control characters, which can harm terminals, are replaced."""
         left_out = self.length - len(self.head) - len(self.tail)
-        middle = f" ... ({left_out} bytes left out) ... ".encode() if left_out else b""
+        middle = f" ... ({left_out} bytes omitted) ... ".encode() if left_out else b""
         text = (self.head + middle + self.tail).decode("utf-8", "replace").replace("\r\n", "\n").strip()
         return "".join(letter if letter.isprintable() or letter in "\n\t" else "\ufffd" for letter in text)
 
 
 def main(timeout: float, words: list[str]) -> dict[str, object]:
-    """Run a program until it ends, exceeds its time limit [s], or Calibray ends or stops it; report how it ended."""
+    """Run a program until it ends, its time limit [s] expires, or Calibray ends or stops it; return a report."""
     prctl = _prctl()
     prctl(PR_SET_CHILD_SUBREAPER, 1)
     streams = [os.pipe(), os.pipe()]
@@ -84,7 +85,7 @@ def main(timeout: float, words: list[str]) -> dict[str, object]:
 
 
 def _prctl():
-    """The system call by which a process adopts orphans or dies with its parent; a dummy except on Linux."""
+    """The system call with which a process adopts orphans or dies with its parent; a dummy function except on Linux."""
     if sys.platform != "linux":
         return lambda option, value: None
     library = ctypes.CDLL(None)
@@ -126,7 +127,7 @@ def _listen(process: subprocess.Popen, deadline: float, signals: int, outputs: d
 
 
 def _kill_tree(process: subprocess.Popen) -> None:
-    """Kill the program's group, and then all descendants of this process until none is left."""
+    """Kill the program's process group, and then all descendants of this process until none is left."""
     # On Linux the guard adopts orphans; elsewhere they are found only if they are listed before their parent ends.
     adopts = sys.platform == "linux"
     if adopts:
@@ -155,7 +156,7 @@ def _kill_group(process: subprocess.Popen) -> None:
 
 
 def _has_child() -> bool:
-    """Whether this process has a child, after those that have ended are reaped."""
+    """Whether this process still has a child after all children that have ended are reaped."""
     with suppress(ChildProcessError):
         while os.waitpid(-1, os.WNOHANG)[0]:
             pass

@@ -1,4 +1,4 @@
-"""An external program, run for one candidate: its request and response files, time limit and attempts."""
+"""Calls of an external program for one candidate: request and response files, time limit and attempts."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ Response = tuple[NDArray[np.float64], NDArray[np.float64]] | bytes
 
 
 class Unstartable(Unusable):
-    """The program does not exist or cannot be executed, so another attempt would fail too."""
+    """The program does not exist or cannot be executed, so another attempt would also fail."""
 
 
 class Lost(Unusable):
@@ -54,18 +54,18 @@ class Lost(Unusable):
 
 
 class Stopped(Exception):
-    """The call was ended from outside before it answered."""
+    """The call was stopped from outside before the program answered."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """How the attempts at one candidate ended.
+    """Outcome of all attempts to run the program for one candidate.
 
     Attributes:
         path_loss_db: Path loss [L], [dB]; +inf for a link without a path, and for all links if the attempts failed.
         seconds: Total duration of all attempts [s].
         failure: Error of the last attempt; empty if it succeeded.
-        rays: The response of a program that answers with rays; otherwise further observables [K, L] in SI units as
+        rays: The response of a program that returns rays; otherwise further observables [K, L] in SI units as
             little-endian doubles, or empty.
         lost: Whether the last attempt failed because a worker or the guard ended, which is not the program's fault.
     """
@@ -79,19 +79,19 @@ class Outcome:
 
 @dataclass(frozen=True)
 class ExternalProgram:
-    """How to call an external program; picklable, for calls in other processes and on other machines.
+    """Settings for calls of an external program; picklable, so that the program can be called on other machines.
 
     Attributes:
-        words: The program and its arguments. The files' paths replace `{request}` and `{response}`, and are appended if
-            these are absent.
-        folder: Folder to run it in.
+        words: The program and its arguments. The paths of the files replace `{request}` and `{response}`; a path whose
+            placeholder is absent is appended.
+        folder: Folder in which the program runs.
         timeout: Time limit for one attempt [s].
         retries: Number of further attempts after a failure.
         file_format: "json" or "hdf5".
-        rays: Whether the program answers with a ray table instead of path loss.
+        rays: Whether the program returns a ray table instead of path loss.
 
     Raises:
-        InputError: A word contains a NUL character, which the system does not pass to programs.
+        InputError: A word contains a NUL character, which cannot be passed to a program.
     """
 
     words: tuple[str, ...]
@@ -112,8 +112,8 @@ class ExternalProgram:
     def run(self, request: Request, stop: Event | None = None) -> Outcome:
         """Call the program for one candidate; after a failure, call it again until no attempts are left.
 
-        A failure is returned instead of raised, so that only one candidate is lost, not the batch. Another thread sets
-        `stop` to kill the program.
+        A failure is returned instead of raised, so that only one candidate is lost, not the batch. Another thread can
+        set `stop` to kill the program.
 
         Raises:
             Stopped: `stop` was set before the program answered.
@@ -220,7 +220,7 @@ class ExternalProgram:
 
 
 def _last_report(guard: subprocess.Popen) -> bytes:
-    """The report of a guard that was asked to end; it first kills its program."""
+    """The report of a guard whose standard input was closed; the guard first kills its program."""
     try:
         return guard.communicate(timeout=GUARD_WAIT)[0]
     except subprocess.TimeoutExpired:
@@ -239,7 +239,7 @@ def _describe_status(status: int) -> str:
 
 @contextmanager
 def _call_folder() -> Iterator[Path]:
-    """A temporary folder for one call, with a file that names its owner; folders of ended processes are removed."""
+    """A temporary folder for one call, with a file that names the owner; folders of ended processes are removed."""
     try:
         parent = Path(tempfile.gettempdir())
         _remove_abandoned(parent)
@@ -258,13 +258,13 @@ def _call_folder() -> Iterator[Path]:
 def _unwritable(error: OSError) -> EngineError:
     return EngineError(
         f"temporary folder {error.filename or 'of the system'}: the files of a call cannot be written "
-        f"({error.strerror or error}); free disk space, or set the variable TMPDIR to another folder"
+        f"({error.strerror or error}); free disk space, or set the environment variable TMPDIR to another folder"
     )
 
 
 @cache
 def _remove_abandoned(parent: Path) -> None:
-    """Remove, once per process, folders of calls whose process was killed together with its guard."""
+    """Remove, once per process, the folders of calls whose processes were killed together with their guards."""
     for folder in parent.glob(f"{PREFIX}*"):
         try:
             mark = folder / OWNER_FILE

@@ -1,4 +1,4 @@
-"""The kinds of engines, one module each; a new module here adds a kind, and its section, to study files."""
+"""The kinds of engines, one per module; a new module in this folder adds a kind and its section to study files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calibray.engines.section import EngineSection
 
 
 def _sections() -> dict[str, type[EngineSection]]:
-    """The section that each module here defines, by name."""
+    """The sections defined by the modules in this folder, by name."""
     modules = [import_module(f"{__name__}.{entry.name}") for entry in iter_modules(__path__)]
     sections = [
         value

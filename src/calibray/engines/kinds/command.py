@@ -41,7 +41,7 @@ class CommandSection(EngineSection):
         retries: Number of further attempts after a failure.
         format: Format of the files exchanged with the program: "json" or "hdf5".
         give_up_after: Number of successive failed calls after which the run ends.
-        rays: Whether the program answers with a ray table instead of path loss.
+        rays: Whether the program returns a ray table instead of path loss.
     """
 
     expensive: ClassVar[bool] = True
@@ -60,12 +60,12 @@ class CommandSection(EngineSection):
     def _has_command(self) -> Self:
         if not self.command:
             raise InputError(
-                'name = \'command\' needs command, the program and its arguments, such as ["octave-cli", "model.m"]'
+                'name = \'command\' requires command, the program and its arguments, such as ["octave-cli", "model.m"]'
             )
         return self
 
     def answers_by(self, study: OpenedStudy) -> list[str]:
-        """The program, its arguments, and whether it answers with rays; the program's version is unknown."""
+        """The program, its arguments, and "rays" if it returns rays; the program's version is unknown."""
         return [*self.command, *(["rays"] if self.rays else [])]
 
     def open(
@@ -85,12 +85,12 @@ _LOG: Final = logging.getLogger(__name__)
 class Command:
     """An external program, called once for every candidate.
 
-    If all attempts of a call fail, only this candidate is lost: its links count as links without a path. If every
-    candidate of the first batch fails, or many successive calls fail, the run ends, because the program must be at
-    fault.
+    If all attempts of a call fail, only this candidate is lost: its links are treated as links without a path. The run
+    ends if every candidate of the first batch fails or many successive calls fail, because the fault is then probably
+    in the program.
 
     Args:
-        program: How the program is called.
+        program: Settings for calls of the program.
         study: The opened study.
         give_up_after: Number of successive failed calls after which the run ends.
         executor: Executor for the calls of a batch; if None, calls run sequentially.
@@ -132,12 +132,12 @@ class Command:
         values = check_candidates(candidates, len(self.parameters))
         if derivatives or wanted != tuple(each.statistic for each in self._study.radio.observables):
             raise InputError(
-                f"{self._source}: the program answers only the study's [observables], without derivatives"
+                f"{self._source}: the program returns only the study's [observables], and no derivatives"
             )
         return gather_responses(self.answers(values), (len(values), self.num_links), len(wanted), first)
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
-        """Answer candidates, each as soon as its call ends; see `Answering.answers`."""
+        """Yield the answer to each candidate as soon as its call ends; see `Answering.answers`."""
         if not self.calls:
             # A study may come from someone else, so the user must see what it runs on this machine.
             _LOG.warning(
@@ -161,13 +161,13 @@ class Command:
             self._successive_failures = self._successive_failures + 1 if failure else 0
             if self._successive_failures >= self._give_up_after:
                 raise EngineError(
-                    f"{failure}; the {self._successive_failures - 1} calls before it failed too. All answers are in "
-                    "the ledger: correct the program, remove the failures with `calibray ledger DIR --forget-failed`, "
-                    "and start again"
+                    f"{failure}; the {self._successive_failures - 1} calls before it also failed. All answers are in "
+                    "the ledger. Correct the program, remove the failures with `calibray ledger DIR --forget-failed`, "
+                    "and start the run again"
                 )
 
     def _with_path_loss(self, outcome: Outcome) -> Outcome:
-        """The outcome with the path loss of its rays, or with the error in them."""
+        """The outcome with the path loss computed from its rays, or with the error found in the rays."""
         from calibray.engines.rays.export import Export
 
         try:

@@ -35,10 +35,12 @@ class ReplaySection(EngineSection):
 
     Attributes:
         name: "replay".
-        compress_db: Largest error in path loss if a few weighted paths replace all paths [dB]; None replays all paths.
-        chunk_links: Largest number of links that are traced and replayed together. If None, all links; with workers,
-            `chunks.CHUNK_LINKS`, or more if there would be over `chunks.MOST_CHUNKS` chunks.
-        rays: Ray table with the paths of another engine, instead of a trace.
+        compress_db: Largest error in path loss when a few weighted paths replace all paths [dB]; None to replay all
+            paths.
+        chunk_links: Largest number of links that are traced and replayed together. If None, all links are traced
+            together. With workers, the default is `chunks.CHUNK_LINKS`, or more if there would otherwise be over
+            `chunks.MOST_CHUNKS` chunks.
+        rays: Ray table with the paths of another engine, which are used instead of a trace.
     """
 
     expensive: ClassVar[bool] = False
@@ -80,12 +82,13 @@ class ReplaySection(EngineSection):
         if displaced:
             raise InputError(
                 f"{study.source}: parameters: {displaced[0]!r}: path loss between traced positions can be checked only "
-                "for all links at once; calibrate without workers (--workers, --scheduler) and engine.chunk_links"
+                "for all links together; calibrate without workers (--workers, --scheduler) and without "
+                "engine.chunk_links"
             )
         chunks = cut(study.links, chunk_size(self.chunk_links, len(study.links)))
         if workers is None and (seconds := seconds_to_trace(study, chunks)) > LONG_TRACE_SECONDS:
             _LOG.warning(
-                "Tracing %s links in %d chunks; about %s on two cores",
+                "Tracing %s links in %d chunks; this takes about %s on two cores",
                 f"{len(study.links):,}", len(chunks), duration(seconds),
             )  # fmt: skip
         opening = partial(trace_and_replay, self.compress_db)
@@ -96,22 +99,23 @@ class ReplaySection(EngineSection):
             study.radio.combining != "power" or study.links.frequency is not None or study.parameters.has_laws
         ):
             raise InputError(
-                f"{study.source}: engine.compress_db = {self.compress_db:g} needs objective.combining = 'power' and "
-                "a single carrier without coefficients of laws; remove it"
+                f"{study.source}: engine.compress_db = {self.compress_db:g} requires objective.combining = 'power' "
+                "and a single carrier, without coefficients of laws as parameters; remove engine.compress_db"
             )
 
 
 def trace_and_replay(
     compress_db: float | None, study: OpenedStudy, materials: Mapping[str, Material]
 ) -> Replay | ReplayCarriers:
-    """The replay of a chunk's links on paths traced with the given materials; this function can be sent to a worker."""
+    """The replay of a chunk's links on paths traced with the given materials; the function can be sent to a worker."""
     return replay(study, study.trace(materials), compress_db)
 
 
 def replay(study: OpenedStudy, paths: Paths, compress_db: float | None = None) -> Replay | ReplayCarriers:
     """The replay of an opened study on stored paths, with one program per carrier.
 
-    `compress_db` is the largest error in path loss if a few weighted paths replace all paths [dB]; None keeps all.
+    `compress_db` is the largest error in path loss when a few weighted paths replace all paths [dB]; None keeps all
+    paths.
     """
     from calibray.engines.compression import compress
     from calibray.engines.replay import CarrierPaths, Replay, ReplayCarriers

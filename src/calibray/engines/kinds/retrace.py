@@ -59,7 +59,7 @@ class CarrierTracer:
     """The ray tracer at one carrier.
 
     Attributes:
-        tracer: The scene in the ray tracer, with the constants at this carrier before calibration.
+        tracer: The ray tracer with its scene, whose materials have the constants at this carrier before calibration.
         links: The links measured at this carrier.
         index: Indices of these links among all links [l].
     """
@@ -77,7 +77,7 @@ class Retrace:
         tracers: The ray tracer at each carrier; together they contain every link once.
         materials: The scene's materials before calibration, at the study's carrier.
         parameters: The parameters whose values a candidate contains.
-        combining: How a link's paths combine: "power", "coherent" or "band".
+        combining: How a link's paths are combined: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
         progress: Called with "running" after every candidate of a batch.
     """
@@ -102,7 +102,7 @@ class Retrace:
         return np.stack([answer.path_loss_db for answer in self.answers(values)])
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
-        """Answer candidates in their order; see `Answering.answers`."""
+        """Yield the answers in the order of the candidates; see `Answering.answers`."""
         for index, candidate in enumerate(candidates):
             if stop is not None and stop.is_set():
                 return

@@ -1,11 +1,11 @@
 """The SQLite file of a ledger: tables, transactions, errors, and entries with a digest that reveals damage.
 
-A rescue file is written next to the ledger or, if that folder is gone or full, into the user's own state folder or the
-temporary folder. The next run with the ledger reads it.
+A rescue file is written next to the ledger. If that folder is missing or full, the file is written to the user's state
+folder or the temporary folder. The next run with the same ledger reads the file.
 
-Claims state which run works on which candidate, so that two runs with one ledger do not compute the same candidate. A
-claim is valid while its run renews it, and ends at once if the run's process has certainly ended. Each run times the
-renewals of other runs with its own clock, because the clocks of two machines may differ by hours.
+A claim states which run computes a candidate, so that two runs with one ledger do not compute the same candidate. A
+claim is valid as long as its run renews it. It ends immediately if the run's process is known to have ended. Each run
+times the renewals of other runs with its own clock, because the clocks of two machines can differ by hours.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ SKEW: Final = 86_400.0  # largest difference between the clocks of two machines 
 RENEWAL: Final = EXPIRY / 5  # interval between renewals [s]; a few may fail
 _active_runs: set[str] = set()  # the runs of this process
 _observed: dict[tuple[str, bytes, str], tuple[float, float]] = {}
-"""For each claim of another run: its latest `expires`, and the time on this process's clock when it changed [s]."""
+"""For each claim of another run: its latest `expires`, and the time of that change on this process's clock [s]."""
 
 
 def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Sequence[bytes]) -> list[bytes]:
-    """Claim candidates within the caller's transaction, and return those that no other run has claimed."""
+    """Claim candidates within the caller's transaction, and return the candidates that no other run has claimed."""
     now, owner = time.time(), json.dumps(ProcessOwner.current().record())
     _active_runs.add(run)
     claimed = []
@@ -70,8 +70,8 @@ def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Se
 def _is_valid(claimed: tuple[str, bytes, str], owner: object, expires: object, now: float) -> bool:
     """Whether a claim of another run is still valid.
 
-    A claim is invalid if its process has ended, or has not renewed it for `EXPIRY`. `expires` and `now` are times [s
-    since 1970] by the clocks of the claim's machine and of this machine.
+    A claim is invalid if its process has ended or has not renewed the claim for `EXPIRY`. `expires` and `now` are times
+    [s since 1970] on the clocks of the claim's machine and of this machine.
     """
     # A clock may be wrong by `SKEW`; a claim further away from now is damaged or was left behind.
     if not isinstance(expires, float) or not abs(expires - now) <= SKEW + EXPIRY:
@@ -92,7 +92,7 @@ def _is_valid(claimed: tuple[str, bytes, str], owner: object, expires: object, n
 
 
 def release(connection: sqlite3.Connection, run: str) -> None:
-    """Release all claims of a run; if the ledger cannot be written, they end with the process."""
+    """Release all claims of a run; if the ledger cannot be written, the claims end with the process."""
     _active_runs.discard(run)
     with suppress(sqlite3.Error):
         (timeout,) = connection.execute("PRAGMA busy_timeout").fetchone()
@@ -105,7 +105,7 @@ def release(connection: sqlite3.Connection, run: str) -> None:
 
 @contextmanager
 def renewing(file: Path, run: str) -> Iterator[None]:
-    """Renew a run's claims while its engine works."""
+    """Renew a run's claims while its engine is running."""
     ended = Event()
     thread = Thread(target=_renew, args=(file, run, ended), daemon=True)
     thread.start()
@@ -138,7 +138,7 @@ class LedgerEntry:
         path_loss_db: Path loss [L], [dB]; +inf for a link without a path.
         seconds: Duration of the call [s].
         failure: Error message; empty if the call succeeded.
-        rays: Rays or further observables, as in `engines.protocol.Answer`; empty without either.
+        rays: Rays or further observables, as in `engines.protocol.Answer`; empty if there are none.
     """
 
     path_loss_db: NDArray[np.float64]
@@ -162,7 +162,7 @@ class LedgerEntry:
 
     @property
     def fault(self) -> str:
-        """The reason why an engine cannot have given this answer; empty if the answer is possible."""
+        """The reason why an engine cannot have returned this answer; empty if the answer is possible."""
         values, (lower, upper) = self.path_loss_db, RANGE_DB
         outside = ~((values >= lower) & (values <= upper) | np.isposinf(values))
         if outside.any():
@@ -175,7 +175,7 @@ class LedgerEntry:
 def read_entry(
     problem: str, candidate: bytes, columns: tuple[object, ...], num_links: int | None = None
 ) -> LedgerEntry | str:
-    """Read a ledger row (path loss as bytes, seconds, failure, digest, rays); a description of the damage if any."""
+    """Read a ledger row (path loss as bytes, seconds, failure, digest, rays); a damaged row returns a description."""
     blob, seconds, failure, digest, rays = columns
     if not (isinstance(problem, str) and isinstance(candidate, bytes) and isinstance(blob, bytes)):
         return "a value of the wrong type"
@@ -214,7 +214,7 @@ _COLUMNS: Final = {
 
 
 def check_own_file(path: Path) -> None:
-    """Refuse a ledger whose path, which need not exist, leads to another file: SQLite would write to that file.
+    """Refuse a ledger path that leads to another file, because SQLite would write to that file.
 
     Raises:
         InputError: The file, or a file that SQLite keeps next to it, is a link, a folder, a device or a FIFO, or has
@@ -228,13 +228,13 @@ def check_own_file(path: Path) -> None:
             continue
         if not stat.S_ISREG(status.st_mode):
             raise InputError(
-                f"{file}: must be a regular file of the ledger, but is a link, a folder, a device or a FIFO; move it "
-                "away, or name another folder"
+                f"{file}: must be a regular file, but is a link, a folder, a device or a FIFO; move it away or "
+                "choose another folder"
             )
         if status.st_nlink > 1:
             raise InputError(
                 f"{file}: must be a file with a single name, but has {status.st_nlink} names (hard links); replace "
-                "it with a copy, or name another folder"
+                "it with a copy or choose another folder"
             )
 
 
@@ -265,11 +265,11 @@ def _set_up(connection: sqlite3.Connection, path: Path) -> None:
     tables = {name for (name,) in run("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if version not in (0, VERSION):
         raise InputError(
-            f"{path}: is a ledger of version {version}, but this Calibray uses version {VERSION}; name another folder"
+            f"{path}: is a ledger of version {version}, but Calibray uses version {VERSION}; choose another folder"
         )
     if version == 0 and tables - set(_COLUMNS):
         raise InputError(
-            f"{path}: is not a ledger but a database with a table {min(tables - set(_COLUMNS))!r}; name another folder"
+            f"{path}: is a database with a table {min(tables - set(_COLUMNS))!r}, not a ledger; choose another folder"
         )
     if tables and (fault := run("PRAGMA integrity_check(1)").fetchone()[0]) != "ok":
         raise sqlite3.DatabaseError(f"database disk image is malformed: {fault.splitlines()[-1]}")
@@ -283,7 +283,7 @@ def _set_up(connection: sqlite3.Connection, path: Path) -> None:
             if names != columns:
                 raise InputError(
                     f"{path}: is not a ledger: its table {table!r} has the columns {', '.join(names)}; it must have "
-                    f"{', '.join(columns)}; name another folder"
+                    f"{', '.join(columns)}; choose another folder"
                 )
         if version != VERSION:
             run(f"PRAGMA user_version = {VERSION}")
@@ -299,7 +299,7 @@ def insert_problem(
 
 
 def insert_answer(connection: sqlite3.Connection, problem: str, candidate: bytes, entry: LedgerEntry) -> None:
-    """Write an answer, unless there is one already."""
+    """Write an answer, unless the ledger already contains one."""
     now = datetime.now(UTC).isoformat(timespec="milliseconds")
     digest = entry.digest(problem, candidate)
     connection.execute(
@@ -337,7 +337,7 @@ def explain(error: sqlite3.Error | OSError) -> str:
         sqlite3.SQLITE_READONLY: "make it and its folder writable and start again",
         sqlite3.SQLITE_CANTOPEN: "make its folder writable and start again",
         sqlite3.SQLITE_CORRUPT: damaged,
-    }.get(code, damaged if "malformed" in str(error) else "name another folder")
+    }.get(code, damaged if "malformed" in str(error) else "choose another folder")
     return f"{error}; {remedy}"
 
 

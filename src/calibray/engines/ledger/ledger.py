@@ -1,8 +1,8 @@
 """The ledger stores every completed RT call in one SQLite file.
 
-An answer is committed before the optimizer sees it, so a killed run finds its answers when it is started again. Several
-runs may write to one ledger at the same time. The ledger must be on a local disk, because SQLite's write-ahead log
-needs one. If the ledger cannot store an answer, a rescue file does (see `rescue`).
+An answer is committed before the optimizer receives it, so a killed run finds its answers when it is started again.
+Several runs can write to one ledger at the same time. The ledger must be on a local disk, because SQLite's write-ahead
+log requires one. Answers that cannot be stored in the ledger are written to a rescue file (see `Ledger.rescue`).
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ class Ledger:
     def claim(self, problem: str, candidates: Sequence[bytes], num_links: int) -> list[bytes]:
         """Claim candidates that this run will compute; `commit` and the end of `working` release the claims.
 
-        Returns the candidates without an answer that no other run has claimed.
+        Returns the candidates that have no answer and are not claimed by another run.
 
         Raises:
             InputError: The ledger is read-only.
@@ -150,7 +150,7 @@ class Ledger:
         if self.read_only:
             raise InputError(
                 f"{self.path}: cannot be written, and {len(candidates)} candidates are not in it; "
-                "make it and its folder writable, or name another folder"
+                "make it and its folder writable, or choose another folder"
             )
         self._check_identity()
         with self._errors(), database.transaction(self._connection):
@@ -161,7 +161,7 @@ class Ledger:
 
     @contextmanager
     def working(self) -> Iterator[None]:
-        """Renew this run's claims while its engine works, and release them afterwards."""
+        """Renew this run's claims while its engine is running, and release them afterwards."""
         try:
             with database.renewing(self.path, self._run):
                 yield
@@ -172,7 +172,7 @@ class Ledger:
         """Write an entry, unless another run has written one first; return the stored entry.
 
         Raises:
-            EngineError: The ledger cannot store it; `rescue` keeps it in a file.
+            EngineError: The ledger cannot store the entry; `rescue` can write it to a file.
         """
         with self._errors(), database.transaction(self._connection):
             earlier = self.find(problem, candidate, len(entry.path_loss_db))
@@ -191,7 +191,7 @@ class Ledger:
         parameters: Sequence[str],
         answers: Sequence[tuple[bytes, database.LedgerEntry]],
     ) -> str:
-        """Write answers that the ledger could not store to a rescue file, and return a sentence that names the file."""
+        """Write answers that were not stored in the ledger to a rescue file, and return a sentence with its path."""
 
         def fill(connection: sqlite3.Connection) -> None:
             database.set_up(connection, self.path)
@@ -203,7 +203,7 @@ class Ledger:
         return _describe_rescue(database.write_rescue_file(self.path, fill), len(answers))
 
     def forget_failures(self, problem: str | None = None) -> int:
-        """Delete failed calls of a problem, or of all problems, so that they run again, and return their number.
+        """Delete the failed calls of one problem or of all problems, so that they are run again; return their number.
 
         Raises:
             InputError: The ledger is read-only.
@@ -217,10 +217,11 @@ class Ledger:
             ).rowcount
 
     def table(self, path_loss: bool = False) -> pd.DataFrame:
-        """All RT calls in the order in which they were committed; damaged calls are left out with a warning.
+        """All RT calls in the order in which they were committed; damaged calls are omitted with a warning.
 
-        Columns are `problem` (the start of its fingerprint), `engine`, `time`, `seconds`, `status` ("ok" or "failed"),
-        `message`, one per parameter and, with `path_loss`, one per link: `link_1`, `link_2`, ... [dB].
+        The columns are `problem` (the start of its fingerprint), `engine`, `time`, `seconds`, `status` ("ok" or
+        "failed"), `message` and one column per parameter. With `path_loss`, there is also one column per link:
+        `link_1`, `link_2`, ... [dB].
 
         Raises:
             EngineError: The ledger cannot be read.
@@ -239,7 +240,7 @@ class Ledger:
             except (TypeError, ValueError):
                 entry, values = "no candidate", {}
             if not isinstance(entry, database.LedgerEntry):
-                _LOG.warning("%s: call %d is damaged (%s); left out", self.path, number, entry)
+                _LOG.warning("%s: call %d is damaged (%s) and is omitted", self.path, number, entry)
                 continue
             status = "failed" if entry.failure else "ok"
             texts = (problem[:12], engine, when, entry.seconds, status, entry.failure)
@@ -251,7 +252,7 @@ class Ledger:
 
     @contextmanager
     def _errors(self) -> Iterator[None]:
-        """Convert errors of SQLite to errors with a remedy."""
+        """Convert SQLite errors to errors with a remedy."""
         try:
             yield
         except sqlite3.Error as error:
@@ -277,7 +278,7 @@ def open_ledger(folder: str | Path) -> Ledger:
     path = Path(folder) / LEDGER_FILE
     if not path.is_file():
         raise InputError(
-            f"{path}: no such ledger; name a folder that `calibray run` wrote with engine retrace or command"
+            f"{path}: no such ledger; give a folder that `calibray run` wrote with the engine retrace or command"
         )
     return Ledger(path)
 
@@ -294,5 +295,5 @@ def _identity(path: Path) -> tuple[int, int] | None:
 def _describe_rescue(file: Path | None, count: int) -> str:
     answers_are = "1 answer is" if count == 1 else f"{count} answers are"
     if file is None:
-        return f"{answers_are} lost, because no other folder could be written either"
+        return f"{answers_are} lost, because no other folder was writable either"
     return f"{answers_are} kept in {file}, and used when the run is started again"

@@ -38,10 +38,11 @@ class Recorded:
         ledger: The ledger.
         problem: Fingerprint of everything that determines the engine's answers apart from the candidate.
         name: Name of the engine.
-        progress: Called with "waiting", the number of answers that other runs have given and the number awaited.
+        progress: Called with "waiting", the number of answers received from other runs, and the number awaited.
 
     Attributes:
-        hits: Number of candidates so far that needed no RT call: answered by the ledger, or repeated in a batch.
+        hits: Number of candidates so far that required no RT call, because they were in the ledger or repeated in a
+            batch.
     """
 
     def __init__(
@@ -86,7 +87,7 @@ class Recorded:
         """
         if derivatives:
             raise InputError(
-                f"engine {self._name!r}: gives no derivatives; use a method that needs none, such as 'auto'"
+                f"engine {self._name!r}: provides no derivatives; use a method that needs none, such as 'auto'"
             )
         answers, first = self._all_answers(candidates)
         return gather_responses(answers, (len(candidates), self._engine.num_links), len(wanted), first)
@@ -108,7 +109,7 @@ class Recorded:
         return answers, first
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
-        """Answer candidates from the ledger or otherwise the engine, until `stop` is set; see `Answering.answers`."""
+        """Yield answers from the ledger, or otherwise from the engine, until `stop` is set; see `Answering.answers`."""
         values, stop = candidates, stop or Event()
         # A candidate that occurs several times in one batch is run only once.
         missing: dict[bytes, list[int]] = {}
@@ -135,7 +136,7 @@ class Recorded:
                 pause = min(2 * pause, LONGEST_WAIT)
 
     def _from_ledger(self, missing: dict[bytes, list[int]]) -> Iterator[Answer]:
-        """The answers in the ledger; their candidates are removed from `missing`."""
+        """Yield the answers in the ledger, and remove their candidates from `missing`."""
         for candidate in list(missing):
             entry = self._ledger.find(self._problem, candidate, self._engine.num_links)
             if entry is not None:
@@ -146,7 +147,7 @@ class Recorded:
     def _from_engine(
         self, values: NDArray[np.float64], indices: dict[bytes, list[int]], stop: Event
     ) -> Iterator[Answer]:
-        """The engine's answers to candidates that this run has claimed, given by their indices in the batch."""
+        """Yield the engine's answers to candidates that this run has claimed, given by their indices in the batch."""
         keys = list(indices)
         with self._ledger.working():
             answers = self._engine.answers(values[[indices[candidate][0] for candidate in keys]], stop)

@@ -1,7 +1,7 @@
 """Convert a ray table to a path program and back, with checks and the correction of every path's power.
 
 The correction is the power that the engine states divided by the power of the replay. It accounts for properties that
-only the engine knows, such as its antennas. Replay at other constants multiplies the replayed power by the correction.
+only the engine models, such as its antennas. At other constants, the replayed power is multiplied by the correction.
 """
 
 from __future__ import annotations
@@ -33,33 +33,37 @@ from calibray.tracing.settings import Antenna
 _LOG: Final = logging.getLogger(__name__)
 
 UNKNOWN: Final = Antenna("iso", "VH")
-"""Antenna assumed at an end whose real antenna is unknown: its two ports cover every polarization, and the correction
-accounts for the rest."""
+"""Antenna assumed at an end with an unknown antenna. Its two ports cover every polarization, and the correction
+accounts for its gain.
+"""
 
 FREE_SPACE_DB: Final = 1.0
-"""Largest deviation of a direct path from free-space power if antennas are known [dB]: pattern tables of engines differ
-by tenths of a decibel, while a wrong transmitted power or watts instead of decibels cause tens of decibels."""
+"""Largest deviation of a direct path from free-space power if the antennas are known [dB]. Pattern tables of engines
+differ by tenths of a decibel. A wrong transmitted power, or watts instead of decibels, causes tens of decibels.
+"""
 
 DIRECT_GAIN_DB: Final = 60.0
 """Largest total gain of both antennas of a direct path [dB], for example two dishes of 30 dBi."""
 
 ROUNDING: Final = 1e-12
-"""Power relative to free space below which a path lies in a null of the antennas: a few rounding errors of a field in
-single precision, as in Sionna RT."""
+"""Power relative to free space below which a path is assumed to lie in a null of the antennas. The value corresponds to
+a few rounding errors of a field in single precision, as in Sionna RT.
+"""
 
 HIGH_GAIN_DB: Final = 25.0
-"""Total gain of both antennas above which a warning is issued [dB]: 18 dBi of a sector antenna plus 7 dBi."""
+"""Total gain of both antennas above which a warning is issued [dB], for example a sector antenna of 18 dBi plus 7 dBi.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class RaySetting:
-    """The context in which the paths of a table are read.
+    """Context that is needed to read the paths of a table.
 
     Attributes:
         scene: The scene, with the constants that the engine used.
         frequency: Carrier frequency [Hz].
-        antennas: Transmit and receive antenna; None if they are unknown.
-        links: The links of the program; the links of the table if None.
+        antennas: Transmit and receive antennas; None if they are unknown.
+        links: The links of the program; if None, the links of the table.
     """
 
     scene: Scene
@@ -69,15 +73,16 @@ class RaySetting:
 
     @classmethod
     def of(cls, study: OpenedStudy) -> RaySetting:
-        """The setting of a study at its start values; antennas that the study does not state are unknown."""
+        """The setting of a study at its start values; the antennas are unknown if the study does not state them."""
         return cls(study.scene, study.radio.frequency, study.known_antennas, study.links)
 
 
 def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
-    """Compile the paths of a table; paths of power 0 are left out, but not their links.
+    """Compile the paths of a table; paths with zero power are omitted, but their links are kept.
 
     Raises:
-        InputError: The table does not agree with the scene, the links or itself, or has no power without `links`.
+        InputError: The table contradicts the scene, the links or itself, or `links` is None and no path has a power
+            above 0.
     """
     scene = setting.scene
     absent = np.zeros(len(table.path), dtype=bool) if table.power is None else table.power == 0
@@ -108,8 +113,8 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
         paths = replace(paths, correction=_correction(table, paths, power))
     elif (table.kind == Kind.DIFFUSE).any():
         raise InputError(
-            f"{table.source}: diffuse reflections need the power of the path, because the solid angle of their rays is "
-            "unknown; add power_db"
+            f"{table.source}: diffuse reflections require the power of the path, because the solid angle of their rays "
+            "is unknown; add power_db"
         )
     return paths if chosen is None else take_links(paths, chosen)
 
@@ -117,7 +122,7 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
 def rays_of(paths: Paths) -> RayTable:
     """The ray table of a path program, with the power of every path at the constants of the program's materials.
 
-    A link without a path gets a direct path of power 0, so that the table contains all links.
+    A link without a path is represented by a direct path with zero power, so that the table contains all links.
     """
     silent = np.asarray(paths.links_without_path, dtype=np.int64)
     link = np.concatenate([paths.link, silent])
@@ -150,7 +155,7 @@ def _free_space(paths: Paths) -> NDArray[np.float64]:
 
 
 def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
-    """The paths with the normals and materials of their surfaces, and the largest distance from a surface [m]."""
+    """The paths with normals and materials of their surfaces, and the largest distance of a point from its surface."""
     present = table.kind != 0
     stops = np.concatenate([table.tx[:, None], table.vertex, table.rx[:, None]], axis=1)
     stops[np.arange(len(stops)), present.sum(axis=1) + 1] = table.rx
@@ -160,7 +165,9 @@ def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
     segment = length * used  # 0 beyond the receiver
     if (used & (length == 0)).any():
         number = int(np.argmax((used & (length == 0)).any(axis=1)))
-        raise InputError(f"{table.source}: path {table.path[number]} has the same point twice; correct it")
+        raise InputError(
+            f"{table.source}: path {table.path[number]} has the same point twice in succession; remove one"
+        )
     row, step = np.nonzero(present)
     direction = ahead / np.where(length > 0, length, 1)[..., None]
     names = list(scene.materials)
@@ -206,16 +213,14 @@ def _stated_materials(table: RayTable, scene: Scene) -> NDArray[np.int64]:
     index = np.full(table.kind.shape, -1)
     for name in np.unique(table.object[table.object != ""]).tolist():
         if name not in by_object:
-            raise InputError(
-                f"{table.source}: the scene has no object {name!r}; correct it, or leave it empty"
-            )
+            raise InputError(f"{table.source}: the scene has no object {name!r}; correct or remove the name")
         index[table.object == name] = by_object[name]
     for name in np.unique(table.material[table.material != ""]).tolist():
         if name not in names:
             raise InputError(
-                f"{table.source}: material: the scene has no material {name!r}; {did_you_mean(name, names)}. Name "
-                "materials as in the scene, or remove the column material: interactions then get the material of the "
-                "nearest face"
+                f"{table.source}: material: the scene has no material {name!r}; {did_you_mean(name, names)}. Use "
+                "the scene's names of materials, or remove the column material; each interaction then has the material "
+                "of the nearest face"
             )
         stated = table.material == name
         if (stated & (index >= 0) & (index != names[name])).any():
@@ -238,7 +243,7 @@ def _check_straight(hits: Hits, transmits: NDArray[np.bool_]) -> None:
 
 
 def _check_delays(table: RayTable, segment: NDArray[np.float64]) -> None:
-    """Refuse delays that do not agree with the lengths of the paths' segments [P, D + 1], [m]."""
+    """Refuse delays that contradict the lengths of the paths' segments [P, D + 1], [m]."""
     if table.delay is None:
         return
     length = segment.sum(axis=1)
@@ -256,9 +261,9 @@ def _check_delays(table: RayTable, segment: NDArray[np.float64]) -> None:
 def _assign_links(
     table: RayTable, links: Links | None
 ) -> tuple[LinkPositions, NDArray[np.int64], NDArray[np.int64] | None]:
-    """Ends of distinct links, the index of every path's link, and the indices of the program's links, or None.
+    """Ends of distinct links, index of every path's link, and indices of the program's links (None without `links`).
 
-    Paths between positions that are not in `links` have the link -1.
+    Paths between positions that are not in `links` have the index -1.
 
     Raises:
         InputError: No path belongs to a link, or the paths of a link have different ends.
@@ -272,7 +277,7 @@ def _assign_links(
     if (apart > TOLERANCE).any():
         raise InputError(
             f"{table.source}: path {table.path[int(np.argmax(apart))]} does not have the same ends as the other paths "
-            "of its link; correct them"
+            "of its link; correct its first and last points"
         )
     if links is None:
         return LinkPositions(own[first, :3], own[first, 3:]), link, None
@@ -286,14 +291,14 @@ def _assign_links(
         )
         if lost.all():
             raise InputError(
-                f"{fault}; check units [m], export the rays of these links, or correct the argument axes"
+                f"{fault}; check units [m], export the rays of the study's links, or correct the argument axes"
             )
-        _LOG.warning("%s; they are left out", fault)
+        _LOG.warning("%s; these paths are omitted", fault)
     return LinkPositions(ends[:, :3], ends[:, 3:]), np.where(lost, -1, link), chosen.reshape(-1)
 
 
 def _ranks(label: NDArray) -> NDArray[np.int64]:
-    """Numbers of labels in their order [P]; digits in names compare as numbers, so that `rx2` precedes `rx10`."""
+    """Ranks of the labels in sorted order [P]; digits in names are compared as numbers, so `rx2` precedes `rx10`."""
     names = np.unique(label).tolist()
     if label.dtype.kind not in "iu":
         names.sort(key=lambda name: re.sub(r"\d+", lambda digits: digits[0].zfill(20), name))
@@ -302,7 +307,7 @@ def _ranks(label: NDArray) -> NDArray[np.int64]:
 
 
 def _check_repeats(table: RayTable, link: NDArray[np.int64]) -> None:
-    """Refuse two paths of a link with the same types and points, as in merged exports: their powers would add up."""
+    """Refuse two paths of a link with the same types and points, as in merged exports; their powers would be added."""
     point = np.round(table.vertex, 3).reshape(len(link), 3 * table.kind.shape[1])
     rows = np.column_stack([link, table.kind, point])
     _, first, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
@@ -316,7 +321,7 @@ def _check_repeats(table: RayTable, link: NDArray[np.int64]) -> None:
 
 
 def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], known: bool) -> None:
-    """Refuse a direct path whose power is not plausible for its antennas."""
+    """Refuse a direct path with a power that is implausible for its antennas."""
     direct = np.diff(paths.first) == 0
     free_space = _free_space(paths)
     replayed, least = powers(paths) if known else free_space, ROUNDING * free_space
@@ -328,7 +333,7 @@ def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], kno
         what = "with the stated antennas" if known else "between isotropic antennas"
         common = ""
         if np.ptp(off[direct]) < FREE_SPACE_DB and direct.sum() > 1:
-            common = "; all direct paths differ by this amount, e.g. transmitted power or a cable loss: subtract it"
+            common = "; all direct paths differ by this amount, e.g. the transmitted power or a cable loss; subtract it"
         raise InputError(
             f"{table.source}: path {table.path[worst]}, a direct path, is {abs(off[worst]):.1f} dB {side} free space "
             f"{what}; power_db must be the path gain, received minus transmitted power, with antenna gains{common}"

@@ -1,4 +1,4 @@
-"""The rays of one call, and an engine that answers with rays and stores them."""
+"""The rays of one RT call, and an engine that returns rays and stores them."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ FAINT: Final = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Export:
-    """The rays of one call.
+    """The rays of one RT call.
 
     Attributes:
-        paths: The rays as a path program; at the scene's constants, its powers are those of the engine.
+        paths: The rays as a path program; at the scene's constants, its powers equal those of the engine.
         level_db: Power of every path [P], [dB].
     """
 
@@ -43,7 +43,7 @@ class Export:
         """Read and check the response of a program.
 
         Raises:
-            InputError: The response is not a ray table, states no power, or does not agree with the scene or the links.
+            InputError: The response is not a ray table, contains no power, or contradicts the scene or the links.
         """
         return cls.of_table(RayTable.of(parse_rays(response, RESPONSE)), RaySetting.of(study))
 
@@ -52,16 +52,16 @@ class Export:
         """Compile the rays of a call.
 
         Raises:
-            InputError: The rays state no power, or do not agree with the scene or the links.
+            InputError: The rays have no power, or contradict the scene or the links.
         """
         if table.power is None:
-            raise InputError(f"{table.source}: states no power of its paths; add power_db")
+            raise InputError(f"{table.source}: states no power for its paths; add power_db")
         paths = compile_rays(table, setting)
         return cls(paths, 10 * np.log10(powers(paths)))
 
     @property
     def path_loss_db(self) -> NDArray[np.float64]:
-        """The engine's path loss [L]; +inf for a link without a path."""
+        """The engine's path loss [L], [dB]; +inf for a link without a path."""
         power = np.bincount(self.paths.link, 10 ** (self.level_db / 10), self.paths.num_links)
         with np.errstate(divide="ignore"):
             return -10 * np.log10(power)
@@ -75,7 +75,7 @@ class Export:
 
 @final
 class Exporting:
-    """An engine that answers with rays and stores them, so that it is called only once for each candidate.
+    """An engine that returns rays and stores them, so that each candidate requires only one call.
 
     Attributes:
         parameters: The parameters whose values a candidate contains.
@@ -112,7 +112,7 @@ class Exporting:
             (answer,) = self._engine.answers(check_candidates(candidate[None], len(self.parameters)))
             if answer.failure:
                 raise EngineError(
-                    f"{answer.failure}. Ray mapping needs this call: correct the program, remove the failure with "
+                    f"{answer.failure}. Ray mapping needs this call. Correct the program, remove the failure with "
                     "`calibray ledger DIR --forget-failed`, and start again"
                 )
             self._exports[name] = Export.of(self._study, answer.rays)

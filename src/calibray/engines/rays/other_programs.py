@@ -49,8 +49,8 @@ def rows_of(paths: Iterable[Polyline], source: str) -> SourceTable:
     for number, path in enumerate(paths):
         if len(path.points) != len(path.types) + 2:
             raise InputError(
-                f"{source}: path {number} has {len(path.points)} points and {len(path.types)} interactions; it needs "
-                "two more points than interactions, for its transmitter and its receiver"
+                f"{source}: path {number} has {len(path.points)} points and {len(path.types)} interactions; it must "
+                "have two more points than interactions, for its transmitter and its receiver"
             )
         if np.isnan(path.power_db):
             ends = " to ".join(np.array2string(path.points[end], precision=3) for end in (0, -1))
@@ -75,7 +75,7 @@ def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
     """The rows of a ray table, of a file that contains one, or of the paths of another program.
 
     Raises:
-        InputError: The file or folder is malformed or not of a known kind, or the power is not a number.
+        InputError: The file or folder is malformed or of an unknown kind, or the power is not a finite number.
     """
     if tx_power_dbm is not None and not (isinstance(tx_power_dbm, Real) and np.isfinite(tx_power_dbm)):
         raise InputError(f"tx_power_dbm = {tx_power_dbm!r}: must be a finite number, in dBm")
@@ -108,29 +108,29 @@ def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
     if (path / AODT_FILES[0]).is_file():
         return read_aodt(path)
     raise InputError(
-        f"{path}: a folder must have {' and '.join(AODT_FILES)} (AODT) or power_t*.mat (DeepMIMO); "
-        "otherwise name a file"
+        f"{path}: a folder must contain {' and '.join(AODT_FILES)} (AODT) or power_t*.mat (DeepMIMO); "
+        "otherwise give a file"
     )
 
 
 INSITE_TYPES: Final = {"R": "reflection", "D": "diffraction", "DS": "diffuse", "T": "transmission"}
-"""Types of interaction by their letters; foliage (F, X) is refused, because it is not a surface with a material."""
+"""Types of interactions by letter; foliage (F, X) is refused, because it is not a surface with a material."""
 
 
 def read_insite(file: Path, tx_power_dbm: float | None) -> SourceTable:
     """Read the paths of one transmitter from a text file `*.paths.*.p2m` of Remcom Wireless InSite.
 
-    Lines that begin with # are comments. The first line is the number of receivers. For each receiver, a line with its
-    number and its number of paths follows and, if there are any paths, a line of totals. A path has a line of nine
-    numbers (number, number of interactions, received power [dBm], phase [deg], time of arrival [s], four angles [deg])
-    or of eight without the phase, a line such as Tx-R-D-Rx, and a line for each point.
+    Lines that begin with # are comments. The first line contains the number of receivers. Each receiver has a line with
+    its number and its number of paths and, if there are any paths, a line of totals. Each path has a line of nine
+    numbers (number, number of interactions, received power [dBm], phase [deg], time of arrival [s], four angles [deg]),
+    or of eight numbers without the phase. A line such as Tx-R-D-Rx and a line for each point follow.
 
     Raises:
         InputError: The transmitted power is missing, the file is malformed, or a path crosses foliage.
     """
     if tx_power_dbm is None:
         raise InputError(
-            f"{file}: states received power in dBm; give tx_power_dbm, the transmitted power of the project"
+            f"{file}: contains received power in dBm; give tx_power_dbm, the transmitted power of the project"
         )
     lines = [
         (number, line.strip())
@@ -161,7 +161,7 @@ def _insite_paths(file: Path, rest: Iterator[tuple[int, str]], tx_power_dbm: flo
             if unknown := [name for name in names if name not in INSITE_TYPES]:
                 raise InputError(
                     f"{file}, line {number}: {shortened(text)!r} has the interaction {shortened(unknown[0])!r}; "
-                    f"Calibray reads {', '.join(INSITE_TYPES)}, so export without foliage"
+                    f"Calibray reads {', '.join(INSITE_TYPES)}, so export the paths without foliage"
                 )
             points = np.array([_insite_numbers(file, next(rest), 3) for _ in range(int(depth) + 2)])
             paths.append(
@@ -197,11 +197,11 @@ AODT_TYPES: Final = {
 
 
 def read_aodt(folder: Path) -> SourceTable:
-    """Read the first time step with paths from a folder of NVIDIA's Aerial Omniverse Digital Twin, with two tables.
+    """Read the first time step with paths from an export folder of NVIDIA's Aerial Omniverse Digital Twin.
 
-    Both tables state the time, the radio unit and the user equipment. `raypaths` has a row for each path, with its
-    points in units of the scene (centimetres) and its types of interaction. `cirs` has a row for each pair of antenna
-    elements, with lists of complex gains and delays [s] in the order of the paths.
+    The folder contains two tables, which both state the time, the radio unit and the user equipment. `raypaths` has a
+    row for each path, with its points in units of the scene (centimetres) and its types of interactions. `cirs` has a
+    row for each pair of antenna elements, with lists of complex gains and delays [s] in the order of the paths.
 
     Powers are summed over the antenna elements of the user equipment and averaged over those of the radio unit.
 
@@ -223,7 +223,7 @@ def read_aodt(folder: Path) -> SourceTable:
     for pair, rows in frames[0].groupby(AODT_PAIR, sort=False):
         if pair not in responses:
             raise InputError(
-                f"{gains.source}: has no gains for ru_id, ue_id = {pair}, which have {len(rows)} paths"
+                f"{gains.source}: has no gains for ru_id, ue_id = {pair}, but raypaths has {len(rows)} paths for them"
             )
         power, delay = _aodt_response(gains.source, pair, responses[pair], len(rows))
         with np.errstate(divide="ignore"):
@@ -270,7 +270,7 @@ def _aodt_numbers(source: str, name: str, values: Any) -> NDArray[np.float64]:
 
 
 def _aodt_element(element: Any) -> Any:
-    """A hashable antenna element; exports contain a number, a list or a dictionary, such as row, column and port."""
+    """An antenna element in hashable form; exports contain a number, a list or a dictionary (row, column, port)."""
     if isinstance(element, dict):
         return tuple(element.values())
     return tuple(element) if np.ndim(element) else element
@@ -314,11 +314,11 @@ def is_deepmimo(folder: Path) -> bool:
 
 
 def read_deepmimo(folder: Path) -> SourceTable:
-    """Read the paths of all transmitters of a DeepMIMO scenario (version 4), `NAME_tSET_txTX_rSET.mat` or `.npz`.
+    """Read the paths of all transmitters of a DeepMIMO scenario (version 4): `NAME_tSET_txTX_rSET.mat` or `.npz`.
 
-    For each transmitter and set of N receivers: `power` [N, P], path gain [dB]; `delay` [N, P], [s]; `inter` [N, P],
-    one digit for each interaction; `inter_pos` [N, P, I, 3], `tx_pos` [3] and `rx_pos` [N, 3], [m]. Missing paths are
-    NaN in all matrices.
+    For each transmitter and set of N receivers, there are six matrices: `power` [N, P], path gain [dB]; `delay` [N, P],
+    [s]; `inter` [N, P], one digit for each interaction; `inter_pos` [N, P, I, 3], `tx_pos` [3] and `rx_pos` [N, 3],
+    [m]. Missing paths are NaN in all matrices.
 
     Raises:
         InputError: A matrix is missing, malformed or too large, or its shape does not match the others.
@@ -418,10 +418,10 @@ def check_carrier(rays: Any, frequency: float) -> None:
 
 
 def read_sionna_paths(paths: Any) -> SourceTable:
-    """Read paths of Sionna RT in memory, as returned by its `PathSolver`, between antennas with one position each.
+    """Read paths of Sionna RT in memory, as returned by its `PathSolver`, for arrays with a single antenna position.
 
-    Vertices and interactions are [D, R, T, P] with synthetic arrays, otherwise [D, R, Ra, T, Ta, P] for the antennas of
-    the arrays. Gains `a` are pairs of real and imaginary parts [R, Ra, T, Ta, P].
+    Vertices and interactions have the shape [D, R, T, P] with synthetic arrays; otherwise, their shape is [D, R, Ra, T,
+    Ta, P] for the antennas of the arrays. Gains `a` are pairs of real and imaginary parts [R, Ra, T, Ta, P].
 
     Powers are summed over the ports of a receiver and averaged over those of a transmitter.
 
