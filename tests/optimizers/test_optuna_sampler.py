@@ -180,3 +180,17 @@ def test_what_it_cannot_search_is_refused():
     study = optuna.create_study(directions=["minimize"] * 2, sampler=SGWOIMSampler(SPACE))
     with pytest.raises(InputError, match="2 objectives"):
         study.ask(SPACE)
+
+
+@pytest.mark.parametrize("direction", ["minimize", "maximize"])
+def test_infinite_values_count_as_failed_evaluations(direction):
+    """Optuna stores them as completed trials, and the study goes on."""
+    sign = 1.0 if direction == "minimize" else -1.0
+
+    def some_infinite(trial):
+        value = sign * objective(trial)
+        return {3: np.inf, 4: -np.inf}.get(trial.number, value)
+
+    study = optuna.create_study(direction=direction, sampler=SGWOIMSampler(SPACE, seed=0, **SMALL))
+    study.optimize(some_infinite)
+    assert len(study.trials) == 20

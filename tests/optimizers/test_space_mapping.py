@@ -349,6 +349,11 @@ def test_a_constant_in_the_value_does_not_change_the_search():
         shifted.tell(x, value(residuals) - shift, residuals=residuals)
 
 
+def test_a_box_without_a_point_far_from_all_evaluated_ones_is_searched_on(monkeypatch):
+    monkeypatch.setattr("calibray.optimizers.multifidelity.space_mapping.SEPARATION", 0.5)
+    assert len(excess(SpaceMapping(LOWER, UPPER, cheap_model=cheap(1.1), budget=16))) == 16
+
+
 def test_failed_calls_are_ignored():
     optimizer = SpaceMapping(LOWER, UPPER, cheap_model=cheap(1.4), budget=9)
     for call in range(9):

@@ -77,6 +77,13 @@ def test_earlier_points_count_as_initial_design():
     assert STREET.run(flat).evaluations == 32
 
 
+def test_a_box_without_a_point_far_from_all_evaluated_ones_is_searched_on(monkeypatch):
+    """In one parameter, some hundred evaluations leave no gap of the smallest separation."""
+    monkeypatch.setattr("calibray.optimizers.vector_surrogate.SEPARATION", 0.02)
+    optimizer = bent(1, VectorSurrogate([0.0], [1.0], budget=60))
+    assert optimizer.evaluations == 60
+
+
 def test_the_default_budget_is_used_up():
     optimizer = bent(5, VectorSurrogate(np.zeros(5), np.ones(5)))
     assert optimizer.best.y < 0.01

@@ -264,6 +264,7 @@ def test_the_command_prints_and_writes_the_suggestions(folder, result, table):
     written, suggestions = pd.read_csv(folder / "next.csv"), cb.suggest(result, table, 3)
     assert written.rx_x.tolist() == suggestions.rx_x.tolist()
     assert [row["rx_x"] for row in json.loads(run.stdout)] == pytest.approx(suggestions.rx_x.tolist())
+    assert "`calibray predict`, which uses the model 'calibrated', may give other values" in run.stderr
     printed = CliRunner().invoke(app, [*command, "--observables"]).stdout
     assert "Where to measure next" in printed
     assert "Further observables to measure there" in printed

@@ -90,6 +90,26 @@ def test_a_study_without_an_offset_has_no_unknown_for_it(town):
     assert "7 links for 2 unknowns" in finding.problem
 
 
+def test_coefficients_of_nuisance_terms_are_unknowns(town):
+    table = links().head(24)
+    table.assign(street=[f"s{k % 4}" for k in range(24)]).to_csv(town / "streets.csv", index=False)
+    content = {
+        "version": 1,
+        "scene": {"file": "scene.xml", "frequency": 3.5e9},
+        "links": {"file": "streets.csv", "tx": MAST.tolist(), "rx": ["x", "y", "z"], "value": "loss"},
+        "parameters": {"walls.relative_permittivity": {"bounds": [1.5, 12.0]}},
+    }
+
+    def problem(**term):
+        study = Study.from_content(content | {"nuisance": {"a": term}}, town / "study.toml")
+        return "".join(finding.problem for finding in count_unknowns(study, study.measurements()))
+
+    text = problem(by="constant", per="street")
+    assert "24 links for 5 unknowns (1 parameters, 0 offsets, 4 coefficients of [nuisance])" in text
+    assert problem(by="constant", per="street", prior="auto") == problem(by="log_distance") == ""
+    assert "24 coefficients" in problem(by="constant", per="cluster", cluster_m=0.01)
+
+
 @pytest.mark.parametrize(
     ("mistake", "named"),
     [

@@ -18,6 +18,8 @@ from calibray.scenes.checks import SceneSurfaces
 from calibray.scenes.obstruction import clutter_loss_db
 from calibray.study import Setup, Study
 from calibray.study.regions import Place, RegionSection, dense_trees, region_effects
+from calibray.study.row_steps import study_regions
+from commands import write_study
 from link_tables import links_from_frame
 from planted_maps import FRAME, write_park
 
@@ -226,6 +228,36 @@ def test_a_polygon_without_ground_below_it_is_refused_by_its_number():
     section = RegionSection(boxes=boxes, top=8.0, heights="ground", specific_attenuation=0.3)
     with pytest.raises(InputError, match=r"boxes: the scene has no ground below polygon 3; remove it"):
         section.region(None, Place(None, lambda: surfaces))
+
+
+def test_a_region_outside_the_scene_is_named_in_a_warning(tmp_path, caplog):
+    away = REGIONS["trees"] | {"boxes": [[5000, 5000, 5010, 5010]], "heights": "ground"}
+    assert not len(study_regions(study(tmp_path, regions={"trees": away}))["trees"].outline)
+    assert "study.toml: [regions.trees] is outside the scene, so it has no effect" in caplog.text
+    caplog.clear()
+    study_regions(study(tmp_path, regions={"trees": REGIONS["trees"] | {"heights": "ground"}}))
+    assert not caplog.text
+
+
+def test_keys_without_effect_are_named_when_the_study_is_read(tmp_path, caplog):
+    planted.links().to_csv(tmp_path / "links.csv", index=False)
+    facade = {"of": "marble", "boxes": [BOX], "position": "scene", "module": 2.0, "storey_height": 4.0}
+    regions = {"trees": REGIONS["trees"] | {"position": "geographic"}}
+    content = planted.content("links.csv") | {"regions": regions, "facades": {"shop": facade}}
+    write_study(tmp_path, content)
+    Study.load(tmp_path / "study.toml")
+    for key, needed in (
+        ("regions.trees.position", "file"),
+        ("facades.shop.position", "file"),
+        ("facades.shop.module", "share"),
+        ("facades.shop.storey_height", "storeys"),
+    ):
+        assert f"study.toml: {key} has no effect without {needed}" in caplog.text
+    caplog.clear()
+    rules = {"of": "marble", "storeys": [1, 1], "storey_height": 4.0, "share": 0.2, "module": 2.0}
+    write_study(tmp_path, content | {"regions": REGIONS, "facades": {"shop": rules}})
+    Study.load(tmp_path / "study.toml")
+    assert "no effect" not in caplog.text
 
 
 def test_attenuation_rises_with_the_carrier(opened, engine):

@@ -234,6 +234,12 @@ def suggest(
         if options.as_json
         else render(*suggestion_tables(suggestion))
     )
+    model = str(result.prediction.model.name)
+    echo(
+        "Note: path loss is the mean over the draws of the calibrated model; `calibray predict`, which uses the model "
+        f"{model!r}, may give other values.",
+        err=True,
+    )
     if options.out is not None:
         write_table(options.out, suggestion)
         echo(f"Written to {options.out}", err=True)

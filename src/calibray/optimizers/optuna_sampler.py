@@ -165,7 +165,9 @@ class SGWOIMSampler(BaseSampler):
         if x.shape != optimizer.box.lower.shape or not np.array_equal(x, optimizer.box.clip(x)):
             return
         sign = -1.0 if study.direction == optuna.study.StudyDirection.MAXIMIZE else 1.0
-        optimizer.tell([x], [sign * values[0] if state == TrialState.COMPLETE and values else np.inf])
+        answer = sign * values[0] if state == TrialState.COMPLETE and values else np.inf
+        # Optuna accepts infinite values; an infinitely good one is no value that a search can improve on.
+        optimizer.tell([x], [answer if np.isfinite(answer) else np.inf])
 
     def _foreign(self, trial: FrozenTrial) -> list[float]:
         """Search coordinates of a trial that the pack did not propose; empty if the trial lacks a parameter."""

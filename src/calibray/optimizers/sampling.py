@@ -66,6 +66,14 @@ def distance_to_nearest(x: NDArray[np.float64], points: NDArray[np.float64]) -> 
     return cdist(x, points).min(axis=1)
 
 
+def not_evaluated(
+    candidates: NDArray[np.float64], points: NDArray[np.float64], separation: float
+) -> NDArray[np.float64]:
+    """The candidates [k, d] farther than `separation` from all evaluated points [n, d]; if none, the farthest one."""
+    distance = distance_to_nearest(candidates, points)
+    return candidates[distance > min(separation, np.nextafter(distance.max(), -np.inf))]
+
+
 class Sampling(Optimizer):
     """A search that evaluates a design and learns nothing from it; subclasses define the kind of design.
 

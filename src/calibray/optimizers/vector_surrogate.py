@@ -37,7 +37,13 @@ from calibray.optimizers.descent import descend_all
 from calibray.optimizers.evaluations import Archive, Objective, merge_repeated, root_mean_square
 from calibray.optimizers.protocol import Optimizer, Search, Session
 from calibray.optimizers.regression import Kriging, fit, solve
-from calibray.optimizers.sampling import SEPARATION, distance_to_nearest, draw_around, maximin_design
+from calibray.optimizers.sampling import (
+    SEPARATION,
+    distance_to_nearest,
+    draw_around,
+    maximin_design,
+    not_evaluated,
+)
 
 FIRST = 5
 """Largest excess of the number of points in the initial design over the number of parameters."""
@@ -185,7 +191,7 @@ class VectorSurrogate(Optimizer):
         """The point [d] with the largest expected improvement."""
         around = draw_around(taken[:5], CANDIDATES, -3.0, self._rng)
         candidates = np.vstack([self._rng.random((CANDIDATES, self.box.dimension)), around, fresh])
-        candidates = candidates[distance_to_nearest(candidates, taken) > SEPARATION]
+        candidates = not_evaluated(candidates, taken, SEPARATION)
         # Multiplied by the root, these are draws with the covariance of the residuals.
         normal = self._rng.standard_normal((DRAWS, len(model.root)))
         mean, share = model.predict(candidates)

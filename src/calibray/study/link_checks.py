@@ -19,6 +19,8 @@ from calibray.measurements.column_names import LENGTH_UNITS, WATTS, find_length_
 from calibray.measurements.observables import KINDS
 from calibray.measurements.placement import NOT_ON_TRACK
 from calibray.scenes.checks import Finding, SceneSurfaces, scale_findings
+from calibray.scenes.obstruction import CLUSTER
+from calibray.study.calibration_sections import NuisanceSection
 from calibray.study.model import StudyModel
 from calibray.study.mounting import largest_gain_dbi, link_antennas, link_mountings
 from calibray.tracing.gain_table import read_gain_table
@@ -111,17 +113,29 @@ def count_unknowns(study: StudyModel, links: Measurements) -> tuple[Finding, ...
     """A suspicion with its remedy if there are fewer than `LINKS_PER_UNKNOWN` links per unknown."""
     grouped = len(links.group_names) if links.group is not None else 1
     offsets = 0 if study.offset is None else grouped
-    unknowns = len(study.parameters) + offsets
+    coefficients = sum(_count_coefficients(study, section, links) for section in study.nuisance.values())
+    unknowns = len(study.parameters) + offsets + coefficients
     if len(links) >= LINKS_PER_UNKNOWN * unknowns:
         return ()
+    counted = f"{len(study.parameters)} parameters, {offsets} offsets" + (
+        f", {coefficients} coefficients of [nuisance]" if coefficients else ""
+    )
     problem = (
-        f"{len(links)} links for {unknowns} unknowns ({len(study.parameters)} parameters, {offsets} offsets), fewer "
-        f"than {LINKS_PER_UNKNOWN} per unknown"
+        f"{len(links)} links for {unknowns} unknowns ({counted}), fewer than {LINKS_PER_UNKNOWN} per unknown"
     )
     remedy = "calibrate fewer parameters, or measure at more positions"
     if study.links.average is not None and study.links.average.by != "place":
         remedy = f"average over smaller areas (links.average.size), {remedy}"
     return (Finding("warning", links.source, problem, remedy),)
+
+
+def _count_coefficients(study: StudyModel, section: NuisanceSection, links: Measurements) -> int:
+    """Number of coefficients of a nuisance term, one per group; of a random effect, only the mean is free."""
+    if section.per is None or section.prior == "auto":
+        return 1
+    if section.per == CLUSTER and CLUSTER not in links.frame and study.cluster_m is not None:
+        return len(np.unique(np.floor(links.rx[:, :2] / study.cluster_m), axis=0))
+    return len(np.unique(links.table.labels(section.per)))
 
 
 def _averages(study: StudyModel, overhead: SceneSurfaces) -> Iterator[tuple[str, str]]:

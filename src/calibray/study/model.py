@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 from abc import ABC
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +29,16 @@ from calibray.study.regions import PREFIX
 from calibray.study.toml_file import expand, read_content, refuse_unquoted_names, split_engine_keys
 from calibray.support.messages import shortened, type_name
 from calibray.support.output_files import as_path, exists
-from calibray.support.strict_models import explain
+from calibray.support.strict_models import dotted, explain
 from calibray.tracing.settings import Antenna
+
+_LOG: Final = logging.getLogger(__name__)
+
+_NEEDED: Final = {
+    "regions": {"position": "file"},
+    "facades": {"position": "file", "module": "share", "storey_height": "storeys"},
+}
+"""For each section of named tables, the keys that have no effect without another key of their table."""
 
 
 class StudyModel(StudyContent, ABC):
@@ -44,8 +53,11 @@ class StudyModel(StudyContent, ABC):
                 file that does not exist; one line for each error.
         """
         path = as_path(path, "study")
-        study = cls.from_content(read_content(path), path)
+        content = read_content(path)
+        study = cls.from_content(content, path)
         study.check_files()
+        for key, needed in _keys_without_effect(content):
+            _LOG.warning("%s: %s has no effect without %s; remove it", path, key, needed)
         return study
 
     @classmethod
@@ -394,3 +406,12 @@ class StudyModel(StudyContent, ABC):
         if engine is not None:
             content["engine"]["name"] = engine
         return type(self).from_content(content, self._path)
+
+
+def _keys_without_effect(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """The keys of a valid study file that have no effect, each with the key that it needs."""
+    for section, keys in _NEEDED.items():
+        for name, table in content.get(section, {}).items():
+            for key, needed in keys.items():
+                if key in table and needed not in table:
+                    yield dotted((section, name, key)), needed

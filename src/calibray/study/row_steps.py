@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from calibray.scenes.checks import SceneSurfaces
     from calibray.scenes.obstruction import Region
 
+_LOG: Final = logging.getLogger(__name__)
 _COLUMN_KEYS: Final = {"tx", "rx", "value", "quantity", "weight", "std", "tx_power_dbm", "frequency"}
 """Keys of ``[links]`` that are fields of `LinkColumns`."""
 
@@ -191,7 +193,13 @@ def study_regions(study: StudyModel) -> dict[str, Region]:
         return {}
 
     place, paths = scene_place(study), study.region_paths
-    return {name: section.region(paths[name], place) for name, section in study.regions.items()}
+    regions = {name: section.region(paths[name], place) for name, section in study.regions.items()}
+    for name in [name for name, region in regions.items() if not len(region.outline)]:
+        _LOG.warning(
+            "%s: [regions.%s] is outside the scene, so it has no effect; check its position, or remove it",
+            study.path, name,
+        )  # fmt: skip
+    return regions
 
 
 def scene_place(study: StudyModel) -> Place:

@@ -48,7 +48,7 @@ from calibray.optimizers.multifidelity.correction import (
 )
 from calibray.optimizers.protocol import CheapModel, Optimizer, Search, Session
 from calibray.optimizers.regression import Inputs
-from calibray.optimizers.sampling import design, distance_to_nearest, draw_around
+from calibray.optimizers.sampling import design, distance_to_nearest, draw_around, not_evaluated
 from calibray.optimizers.vector_surrogate import VectorSurrogate, improvement
 
 CLOUD: Final = 64
@@ -264,7 +264,7 @@ class SpaceMapping(Optimizer):
         d, stretch = self.box.dimension, self._errors.stretch
         around = draw_around(taken[:5], CANDIDATES, -2.5, self._rng)
         candidates = np.vstack([fresh, self._rng.random((CANDIDATES, d)), around])
-        candidates = candidates[distance_to_nearest(candidates, taken) > SEPARATION]
+        candidates = not_evaluated(candidates, taken, SEPARATION)
         prediction, gain = model.predict(candidates), np.zeros(len(candidates))
         draws = max(1, DRAWS // len(model.members))
         for member, (residuals, share) in zip(model.members, prediction.members, strict=True):
