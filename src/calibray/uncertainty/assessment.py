@@ -45,10 +45,11 @@ from calibray.uncertainty.sequential_monte_carlo import Posterior, draw_posterio
 from calibray.uncertainty.verdicts import Axes, JudgedSet, consistent, local_intervals, verdicts, with_reason
 
 EQUAL: Final = 0.1
-"""If drawn emulators differ from their mean by less than this share of the lowest objective, only the mean is used."""
+"""If the drawn emulators differ from their mean by less than this share of the lowest objective, only the mean is
+used."""
 
 KEPT_DRAWS: Final = 128
-"""Draws kept with the result."""
+"""Number of draws that are kept with the result."""
 
 FEW_LINKS: Final = 500
 """Number of links up to which linear algebra uses one thread."""
@@ -60,7 +61,7 @@ MAX_COLUMNS: Final = 100
 """Largest number of nuisance columns for which the draws include the coefficients."""
 
 SHOWN_DIFFERENCE: Final = 0.1
-"""The credible set for the measured buildings is reported if it differs from the set for all buildings on more than
+"""The credible set for the measured buildings is reported if it differs from the set for all buildings over more than
 this share of the range that both span."""
 
 CUSTOMARY: Final = {("relative_permittivity", "linear"): 10.0, ("conductivity", "log"): float(np.log(1000.0))}
@@ -71,10 +72,11 @@ EXACT_DB: Final = 1e-6
 """RMSE below which the data count as free of noise, so that linear theory is exact [dB]."""
 
 FEWEST_DRAWS: Final = 30
-"""Smallest number of effective draws whose standard deviation is compared; its uncertainty is then 13 %."""
+"""Smallest number of effective draws for which standard deviations are compared; their uncertainty is then 13 %."""
 
 NOTABLE_SHARE: Final = 0.85
-"""Largest share that is reported; larger shares may be chance, as few draws give an uncertain standard deviation."""
+"""Largest share that is reported; larger shares may be due to chance, because a standard deviation from few draws is
+uncertain."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +85,8 @@ class Certainty:
 
     Attributes:
         record: The uncertainty that a result states.
-        posterior: All draws; None if none were made.
-        calls: Number of replays that the assessment took.
+        posterior: All draws; None if no draws were made.
+        calls: Number of replays made for the assessment.
         seconds: Time taken by the assessment [s].
     """
 
@@ -285,7 +287,7 @@ def _intervals(
 
 
 def _differ(verdict: JudgedSet) -> bool:
-    """Whether the sets for measured and for all buildings differ on more than a tenth of the range that both span."""
+    """Whether the sets for measured and for all buildings differ over more than a tenth of the range that both span."""
     both = (np.array(verdict.pieces), np.array(verdict.seen))
     line = np.linspace(min(each.min() for each in both), max(each.max() for each in both), 1000)
     one, other = (((each[:, :1] <= line) & (line <= each[:, 1:])).any(axis=0) for each in both)
@@ -316,8 +318,8 @@ def remaining_widths(model: JointModel, posterior: Posterior) -> list[dict[Cause
 
     Draws without a cause, for example those with equal buildings, are draws from the posterior of a study that rules
     this cause out. The effect of the constants that the scene fixes is removed by linear regression of the parameter on
-    them; the share that remains is an upper bound, because the true dependence may be nonlinear. Only causes that
-    noticeably widen an interval are listed, in ascending order of the shares.
+    these constants. The share that remains is an upper bound, because the true dependence may be nonlinear. Only causes
+    that noticeably widen an interval are listed, in ascending order of the shares.
     """
     draws, width = posterior.means, len(model.study)
     models = [model.marginal.models[index] for index in posterior.model]
@@ -365,19 +367,21 @@ REPEAT_M: Final = 0.01
 """Largest distance between the ends of rows that count as repeats of a link [m]; antennas are larger."""
 
 REPEAT_DB: Final = 0.1
-"""Largest difference in modelled path loss between such rows [dB]; another antenna or carrier changes it by more."""
+"""Largest difference in modelled path loss between such rows [dB]; a different antenna or carrier changes it by
+more."""
 
 
 def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     """Replace the rows that repeat a link by their mean; the problem is unchanged if no row repeats a link.
 
     Rows at one position share the error of the link. If they were treated as independent, intervals would be too narrow
-    by a factor of the square root of the number of rows. The scatter of the rows says nothing about the shared error:
-    if the rows agree closely, a noise model with one variance for both would underestimate this error.
+    by a factor of the square root of the number of rows. The scatter of the rows contains no information about the
+    shared error. If the rows agree closely, a noise model with one variance for scatter and shared error would
+    underestimate the shared error.
 
-    Rows repeat a link if their ends are at the same positions, they have the same nuisances and biases, and the model
-    gives them the same path loss, both for the initial values and for the best candidate. The first row gets the mean
-    path loss, the mean weight and the means of further observables; the other rows get the weight 0.
+    Rows repeat a link if they have the same end positions, nuisances and biases, and if their modelled path loss is the
+    same for both the initial values and the best candidate. The first row is assigned the mean path loss, the mean
+    weight and the means of further observables. The other rows are assigned a weight of 0.
 
     Args:
         problem: The problem.
@@ -427,7 +431,7 @@ def _means(
 ) -> NDArray[np.float64]:
     """Values [L] in which the first row of each link has the mean of the link's known values; NaN if none is known.
 
-    `first` has, for each of the m rows with weight, the index of the first row of the same link [m].
+    For each of the m rows with weight, `first` is the index of the first row of the same link [m].
     """
     known = np.isfinite(values[counted])
     number = np.bincount(first[known], minlength=len(counted))

@@ -1,7 +1,7 @@
-"""Replay with constants that the study does not vary: constants of single buildings, and constants fixed by the scene.
+"""Replay in which further constants vary: constants of single buildings, and constants that the scene fixes.
 
-The building of every interaction follows from its position and the scene's meshes (`scenes/buildings.py`). Each pair of
-building and material becomes a separate material.
+The building of every interaction follows from its position and the scene's meshes (`scenes/buildings.py`). Each
+combination of a building and a material becomes a separate material.
 """
 
 from __future__ import annotations
@@ -31,13 +31,14 @@ BATCHES: Final = (1, 128)
 """Smallest and largest number of candidates per replay."""
 
 BATCH_INTERACTIONS: Final = 400_000
-"""Target for the interactions of one replay, over all its candidates; larger programs replay fewer at once."""
+"""Target for the number of interactions of one replay over all its candidates. Larger programs are replayed with fewer
+candidates at a time."""
 
 MANY: Final = 10_000
 """Number of interactions above which weak paths are left out."""
 
 WEAK: Final = 0.1
-"""Largest share of a link's power that all omitted paths carry together, summed over 16 candidates. On an office floor
+"""Largest share of a link's power that all omitted paths together carry, summed over 16 candidates. On an office floor
 in Auckland, 71 % of the interactions are left out, which changes the path loss of posterior draws by 0.05 dB (RMS); the
 errors are 5.3 dB. With a share of 0.03, 61 % are left out, and the change is 0.02 dB."""
 
@@ -74,7 +75,7 @@ class _Part:
 
 @dataclass(frozen=True, eq=False)
 class Split(ABC):
-    """A replay whose candidates set more constants than the study's parameters.
+    """A replay with candidates that set further constants in addition to the study's parameters.
 
     Attributes:
         parameter_of: Index of the parameter to which each of c constants belongs, ascending [c].
@@ -102,7 +103,7 @@ class Split(ABC):
     def respond(
         self, values: NDArray[np.float64], factors: NDArray[np.float64], wanted: tuple[Statistic, ...]
     ) -> Responses:
-        """Path loss and further observables, if any are wanted; the other arguments are as for `path_loss`."""
+        """Path loss and the observables in `wanted`, if any; the other arguments are as for `path_loss`."""
 
 
 @final
@@ -136,7 +137,7 @@ class SplitChunks(Split):
 
     Attributes:
         engine: The chunks.
-        splitting: How they are split.
+        splitting: The settings for splitting their replays.
     """
 
     engine: Chunked
@@ -152,7 +153,7 @@ class SplitChunks(Split):
 
 @dataclass(frozen=True)
 class _Splitting:
-    """How replays are split; picklable. Equal objects split a replay in the same way.
+    """Settings for splitting replays, which can be pickled. Equal settings split a replay in the same way.
 
     Attributes:
         parameters: The study's parameters and further constants.
@@ -218,14 +219,14 @@ def can_split(problem: Problem) -> bool:
 
 
 def replayed_materials(problem: Problem) -> list[dict[str, Material]]:
-    """The materials in the replay of every carrier, of a problem that `can_split`."""
+    """The materials in the replay of every carrier; `can_split` must be true for the problem."""
     if isinstance(problem.engine, Chunked):
         return list(chain.from_iterable(problem.engine.ask(_chunk_materials)))
     return [replay.materials for replay, _ in cast(Replay | ReplayCarriers, problem.engine).parts]
 
 
 def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool) -> Split:
-    """Give a problem's replay further parameters and, if `by_building`, each building of its scene its own constants.
+    """Extend a problem's replay by further parameters and, if `by_building`, by separate constants for each building.
 
     `can_split` must be true for the problem. The study's parameters come first; a further parameter is a constant that
     is equal at all carriers. If the paths meet fewer than two buildings, no constant belongs to a building.
@@ -249,7 +250,7 @@ def _split_paths(
 ) -> tuple[Replay, list[tuple[int, int]]]:
     """The replay of one carrier with the given paths; and for each constant, its parameter and its building (-1: none).
 
-    If its paths depend on no constants, the replay is unchanged, and the list is empty.
+    If the paths depend on no constant, the replay is unchanged and the list is empty.
     """
     names = list(paths.materials)
     # One material per pair of building and material, numbered by the sorted pairs.
@@ -295,7 +296,7 @@ def _chunk_materials(chunk: Chunk) -> list[dict[str, Material]]:
 
 
 def _split_chunk(chunk: Chunk, splitting: _Splitting) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
-    """Parameter and building of each constant in a chunk [c, 2], buildings that paths hit, number of interactions."""
+    """Parameter and building of each constant in a chunk [c, 2], buildings hit by paths, and number of interactions."""
     split = chunk.derived(splitting)
     return np.stack([split.parameter_of, split.building_of], axis=1), split.met, split.interactions
 

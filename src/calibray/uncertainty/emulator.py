@@ -2,10 +2,10 @@
 
 Intervals need thousands of evaluations, and calls are expensive. A Gaussian process for the path loss of every link
 interpolates the calls (`multifidelity/discrepancy.py`). The mean of the process is the corrected replay of the study's
-scene, if there is one and it is not misleading; otherwise a constant. The uncertainty of the process must widen the
-intervals. We therefore draw functions from it, use each as an engine, and pool the resulting posteriors. Every call is
-also predicted from all others. If the errors of these predictions exceed the expected errors, the spread of the drawn
-functions is increased by the same factor.
+scene if it is available and not misleading, and otherwise a constant. The uncertainty of the process must widen the
+intervals. We therefore draw functions from the process, use each function as an engine, and pool the resulting
+posteriors. Every call is also predicted from all others. If the errors of these predictions exceed the expected errors,
+the spread of the drawn functions is increased by the same factor.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ MAX_CALLS: Final = 200
 """Largest number of calls that the process interpolates; its matrix is factored about a hundred times."""
 
 NEAR: Final = 0.005
-"""If there are more than `MAX_CALLS` calls, only the better of two calls closer than this in the unit cube is used."""
+"""If there are more than `MAX_CALLS` calls, only the better of two calls that are closer together than this in the unit
+cube is used."""
 
 
 class MeanFunction(Protocol):
@@ -83,9 +84,10 @@ class ConstantMean:
 
 @dataclass(frozen=True, eq=False)
 class ResponseRows:
-    """The emulated rows, which are a cheap model's residuals: path loss of links with weight, then further observables.
+    """The emulated rows, which replace the residuals: path loss of links with weight, then further observables.
 
-    Further observables are divided by their errors and multiplied by that of path loss, so that rows are comparable.
+    Further observables are divided by their errors and multiplied by that of path loss, so that all rows are
+    comparable.
 
     Attributes:
         problem: The problem.
@@ -112,7 +114,7 @@ class ResponseRows:
     def residuals(
         self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64], observed: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """See `Rows.residuals`; the measured value replaces an observable of a link without a path."""
+        """See `Rows.residuals`; an observable of a link without a path is replaced by its measured value."""
         rows = [self.problem.objective.capped(path_loss)[:, self.links]]
         for index, (each, used) in enumerate(zip(self.problem.observed, self.used, strict=True)):
             values = observed[:, index, used] / each.scale
@@ -136,7 +138,7 @@ class ResponseRows:
 
     @property
     def used(self) -> list[NDArray[np.int64]]:
-        """Indices of the links that have each further observable."""
+        """For each further observable, indices of the links that have it."""
         return [each.used(self.problem.objective.weight) for each in self.problem.observed]
 
     def unit(self, index: int) -> float:
@@ -169,7 +171,8 @@ class EmulatedEngine:
         mean: The mean function.
         function: The function added to the mean.
         rows: The definition of the m emulated rows.
-        initial_loss: Path loss of all links at the initial values [L], [dB]; links that are not emulated keep it.
+        initial_loss: Path loss of all links at the initial values [L], [dB]; it is returned for links that are not
+            emulated.
         calls: Number of candidates evaluated so far.
     """
 
@@ -250,7 +253,7 @@ class Ensemble:
     Attributes:
         mean: The posterior mean of the process.
         drawn: Functions drawn from the process.
-        apart_db: Root mean square difference between drawn functions and the mean, over all of the unit cube [dB].
+        apart_db: Root mean square difference between drawn functions and the mean over the unit cube [dB].
         error_db: Root mean square leave-one-out error of the better half of the calls [dB].
         calls: Number of calls that the process interpolates.
         replayed: The corrected replay in the mean function; None if there is none, or if it is misleading.
@@ -316,7 +319,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
 
 
 def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Calls:
-    """The calls with a path loss for every link with weight; of too many calls, a selection that favours the best."""
+    """The calls with a path loss for every link with weight; if these are too many, mainly the best of them."""
     parameters = problem.parameters
     candidates, modelled = np.array(trail.candidates), np.array(trail.modelled)
     observed = np.array(trail.observed)

@@ -1,12 +1,12 @@
-"""The joint model of everything that is unknown: parameters, fixed constants, buildings and errors.
+"""The joint model of all unknowns: parameters, fixed constants, buildings and errors.
 
 - The study's parameters have flat priors over their bounds, or the priors that the study declares.
 - Constants of these materials that come from the scene, such as thickness, have a log-normal prior around the scene's
   value, because they are never known exactly. A scattering coefficient of 0 is exact with a probability of one half.
 - A constant of the walls of building b is x exp(s z_b), where x is the material's mean and z_b is standard normal. The
-  between-building spread s is zero with probability `ALIKE`, otherwise exponential.
-- Errors follow one of several noise models (`noise_models.py`), whose level, nuisances and undeclared offset are
-  integrated out.
+  between-building spread s is zero with probability `ALIKE`, and otherwise exponentially distributed.
+- Errors follow one of several noise models (`noise_models.py`). The noise level, the nuisances and an undeclared offset
+  are integrated out.
 
 `sequential_monte_carlo.py` draws from the posterior.
 
@@ -40,7 +40,7 @@ from calibray.uncertainty.buildings import can_split, replayed_materials, split_
 from calibray.uncertainty.noise_models import HEAVY, Marginal, excess_db, noise_models
 
 MAX_LINKS: Final = 300
-"""Number of links up to which the matrices are stored; those of 26 Gaussian models then need 19 MB."""
+"""Number of links up to which the matrices are stored; those of 26 Gaussian models then occupy 19 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +50,9 @@ class QuadraticForms:
     Attributes:
         marginal: The density.
         group: Group of each model; models of one group are evaluated together [models]. It is the model's own index for
-            a Gaussian model, -1 for Student's t, -2 for gross errors.
+            a Gaussian model, -1 for Student's t, and -2 for gross errors.
         square: For each Gaussian model, the matrix [m, m], constant and exponent of its quadratic form; None for other
-            models. Empty if there are too many links, or censored ones.
+            models. Empty if there are too many links or any censored links.
     """
 
     marginal: Marginal
@@ -95,8 +95,8 @@ FIXED_FIELDS: Final = ("thickness", "conductivity", "scattering_coefficient")
 """Constants that come from the scene if they are not parameters."""
 
 NO_EFFECT: Final = 0.02
-"""A constant from the scene stays fixed if one standard deviation of it changes path loss by less than this share of
-the noise level: the resulting variance is then below 0.04 % of the noise variance."""
+"""A constant from the scene stays fixed if a change by one standard deviation changes path loss by less than this share
+of the noise level. The resulting variance is then below 0.04 % of the noise variance."""
 
 ALIKE: Final = 0.5
 """Prior probability that buildings do not differ."""
@@ -165,7 +165,8 @@ class JointModel:
     def _split(self, gaps: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Gaps of path loss [n, m], and the log likelihood of the further observables [n].
 
-        If their error is not stated, it is integrated out with a prior inversely proportional to it.
+        If the study does not state an observable's error, the error is integrated out, with a prior inversely
+        proportional to the error.
         """
         last = gaps.shape[1] - sum(count for count, _, _ in self.observed)
         links, further = gaps[:, :last], np.zeros(len(gaps))
@@ -229,9 +230,10 @@ class JointModel:
 
 
 def joint_model(problem: Problem, best: NDArray[np.float64], square: float, freedom: int) -> JointModel:
-    """Set up the joint model of everything that is unknown, from the optimum `best` in the search space [d].
+    """Set up the joint model of all unknowns, from the optimum `best` in the search space [d].
 
-    `square` is the mean square of the residuals there [dB^2], and `freedom` their number minus the number of unknowns.
+    `square` is the mean square of the residuals at the optimum [dB^2]. `freedom` is the number of residuals minus the
+    number of unknowns.
     """
     objective, links, section = problem.objective, problem.setup.links, problem.setup.study.noise
     weight, censored = _weights_and_censoring(problem)
@@ -366,7 +368,7 @@ def _with_constants(
 
 
 def _further(problem: Problem, observed: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Rows of each further observable [n, m], in units of its error if the study states it."""
+    """Rows of each further observable [n, m], in units of its error if the study states this error."""
     rows = []
     for index, each in enumerate(problem.observed):
         residuals, _ = each.residuals(observed[:, index], problem.objective.weight)
@@ -383,9 +385,9 @@ def has_offset(problem: Problem) -> bool:
 
 
 def _fixed_constants(problem: Problem) -> list[Parameter]:
-    """Constants of materials with a parameter that the scene fixes and that are equal at all carriers.
+    """Constants that the scene fixes and that are equal at all carriers, of materials with a parameter.
 
-    A scattering coefficient of 0 that the study states is exact, also for facades of the material.
+    A scattering coefficient of 0 that the study states is exact for the material and its facades.
     """
     study = problem.setup.study
     materials, spread = problem.engine.materials, study.noise.constants_spread
@@ -415,7 +417,7 @@ def _fixed_constants(problem: Problem) -> list[Parameter]:
 def _weights_and_censoring(problem: Problem) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Weights of the links in the likelihood [L], and mask of the censored ones [L].
 
-    With censored links in the likelihood, links measured near the noise floor are used as well, so that links are not
+    With censored links in the likelihood, links measured near the noise floor are also used, so that links are not
     selected by their measured values.
     """
     objective, links = problem.objective, problem.setup.links

@@ -1,13 +1,13 @@
-"""Densities of errors whose integrals over nuisance and scale have no closed form: Laplace's approximation.
+"""Laplace's approximation of error densities whose integrals over nuisance and scale have no closed form.
 
-Heavy tails: either the errors follow Student's t, whose tails decrease gradually, or most errors are Gaussian and a few
-are gross, for example because a link's position was recorded wrongly. Gross errors are Gaussian with a larger standard
-deviation (J. W. Tukey, in: Contributions to Probability and Statistics, 1960). We fit both distributions by iteratively
-reweighted least squares (K. L. Lange, R. J. A. Little, J. M. G. Taylor, J. Am. Stat. Assoc. 84 (1989) 881) and
-integrate at the mode, with the Fisher information.
+There are two models of heavy tails. Either the errors follow Student's t, with tails that decrease gradually, or most
+errors are Gaussian and a few are gross, for example because a link's position was recorded incorrectly. Gross errors
+are Gaussian with a larger standard deviation (J. W. Tukey, in: Contributions to Probability and Statistics, 1960). We
+fit both distributions by iteratively reweighted least squares (K. L. Lange, R. J. A. Little, J. M. G. Taylor, J. Am.
+Stat. Assoc. 84 (1989) 881) and integrate around the mode, with the Fisher information.
 
-Censored links, whose path loss is only known to be above the noise floor: a measured link contributes the density of
-its error, and a censored one the probability that its error is at least as large as the floor requires (J. Tobin,
+Censored links are known only to lie below the noise floor. A measured link contributes the density of its error. A
+censored link contributes the probability that its error is at least as large as the floor requires (J. Tobin,
 Econometrica 26, 1958). Without the censored links, only links with favourable errors would remain near the floor. For
 errors e = s u, with u standard normal or Student's t, and nuisance coefficients b, damped Newton steps in b and log s
 maximise the logarithm of
@@ -29,7 +29,8 @@ CENSORED_TOLERANCE: Final = 1e-9
 """Predicted gain in log density below which the iteration ends."""
 
 LARGEST: Final = 1e4
-"""Limit for the error of a censored link, in units of the median absolute error; it is infinite without a path."""
+"""Largest magnitude of a censored link's error, in units of the median absolute error. Without this limit, the error of
+a link without a path would be infinite."""
 
 
 class _Terms(NamedTuple):
@@ -41,7 +42,7 @@ class _Terms(NamedTuple):
 
 
 def log_survival(error: NDArray[np.float64], freedom: float) -> NDArray[np.float64]:
-    """Log probability that Student's t exceeds an error, in units of its scale; Gaussian if `freedom` is infinite.
+    """Log probability that a Student's t variable exceeds an error; it is Gaussian if `freedom` is infinite.
 
     Example:
         >>> log_survival(np.array([0.0, 40.0]), np.inf).round(2).tolist()
@@ -57,7 +58,7 @@ def log_evidence(
     ridge: NDArray[np.float64],
     freedom: float = np.inf,
 ) -> NDArray[np.float64]:
-    """Log density of errors with censored links; nuisance and noise level integrated out.
+    """Log density of errors with censored links, with nuisance and noise level integrated out.
 
     Args:
         gap: Measured minus modelled path loss; for a censored link, path loss at the floor minus modelled path loss
@@ -122,7 +123,7 @@ def joint(
     """The joint log density of errors, coefficients and log scale, with its derivatives; see `log_evidence`.
 
     At coefficients and log scale [n, q + 1], the results are its value up to a constant [n], its gradient [n, q + 1],
-    and minus its Hessian [n, q + 1, q + 1].
+    and its negative Hessian [n, q + 1, q + 1].
     """
     coefficients, scale = point[:, :-1], np.exp(point[:, -1])
     error = (gap - coefficients @ design.T) / scale[:, None]
@@ -174,7 +175,7 @@ def _damped(curvature: NDArray[np.float64], damping: NDArray[np.float64]) -> NDA
 
 
 def _longest(point: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Longest step: three scales for a coefficient, a factor of e for the scale."""
+    """Longest step: three scales for a coefficient, and a factor of e for the scale."""
     longest = np.repeat(3.0 * np.exp(point[:, -1:]), point.shape[1], axis=1)
     longest[:, -1] = 1.0
     return longest
@@ -184,7 +185,8 @@ MAX_STEPS: Final = 25
 """Largest number of steps to the mode."""
 
 TOLERANCE: Final = 1e-3
-"""Change of errors and scale, relative to the scale, at which the iteration ends; the density is flat at the mode."""
+"""Change of errors and scale, relative to the scale, at which the iteration ends. It need not be smaller, because the
+density is flat at the mode."""
 
 GROSS_SHARE: Final = 0.1
 """Share of gross errors."""
@@ -197,7 +199,7 @@ OfSquare = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 class Tail(NamedTuple):
-    """A distribution of errors with scale one, the same for all gaps or one per gap.
+    """A distribution of errors with unit scale; it is either the same for all gaps or different for each gap.
 
     Attributes:
         log_density: Its log density as a function of the squared errors.
@@ -218,7 +220,7 @@ class Tail(NamedTuple):
 
 
 def student(freedom: float | NDArray[np.float64]) -> Tail:
-    """Student's t distribution with one number of degrees of freedom, or one per gap [n]."""
+    """Student's t distribution with the same degrees of freedom for all gaps, or with one value per gap [n]."""
     constant = gammaln((freedom + 1) / 2) - gammaln(freedom / 2) - 0.5 * np.log(freedom * np.pi)
     return _student(
         np.asarray(freedom, dtype=np.float64)[..., None], np.asarray(constant, dtype=np.float64)[..., None]
@@ -268,13 +270,13 @@ def gross() -> Tail:
 def evidence(
     gap: NDArray[np.float64], design: NDArray[np.float64], ridge: NDArray[np.float64], tail: Tail
 ) -> NDArray[np.float64]:
-    """Log density of heavy-tailed errors; nuisance and scale integrated out.
+    """Log density of heavy-tailed errors, with nuisance and scale integrated out.
 
     Args:
         gap: Measured minus modelled path loss, without the nuisance [n, m], [dB].
         design: Columns of the nuisance [m, q].
-        ridge: Inverse standard deviations of the coefficients' priors, the same for all gaps [q] or one per gap [n, q];
-            0 for a flat prior.
+        ridge: Inverse standard deviations of the coefficients' priors, either the same for all gaps [q] or for each gap
+            [n, q]; 0 for a flat prior.
         tail: The distribution of the errors.
 
     Returns:

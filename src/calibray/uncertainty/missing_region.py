@@ -1,8 +1,8 @@
-"""Search for a missing region, such as unmapped trees, whose extra loss explains the residuals best.
+"""Search for a missing region, such as unmapped trees, whose extra loss best explains the residuals.
 
 For each rectangle of cells of a grid, at several heights, the residuals are regressed on the length of every link's
-straight line inside it. The same search over residuals in random order shows what chance can explain (a scan statistic;
-M. Kulldorff, Communications in Statistics 26, 1997).
+straight line inside the rectangle. The same search on randomly permuted residuals shows how much chance alone can
+explain (a scan statistic; M. Kulldorff, Communications in Statistics 26, 1997).
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ SAMPLES: Final = 128
 """Number of points along each line, several in each cell that it crosses."""
 
 HEIGHTS: Final = (5.0, 10.0, 20.0)
-"""Heights above the lowest antenna up to which the rectangles reach [m]: hedges, street trees, tall trees."""
+"""Heights of the rectangles above the lowest antenna [m], for hedges, street trees and tall trees."""
 
 FEWEST_LINKS: Final = 30
 """Smallest number of links for a search."""
 
 MOST: Final = 20_000
-"""Largest number of links in a search; if there are more, every second, third, ... link is used."""
+"""Largest number of links in a search; if there are more, only every kth link is used."""
 
 SHUFFLES: Final = 99
-"""Number of random orders of the residuals; a rectangle is significant only if none has one that explains as much."""
+"""Number of random permutations of the residuals. A rectangle is significant only if no permutation has a rectangle
+that explains as much."""
 
 
 class Explained(NamedTuple):
@@ -42,7 +43,7 @@ class Explained(NamedTuple):
         explained: Sum of squares that the rectangle explains.
         attenuation: Its attenuation [dB/m].
         cells: Its south-west and north-east corners, in cells [2, 2].
-        chance: Sum of squares that the best rectangle of this width explains, by random order of the residuals [k - 1].
+        chance: Sum of squares that the best rectangle of this width explains, for each permutation [k - 1].
     """
 
     explained: float
@@ -53,16 +54,16 @@ class Explained(NamedTuple):
 
 @dataclass(frozen=True)
 class MissingRegion:
-    """A rectangle whose extra loss would explain residuals.
+    """A rectangle whose extra loss would explain part of the residuals.
 
     Attributes:
         box: West, south, east and north sides in the scene frame [m].
         height: Height of its top in the scene frame [m].
         attenuation: Loss per length inside [dB/m].
-        links: Number of links whose straight line crosses it; an estimate if not all links are searched.
+        links: Number of links whose straight line crosses it; an estimate if not all links are used.
         share: Share of the mean square of the residuals that it explains.
-        chance: Median share that the best rectangle explains of residuals in random order.
-        significant: Whether at least `FEW` links cross it, and no random order has a rectangle that explains as much.
+        chance: Median share that the best rectangle explains of permuted residuals.
+        significant: Whether at least `FEW` links cross it, and no permutation has a rectangle that explains as much.
     """
 
     box: tuple[float, float, float, float]
@@ -74,7 +75,7 @@ class MissingRegion:
     significant: bool
 
     def row(self) -> dict[str, Any]:
-        """Its values by name, with the four sides of the box."""
+        """The values by name; the four sides of the box are separate values."""
         sides = dict(zip(("west", "south", "east", "north"), self.box, strict=True))
         return sides | {name: value for name, value in asdict(self).items() if name != "box"}
 
@@ -85,16 +86,17 @@ def missing_region(
     excess_db: NDArray[np.float64],
     known: Sequence[NDArray[np.float64]] = (),
 ) -> MissingRegion | None:
-    """Search for the rectangle whose extra loss explains most of the residuals.
+    """Search for the rectangle whose extra loss explains the largest part of the residuals.
 
     Args:
         tx: Positions of the transmitters [n, 3], [m].
         rx: Positions of the receivers [n, 3], [m].
         excess_db: Measured minus predicted path loss [n], [dB].
-        known: Columns that explain residuals in another way, such as whether a link is out of sight [n].
+        known: Columns that can explain the residuals in another way, such as whether a link is out of sight [n].
 
     Returns:
-        The rectangle; None if there are too few links, or if extra loss in a rectangle explains no residuals.
+        The rectangle; None if there are too few links, or if no rectangle with extra loss explains any of the
+        residuals.
     """
     if len(excess_db) < FEWEST_LINKS:
         return None

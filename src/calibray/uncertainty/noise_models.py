@@ -1,15 +1,15 @@
 """Noise models, and the marginal density of the measurements under each.
 
-Errors may be independent and Gaussian, correlated between neighbours, larger out of sight, or heavy-tailed, and an
-offset may be undeclared. Larger errors out of sight are a discrepancy of the twin (M. C. Kennedy and A. O'Hagan, J.
-Royal Statistical Society B 63, 2001): paths that it lacks change the path loss of its weak links (`excess_db`). The
-right model is unknown, and choosing the best-fitting one ignores others that fit nearly as well. Every model therefore
-gets a prior weight, and results are averages over all models (Bayesian model averaging). A discrepancy that the data do
-not need therefore gets almost no weight, and does not absorb what the parameters explain.
+Errors may be independent and Gaussian, correlated between neighbours, larger out of sight, or heavy-tailed. An offset
+may be undeclared. Larger errors out of sight are a discrepancy of the digital twin (M. C. Kennedy and A. O'Hagan, J.
+Royal Statistical Society B 63, 2001): paths that the twin lacks change the path loss of its weak links (`excess_db`).
+The right model is unknown, and a choice of the best-fitting model would ignore others that fit nearly as well. Every
+model therefore has a prior weight, and results are averages over all models (Bayesian model averaging). A discrepancy
+that the data do not support receives almost no weight, and does not absorb effects that the parameters explain.
 
-The noise level has the prior 1/level, and nuisances have their own priors, flat unless declared. For Gaussian noise
-with covariance C times an unknown variance, the integrals over both have closed forms (D. A. Harville, Biometrika 61,
-1974): with whitened errors y and design Z, ridge R, A = Z'Z + R'R and S = y'y - y'Z A^-1 Z'y,
+The noise level has the prior 1/level. The priors of nuisances are flat unless the study declares them. For Gaussian
+noise with covariance C times an unknown variance, the integrals over noise level and nuisances have closed forms (D. A.
+Harville, Biometrika 61, 1974): with whitened errors y and design Z, ridge R, A = Z'Z + R'R and S = y'y - y'Z A^-1 Z'y,
 
     p = (2 pi)^(-f/2) Gamma(f/2) / 2 (S/2)^(-f/2) |C|^(-1/2) |A|^(-1/2) |R|,
 
@@ -66,7 +66,7 @@ def excess_db(problem: Problem) -> NDArray[np.float64]:
 
 
 def missing_db(excess: NDArray[np.float64], level: float) -> NDArray[np.float64]:
-    """Change of path loss [dB] due to missing power `level` dB below the line of sight, for links with this excess."""
+    """Change of path loss [dB] due to missing power `level` dB below the line of sight, at the given excess losses."""
     # 10 log10(1 + 10^((excess - level) / 10)), without overflow.
     return 10.0 * np.logaddexp(0.0, (excess - level) * (0.1 * np.log(10.0))) / np.log(10.0)
 
@@ -78,29 +78,30 @@ NO_OFFSET: Final = 1e3
 """Inverse prior standard deviation that keeps an offset at 0 [1/dB]."""
 
 SHARES: Final = (0.4, 0.7, 0.95)
-"""Correlated shares of the variance that are tried."""
+"""Trial values of the correlated share of the variance."""
 
 RANGES: Final = 4
 """Number of correlation ranges tried, from the distance between neighbours to a third of the campaign's extent."""
 
 SAME_PLACE: Final = 0.01
-"""Correlation range of errors that only links at one position share, as a share of the distance between neighbours."""
+"""Correlation range of errors that only links at the same position share, relative to the distance between
+neighbours."""
 
 FREEDOMS: Final = (2.0, 4.0)
-"""Degrees of freedom of Student's t that are tried."""
+"""Trial values of the degrees of freedom of Student's t."""
 
 DEPARTURE: Final = 2.0
-"""Prior weight of an offset, of correlated errors and of heavy-tailed errors, relative to none and to independent
-Gaussian errors: measured errors are rarely independent and Gaussian. Larger errors out of sight have weight one: if the
-twin lacks refraction, their posterior weight exceeds 0.9 in five of nine development runs."""
+"""Prior weight of an offset, relative to no offset, and of correlated or heavy-tailed errors, relative to independent
+Gaussian errors. Measured errors are rarely independent and Gaussian. Larger errors out of sight have weight one. If the
+twin lacks refraction, their posterior weight then exceeds 0.9 in five of nine development runs."""
 
 IMPROBABLE: Final = 50.0
-"""With many links, a model is left out if the log odds against it at the optimum reach this. At its own optimum, the
-model can gain a few units per parameter, which is far less."""
+"""With many links, a model is left out if the log odds against it at the optimum reach this value. At its own optimum,
+the model can gain a few units per parameter, which is far less."""
 
 LEVELS: Final = (5.0, 15.0, 25.0)
 """Trial levels of the power that the twin lacks out of sight, in dB below the power in sight. In three development
-districts whose twins lack refraction, the missing power is 2 to 35 dB below."""
+districts with twins that lack refraction, the missing power is 2 to 35 dB below the power in sight."""
 
 COMMON: Final = 0.5
 """Share of the variance of errors out of sight that all links have in common: missing paths can only add power."""
@@ -109,7 +110,7 @@ COMMON: Final = 0.5
 GAUSSIAN, CORRELATED, OUT_OF_SIGHT, HEAVY = "gaussian", "correlated", "out_of_sight", "student-t"
 
 DIFFERING: Final = "heterogeneous"
-"""Name of the hypothesis that buildings differ, which has a posterior weight as the kinds of noise do."""
+"""Name of the hypothesis that buildings differ, which has a posterior weight like the kinds of noise."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,7 @@ def noise_models(
 def _ranges(position: NDArray[np.float64]) -> tuple[float, ...]:
     """Correlation ranges to try; none for fewer than three positions.
 
-    If several links have one position, errors that only these links share are tried as well.
+    If several links share a position, errors that only these links share are also tried.
     """
     places = np.unique(position, axis=0)
     distance = pairwise(places)
@@ -246,7 +247,7 @@ class Marginal:
             noise_db: Approximate noise level [dB].
             models: The noise models.
             censored: Mask of the censored links [m]; none if None.
-            excess_db: The function `excess_db` at these links [m], [dB]; None if no model is "out_of_sight".
+            excess_db: Values of the function `excess_db` at these links [m], [dB]; None if no model is "out_of_sight".
         """
         censored = np.zeros(len(scale), dtype=bool) if censored is None else censored
         whiteners = {}
@@ -263,7 +264,7 @@ class Marginal:
         return cls(design * scale[:, None], ridge, scale, noise_db, tuple(models), whiteners, censored)
 
     def without_improbable(self, gap: NDArray[np.float64]) -> Marginal:
-        """The density without models that explain the gaps at the optimum [1, m] much worse than the best one."""
+        """The density without models that explain the gaps at the optimum [1, m] much worse than the best model."""
         density = self.densities(gap)[0]
         kept = np.flatnonzero(density > density.max() - IMPROBABLE)
         return replace(self, models=tuple(self.models[k] for k in kept)) if len(kept) else self
@@ -297,7 +298,7 @@ class Marginal:
         return log_density
 
     def form(self, model: NoiseModel) -> tuple[NDArray[np.float64], float, float]:
-        """The matrix Q [m, m], c and h under Gaussian noise: the log density of gaps g is c - h log g'Q g."""
+        """Matrix Q [m, m] and constants c and h of a Gaussian model: the log density of gaps g is c - h log g'Q g."""
         design, ridge = self._with_offset(model.offset)
         white, shift = np.eye(len(design)), 0.0
         if model.kind != GAUSSIAN:

@@ -1,4 +1,4 @@
-"""Moves of a population's members, which leave the prior times a power of the likelihood invariant.
+"""Moves of a population's members that leave the prior times a power of the likelihood invariant.
 
 - One or more parameters move along the difference of two other members (C. J. F. ter Braak, Statistics and Computing
   16, 2006).
@@ -6,8 +6,7 @@
   walls, several narrow ranges of a permittivity can fit; a member can reach any of them in one move.
 - The constants of one, two or all buildings are redrawn around their current values (S. L. Cotter, G. O. Roberts, A. M.
   Stuart and D. White, Statistical Science 28, 2013).
-- The between-building spread is redrawn from its prior, together with all buildings: buildings become equal or
-  different.
+- The between-building spread is redrawn from its prior, together with all buildings, which become equal or different.
 - Means and spread are redrawn given the buildings' constants. The constants, and with them path loss, stay the same, so
   no replay is needed (interweaving: Y. Yu and X.-L. Meng, J. Computational and Graphical Statistics 20, 2011).
 - The noise model is redrawn given the errors.
@@ -27,17 +26,18 @@ SPREAD_GRID: Final = 64
 """Number of points of the logarithmic grid from which the spread is drawn."""
 
 ACCEPTANCE: Final = 0.25
-"""Target share of accepted moves, which sets their lengths; near the optimal 0.234 of random walks (G. O. Roberts, A.
-Gelman and W. R. Gilks, Annals of Applied Probability 7, 1997)."""
+"""Target share of accepted moves, which determines the lengths of moves. It is near 0.234, the optimum of random walks
+(G. O. Roberts, A. Gelman and W. R. Gilks, Annals of Applied Probability 7, 1997)."""
 
 JITTER: Final = 1e-4
-"""Standard deviation of the random addition to moves along differences, so that every point can be reached."""
+"""Standard deviation of the random displacement added to moves along differences, so that every point can be
+reached."""
 
 NEIGHBOURHOOD: Final = 32
-"""Inverse of the share of the population, on either side of a kernel's centre, that sets the width of the kernel."""
+"""The width of a kernel spans the share 1 / `NEIGHBOURHOOD` of the population on either side of its centre."""
 
 TINY: Final = 1e-30
-"""Replaces a constant of 0 in logarithms; its factors have no effect."""
+"""Value that replaces a constant of 0 in logarithms; factors on such a constant have no effect."""
 
 NEVER: Final = -1e300
 """Finite replacement for a log density of minus infinity."""
@@ -79,7 +79,7 @@ class Population:
         )
 
     def without_gaps(self) -> Population:
-        """The members without their gaps, which take most of the memory."""
+        """The members without their gaps, which occupy most of the memory."""
         return replace(self, gap=self.gap[:, :0])
 
     def parts(self) -> tuple[NDArray, ...]:
@@ -89,7 +89,7 @@ class Population:
 
 @dataclass(frozen=True)
 class Lengths:
-    """Lengths of moves, adapted to their acceptance.
+    """Lengths of moves, adapted to their acceptance rates.
 
     Attributes:
         buildings: Length of a move of all buildings; 1 draws them independently of their current values.
@@ -117,7 +117,7 @@ class Moves:
     Attributes:
         model: The joint model.
         power: The power.
-        random: Random numbers.
+        random: The random number generator.
     """
 
     model: JointModel
@@ -125,7 +125,7 @@ class Moves:
     random: np.random.Generator
 
     def sweep(self, population: Population, lengths: Lengths) -> tuple[Population, Lengths]:
-        """Apply each kind of move to every member, except for those of `redraw_categories`."""
+        """Apply each kind of move to every member, except the moves of `redraw_categories`."""
         population, lengths = self._move_points(population, lengths)
         if len(self.model.parameter_of):
             population, lengths = self._move_buildings(population, lengths)
@@ -181,7 +181,7 @@ class Moves:
     def _at_points(
         self, population: Population, point: NDArray[np.float64], log_ratio: float | NDArray[np.float64] = 0.0
     ) -> tuple[Population, NDArray[np.bool_]]:
-        """The population at proposed points [n, d + k] if accepted [n]; a point outside the bounds needs no replay."""
+        """The population with accepted points [n, d + k], and their mask [n]; a point out of bounds needs no replay."""
         inside = np.asarray(((point >= 0.0) & (point <= 1.0)).all(axis=1))
         proposal = self._evaluated_where(inside, population, replace(population, point=point))
         accepted = inside & self._accepts(population, proposal, log_ratio)
@@ -208,7 +208,7 @@ class Moves:
         return population.updated(accepted, proposal), replace(lengths, buildings=buildings)
 
     def _redraw_all_buildings(self, population: Population) -> Population:
-        """Propose spread and deviations from their prior: buildings become equal, or differ by more or less."""
+        """Propose spread and deviations from their prior, so that buildings become equal or differ more or less."""
         count = len(population.spread)
         proposal = replace(
             population,
@@ -267,7 +267,7 @@ class Moves:
     def _evaluated_where(
         self, changed: NDArray[np.bool_], population: Population, proposal: Population
     ) -> Population:
-        """The proposal, evaluated for the members that need it [n]; the others keep their densities."""
+        """The proposal, evaluated for the members in `changed` [n]; the others keep their densities."""
         rows = np.flatnonzero(changed)
         if not len(rows):
             return proposal
@@ -281,7 +281,7 @@ class Moves:
     def _accepts(
         self, population: Population, proposal: Population, log_ratio: float | NDArray[np.float64] = 0.0
     ) -> NDArray[np.bool_]:
-        """Metropolis-Hastings rule [n]; minus an exponential number is the logarithm of a uniform one."""
+        """Metropolis-Hastings rule [n]; minus an exponential variate is the logarithm of a uniform variate."""
         change = self.power * (proposal.log_likelihood - population.log_likelihood)
         change += proposal.log_prior - population.log_prior + log_ratio
         return np.asarray(-self.random.standard_exponential(len(change)) < change)
@@ -302,7 +302,7 @@ def _redraw_spread(population: Population, random: np.random.Generator) -> Popul
 
 
 def _adapted(length: float, accepted: NDArray[np.bool_], longest: float) -> float:
-    """The length of moves, adapted to their acceptance."""
+    """The length of moves, adapted to their acceptance rate."""
     if not len(accepted):
         return length
     return float(np.clip(length * np.exp(0.5 * (accepted.mean() - ACCEPTANCE)), 0.02, longest))

@@ -1,11 +1,11 @@
 """Checks of a finished calibration that lead to remarks: noise, missed optimum, intervals, undeclared offset, conflict.
 
-Path loss and further observables may contradict each other beyond their errors, and require different parameters. The
-parameters are fitted to path loss alone, to the further observables alone, and to both. The increase in both sums of
-squares from the separate fits to the common one, divided by the variances of the errors and by the number of
-parameters, follows an F distribution if one set of parameters explains everything. It is also possible that no
-parameters explain an observable, as if it were measured in a different scene. Measured values are regressed on modelled
-ones: the slope is 1 if the model is right, and near 0 if the two are unrelated.
+Path loss and further observables may contradict each other by more than their errors explain, so that they require
+different parameters. The parameters are fitted to path loss alone, to the further observables alone, and to both. The
+increase in both sums of squares from the separate fits to the common one, divided by the variances of the errors and by
+the number of parameters, follows an F distribution if one set of parameters explains all data. It is also possible that
+no parameter values explain an observable, as if it were measured in a different scene. Measured values are therefore
+regressed on modelled values. The slope is 1 if the model is right, and near 0 if the two are unrelated.
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ from calibray.uncertainty.joint_model import has_offset
 from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, HEAVY, OUT_OF_SIGHT
 
 SIGNIFICANT: Final = 0.005
-"""A conflict is reported if the probability of a larger increase without a conflict is below this. Errors that
+"""A conflict is reported if the probability of a larger increase without a conflict is below this value. Errors that
 neighbouring links share make small probabilities slightly more frequent."""
 
 UNRELATED: Final = 0.02
-"""An observable does not fit the scene if the probability of so small a slope under the model is below this value,
-divided by the number of observables."""
+"""An observable is reported not to fit the scene if the probability of such a small slope under the model is below this
+value, divided by the number of observables."""
 
 FEWEST: Final = 5
-"""Degrees of freedom below which no slope is judged."""
+"""Degrees of freedom below which no slope is tested."""
 
 CONFLICT_STARTS: Final = 32
 """Number of local searches per fit."""
 
 DOMINANT: Final = 1e3
-"""Factor on the residuals of the further observables in the fit that is meant to use only them; the fit to path loss
-alone divides by it. All fits can then use the same compiled program."""
+"""Factor on the residuals of the further observables in the fit to these observables alone. In the fit to path loss
+alone, these residuals are divided by this factor. All fits can then use the same compiled program."""
 
 
 def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...]:
     """Compare the parameters that path loss requires with those that further observables require; `minima` are [k, d].
 
     Returns:
-        Remarks that give both fits and the size of the conflict, in standard errors; empty if there is no conflict.
+        Remarks that state both fits and the size of the conflict in standard errors; empty if there is no conflict.
     """
     objective, width = problem.objective, len(problem.parameters)
     starts = minima[:BASINS]
@@ -155,7 +155,8 @@ SLACK: Final = 0.02
 """A calibrated value is reported if its distance from its interval exceeds this share of the parameter's range."""
 
 MISSED_DB: Final = 0.01
-"""The method is reported to have missed the optimum if a draw has an objective that is lower by at least this [dB]."""
+"""The method is reported to have missed the optimum if a draw has an objective that is lower by at least this much
+[dB]."""
 
 STARTS: Final = 16
 """Number of local searches with a free offset, in addition to those that start from the minima without an offset."""
@@ -274,7 +275,7 @@ def fit_undeclared_offset(
 
     Args:
         problem: The problem.
-        minima: Its minima, the lowest first [k, d].
+        minima: The problem's minima, lowest first [k, d].
         square: Mean square of the residuals at the lowest minimum [dB^2].
         freedom: Number of residuals minus unknowns.
 

@@ -3,8 +3,8 @@
 A link's error has a correlated and an uncorrelated part. Nearby receivers share the correlated part, for example
 because clutter that the scene lacks shadows all of them. Its covariance falls off exponentially with distance. Range
 and size maximise the restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971), so that the fit of
-parameters does not bias the noise low. The fit is exact, with one Cholesky factorisation per trial, for up to a few
-thousand links.
+parameters does not bias the noise estimate downwards. The fit is exact, with one Cholesky factorisation per trial, for
+up to a few thousand links.
 
 Whitening makes errors independent. For up to a few hundred links, the covariance of the errors is factored. For more
 links, each error is modelled as its conditional mean given the errors of the nearest earlier links, plus an independent
@@ -31,7 +31,7 @@ SHARES: Final = (0.001, 0.999)
 """Bounds of the correlated share of the variance; at 1, the covariance of links at one position would be singular."""
 
 FEWEST_LINKS: Final = 10
-"""Number of links below which no correlation is reported; fewer links cannot show one."""
+"""Number of links below which no correlation is reported; fewer links cannot establish a correlation."""
 
 MOST_LINKS: Final = 500
 """Largest number of links used for correlation and variogram; if there are more, an evenly spaced subset is used."""
@@ -49,7 +49,8 @@ CHUNK: Final = 500
 """Number of links whose neighbourhoods are solved together."""
 
 Neighbours = tuple[NDArray[np.int64], NDArray[np.int64]]
-"""An order of the links [m], and the indices in it of each link's nearest earlier links [m, NEAREST]; -1 for none."""
+"""An order of the links [m], and the indices in this order of each link's nearest earlier links [m, NEAREST]; -1 for
+none."""
 
 
 @dataclass(frozen=True)
@@ -85,14 +86,15 @@ def fit_correlation(
     rank, were fitted to the same links: nuisances, and derivatives with respect to the parameters.
 
     Raises:
-        InputError: The number of links exceeds that of columns by less than three, or all receivers share one position.
+        InputError: The number of links exceeds the number of columns by less than three, or all receivers share one
+            position.
         EngineError: The errors are all zero.
     """
     count = len(errors)
     columns = np.zeros((count, 0)) if design is None else design
     if count - columns.shape[1] < 3:
         raise InputError(
-            f"noise: {count} links and {columns.shape[1]} fitted columns; the correlation of errors needs at least "
+            f"noise: {count} links and {columns.shape[1]} fitted columns; the correlation of errors requires at least "
             f"{columns.shape[1] + 3} links"
         )
     distance, pairs = cdist(position, position), pdist(position)
@@ -164,9 +166,10 @@ def variogram(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Empirical variogram: half the mean squared difference of errors versus distance between links.
 
-    A rising variogram indicates correlated errors [m], [dB], and a flat one indicates independent errors. Positions
-    [m, k], [m], are those of the receivers or of both ends. The result is the mean distance [8], [m], the semivariance
-    [8], [dB^2], and the number of pairs [8], for classes with about equally many pairs; fewer than 8 if pairs are few.
+    A rising variogram indicates correlated errors, and a flat variogram indicates independent errors. Errors [m] are in
+    dB. Positions [m, k], [m], are those of the receivers or of both ends. The result is the mean distance [8], [m], the
+    semivariance [8], [dB^2], and the number of pairs [8], for distance classes with about the same number of pairs.
+    There are fewer than 8 classes if there are fewer than 8 pairs.
     """
     chosen = evenly_spaced(len(errors), MOST_LINKS)
     distance, half = pdist(position[chosen]), 0.5 * pdist(errors[chosen, None], "sqeuclidean")
@@ -187,7 +190,7 @@ class Whitener:
     """A factor of the inverse of a covariance.
 
     Attributes:
-        factor: Matrix that turns the errors into independent ones of unit variance [m, m].
+        factor: Matrix that transforms the errors into independent errors of unit variance [m, m].
         log_determinant: Log determinant of the covariance.
     """
 
@@ -200,7 +203,7 @@ class Whitener:
 
 
 def pairwise(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances between positions [n, k] of links; of a subset [m, m] for at least twice `EXACT` links."""
+    """Distances [m, m] between positions [n, k] of links; of a subset if there are at least twice `EXACT` links."""
     subset = position[:: max(1, len(position) // EXACT)]
     return np.asarray(cdist(subset, subset), dtype=np.float64)
 
@@ -213,11 +216,11 @@ def whitener(
     exact: int = EXACT,
     neighbours: Neighbours | None = None,
 ) -> Whitener:
-    """Make the whitener of errors of links whose ends have positions [m, k], [m].
+    """Make the whitener of the errors of links with end positions [m, k], [m].
 
-    The errors were multiplied by `scale` [m], so the uncorrelated part has the same variance for all. The correlated
-    part has `share` of the variance, from 0 to below 1, and its covariance falls to 1/e at the distance `range_m` [m].
-    Up to `exact` links, the covariance is factored exactly. `neighbours` are computed if None.
+    The errors have been multiplied by `scale` [m], so that their uncorrelated part has the same variance for all links.
+    The correlated part has `share` of the variance, from 0 to below 1, and its covariance falls to 1/e at the distance
+    `range_m` [m]. Up to `exact` links, the covariance is factored exactly. If `neighbours` is None, they are computed.
     """
     count = len(position)
     if count <= exact:
@@ -227,9 +230,9 @@ def whitener(
 
 
 def shared(error: NDArray[np.float64], share: float) -> Whitener:
-    """The whitener of errors of unit variance plus further errors with these standard deviations [m].
+    """The whitener of errors of unit variance plus further errors with the standard deviations `error` [m].
 
-    All links have `share` of the further variance in common; above `EXACT` links, errors count as independent.
+    All links have `share` of the further variance in common. For more than `EXACT` links, errors count as independent.
     """
     if len(error) > EXACT:
         variance = 1.0 + error**2
@@ -244,7 +247,7 @@ def _exact(covariance: NDArray[np.float64]) -> Whitener:
 
 
 def nearest_earlier(position: NDArray[np.float64]) -> Neighbours:
-    """A random order of links at positions [m, k], so that earlier links are near and far; and the nearest of these."""
+    """A random order of links at positions [m, k], and the nearest earlier links of each link in this order."""
     order = np.random.default_rng(0).permutation(len(position))
     shuffled, near = position[order], np.full((len(order), NEAREST), -1)
     for index in range(1, len(order)):

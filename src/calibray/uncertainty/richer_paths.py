@@ -1,8 +1,8 @@
 """Uncertainty if the measurements favour paths that the study's trace leaves out.
 
-If a twin lacks paths, such as paths through buildings, its intervals lie around wrong values: the constants compensate
-for the missing power. The links are therefore traced once more with refraction and diffraction. The evidence for each
-of the two twins, estimated from its draws, decides between them.
+If a twin lacks paths, such as paths through buildings, its intervals lie around wrong values, because the constants
+compensate for the missing power. The links are therefore traced once more with refraction and diffraction. The evidence
+for each of the two twins, estimated from its draws, decides between them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from calibray.uncertainty.verdicts import consistent
 _LOG: Final = logging.getLogger(__name__)
 
 LONGEST_TRACE: Final = 60.0
-"""Estimated duration above which no richer paths are traced [s]."""
+"""Estimated duration of a trace above which no richer paths are traced [s]."""
 
 LIKELY_LOG_ODDS: Final = float(np.log(LIKELY / (1.0 - LIKELY)))
 """The uncertainty with richer paths is used if the logarithm of the odds in their favour is at least this."""
@@ -44,7 +44,7 @@ OF_THE_FIT: Final = (RemarkKind.MISSED_OPTIMUM, RemarkKind.OUTSIDE_INTERVAL)
 def assess_richer_paths(
     problem: Problem, trail: Trail, assessed: Certainty, progress: Progress | None = None
 ) -> Certainty:
-    """The uncertainty with richer paths, with a remark, if the measurements favour these paths; otherwise `assessed`.
+    """The uncertainty with richer paths, and a remark, if the measurements favour these paths; otherwise `assessed`.
 
     Nothing is traced if `lacking` is empty: for example, if the study states the noise, if its `fidelity.rounds` is 0,
     or if no link is out of sight. The stages of `progress` are "tracing more paths", "fitting more paths" and "drawing
@@ -108,7 +108,7 @@ def assess_richer_paths(
 
 
 def lacking(problem: Problem) -> dict[str, bool]:
-    """Settings of the tracer with which it finds more paths than with the study's; empty if there is nothing to try."""
+    """Tracer settings that find more paths than the study's settings; empty if there is nothing to try."""
     study, counted = problem.setup.study, problem.objective.weight > 0
     traced = isinstance(problem.engine, Replay | ReplayCarriers) and study.rays_path is None
     displaced = any(displaces(name) for name in problem.parameters.names)

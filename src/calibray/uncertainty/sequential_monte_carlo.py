@@ -25,8 +25,8 @@ SIZE: Final = (64, 256)
 """Smallest and largest number of members of a population."""
 
 BUDGET: Final = 1_100_000_000
-"""Number of interactions that all populations may evaluate together. With a budget that is smaller by a tenth, the
-draws in Auckland are worth 392 to 422 independent draws (`benchmarks/certainty_cost.py --seeds 3`)."""
+"""Number of interactions that all populations may evaluate together. With a budget that is smaller by 10 %, the draws
+in Auckland correspond to 392 to 422 independent draws (`benchmarks/certainty_cost.py --seeds 3`)."""
 
 EVALUATIONS: Final = 100
 """Approximate number of evaluations per member: steps times moves."""
@@ -37,18 +37,19 @@ slabs fit, the mean of a population of 256 members scatters by 0.2 posterior sta
 districts, the draws of two or four populations agree for half of the true scenes."""
 
 SWEEPS: Final = 4
-"""Number of sweeps per step; a sweep moves every member in each way. The share of one of two distant ranges in five
-dimensions then scatters by 0.03 between seeds; with 2 sweeps by 0.08."""
+"""Number of sweeps per step; a sweep applies each kind of move to every member. The share of one of two distant ranges
+in five dimensions then scatters by 0.03 between seeds. With 2 sweeps, it scatters by 0.08."""
 
 LAST_SWEEPS: Final = (8, 48)
-"""Smallest and largest number of further sweeps at power 1. A population that the budget makes smaller gets more
-sweeps, so that it gives as many draws; a small program gets as many as the budget allows. In districts of 300 to 800
-interactions, distribution functions after 8, 24 and 48 sweeps differ by 0.053, 0.043 and 0.036 from those of a million
-draws from the prior (`benchmarks/simulation_based.py --reference`). With 8 sweeps of 104 members, widths of intervals
-differ by up to 13 % between seeds in Auckland, and with 16 by up to 8 % (`benchmarks/certainty_cost.py --seeds 3`)."""
+"""Smallest and largest number of further sweeps at power 1. A population that is smaller because of the budget has more
+sweeps, so that it provides as many draws. On a small program, the number of sweeps is as large as the budget allows. In
+districts of 300 to 800 interactions, distribution functions after 8, 24 and 48 sweeps differ by 0.053, 0.043 and 0.036
+from those of a million draws from the prior (`benchmarks/simulation_based.py --reference`). With 8 sweeps of 104
+members, widths of intervals differ by up to 13 % between seeds in Auckland, and with 16 by up to 8 %
+(`benchmarks/certainty_cost.py --seeds 3`)."""
 
 KEPT: Final = 2
-"""Number of sweeps at power 1 between members that are kept as draws."""
+"""Number of sweeps at power 1 between two states of a member that are kept as draws."""
 
 EFFECTIVE: Final = 0.5
 """Share of the population that stays effective when a step raises the power."""
@@ -61,8 +62,8 @@ APART: Final = 0.2
 256 independent draws differ by up to 0.12 in 19 of 20 cases; members of one population are not quite independent."""
 
 APART_BY_CHANCE: Final = 2.0
-"""The same limit for small populations: it is this number times sqrt(2 / n) for halves of n members each; 1.36 would be
-the 95 % point of independent draws (Kolmogorov and Smirnov)."""
+"""Factor of the same limit for small populations. The limit is this factor times sqrt(2 / n) for halves of n members
+each. A factor of 1.36 would be the 95 % point of independent draws (Kolmogorov and Smirnov)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +76,7 @@ class Posterior:
         joint: Points of the unit cube of all parameters [n, d + k].
         spread: Between-building spread of every draw [n].
         model: Index of the noise model of every draw [n].
-        replays: Number of evaluations of path loss that the draws took.
+        replays: Number of evaluations of path loss for the draws.
         shape: Number of populations, number of states of each member kept as draws, and members per population.
         log_evidence: Logarithm of the probability density of the measurements, averaged over the prior.
     """
@@ -105,9 +106,9 @@ def joined(posteriors: Sequence[Posterior]) -> Posterior:
 
 
 def population_size(interactions: int, budget: int = BUDGET, models: int = 1) -> int:
-    """Number of members of each of two populations within a budget, from the interactions of one evaluation.
+    """Number of members of each of two populations within a budget, for a given number of interactions per evaluation.
 
-    Draws of several models are pooled with equal weight, so that each model needs fewer members.
+    Draws of several models are pooled with equal weight, so each model requires fewer members.
 
     Example:
         >>> population_size(1_000), population_size(50_000), population_size(1_000, models=8)
@@ -140,7 +141,7 @@ def draw_posterior(
     """Draw from the joint posterior.
 
     `progress` is called with the share of the work done after every step. The budget is the number of interactions that
-    may be evaluated; it is shared if the draws of several models are pooled.
+    may be evaluated; it is shared between the models if the draws of several models are pooled.
     """
     size = population_size(model.interactions, budget, models)
     sweeps = last_sweeps(model.interactions, budget, models)

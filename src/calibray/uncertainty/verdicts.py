@@ -25,7 +25,7 @@ from calibray.uncertainty.draws import Draws, systematic_resampling
 
 
 def local_intervals(problem: Problem, trail: Trail, optimum: Evaluation) -> dict[str, Interval]:
-    """Intervals by parameter from linear theory in the search space, where a parameter over decades is logarithmic.
+    """Intervals by parameter from linear theory in the search space, where parameters over decades are logarithmic.
 
     `optimum` is the evaluation at the optimum, with derivatives.
     """
@@ -51,7 +51,7 @@ def local_intervals(problem: Problem, trail: Trail, optimum: Evaluation) -> dict
 
 
 def with_reason(local: dict[str, Interval], reason: Reason) -> dict[str, Interval]:
-    """Add the reason why the posterior was not sampled to the intervals by linear theory.
+    """Add the reason why the posterior was not sampled to the intervals from linear theory.
 
     Curvature alone does not show other minima or correlated errors, so no parameter is more than weakly identified,
     unless the data contain no noise.
@@ -74,8 +74,8 @@ def linear_intervals(
 ) -> list[Interval]:
     """95 % confidence intervals from the curvature of the sum of squares at the optimum [d], one per parameter.
 
-    A parameter is not identifiable if its interval is wider than half of its range between bounds [d]. Other minima and
-    correlated errors can make the true interval wider. The nuisance is eliminated from the residuals [m], [dB], and
+    A parameter is not identifiable if its interval is wider than half the range between its bounds [d]. Other minima
+    and correlated errors can make the true interval wider. The nuisance is eliminated from the residuals [m], [dB], and
     their derivatives [m, d]; `freedom` is the number of full residuals minus unknowns.
     """
     freedom = max(freedom, 1)
@@ -101,8 +101,8 @@ def linear_intervals(
 
 
 JUDGED: Final = 0.9
-"""Level of the credible sets behind the verdicts. The last few per cent of a 95 % interval can lie far away, under a
-noise model of small weight."""
+"""Level of the credible sets on which the verdicts are based. The last few per cent of a 95 % interval can lie far
+away, because of a noise model of small weight."""
 
 IDENTIFIED: Final = 0.25
 """Largest width of the credible set of an identified parameter, as a share of the range."""
@@ -111,14 +111,14 @@ WEAKLY: Final = 0.5
 """Largest such share for a weakly identified parameter; with a wider set, a parameter is not identifiable."""
 
 NO_EFFECT_DB: Final = 1.0
-"""Change of path loss over a parameter's range below which no link counts as dependent on it [dB]."""
+"""Change of path loss over a parameter's range below which no link counts as dependent on the parameter [dB]."""
 
 END: Final = 0.1
-"""Largest distance of an interval's end from the bound, as a share of the range, that counts as chance if no link
-depends on the parameter."""
+"""Largest distance of an interval's end from the bound, as a share of the range, that is attributed to chance if no
+link depends on the parameter."""
 
 TRADE_OFF: Final = 0.5
-"""Rank correlation above which another parameter is said to compensate for a parameter."""
+"""Rank correlation above which another parameter is reported to compensate for a parameter."""
 
 LARGE_EFFECT: Final = 3.0
 """Change of path loss, in standard deviations of the errors, above which one link would determine the parameter."""
@@ -130,7 +130,7 @@ LINE: Final = 25
 """Number of values over the range of a parameter at which its effect is computed."""
 
 QUANTILES: Final = 400
-"""Quantiles that represent the draws."""
+"""Number of quantiles that represent the draws."""
 
 GRID: Final = 101
 """Number of equally spaced points over the whole range, in addition to the quantiles."""
@@ -139,13 +139,14 @@ STEPS: Final = np.array([0.5, 1.0, 1.5, 2.0, 3.0])
 """Distance of points beyond the outermost quantiles, in kernel widths."""
 
 KERNEL_SHARE: Final = 0.08
-"""Share of the draws within the width of a kernel, up to 200 draws; more draws allow narrower kernels (Silverman)."""
+"""Share of the draws within the width of a kernel, for up to 200 draws; more draws allow narrower kernels
+(Silverman)."""
 
 MOST_INDEPENDENT: Final = 1000
 """Largest number of draws that count as independent; further draws are mostly later states of the same members. In four
-districts, 90 % sets then contain 0.88 to 0.90 of a reference posterior. The sets for the
-constants of window glass have 1.5 pieces on average, those of the reference 1.1. If all draws count as independent, the
-sets contain 0.87 to 0.90, and those for window glass have 2.0 pieces (`benchmarks/simulation_based.py --reference`)."""
+districts, 90 % sets then contain 0.88 to 0.90 of a reference posterior. The sets for the constants of window glass have
+1.5 pieces on average, and those of the reference have 1.1. If all draws count as independent, the sets contain 0.87 to
+0.90, and those for window glass have 2.0 pieces (`benchmarks/simulation_based.py --reference`)."""
 
 LEAST_SHARE: Final = 0.005
 """Smallest share of the posterior in a piece; smaller shares count as chance."""
@@ -192,7 +193,7 @@ class JudgedSet:
     """The credible set of one parameter, with its verdict.
 
     Attributes:
-        pieces: Lower and upper end of every piece of the credible set, ascending, within the bounds.
+        pieces: Lower and upper ends of the pieces of the credible set, ascending and within the bounds.
         name: The verdict.
         reason: Its reason.
         seen: The pieces for the measured buildings; equal to `pieces` if the draws do not distinguish these buildings.
@@ -223,7 +224,7 @@ def verdicts(
     level: float = 0.95,
     seen: Draws | None = None,
 ) -> list[JudgedSet]:
-    """Judge every parameter by its posterior; if buildings differ, by that of the mean over all buildings.
+    """Judge every parameter by its posterior; if buildings differ, by the posterior of the mean over all buildings.
 
     The links' errors have the standard deviation `noise_db` [dB]. Intervals cover the share `level` of the posterior.
     `seen` is the posterior for the measured buildings; the same as `draws` if None.
@@ -330,7 +331,7 @@ def _effect(index: int, modelled: Modelled, best: NDArray[np.float64], axes: Axe
 
 
 def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, noise_db: float) -> Reason:
-    """Why most of the range fits although links depend on the parameter: trade-offs with others, or large errors."""
+    """Why most of the range fits although links depend on the parameter: trade-offs or large errors."""
     drawn = draws.point[systematic_resampling(draws.weight, RANKED, np.random.default_rng(0))]
     # Spearman's correlation is that of the ranks.
     rank = np.argsort(np.argsort(drawn, axis=0), axis=0)
@@ -366,7 +367,7 @@ def credible_sets(
 ) -> list[tuple[tuple[float, float], ...]]:
     """For each level, the smallest set that contains this share of the posterior, from one smoothed density.
 
-    Draws [n] have weights [n]; a set is the lower and upper end of every piece, ascending.
+    Draws [n] have weights [n]. A set consists of the lower and upper ends of its pieces, ascending.
 
     Example:
         >>> draws = np.random.default_rng(0).normal(5.0, 0.1, 4000)
@@ -414,7 +415,7 @@ def _masses(
 def _pieces(
     edges: NDArray[np.float64], mass: NDArray[np.float64], inside: NDArray[np.bool_]
 ) -> list[tuple[float, float]]:
-    """Merge adjacent intervals into pieces; drop pieces and close gaps that count as chance."""
+    """Merge adjacent intervals into pieces; drop pieces and close gaps that are attributed to chance."""
     first = np.flatnonzero(inside & ~np.concatenate([[False], inside[:-1]]))
     last = np.flatnonzero(inside & ~np.concatenate([inside[1:], [False]]))
     kept: list[tuple[float, float]] = []
