@@ -1,4 +1,4 @@
-"""Makes `python -m calibray` equivalent to the command `calibray`, for when the command is not on the path."""
+"""Allow `python -m calibray` to be used if the command `calibray` is not on the search path."""
 
 from calibray.cli import main
 

@@ -2,7 +2,7 @@
 
 A scene has a local frame: x points east and y points north from an origin. Map projections distort lengths (UTM by up
 to 0.4 m per kilometre). The default frame is therefore PROJ's azimuthal equidistant projection (`aeqd`), centred on the
-scene: its lengths are accurate to 1 mm per kilometre within several kilometres of the centre.
+scene. In this projection, lengths are accurate to 1 mm per kilometre within several kilometres of the centre.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Frame:
         height: Height of z = 0 [m], above the same vertical datum as the other heights.
 
     Raises:
-        InputError: PROJ does not know the projection; it is not in metres with x pointing east and y pointing north; or
-            the origin is not finite.
+        InputError: The projection is unknown to PROJ or not in metres with x pointing east and y pointing north, or the
+            origin is not finite.
     """
 
     crs: str
@@ -62,10 +62,11 @@ class Frame:
     def local(cls, longitude: float, latitude: float, height: float = 0.0) -> Frame:
         """Make the local frame centred on a point; distances from this point are not distorted.
 
-        Longitude is east of Greenwich and latitude north of the equator [deg]; `height` is the height of z = 0 [m].
+        The longitude is positive east of Greenwich and the latitude positive north of the equator [deg]; `height` is
+        the height of z = 0 [m].
 
         Raises:
-            InputError: The point is not on the globe.
+            InputError: The longitude or the latitude is out of range.
         """
         _check_degrees(np.array([longitude]), np.array([latitude]))
         # 1e-7 degrees is 1 cm. Rounded, the string is short and states the origin exactly.
@@ -74,10 +75,12 @@ class Frame:
 
     @classmethod
     def utm(cls, longitude: float, latitude: float, height: float = 0.0) -> Frame:
-        """Make the frame of the UTM zone of a point, with the origin rounded to whole metres; arguments as for `local`.
+        """Make the frame of a point's UTM zone, with the origin rounded to whole metres.
+
+        The arguments are those of `local`.
 
         Raises:
-            InputError: The point is not on the globe, or too close to a pole for UTM.
+            InputError: The longitude or the latitude is out of range, or the point is too close to a pole for UTM.
         """
         _check_degrees(np.array([longitude]), np.array([latitude]))
         if not -80 <= latitude <= 84:
@@ -90,7 +93,7 @@ class Frame:
 
     @classmethod
     def from_record(cls, record: object) -> Frame:
-        """Read a frame from the dictionary that `record` returned.
+        """Read a frame from a dictionary that `record` returned.
 
         Raises:
             InputError: The record is not such a dictionary.
@@ -115,16 +118,17 @@ class Frame:
         """Convert positions to the scene's frame.
 
         Args:
-            longitude: East of Greenwich [n], [deg]; or x in the units of `crs`.
-            latitude: North of the equator [n], [deg]; or y in the units of `crs`.
-            height: Height [n], or one value for all [m], above the same vertical datum as the frame's.
+            longitude: Longitude, positive east of Greenwich [n], [deg]; or x in the units of `crs`.
+            latitude: Latitude, positive north of the equator [n], [deg]; or y in the units of `crs`.
+            height: Height of each position [n], or one height for all [m], above the vertical datum of the frame.
             crs: Coordinate reference system of the positions.
 
         Returns:
             Positions x, y, z [n, 3], [m].
 
         Raises:
-            InputError: A position is not on the globe, or lies outside the projection's area of validity.
+            InputError: A longitude or latitude is out of range, or a position is outside the projection's area of
+                validity.
         """
         x, y, z = (np.asarray(part, dtype=float) for part in np.broadcast_arrays(longitude, latitude, height))
         if crs == WGS84:
@@ -147,10 +151,10 @@ class Frame:
 
 
 def parse_crs(crs: object) -> CRS:
-    """Look up a coordinate reference system, given in any form that PROJ reads.
+    """Look up a coordinate reference system given in any form that PROJ reads.
 
     Raises:
-        InputError: PROJ does not know it.
+        InputError: The system is unknown to PROJ.
     """
     pyproj = library("pyproj", "geo")
     try:
@@ -158,7 +162,7 @@ def parse_crs(crs: object) -> CRS:
     except pyproj.exceptions.CRSError as error:
         reason = str(error).splitlines()[0]
         raise InputError(
-            f"crs = {crs!r}: PROJ does not know it ({reason}); give an EPSG code, such as EPSG:4326"
+            f"crs = {crs!r}: unknown to PROJ ({reason}); give an EPSG code, such as EPSG:4326"
         ) from None
 
 
@@ -166,10 +170,10 @@ def parse_crs(crs: object) -> CRS:
 def transformer(source: object, target: object) -> Transformer:
     """The transformation between two coordinate reference systems, with x (longitude) always first.
 
-    It is created once per process, which takes up to 0.3 s.
+    Each transformation is created once per process, which takes up to 0.3 s.
 
     Raises:
-        InputError: PROJ does not know one of the two systems.
+        InputError: One of the two systems is unknown to PROJ.
     """
     pyproj = library("pyproj", "geo")
     return pyproj.Transformer.from_crs(parse_crs(source), parse_crs(target), always_xy=True)
@@ -190,7 +194,8 @@ def find_projection(
         high: East and north bounds of the scene [2], [m].
 
     Returns:
-        The projection that places the most positions on the scene; None if no projection places half of them there.
+        The projection that places the most positions on the scene; None if no projection places at least half of them
+        there.
 
     Example:
         >>> frame = Frame.local(11.5755, 48.1374)

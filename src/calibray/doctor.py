@@ -20,7 +20,7 @@ from calibray.tracing import llvm
 from calibray.tracing.llvm import Llvm
 
 CHECK_TIMEOUT = 300.0
-"""Time limit of one check [s]; the first import from a slow disk takes most of this time."""
+"""Time limit of one check [s]; the first import from a slow disk can take most of this time."""
 
 # Package name and, if present, extra: "numpy>=2.0", "pyarrow>=16; extra == 'parquet'".
 _REQUIREMENT = re.compile(r"""^([\w.-]+)(?:.*extra == ['"]([\w-]+)['"])?""")
@@ -63,13 +63,13 @@ print(", ".join(f"{device.platform}:{device.id}" for device in jax.devices()))
 
 @dataclass(frozen=True)
 class Check:
-    """The check of one library that Calibray needs.
+    """The check of one library that Calibray requires.
 
     Attributes:
         name: The library.
         passed: Whether it works.
-        detail: What the check found, or how it failed.
-        remedy: What to do if the check failed.
+        detail: Result of the check, or the reason why it failed.
+        remedy: Recommended action if the check failed.
     """
 
     name: str
@@ -83,7 +83,7 @@ class Diagnosis:
     """The state of a machine, as `calibray doctor` prints it.
 
     Attributes:
-        versions: Python, Calibray and each package, with its version or the command that installs it.
+        versions: Python, Calibray and each required package, with its version or the command that installs it.
         variant: The Mitsuba variant used for tracing.
         cuda_devices: Number of GPUs on which Mitsuba can trace.
         libraries: Every libLLVM found on this machine.
@@ -113,13 +113,18 @@ class Diagnosis:
             ),
             *((check.name, f"{'ok' if check.passed else 'FAILED'}, {check.detail}") for check in self.checks),
             *(("To do", check.remedy) for check in self.checks if not check.passed),
-            ("Verdict", "Calibray works here" if self.usable else "Calibray cannot trace and replay here"),
+            (
+                "Verdict",
+                "Calibray works on this machine"
+                if self.usable
+                else "Calibray cannot trace and replay on this machine",
+            ),
         ]
         return Table("", (Column(), Column()), tuple(rows))
 
 
 def examine() -> Diagnosis:
-    """Check this machine, which takes a few seconds; no exception is raised if it is unusable."""
+    """Check this machine, which takes a few seconds; an unusable machine raises no exception."""
     variant = llvm.mitsuba_variant()
     return Diagnosis(
         versions=versions(),
@@ -131,7 +136,7 @@ def examine() -> Diagnosis:
 
 
 def check_tracing(variant: str) -> tuple[Check, ...]:
-    """Check what tracing with a Mitsuba variant needs: libLLVM (on the CPU only), then Dr.Jit, then Sionna RT.
+    """Check the libraries that a Mitsuba variant needs for tracing: libLLVM (on the CPU only), Dr.Jit and Sionna RT.
 
     Returns the checks up to and including the first failure, because the later checks depend on it.
     """
@@ -154,8 +159,8 @@ def check_tracing(variant: str) -> tuple[Check, ...]:
 def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> Check:
     """Run Python code in a subprocess to check a library.
 
-    The code prints its findings, or fails with an exception, an exit status or a signal. The detail of the
-    check is the output, or the lines that state why it failed.
+    The code prints its findings, or fails with an exception, an exit status or a signal. The detail of the returned
+    check is the output of the code, or the lines that state why the code failed.
     """
     command = [sys.executable, "-c", code, *arguments]
     try:
@@ -174,7 +179,7 @@ def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> 
 
 
 def versions() -> tuple[tuple[str, str], ...]:
-    """Versions of Python, of Calibray and of each package that Calibray's metadata requires, by name.
+    """Versions of Python, Calibray and each package that Calibray's metadata requires, by name.
 
     For a missing package, the value is the command that installs it.
     """

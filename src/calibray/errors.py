@@ -1,15 +1,16 @@
-"""Calibray's two exceptions: for invalid input, and for an engine that failed while running."""
+"""Calibray's two exceptions: one for invalid input, and one for an engine that failed while running."""
 
 from __future__ import annotations
 
 from typing import Final
 
 LONGEST_MESSAGE: Final = 4000
-"""Largest number of characters of a message; a value quoted from the input may be of any length."""
+"""Maximum number of characters in a message; the limit is needed because values quoted from the input can be of any
+length."""
 
 
 def _bounded(message: str) -> str:
-    """Shorten a message that is too long to its start and its end, which states the remedy."""
+    """Shorten an overlong message: keep its start, and its end, which states the remedy."""
     if len(message) <= LONGEST_MESSAGE:
         return message
     return f"{message[: LONGEST_MESSAGE - 1000]} ... {message[-900:]}"
@@ -27,7 +28,10 @@ class InputError(ValueError):
 
 
 class EngineError(RuntimeError):
-    """An engine failed while running; results computed before are kept. The command line exits with status 1."""
+    """An engine failed while running; results computed before the failure are kept.
+
+    The command line exits with status 1.
+    """
 
     def __str__(self) -> str:
         return _bounded(super().__str__())

@@ -1,8 +1,9 @@
-"""Radio materials: the constants of a surface, and the laws of ITU-R P.2040 from which named materials take them.
+"""Radio materials: the constants of a surface, and the laws of ITU-R P.2040 for the constants of named materials.
 
 Below 100 GHz, P.2040-1 differs from the later revisions (relative permittivity 5.31 instead of 5.24 for concrete, 6.27
-instead of 6.31 for glass). P.2040-2 and -3 have the same Table 3. P.2040-4 keeps its rows and adds rows above 100 GHz
-and new materials. Sionna RT 2.2 follows P.2040-4; below 100 GHz, the default "P.2040-3" gives the same values.
+instead of 6.31 for glass). P.2040-2 and -3 have the same Table 3. P.2040-4 keeps the rows of that table and adds rows
+above 100 GHz and new materials. Sionna RT 2.2 follows P.2040-4; below 100 GHz, the default "P.2040-3" gives the same
+values.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ from calibray.errors import InputError
 from calibray.support.messages import did_you_mean
 
 FREQUENCIES: Final = (1e6, 1e12)
-"""Range of valid carrier frequencies [Hz]; a value outside it was probably stated in MHz or GHz."""
+"""Range of valid carrier frequencies [Hz]; a value outside this range was probably given in MHz or GHz."""
 
 
 def check_frequency(frequency: object, name: str = "frequency") -> float:
-    """Check a carrier frequency [Hz] and convert it to a float; messages call it `name`.
+    """Check a carrier frequency [Hz] and convert it to a float; error messages call it `name`.
 
     Raises:
-        InputError: It is not a number within `FREQUENCIES`.
+        InputError: The frequency is not a number in the range `FREQUENCIES`.
 
     Example:
         >>> check_frequency(28_500_000_000)
@@ -100,8 +101,8 @@ BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
         "lambda_": Bound(0.0, 1.0, "1"),
     }
 )
-"""Bounds of each field: those of Sionna RT, with a thickness greater than 0, and exponents of at most 126, because an
-exponent of 127 gives gains that are not finite."""
+"""Bounds of each field: those of Sionna RT, with a thickness greater than 0 and exponents of at most 126. An exponent
+of 127 would give infinite or undefined gains."""
 
 SCATTERING_PATTERNS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {"lambertian": (), "directive": ("alpha_r",), "backscattering": ("alpha_r", "alpha_i", "lambda_")}
@@ -153,7 +154,7 @@ class Material:
 
 
 def _within_bounds(name: str, value: Any) -> float:
-    """Convert the value of a field to float; an `InputError` names the field, the value and the bound."""
+    """Convert the value of a field to a float; an `InputError` states the field, the value and the bound."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -178,8 +179,8 @@ class ItuLaw(NamedTuple):
     """One row of ITU-R P.2040 Table 3: eps_r = a f^b and sigma = c f^d [S/m], with f in GHz.
 
     Attributes:
-        lower: Lower end of the frequency range [GHz], included.
-        upper: Upper end of the frequency range [GHz], included.
+        lower: Lower end of the frequency range [GHz], inclusive.
+        upper: Upper end of the frequency range [GHz], inclusive.
         a: Relative permittivity [1] at 1 GHz.
         b: Exponent [1] of the relative permittivity.
         c: Conductivity [S/m] at 1 GHz.
@@ -295,8 +296,9 @@ def itu_material(
 
     Args:
         name: Name of the material as in Sionna RT, for instance "concrete" or "very_dry_ground".
-        frequency: Frequency [Hz], within the range of the material's law, limits included.
-        thickness: Thickness of the slab [m]; P.2040 does not state one, and 0.1 m is the default of Sionna RT.
+        frequency: Frequency [Hz], within the range of the material's law, including its limits.
+        thickness: Thickness of the slab [m]; P.2040 does not specify a thickness, and 0.1 m is the default of Sionna
+            RT.
         revision: Revision of the recommendation, a key of `ITU_MATERIALS`.
         **scattering: Other fields of the `Material`, for instance ``scattering_coefficient=0.3``.
 
@@ -345,6 +347,6 @@ def itu_law(name: str, frequency: float, revision: str = DEFAULT_REVISION) -> It
             return law
     ranges = " and ".join(f"{law.lower:g} to {law.upper:g} GHz" for law in table[name])
     raise InputError(
-        f"ITU-R {revision} gives {name!r} for {ranges}, not for {frequency / 1e9:g} GHz: "
+        f"ITU-R {revision} covers {name!r} at {ranges}, not at {frequency / 1e9:g} GHz: "
         "give relative_permittivity and conductivity instead"
     )

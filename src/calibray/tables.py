@@ -1,7 +1,7 @@
 """Tables as data, and the rendering of tables and sentences as plain text and HTML.
 
-Control characters and markup are escaped, because names come from files. The Python prompt and notebooks show short
-forms.
+Control characters and markup are escaped, because some names come from files. The Python prompt and notebooks show
+shortened forms.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ LISTED: Final = 12
 """Largest number of rows, names or findings that are listed; any others are only counted."""
 
 WIDEST: Final = 100_000
-"""Characters per line if the output is not a terminal, or the terminal is too narrow; so large that no cell is cut."""
+"""Number of characters per line if the output is not a terminal or the terminal is too narrow; large enough for every
+cell."""
 
 ROWS: Final = 10
 """Largest number of rows of a table shown at the prompt; any others are only counted."""
 
 CHARACTERS: Final = 60
-"""Largest number of characters shown of a cell or a name; longer ones are cut."""
+"""Largest number of characters shown of a cell or a name; longer texts are cut."""
 
 SENTENCE: Final = 200
-"""Largest number of characters shown of a sentence; longer ones are cut."""
+"""Largest number of characters shown of a sentence; longer sentences are cut."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,8 @@ class Column:
     """A column of a table.
 
     Attributes:
-        name: The quantity in its cells; empty for the column of row names.
-        unit: Unit of all its cells; empty if they have no unit or different units.
+        name: The quantity in the cells; empty for the column of row names.
+        unit: Unit of all cells; empty if the cells have no unit or different units.
         align: "left" for text, "right" for numbers.
 
     Example:
@@ -106,7 +107,7 @@ class Table:
         return (first, *(column.heading for column in self.columns[1:]))
 
     def head(self, count: int) -> Table:
-        """The first `count` rows, and a last row with the number of rows left out, if any.
+        """The table with its first `count` rows; if rows are left out, a last row states their number.
 
         Example:
             >>> Table("", (Column("link"),), (("a",), ("b",), ("c",))).head(1).rows
@@ -135,7 +136,7 @@ def render(*parts: Table | str) -> str:
 
 
 def render_html(*parts: Table | str) -> str:
-    """Render tables and sentences as HTML: elements `p` and `table`, without scripts or links.
+    """Render tables and sentences as HTML elements `p` and `table`, without scripts or links.
 
     Example:
         >>> render_html("a < b")
@@ -147,7 +148,7 @@ def render_html(*parts: Table | str) -> str:
 
 
 def rows_text(rows: Sequence[int]) -> str:
-    """List row numbers of a file; if there are many, only the first ones; empty if there are none.
+    """List at most `LISTED` row numbers of a file, and count the others; without rows, the text is empty.
 
     Example:
         >>> rows_text([3, 4, 9])
@@ -163,7 +164,7 @@ def rows_text(rows: Sequence[int]) -> str:
 
 
 def decibels(value: float | None) -> str:
-    """Format a value [dB] for tables with two decimals, or a dash if it is unknown."""
+    """Format a value [dB] with two decimals for a table; an unknown value becomes a dash."""
     return "-" if value is None else f"{value:.2f}"
 
 
@@ -178,7 +179,7 @@ def short_html(*parts: Table | str) -> str:
 
 
 def named(names: Iterable[str], count: int = 4) -> str:
-    """List names separated by commas; if there are many, only the first ones.
+    """List at most `count` names, separated by commas, and count the others.
 
     Example:
         >>> named(["east", "west"])

@@ -106,7 +106,7 @@ def test_the_table_has_versions_libraries_and_verdict():
     assert f"{OLD.path}, {OLD.problem}" in text
     assert "To do" not in text
     assert text.splitlines()[-1].startswith("Verdict")
-    assert text.endswith("Calibray works here")
+    assert text.endswith("Calibray works on this machine")
 
 
 def test_one_failed_check_makes_the_machine_unusable():

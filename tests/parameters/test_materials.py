@@ -102,7 +102,7 @@ def test_a_gap_between_two_ranges_is_refused_with_both_ranges_and_a_remedy():
     with pytest.raises(InputError) as error:
         itu_material("glass", 150e9)
     assert str(error.value) == (
-        "ITU-R P.2040-3 gives 'glass' for 0.1 to 100 GHz and 220 to 450 GHz, not for 150 GHz: "
+        "ITU-R P.2040-3 covers 'glass' at 0.1 to 100 GHz and 220 to 450 GHz, not at 150 GHz: "
         "give relative_permittivity and conductivity instead"
     )
 

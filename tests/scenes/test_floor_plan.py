@@ -117,7 +117,7 @@ def test_two_walls_near_each_other_stay_two_walls_in_a_plan_of_single_lines():
     assert list(merged.sheets) == [*OUTER, line(5, 0, 5, 6), shaft]
     assert merged.lines == 0
     assert merged.report == [
-        "brick: 1 not merged with a parallel line, as most lines of this type have no opposite face, "
+        "brick: 1 not merged with a parallel line, because most lines of this type have no opposite face, "
         "0.44 m apart, 6.0 m long"
     ]
     # Drawn as single lines of another type, the same two lines are the whole type, and one wall.
@@ -369,7 +369,7 @@ def test_storeys_above_each_other_need_their_own_floors(tmp_path):
         ends = [(0, 0, 10, 0), (10, 0, 10, 6), (10, 6, 0, 6), (0, 6, 0, 0)]
         return [line(*each, bottom=bottom, top=bottom + 2.6) for each in ends]
 
-    with pytest.raises(InputError, match=r"a storey begins at 2\.8 m, .* make a scene of each storey"):
+    with pytest.raises(InputError, match=r"a storey begins at 2\.8 m, .* make a separate scene of each"):
         make_plan_scene([*storey(0.0), *storey(2.8)], tmp_path)
     make_plan_scene([*storey(0.0), *storey(2.8)], tmp_path, lids=())
     parapet = [line(2, 2, 8, 2, top=1.0), line(2, 2, 8, 2, kind="glass", bottom=1.0)]

@@ -340,7 +340,7 @@ def test_an_unknown_reference_system_of_geojson_is_refused(tmp_path):
     crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::999999"}}
     feature = {"type": "Feature", "properties": {}, "geometry": square}
     path.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": [feature]}))
-    with pytest.raises(InputError, match=r"EPSG::999999.*PROJ does not know it"):
+    with pytest.raises(InputError, match=r"EPSG::999999.*unknown to PROJ"):
         read_footprints(path, 5.0)
 
 

@@ -243,11 +243,11 @@ def test_a_header_that_declares_more_than_the_file_holds_allocates_nothing(
         ("v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", "line 2: 'v 1 0': a vertex must be"),
         (
             "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n",
-            "line 4: 'f 1 2 4': a face must have three or more of the 3 vertices",
+            "line 4: 'f 1 2 4': a face must refer to at least three of the 3 vertices",
         ),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 0\n", "line 4: .*a face must have three"),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2.5 3\n", "line 4: .*a face must have three"),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 -2//1\n", "line 4: .*a face must have three"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 0\n", "line 4: .*a face must refer to at least three"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2.5 3\n", "line 4: .*a face must refer to at least three"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 -2//1\n", "line 4: .*a face must refer to at least three"),
         ("v 0 0 0\n", "has no faces"),
     ],
 )

@@ -118,7 +118,7 @@ def test_a_revision_alone_applies_to_the_material_of_the_file(tmp_path: Path) ->
         ("<scene><bsdf", r"is not well-formed XML \(.*line 1.*\); export it again"),
         ("", r"is not well-formed XML"),
         ("\x00\x01", r"is not well-formed XML"),
-        ("<html/>", r"the root element is <html>, a Mitsuba scene has <scene>"),
+        ("<html/>", r"the root element is <html>, but must be <scene>"),
         ("<scene/>", r"the scene has no <shape>"),
     ],
 )

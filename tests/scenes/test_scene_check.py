@@ -126,7 +126,9 @@ def test_names_that_sionna_refuses_are_found(tmp_path):
     ]
     file = tmp_path / "scene.xml"
     file.write_text(file.read_text().replace('id="mat-stone" name', 'id="mat-brick_wall" name'))
-    assert "refers to no material of the scene ('brick_wall')" in problems(check_scene(file))
+    assert "refers to a material that the scene does not contain ('brick_wall')" in problems(
+        check_scene(file)
+    )
     file.write_text(file.read_text().replace('type="itu-radio-material" id="mat-stone"', 'type="diffuse"'))
     assert "a BSDF of type 'diffuse' has no id" in problems(check_scene(file))
 

@@ -1,4 +1,4 @@
-"""The command line: one file per command, which parses arguments, calls the package and prints."""
+"""The command line: commands that parse arguments, call the package and print results."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def main() -> None:
 
 
 def _leave() -> NoReturn:
-    """Exit without Python's shutdown, in which interrupted compiled libraries can crash."""
+    """Exit without the shutdown of Python, during which interrupted compiled libraries can crash."""
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
             stream.flush()

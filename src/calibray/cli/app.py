@@ -1,8 +1,8 @@
-"""The commands, and how their failures are reported.
+"""The application: its commands and its error handling.
 
-Data go to stdout, and progress and messages go to stderr. The exit status is 0 for success, 1 for a failure while
-running, 2 for bad input and 130 for Ctrl-C. Commands import what they need when they run, so that `--version` responds
-at once.
+Data are written to stdout; progress and messages are written to stderr. The exit status is 0 for success, 1 for a
+failure while running, 2 for bad input and 130 for Ctrl-C. Each command imports its dependencies when it runs, so that
+`--version` responds immediately.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from calibray.support.interruption import INTERRUPTED, ensure_interruption
 from calibray.support.memory import check_address_space
 
 LONGEST: Final = 4096
-"""Maximum number of characters in an argument, which is also the limit of a path on Linux."""
+"""Maximum number of characters in an argument; this is also the maximum length of a path on Linux."""
 
 
 class Commands(TyperGroup):
-    """A group of commands that report expected failures with a message and an exit status, without a traceback."""
+    """A group of commands that reports expected failures by a message and an exit status, without a traceback."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Refuse overlong and empty arguments, then parse."""
@@ -44,8 +44,9 @@ class Commands(TyperGroup):
         """Run the command, and convert errors to exit statuses.
 
         Raises:
-            typer.Exit: 2 on bad input; 1 when an engine failed or a file could not be read or written; 130 on Ctrl-C.
-            BrokenPipeError: The reader of stdout has closed it; Typer handles this.
+            typer.Exit: With status 2 for bad input, 1 if an engine failed or a file could not be read or written, and
+                130 for Ctrl-C.
+            BrokenPipeError: The reader of stdout has closed the stream; Typer handles this error.
         """
         try:
             check_address_space()
@@ -58,7 +59,7 @@ class Commands(TyperGroup):
             echo(f"Error: {error}", err=True)
             raise typer.Exit(1) from error
         except MemoryError as error:
-            echo("Error: not enough memory; close other programs, or use fewer links at once", err=True)
+            echo("Error: not enough memory; close other programs, or reduce the number of links", err=True)
             raise typer.Exit(1) from error
         except BrokenPipeError:
             raise
@@ -87,11 +88,12 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-"""All commands. To add one, write a function in a module of its own, and list it below."""
+"""All commands. To add a command, write a function in a module of this package and add the function to the list
+below."""
 
 
 def _print_version(requested: bool) -> None:
-    """Print the version and exit, if requested."""
+    """If requested, print the version and exit."""
     if requested:
         from importlib import metadata
 

@@ -1,6 +1,6 @@
-"""The console for messages and progress, and arguments that several commands share.
+"""The console for messages and progress, and arguments shared by several commands.
 
-Progress is shown as bars on a terminal, and as plain lines every few seconds elsewhere.
+On a terminal, progress is shown as bars. Otherwise, a plain line is printed every few seconds.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @cache
 def log() -> Console:
-    """The console for progress and messages, on stderr; data go to stdout by `typer.echo`.
+    """The console on stderr for progress and messages; data are written to stdout with `typer.echo`.
 
     Rich is imported here, on first use, so that `--version` and `--help` do not load it.
     """
@@ -40,7 +40,7 @@ def log() -> Console:
 
 
 def echo(text: str, err: bool = False, nl: bool = True) -> None:
-    """Print text with control characters escaped, because names from files must not control the terminal."""
+    """Print text with control characters escaped, so that names from files cannot control the terminal."""
     from calibray.support.messages import printable
 
     typer.echo(printable(text, keep="\n\t"), err=err, nl=nl)
@@ -63,7 +63,7 @@ def print_costs() -> None:
 
 
 def option(placeholder: str, meaning: str, *names: str, **limits: Any) -> Any:
-    """An option with a value; `names` are needed only if they differ from the argument's name."""
+    """An option with a value; `names` is needed only if the option is not named after the argument."""
     return typer.Option(*names, metavar=placeholder, help=meaning, **limits)
 
 
@@ -95,7 +95,7 @@ class Pool:
 
 @dataclass(frozen=True)
 class Permissions:
-    """Options that permit what is otherwise refused."""
+    """Options that permit operations that are otherwise refused."""
 
     allow_changed_inputs: Annotated[
         bool,
@@ -111,7 +111,7 @@ def read_origin(text: str) -> tuple[float, float]:
     """Read the longitude and latitude [deg] of ``--origin``.
 
     Raises:
-        InputError: The text is not a longitude and a latitude.
+        InputError: The text is not a valid longitude and latitude.
     """
     try:
         longitude, latitude = (float(part) for part in text.split(","))
@@ -125,7 +125,7 @@ def read_origin(text: str) -> tuple[float, float]:
 
 
 def with_groups(command: Callable[..., None]) -> Callable[..., None]:
-    """Convert a command: every field of an argument that is a dataclass becomes an option."""
+    """Convert a command so that every field of its dataclass arguments becomes an option."""
     arguments: dict[str, Any] = get_type_hints(command, include_extras=True)
     groups: dict[str, Any] = {name: kind for name, kind in arguments.items() if is_dataclass(kind)}
     options: list[Parameter] = []
@@ -163,10 +163,10 @@ def warn(study: Study, links: Measurements) -> None:
 
 
 LINE_INTERVAL: Final = 4.0
-"""Interval between progress lines without a terminal [s]; shorter work prints no line."""
+"""Interval between progress lines if stderr is not a terminal [s]; shorter work prints no line."""
 
 STARTING: Final = "starting"
-"""The stage shown before the first stage with a count: reading, importing, compiling."""
+"""The stage shown until the work reports its first stage, for example during imports."""
 
 
 @contextmanager
@@ -223,7 +223,7 @@ def _bars(console: Console) -> Iterator[Progress]:
 
 @dataclass
 class _State:
-    """The current stage and how much of it is done."""
+    """The current stage and its progress."""
 
     stage: str = STARTING
     done: int = 0
@@ -245,7 +245,7 @@ class _State:
 
 @contextmanager
 def _lines(console: Console, every: float) -> Iterator[Progress]:
-    """Print lines from a separate thread, so that they also appear while the work reports nothing."""
+    """Print lines from a separate thread, so that they also appear while the work reports no progress."""
     state, finished = _State(), Event()
 
     def print_lines() -> None:

@@ -1,4 +1,4 @@
-"""`calibray predict`, `suggest` and `map`: predict path loss at new links and over an area, and where to measure."""
+"""`calibray predict`, `suggest` and `map`: predict path loss for new links or an area, and suggest where to measure."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PREDICTIONS: Final = ("path_loss_db", "lower_db", "upper_db")
-"""Columns that `predict` adds; all except the first need --level. Other measured quantities add more."""
+"""Columns that `predict` adds; all except the first require --level. Other measured quantities add further columns."""
 
 UNREACHED: Final = "no path"
 """The warning about links without a path."""
 
 TEXTS: Final = ("basis", "remark")
-"""Text columns that are added; the remark needs --level."""
+"""Text columns that `predict` adds; the remark requires --level."""
 
 
 @with_groups
@@ -50,7 +50,8 @@ def predict(
         typer.Argument(
             metavar="LINKS",
             help="CSV or Parquet file with the position columns of the study, or tx_x, tx_y, tx_z, rx_x, rx_y, rx_z "
-            "[m]; it also needs the group column of the study's offset and the study's frequency column, if any.",
+            "[m]; if the study's offset has a group column or its links a frequency column, the file needs these "
+            "columns too.",
             show_default=False,
         ),
     ],
@@ -61,18 +62,19 @@ def predict(
         float | None,
         option(
             "P",
-            "Add the interval that contains a measurement with this probability, such as 0.9: columns lower_db "
-            "and upper_db, and a remark if an antenna is inside a building or outside the scene, or if the link is far "
-            "weaker than every measured one.",
+            "Add the interval that contains a measurement with this probability, such as 0.9, as the columns lower_db "
+            "and upper_db. Also add a remark if an antenna is inside a building or outside the scene, or if the link "
+            "is far weaker than every measured link.",
         ),
     ] = None,
     *,
     pool: Pool,
     permissions: Permissions,
 ) -> None:
-    """Predict path loss at new links with the calibrated scene.
+    """Predict path loss for new links with the calibrated scene.
 
-    The column basis names the model of each prediction: the log-distance model for links without a path.
+    The column `basis` names the model used for each prediction. Links without a path are predicted by the log-distance
+    model.
     """
     with progress_bars(log()) as progress:
         import numpy as np
@@ -120,7 +122,9 @@ def predict(
     if UNREACHED in warnings and result.prediction.fallback is not None:
         received = study.links.noise_floor_dbm is not None
         reason = (
-            "; as it is fitted above the noise floor, the true powers may be much lower" if received else ""
+            "; because it is fitted to links above the noise floor, the true powers may be much lower"
+            if received
+            else ""
         )
         echo(
             f"The log-distance model predicts the links without a path; see the column basis{reason}",
@@ -246,7 +250,7 @@ def suggest(
 
 
 def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
-    """Tables of the suggested positions, and of the gain expected from each together with those above it."""
+    """Tables of the suggested positions and of the gain expected from measuring each one and those ranked above it."""
     from calibray.measurements.placement import POSITION_COLUMNS
 
     grouped = ["group"] if "group" in suggestions else []
@@ -314,7 +318,7 @@ class Values:
         str | None,
         option(
             "N|auto",
-            "Number of rays instead of the study's. More rays take more time; too few rays miss paths.",
+            "Number of rays to use instead of the study's. More rays take more time; too few rays miss paths.",
         ),
     ] = None
     column: Annotated[
@@ -338,7 +342,7 @@ def map(
 ) -> None:
     """Predict path loss over an area and write map.tif (GeoTIFF), map.png and map.csv.
 
-    The log-distance model predicts cells without a path; the map hatches these cells.
+    Cells without a path are predicted by the log-distance model and hatched in the map.
     """
     target = out or folder
     with progress_bars(log()) as progress:
@@ -396,7 +400,7 @@ def _samples(text: str) -> int | Literal["auto"]:
 
 
 def _columns(entries: list[str]) -> dict[str, object]:
-    """Values by column, as numbers if they are numeric."""
+    """Values by column; numeric values are converted to numbers."""
     columns: dict[str, object] = {}
     for entry in entries:
         name, equals, value = entry.partition("=")

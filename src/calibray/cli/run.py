@@ -40,17 +40,17 @@ class Changes:
     """Options that override those of the study."""
 
     method: Annotated[
-        str | None, option("NAME", "Method instead of the study's: auto, sgwo-im, gwo, ...")
+        str | None, option("NAME", "Method to use instead of the study's: auto, sgwo-im, gwo, ...")
     ] = None
-    seed: Annotated[int | None, option("N", "Seed instead of the study's.")] = None
+    seed: Annotated[int | None, option("N", "Seed to use instead of the study's.")] = None
     engine: Annotated[
-        str | None, option("NAME", "Engine instead of the study's: replay, retrace or command.")
+        str | None, option("NAME", "Engine to use instead of the study's: replay, retrace or command.")
     ] = None
 
 
 @dataclass(frozen=True)
 class RunPool:
-    """Options for the workers, which may also run an external program."""
+    """Options for the workers, which can also run an external program."""
 
     workers: Annotated[
         int | None,
@@ -70,7 +70,7 @@ class RunPool:
 
 @dataclass(frozen=True)
 class Output:
-    """Options for what is printed and written."""
+    """Options for the printed and written output."""
 
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON instead of tables.")] = (
         False
@@ -125,7 +125,7 @@ def run(
 
 
 def _kept_text(out: Path) -> str:
-    """What an interrupted run has kept, and how to continue."""
+    """Text on the results that an interrupted run has kept, and on how to continue."""
     from contextlib import closing, suppress
 
     from calibray.engines import open_ledger
@@ -140,11 +140,11 @@ def _kept_text(out: Path) -> str:
     if stored_traces():
         parts.append(f"finished traces in {cache_folder()}")
     kept = f"Kept: {' and '.join(parts)}." if parts else "Nothing was finished, so nothing is kept."
-    return f"{kept} Start the same command again to continue; results that are kept are not computed again."
+    return f"{kept} Start the same command again to continue; kept results are not computed again."
 
 
 def _write_report(result: Result, out: Path, output: Output) -> list[str]:
-    """Write the report next to the result; a failure is only a warning, because the result is already saved."""
+    """Write the report next to the result; a failure causes only a warning, because the result is already saved."""
     try:
         from calibray.reporting import page
 
@@ -222,7 +222,7 @@ def trace(
             raise InputError("trace: give -o FILE to store the paths, --check to check them, or both")
         if check and not _traces(study):
             raise InputError(
-                f"--check: {study.path} reads its paths from engine.rays, so no rays are traced; omit it"
+                f"--check: {study.path} reads its paths from engine.rays, so no rays are traced; omit --check"
             )
         if out is not None:
             check_file(out, study.files(), overwrite)
@@ -247,7 +247,7 @@ def trace(
 
 
 def _traces(study: StudyModel) -> bool:
-    """Whether the ray tracer finds the paths of a study, rather than a table or a program."""
+    """Whether the paths of a study come from the ray tracer, rather than from a table or a program."""
     return study.rays_path is None and not study.engine.exports_rays
 
 

@@ -22,7 +22,7 @@ SUMMARY: Final = "Make a scene from an OpenStreetMap extract, building footprint
 scene = typer.Typer(
     name="scene", help=SUMMARY, short_help=SUMMARY, no_args_is_help=True, add_completion=False
 )
-"""The commands; `app.add_typer(scene)` adds them."""
+"""The commands that make scenes; `app.add_typer(scene)` adds them to the application."""
 
 Out = Annotated[Path, option("DIR", "Folder for scene.xml and the meshes.", "--out", "-o")]
 
@@ -59,19 +59,26 @@ class MapOptions:
     ] = "concrete:0.3"
     ground: Annotated[str, option("ITU[:M]", "Material of the ground.")] = "concrete:1.0"
     window_share: Annotated[
-        float, option("SHARE", "Share of windows in every wall, at least 0 and below 1.")
+        float, option("SHARE", "Share of every wall that windows cover, at least 0 and below 1.")
     ] = 0.0
     storey: Annotated[
-        float, option("M", "Height of a storey [m], for buildings that state only their number of storeys.")
+        float,
+        option(
+            "M", "Height of a storey [m], for buildings for which the map states only the number of storeys."
+        ),
     ] = 3.0
     default_height: Annotated[
-        float, option("M", "Height of a building that states neither height nor storeys [m].")
+        float,
+        option(
+            "M", "Height of a building for which the map states neither height nor number of storeys [m]."
+        ),
     ] = 9.0
     margin: Annotated[float, option("M", "Width of the ground around the buildings [m].")] = 50.0
     per_building: Annotated[
         bool,
         typer.Option(
-            "--per-building", help="One mesh per building, so that [objects] can give each its own material."
+            "--per-building",
+            help="Make one mesh per building, so that [objects] can assign a material to each building.",
         ),
     ] = False
     overwrite: Overwrite = False
@@ -83,7 +90,7 @@ class MapOptions:
 
     @property
     def heights(self) -> HeightRule:
-        """The assumptions for heights that a map does not state."""
+        """The assumed heights of buildings for which the map states none."""
         from calibray.scenes.authoring import HeightRule
 
         return HeightRule(self.storey, self.default_height)
@@ -125,7 +132,7 @@ def osm(
     out: Out,
     options: MapOptions,
 ) -> None:
-    """Make a scene from the buildings of an OpenStreetMap extract, and a file with its trees."""
+    """Make a scene from the buildings in an OpenStreetMap extract, and write its trees to a file."""
     from calibray.scenes.authoring import SCENE_FILES, TREES_FILE, read_openstreetmap, read_trees
     from calibray.support.output_files import check_outputs
 
@@ -167,7 +174,10 @@ class PlanOptions:
     height: Annotated[float, option("M", "Height of walls for which the plan states none [m].")] = 3.0
     unit: Annotated[
         float | None,
-        option("M", "Unit of length of the plan [m]; 0.001 for mm. By default the DXF unit, or metres."),
+        option(
+            "M",
+            "Unit of length of the plan [m], such as 0.001 for mm; by default the unit of the DXF file, or metres.",
+        ),
     ] = None
     floor: Annotated[bool, typer.Option(help="Make a floor.")] = True
     ceiling: Annotated[bool, typer.Option(help="Make a ceiling.")] = True
@@ -185,8 +195,8 @@ def plan(
         Path,
         typer.Argument(
             metavar="PLAN",
-            help="CSV with columns x0, y0, x1, y1 (or wkt) and type; optional: thickness, bottom, height. "
-            "Or DXF, GeoJSON and other vector files.",
+            help="CSV file with the columns x0, y0, x1, y1 (or wkt) and type, and optionally thickness, bottom and "
+            "height. DXF, GeoJSON and other vector files are also read.",
         ),
     ],
     out: Out,
@@ -246,7 +256,7 @@ def _make(read: Callable[[], tuple[Footprints, Frame, Trees | None]], out: Path,
 
 
 def _check_origin(origin: str | None, buildings: Footprints) -> None:
-    """Refuse an origin far from the buildings, such as latitude before longitude."""
+    """Refuse an origin far from the buildings, which usually means that latitude and longitude are swapped."""
     import numpy as np
 
     from calibray.scenes.meshes import WIDEST
@@ -254,7 +264,7 @@ def _check_origin(origin: str | None, buildings: Footprints) -> None:
     distance = float(np.abs(buildings.bounds).max())
     if origin is not None and distance > WIDEST:
         raise InputError(
-            f"--origin {origin}: the buildings lie {distance / 1000:,.0f} km from it; give longitude first, then "
+            f"--origin {origin}: the buildings are {distance / 1000:,.0f} km from it; give longitude first, then "
             "latitude"
         )
 
@@ -271,7 +281,7 @@ def _types(entries: list[str]) -> dict[str, SurfaceMaterial]:
             raise InputError(f"--material {entry}: must be TYPE=ITU, such as drywall=plasterboard:0.1")
         if kind in types:
             raise InputError(
-                f"--material {entry}: the type {kind!r} already has a material; give one for each type"
+                f"--material {entry}: the type {kind!r} already has a material; give one material for each type"
             )
         name, taken = material_name(kind), {other.name for other in types.values()}
         while name in taken:

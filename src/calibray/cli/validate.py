@@ -21,7 +21,7 @@ class Division:
         int | None,
         option(
             "N",
-            "Number of blocks, each held out in turn; by default the study's number, or 4.",
+            "Number of blocks, each held out in turn; by default the number in the study, or 4.",
             min=2,
             max=100,
         ),
@@ -29,7 +29,9 @@ class Division:
     by: Annotated[
         str | None,
         option(
-            "COLUMN", "Hold out the links of each value of a column in turn; use tx for each transmitter."
+            "COLUMN",
+            "Hold out the links that share a value of this column, one value at a time; tx holds out one transmitter "
+            "at a time.",
         ),
     ] = None
 
@@ -42,7 +44,7 @@ def validate(
         Path | None,
         option(
             "DIR",
-            "Write the validation into this folder of a result, so that `calibray report DIR` shows it.",
+            "Write the validation into this result folder, so that `calibray report DIR` shows it.",
             "--out",
             "-o",
         ),
@@ -94,12 +96,12 @@ def compare(
     study_file: Annotated[Path, typer.Argument(metavar="STUDY", help="The study file, in TOML.")],
     out: Annotated[
         Path,
-        option("DIR", "Folder for the tables and the figure; it also keeps finished runs.", "--out", "-o"),
+        option("DIR", "Folder for the tables, the figure and the finished runs.", "--out", "-o"),
     ],
     runs: Runs,
     overwrite: Overwrite = False,
 ) -> None:
-    """Compare methods on a study: many seeds, equal budgets of RT calls, replayed paths."""
+    """Compare methods on a study, with many seeds, equal budgets of RT calls and replayed paths."""
     import os
 
     # The matrices are small, so BLAS threads cost more than they save; runs are distributed over processes instead.

@@ -1,7 +1,8 @@
 """Assignment of positions to buildings: objects that touch in plan form one building.
 
-The edges of all triangles except those of the ground are rasterized in plan. Cells that touch, also at corners, form
-one building. Streets separate buildings; a wall with its windows, or a row of houses, is one building.
+The edges of all triangles except those of the ground are rasterized in plan. Cells that touch, even at corners only,
+form one building. Streets therefore separate buildings, but a row of houses, or a wall with its windows, is one
+building.
 """
 
 from __future__ import annotations
@@ -16,13 +17,14 @@ from numpy.typing import NDArray
 from calibray.scenes.triangles import LEVEL, Triangles
 
 CELL: Final = 1.0
-"""Width of a raster cell [m]; objects count as touching if their gap is less than one to two cells."""
+"""Width of a raster cell [m]; objects count as touching if the gap between them is less than one or two cells,
+depending on their position."""
 
 MAX_CELLS: Final = 8_000_000
-"""Largest number of raster cells, which limits memory use; larger scenes get wider cells."""
+"""Largest number of raster cells, which limits memory use; larger scenes have wider cells."""
 
 MAX_POINTS: Final = 2_000_000
-"""Largest number of points along edges that are in memory at once."""
+"""Largest number of points along edges in memory at once."""
 
 
 def building_numbers(triangles: Triangles, position: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -74,7 +76,7 @@ def footprints(
 ) -> list[NDArray[np.float64]]:
     """Outlines of all level surfaces except the ground that are wholly or partly within the given bounds [m].
 
-    They are closed lines [n, 2], [m], whose first corner is not repeated.
+    The outlines are closed lines [n, 2], [m]; the first corner is not repeated.
     """
     normal = triangles.normal
     area = np.linalg.norm(normal, axis=1)

@@ -3,8 +3,8 @@
 Sionna RT finds wedges only between faces that share vertices within one mesh. Where two meshes meet, there is no wedge
 and therefore no diffraction.
 
-Mitsuba does not validate mesh files. With a vertex index out of range, the process crashes or a reflection is missing
-without a message; rays never hit faces whose vertices are NaN. `read_mesh` refuses such files. Integer coordinates are
+Mitsuba does not validate mesh files. If a vertex index is out of range, the process crashes or a reflection is missing
+without a message; rays never hit faces with NaN vertices. `read_mesh` refuses such files. Integer coordinates are
 valid, but with them Mitsuba loses all reflections from the mesh, so the tracer reads a floating-point copy.
 """
 
@@ -29,7 +29,7 @@ MILLIMETRE: Final = 0.001
 """Unit of integer corner coordinates [m]."""
 
 WIDEST: Final = 50_000.0
-"""Largest extent of a new scene [m]; a wider one is probably not in metres, or is not near a local origin."""
+"""Largest extent of a new scene [m]; a wider scene is probably not in metres, or not near a local origin."""
 
 LARGEST_COORDINATE: Final = 1e9
 """Largest coordinate of a vertex or an antenna [m]; the same limit applies to positions in path files."""
@@ -54,10 +54,10 @@ class Mesh:
 
     Attributes:
         vertices: Positions [V, 3], [m].
-        faces: Vertex indices of each triangle, counter-clockwise seen from outside [F, 3].
+        faces: Vertex indices of each triangle, counter-clockwise when seen from outside [F, 3].
         step: Spacing of floating-point numbers at the largest coordinate in the file [m]; 0 if it is negligible.
-        misread: Whether the tracer must read a PLY copy instead: the file stores integer coordinates, Mitsuba would
-            shear the shape, or the shape is a rectangle, which is not a mesh in Mitsuba.
+        misread: Whether the tracer must read a PLY copy instead, because the file stores integer coordinates, Mitsuba
+            would shear the shape, or the shape is a rectangle, which is not a mesh in Mitsuba.
     """
 
     vertices: NDArray[np.float64]
@@ -96,8 +96,8 @@ def weld(
 ) -> Mesh:
     """Make a mesh from triangles with integer corners [F, 3, 3]; equal corners become one vertex.
 
-    Triangles are counter-clockwise seen from outside; those with two equal corners are dropped. Corners are
-    in units of `MILLIMETRE`, unless `position` converts corners [n, 3] to positions [n, 3], [m].
+    Triangles are counter-clockwise when seen from outside; those with two equal corners are dropped. Corners are in
+    units of `MILLIMETRE`, unless `position` converts corners [n, 3] to positions [n, 3], [m].
 
     Example:
         >>> weld(np.array([[[0, 0, 0], [5, 0, 0], [0, 5, 0]], [[5, 0, 0], [5, 5, 0], [0, 5, 0]]])).faces
@@ -229,7 +229,7 @@ def _read_obj(content: bytes) -> Mesh:
             indices = [_obj_index(_number(index), len(positions)) for index, _, _ in parts]
             if len(indices) < 3 or None in indices:
                 raise InputError(
-                    f"line {number}: {shortened(line.strip())!r}: a face must have three or more of the "
+                    f"line {number}: {shortened(line.strip())!r}: a face must refer to at least three of the "
                     f"{len(positions)} vertices before it"
                 )
             first, *rest = (
@@ -247,7 +247,7 @@ def _read_obj(content: bytes) -> Mesh:
 
 
 def _obj_index(number: float, count: int) -> int | None:
-    """Convert a vertex number, from 1 or backwards from -1, to an index; None if there is no such vertex."""
+    """Convert a vertex number, counted from 1 or backwards from -1, to an index; None if there is no such vertex."""
     index = number - 1 if number > 0 else number + count
     return int(index) if 0 <= index < count and index == np.floor(index) else None
 

@@ -1,9 +1,9 @@
 """Obstruction of links by buildings and regions of extra loss, and link columns computed from scene and positions.
 
-The straight line between the ends of a link may pass through buildings, over roofs and through walls. Buildings extend
-from the ground to their roofs, so a line is inside a building where a roof is above it. All lengths are computed from
-the crossings of the line with the scene's triangles, in plan for roofs and in space for walls. Regions of extra loss,
-such as trees, are vertical prisms over polygons, through which rays pass undeflected.
+The straight line between the ends of a link can pass through buildings, over roofs and through walls. Buildings extend
+from the ground to their roofs, so a line is inside a building where a roof is above the line. All lengths are computed
+from the crossings of the line with the scene's triangles, in plan for roofs and in space for walls. Regions of extra
+loss, such as trees, are vertical prisms over polygons, through which rays pass undeflected.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from calibray.scenes.triangles import BATCH, LEVEL, Triangles, read_triangles, v
 from calibray.support.lazy_imports import library
 
 STEP: Final = 5.0
-"""Spacing of the points at which a line's height above ground is computed [m]; lengths in a wood on 50 m hills are
-then wrong by 0.1 m."""
+"""Spacing of the points at which a line's height above ground is computed [m]; with this spacing, lengths in a wood on
+50 m hills have errors of 0.1 m."""
 
 LINES: Final = 5000
-"""Largest number of lines processed at once; each may have hundreds of steps."""
+"""Largest number of lines processed at once; each can have hundreds of steps."""
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Vertical prisms over polygons; where prisms overlap, the length counts once.
+    """Vertical prisms over polygons; where prisms overlap, the length is counted once.
 
     Attributes:
         outline: Shapely polygons [n] in the scene's frame [m].
         bottom: Height of the bottom of each prism [n], [m].
         top: Height of the top of each prism [n], [m].
-        ground: Function that gives the height of the ground [k], [m], at x and y [k], [m], or NaN where there is none.
-            Heights are measured from the ground; if None, from z = 0.
+        ground: Function that returns the height of the ground [k], [m], at x and y [k], [m], or NaN where there is no
+            ground. The heights of the prisms are measured from the ground; if None, from z = 0.
     """
 
     outline: NDArray[Any]
@@ -97,7 +97,9 @@ class Region:
     def _over_ground(
         self, spans: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """The parts of spans (line, lower, upper, prism) at heights above ground from bottom to top, found in steps."""
+        """The parts of spans (line, lower, upper, prism) at heights above ground inside their prisms, found in
+        steps.
+        """
         if self.ground is None:
             return spans
         step = (end - start)[spans[:, 0].astype(np.int64)]
@@ -118,7 +120,7 @@ class Region:
 def united(
     spans: NDArray[np.float64],
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-    """The union of spans (line, lower, upper, ...) that may overlap: line, lower and upper end of each piece."""
+    """The union of spans (line, lower, upper, ...), which can overlap: line, lower and upper end of each piece."""
     count = len(spans)
     if not count:
         return
@@ -139,7 +141,7 @@ def _between(
     bottom: NDArray[np.float64],
     top: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The part of each line between two heights, as fractions of the line [k]; empty unless the second is larger."""
+    """The part of each line between two heights, as two fractions of the line [k]; empty if the first is larger."""
     rise = last - first
     # A level line is between the heights along its whole length or nowhere.
     level = np.abs(rise) < 1e-9
@@ -182,7 +184,7 @@ class Obstruction:
     other_floor: NDArray[np.bool_]
 
     def columns(self, wavelength: NDArray[np.float64] | float) -> dict[str, NDArray[np.float64]]:
-        """The columns `OBSTACLES` [n] by name, for one wavelength [m], or one for each link [n]."""
+        """The columns `OBSTACLES` [n] by name, for one wavelength [m], or one wavelength for each link [n]."""
         values = (self.out_of_sight, self.walls, self.length_m, self.knife_edge_db(wavelength))
         return {name: value.astype(np.float64) for name, value in zip(OBSTACLES, values, strict=True)}
 
@@ -256,7 +258,7 @@ def _on_other_floor(
 ) -> NDArray[np.bool_]:
     """Whether one end [n, 3], [m], has fewer ground sheets below it and more above it than the other end [n].
 
-    If one count is equal at both ends, as where a floor has a hole, the result is False.
+    If one count is equal at both ends, for example where a floor has a hole, the result is False.
     """
     points, index = np.unique(np.concatenate([start, end]), axis=0, return_inverse=True)
     below, above = np.zeros(len(points), dtype=np.int64), np.zeros(len(points), dtype=np.int64)
@@ -315,7 +317,7 @@ def _pairs(
 def _under(
     first: NDArray[np.float64], last: NDArray[np.float64], corners: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where lines pass below level triangles [n, 2], as fractions of the line, and Fresnel parameters of their edges.
+    """Parts of lines below level triangles [n, 2], as fractions of the line, and Fresnel parameters of the edges.
 
     The part of the line within the triangle in plan is found by clipping at the triangle's three sides.
     """
@@ -363,10 +365,10 @@ def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64
 def crossing(
     first: NDArray[np.float64], last: NDArray[np.float64], corners: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Distance from the first end at which each line crosses its triangle [n], [m]; NaN where it does not.
+    """Distance from the first end at which each line crosses its triangle [n], [m]; NaN where it does not cross.
 
     Intersection with the triangle in barycentric coordinates u and v (Moeller and Trumbore, J. Graphics Tools 2(1),
-    1997). A line parallel to the triangle divides by zero and gives NaN, which fails all comparisons.
+    1997). For a line parallel to the triangle, the division by zero yields NaN, which fails all comparisons.
     """
     step = last - first
     one, other = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
@@ -409,8 +411,8 @@ def with_obstruction(
     Args:
         links: The links.
         scene: The scene.
-        frequency: Carrier frequency [Hz], used if the links do not state it.
-        regions: The regions of extra loss by name; `REGION` is added only if there are any.
+        frequency: Carrier frequency [Hz], used if the links do not state their own.
+        regions: The regions of extra loss by name; `REGION` is added only if there are regions.
         clutter: Whether to add `CLUTTER`.
         cluster_m: Side of the grid squares for `CLUSTER` [m], aligned to the scene's origin; None to omit the column.
 
@@ -434,7 +436,7 @@ def with_obstruction(
 
 
 SHORTEST: Final = 250.0
-"""Shortest path length for which ITU-R P.2108 gives the loss of clutter at one end [m]."""
+"""Shortest path length for which ITU-R P.2108 specifies the clutter loss at one end [m]."""
 
 CARRIERS: Final = (0.5e9, 67e9)
 """Range of carrier frequencies that ITU-R P.2108 covers [Hz]."""
@@ -443,8 +445,8 @@ CARRIERS: Final = (0.5e9, 67e9)
 def clutter_loss_db(distance: ArrayLike, frequency: ArrayLike) -> NDArray[np.float64]:
     """Median loss in urban or suburban clutter at one end [n], [dB], according to ITU-R P.2108-1 section 3.2.
 
-    `distance` is the length of each path [n], [m]; `frequency` is one carrier frequency for all, or one for each path
-    [n], [Hz]. The loss is 0 for paths shorter than `SHORTEST`, which the recommendation does not cover.
+    `distance` is the length of each path [n], [m]; `frequency` is one carrier frequency for all paths, or one for each
+    path [n], [Hz]. The loss is 0 for paths shorter than `SHORTEST`, which the recommendation does not cover.
 
     Raises:
         InputError: A carrier frequency is outside `CARRIERS`.

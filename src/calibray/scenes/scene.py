@@ -1,9 +1,9 @@
 """Scenes: reading the materials and objects of a Mitsuba XML file, and rewriting the file for the tracer.
 
 In the scene for the tracer, each surface material is a plain Sionna `radio-material` with explicit constants and a name
-that Calibray chooses. This keeps the constants in one place (`Material`), allows frequencies outside the range of an
-ITU law if the study gives the constants (NVlabs/sionna-rt#71, #72), and avoids Sionna's naming rules: an ITU name needs
-the prefix `itu_`, and an object must not have the name of a material.
+that Calibray chooses. This keeps the constants in one place (`Material`) and allows frequencies outside the range of an
+ITU law if the study gives the constants (NVlabs/sionna-rt#71, #72). It also avoids Sionna's naming rules: an ITU name
+needs the prefix `itu_`, and an object must not have the name of a material.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Scene:
         path: The XML file.
         materials: The materials that objects use, by name, with their constants at `frequency`.
         objects: The meshes, in file order.
-        xml: The scene for the tracer; the id of material k of `materials` is `mat-calibray-k`.
+        xml: XML of the scene for the tracer; the id of material k of `materials` is `mat-calibray-k`.
         laws: Frequency law of each material: that of ITU-R P.2040 for ITU materials, otherwise constant.
         sizes: Bounds and size of each object.
         frequency: The frequency for which the scene was read [Hz]; None if the constants are valid at all frequencies.
@@ -132,8 +132,8 @@ def read_scene(
 
     Raises:
         InputError: The file does not exist or is not a Mitsuba scene; a mesh is missing or malformed; a material has no
-            radio constants; an override is for a material that the scene does not have; a pattern matches no object,
-            or objects with different materials; or the frequency is outside the range of an ITU law.
+            radio constants; an override is for a material that is not in the scene; a pattern matches no object, or
+            objects with different materials; or the frequency is outside the range of an ITU law.
     """
     overrides, split = dict(overrides or {}), dict(split or {})
     path = scene_path(str(source))
@@ -205,7 +205,7 @@ def xml_with_copied_meshes(scene: Scene, folder: Path) -> str:
 
 
 def check_material_name(name: str, materials: Mapping[str, object], location: str) -> None:
-    """Refuse a material that a scene does not have; `location` states where the user gave the name.
+    """Refuse a material that is not in a scene; `location` states where the user named the material.
 
     Raises:
         InputError: The scene has no such material; the message suggests a similar name.
@@ -379,10 +379,10 @@ def export_scene(
     copy_meshes: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Write a scene file with new constants and the same frame; it refers to the original meshes or to copies.
+    """Write a scene file with new constants and the same frame; the file refers to the original meshes or to copies.
 
-    Materials and objects get names that Sionna RT accepts (`exported_names`). Sionna scene files support only
-    the Lambertian scattering pattern; set other patterns after loading the scene.
+    Materials and objects are given names that Sionna RT accepts (`exported_names`). Sionna scene files support only the
+    Lambertian scattering pattern; set other patterns after loading the scene.
 
     Args:
         scene: The scene as it was read.
@@ -399,7 +399,7 @@ def export_scene(
     missing = [name for name in scene.materials if name not in materials]
     if missing:
         raise InputError(
-            f"{scene.path}: there are no constants for the material {missing[0]!r}; export all of them"
+            f"{scene.path}: there are no constants for the material {missing[0]!r}; give constants for all materials"
         )
     root = ElementTree.fromstring(scene.xml)
     for bsdf in root.findall("bsdf"):

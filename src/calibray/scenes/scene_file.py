@@ -1,4 +1,4 @@
-"""The XML file of a scene: finding, parsing and checking it before a ray tracer reads it, and writing new ones."""
+"""The XML file of a scene: finding, parsing, checking and writing the file that a ray tracer reads."""
 
 from __future__ import annotations
 
@@ -63,12 +63,12 @@ _FRAME_COMMENT: Final = "calibray frame "
 
 
 def plain_name(name: str) -> str:
-    """Convert a name to one for files and objects, with only letters, digits, `_` and `-`."""
+    """Convert a name to a name for files and objects, which contains only letters, digits, `_` and `-`."""
     return re.sub(r"[^0-9A-Za-z_-]+", "_", name)
 
 
 def unique_names(names: Iterable[str], taken: Collection[str] = (), kind: str = "_") -> list[str]:
-    """Make plain and unique names: a repeated name becomes `NAME-2`, and a name in `taken` becomes `NAME-KIND`.
+    """Make names plain and unique: a repeated name becomes `NAME-2`, and a name in `taken` becomes `NAME-KIND`.
 
     Example:
         >>> unique_names(["Town hall", "Town/hall", '"><x'])
@@ -150,13 +150,13 @@ def parse(path: Path, source: str) -> ElementTree.Element:
         ) from None
     if root.tag != "scene":
         raise InputError(
-            f"scene file {source}: the root element is <{root.tag}>, a Mitsuba scene has <scene>; give a Mitsuba file"
+            f"scene file {source}: the root element is <{root.tag}>, but must be <scene>; give a Mitsuba scene"
         )
     return root
 
 
 def find_scene(source: str | Path) -> tuple[Path, ElementTree.Element]:
-    """Find the file of a scene and parse its XML; returns the file and the root element.
+    """Find the file of a scene, parse its XML, and return the path of the file and the root element.
 
     Raises:
         InputError: The file does not exist or is not a Mitsuba scene.
@@ -166,7 +166,7 @@ def find_scene(source: str | Path) -> tuple[Path, ElementTree.Element]:
 
 
 class _ShallowTree(ElementTree.TreeBuilder):
-    """Builds the elements and refuses deep nesting, which would overflow the stack in recursive code."""
+    """A tree builder that refuses deep nesting, which would overflow the stack in recursive code."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -214,7 +214,7 @@ def shape_mesh(shape: ElementTree.Element, path: Path) -> Mesh | None:
 
 
 def _check_transform(shape: ElementTree.Element, path: Path) -> None:
-    """Refuse a transform that flattens a shape or moves it to infinity: rays would miss it without a message."""
+    """Refuse a transform that flattens a shape or moves it to infinity, because rays would miss the shape."""
     for step in shape.findall("transform/*"):
         words = [value for key, value in step.attrib.items() if key in ("x", "y", "z", "value", "angle")]
         try:
@@ -233,14 +233,14 @@ def _check_transform(shape: ElementTree.Element, path: Path) -> None:
 
 
 def keep_traced_elements(root: ElementTree.Element, path: Path) -> None:
-    """Reduce a scene to the elements that a trace needs, so that Mitsuba reads no others.
+    """Reduce a scene to the elements that a trace needs, so that Mitsuba reads no other elements.
 
-    Mitsuba would load textures, emitters and sensors, and certain malformed ones crash the process. They have no effect
-    on radio waves and are dropped.
+    Mitsuba would also load textures, emitters and sensors, and some malformed elements crash the process. These
+    elements have no effect on radio waves and are therefore dropped.
 
     Raises:
-        InputError: The scene includes another file, or has an element, a property or a parameter that Calibray does not
-            know.
+        InputError: The scene includes another file, or contains an element, a property or a parameter that Calibray
+            does not support.
     """
     if root.find(".//include") is not None:
         raise InputError(f"{path}: <include> is not supported; export the scene into one file")
@@ -287,13 +287,16 @@ def write_scene(
     frame: Frame | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Write a new scene: `scene.xml`, and `meshes/NAME.ply` for each object; returns the XML file.
+    """Write a new scene: `scene.xml`, and `meshes/NAME.ply` for each object.
 
     A material whose `type` is an ITU-R P.2040 material has the permittivity and conductivity of that type. The frame is
     stored in a comment, which `read_frame` reads. With `overwrite`, files that Calibray did not write are replaced.
 
+    Returns the path of the XML file.
+
     Raises:
-        InputError: The folder cannot be written to, or a file in it must not be replaced. No file is then written.
+        InputError: The folder cannot be written to, or a file in it must not be replaced. In these cases, no file is
+            written.
     """
     meshes = {f"{item.name}.ply": item.mesh for item in objects}
     check_outputs(folder, ["scene.xml"], overwrite=overwrite)

@@ -23,15 +23,16 @@ from calibray.scenes.scene_file import shape_mesh
 from calibray.support.messages import shortened
 
 FAR: Final = 1000.0
-"""Coordinate beyond which a scene may be traced in a local frame [m].
+"""Coordinate beyond which a scene can be traced in a local frame [m].
 
-Up to this distance, single-precision rounding errors are at most 0.03 mm. When three scenes of 100 m were moved by
-1 km, all paths were kept and path loss stayed within 0.001 dB. At 2 km, path loss changed by 0.0015 dB, and at 10 km,
+Up to this distance, single-precision rounding errors are at most 0.03 mm. When three scenes 100 m wide were moved by 1
+km, all paths were kept and path loss stayed within 0.001 dB. At 2 km, path loss changed by 0.0015 dB, and at 10 km,
 paths were found twice.
 """
 
 COARSE: Final = 1e-3
-"""Spacing of stored coordinates above which a warning is given [m]; it changes path loss by more than 0.005 dB."""
+"""Spacing of stored coordinates above which a warning is given [m]; a larger spacing changes path loss by more than
+0.005 dB."""
 
 TOO_COARSE: Final = 1e-2
 """Spacing of stored coordinates above which a scene cannot be traced [m]: walls no longer meet, and paths are lost."""
@@ -52,8 +53,8 @@ class SurfaceSize:
         area: Area [m^2].
         sides: Total length of the sides of all triangles [m].
         step: Spacing of floating-point numbers at the largest coordinate in the file [m]; 0 if it is negligible.
-        misread: Whether the tracer needs a copy: the file stores integer coordinates, the shape is a rectangle, or its
-            transform rotates about a vector that is not a unit vector.
+        misread: Whether the tracer needs a copy, because the file stores integer coordinates, the shape is a rectangle,
+            or its transform rotates about a vector that is not a unit vector.
     """
 
     low: tuple[float, float, float]
@@ -97,10 +98,10 @@ def read_surface(shape: ElementTree.Element, path: Path) -> Mesh:
 
 
 def place_mesh(shape: ElementTree.Element, path: Path) -> Mesh:
-    """Read the mesh of a shape, or make that of a rectangle or cube, and apply the shape's transform.
+    """Read the mesh of a shape, or make the mesh of a rectangle or cube, and apply the shape's transform.
 
     Raises:
-        InputError: As for `shape_mesh`, or the transform has an element that Calibray does not know.
+        InputError: As for `shape_mesh`, or the transform contains an element that Calibray does not support.
     """
     mesh = shape_mesh(shape, path)
     if mesh is None:
@@ -192,9 +193,9 @@ def _cube() -> Mesh:
 def local_origin(sizes: tuple[SurfaceSize, ...]) -> NDArray[np.float64]:
     """Choose the origin [3], [m], of the frame in which a scene is traced.
 
-    For a scene far from the origin of its coordinates, the local origin is the scene's centre, rounded to metres. Far
-    means farther than `FAR` and than the scene's width, so that the local frame gains at least one bit of precision.
-    Otherwise the local origin is zero.
+    For a scene far from the origin of its coordinates, the local origin is the scene's centre, rounded to metres. A
+    scene is far if its largest coordinate exceeds both `FAR` and the scene's extent, so that the local frame gains at
+    least one bit of precision. Otherwise the local origin is zero.
     """
     if not sizes:
         return np.zeros(3)
@@ -210,7 +211,7 @@ def local_origin(sizes: tuple[SurfaceSize, ...]) -> NDArray[np.float64]:
 def write_local_shape(
     shape: ElementTree.Element, path: Path, origin: NDArray[np.float64], target: Path
 ) -> None:
-    """Replace the mesh of a shape with a copy, written to `target`, in the local frame with origin `origin` [3], [m].
+    """Replace the mesh of a shape with a copy in the local frame with origin `origin` [3], [m], written to `target`.
 
     Raises:
         InputError: The mesh cannot be read.

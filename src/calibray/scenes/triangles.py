@@ -18,10 +18,10 @@ from calibray.scenes.scene_file import find_scene
 from calibray.scenes.shapes import place_mesh, read_surface
 
 LEVEL: Final = 0.5
-"""A face is level, like a roof or the ground, if the vertical component of its unit normal exceeds this [1]."""
+"""A face is level, like a roof or the ground, if the vertical component of its unit normal exceeds this value [1]."""
 
 STEEP: Final = 0.1
-"""A face is a wall if the vertical component of its unit normal is at most this [1]."""
+"""A face is a wall if the vertical component of its unit normal is at most this value [1]."""
 
 WITHOUT_GAPS: Final = 0.9
 """A level object that covers more than this fraction of its bounding box [1] is a sheet, such as a floor."""
@@ -146,7 +146,7 @@ def _ground(triangles: Triangles, owner: NDArray[np.int64]) -> NDArray[np.bool_]
 
 
 def is_ground(mesh: Mesh, extent: NDArray[np.float64]) -> bool:
-    """Whether a mesh is a level sheet over most of a scene with the given extent east and north [2], [m].
+    """Whether a mesh is a level sheet over most of a scene with the given extents to the east and north [2], [m].
 
     Unlike in `Triangles.ground`, every face must be level. The mesh must span 80 % of the scene in each direction and
     cover half of its area; its height does not matter.
@@ -192,7 +192,7 @@ def ground_heights(
 def vertical_crossings(
     corners: NDArray[np.float64], points: NDArray[np.float64]
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]:
-    """Find where vertical lines through points cross triangles, in batches: triangle, point and height [m].
+    """Find where vertical lines through points cross triangles. Yields batches of triangle, point and height [m].
 
     The points [n, 3], [m], must be sorted by x.
     """

@@ -1,6 +1,6 @@
 """Making scenes from OpenStreetMap extracts, vector files, height models and floor plans.
 
-Names are loaded when first used, because each kind of source needs different libraries.
+Names are imported on first use, because each kind of source needs different libraries.
 """
 
 from typing import TYPE_CHECKING

@@ -1,13 +1,14 @@
-"""Extrusion of buildings into walls, windows, roofs and undersides over cells, which are adjacent areas of ground.
+"""Extrusion of buildings into walls, windows, roofs and undersides.
 
-In each cell, every building that covers it occurs once, between its bottom and its top. Where buildings overlap, the
-taller one is used. Where parts of a building are mapped, they replace the building's outline. Adjacent cells have
-the same corners along their common border, so walls and roofs that meet share their vertices.
+The ground is divided into adjacent cells. In each cell, every building that covers the cell occurs once, between the
+bottom and the top of the building. Where buildings overlap, the taller building is used. Mapped parts of a building
+replace its outline. Adjacent cells have the same corners along their common border, so walls and roofs that meet share
+their vertices.
 
-A wall exists at each height where one side of a border is built and the other is not. Between buildings of different
-heights it begins at the lower roof, and between buildings of equal height there is no wall. All walls that meet at an
-end of a border use the same column of corners, so the surface is closed and its wedges are connected. Coordinates are
-whole millimetres, so that corners are either identical or clearly different.
+A border has a wall at the heights at which a building stands on only one of its sides. Between buildings of different
+heights, the wall begins at the lower roof. Between buildings of equal height, there is no wall. All walls that meet at
+an end of a border use the same column of corners, so the surface is closed and its wedges are connected. Coordinates
+are whole millimetres, so that corners are either identical or clearly different.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ Interval = tuple[float, float, int]
 Length = TypeVar("Length", int, float)
 
 THINNEST: Final = GRID / 2
-"""Intervals thinner than this are rounding artefacts and are dropped [m]."""
+"""Intervals thinner than this limit are rounding artefacts and are dropped [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """An area of ground, a shapely Polygon [m], and the buildings on it, from the lowest up, without overlap."""
+    """An area of ground, a shapely Polygon [m], and the buildings on it, in order of height and without overlap."""
 
     polygon: Any
     stands: tuple[Interval, ...]
@@ -48,7 +49,7 @@ class Cell:
 def split_overlaps(
     footprints: Footprints, bottom: NDArray[np.float64], top: NDArray[np.float64]
 ) -> tuple[list[Cell], int]:
-    """Divide buildings into cells, given the bottom and top of each in the scene's frame [n], [m].
+    """Divide buildings into cells, given the bottom and top of each building in the scene frame [n], [m].
 
     Returns the cells, and the number of footprints that overlap another footprint.
     """
@@ -81,7 +82,7 @@ def split_overlaps(
 
 
 def _overlay(polygons: NDArray[Any]) -> tuple[list[Any], NDArray[np.bool_]]:
-    """The pieces into which the borders cut the ground, and whether each polygon covers each piece [n, pieces]."""
+    """The pieces into which the polygons' borders divide the ground, and which polygon covers which [n, pieces]."""
     shapely = library("shapely", "scenes")
     borders = shapely.union_all(shapely.boundary(polygons), grid_size=GRID)
     pieces = shapely.get_parts(shapely.polygonize([borders]))
@@ -108,7 +109,7 @@ def _stack(stands: list[Interval]) -> tuple[Interval, ...]:
 def subtract(
     interval: tuple[Length, Length, int], bottom: Length, top: Length
 ) -> list[tuple[Length, Length, int]]:
-    """Subtract a range of heights from an interval: none, one or two intervals of the same owner.
+    """Subtract a range of heights from an interval, which leaves up to two intervals of the same owner.
 
     Example:
         >>> subtract((0.0, 10.0, 7), 2.0, 4.0)
@@ -133,11 +134,11 @@ Strips = dict[Edge, list[tuple[Point, int]]]  # start and kind of each strip of 
 class Windows:
     """Division of outer walls into alternating vertical strips of wall and window, with wall at both ends.
 
-    The strips are as high as the wall, so the fraction of window does not depend on the height of an antenna. The
-    strips of wall at both ends keep the wedges at the corners of the building in one material.
+    The strips are as high as the wall, so the fraction of windows is the same at every height. With a strip of wall at
+    both ends, each wedge at a corner of the building consists of one material.
 
     Attributes:
-        share: Fraction of each wall that is window, at least 0 and less than 1 [1].
+        share: Fraction of each wall that windows cover, at least 0 and less than 1 [1].
         module: Approximate distance between the centres of adjacent windows [m].
 
     Raises:
@@ -154,7 +155,7 @@ class Windows:
             raise InputError(f"module = {self.module!r}: must be a finite number of metres greater than 0")
 
     def divide(self, edge: Edge) -> list[tuple[Point, int]]:
-        """Divide a wall, given its two ends [mm], into strips: where each begins and its kind, `WALL` or `WINDOW`.
+        """Divide a wall between two ends [mm] into strips, each with its start [mm] and its kind, `WALL` or `WINDOW`.
 
         Example:
             >>> Windows(0.5, module=2.0).divide(((0, 0), (2000, 0)))
@@ -179,7 +180,7 @@ class Shell:
     """The surfaces of buildings as triangles.
 
     Attributes:
-        corners: Corners, counter-clockwise seen from outside [F, 3, 3], [mm].
+        corners: Corners of each triangle, counter-clockwise when seen from outside [F, 3, 3], [mm].
         owner: Number of the building of each triangle [F].
         kind: `WALL`, `WINDOW`, `ROOF` or `UNDERSIDE` [F].
     """
@@ -195,7 +196,7 @@ def extrude(
     """Extrude buildings from their cells, with heights in the scene's frame.
 
     Without `windows`, walls are not divided. `ground` is the height of the ground under each building [n], [m]; bodies
-    that stand on the ground are open at the bottom, all others are closed. Without `ground`, all bodies are closed.
+    that stand on the ground are open at the bottom, and all others are closed. Without `ground`, all bodies are closed.
     """
     outlines = [_rings(cell.polygon) for cell in cells]
     standing = [
@@ -244,7 +245,7 @@ def _edges(ring: Sequence[Point]) -> Iterator[Edge]:
 
 
 def _wall_stands(standing: Sequence[tuple[Stand, ...]], cell_of: dict[Edge, int], edge: Edge) -> list[Stand]:
-    """The buildings to the left of an edge, cut to the heights at which no building is to its right [mm]."""
+    """The buildings to the left of an edge, limited to the heights [mm] at which no building is to the right."""
     opposite = cell_of.get((edge[1], edge[0]))
     free = list(standing[cell_of[edge]])
     for low, high, _ in standing[opposite] if opposite is not None else ():
@@ -253,7 +254,7 @@ def _wall_stands(standing: Sequence[tuple[Stand, ...]], cell_of: dict[Edge, int]
 
 
 def _strips(walls: dict[Edge, list[Stand]], windows: Windows | None) -> Strips:
-    """Strips of all edges with a wall; both directions of an edge get the same corners."""
+    """Strips of all edges with a wall; both directions of an edge have the same corners."""
     if windows is None or windows.share == 0:
         return {}
     strips: Strips = {}
@@ -283,8 +284,9 @@ def wall_triangles(
 ) -> Iterator[tuple[Corner, Corner, Corner]]:
     """Divide a vertical rectangle into triangles, counter-clockwise for an observer to the right of its base line.
 
-    The base line runs from `left` to `right`, which are x and y of the sides. `left_levels` and `right_levels` are the
-    heights of the corners on the sides, ascending, including both ends. Yields the corners of each triangle [mm].
+    The base line runs from `left` to `right`, the x and y coordinates of the two sides. `left_levels` and
+    `right_levels` are the heights of the corners on these sides, in ascending order and including both ends. Yields the
+    corners of each triangle [mm].
     """
     left_column = [(*left, level) for level in left_levels if low <= level <= high]
     right_column = [(*right, level) for level in right_levels if low <= level <= high]
@@ -338,7 +340,8 @@ def _with_strips(ring: Sequence[Point], strips: Strips) -> list[Point]:
 def triangulate(polygons: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Triangulate polygons [n], [mm], which may have holes, without adding corners.
 
-    Returns the corners of the triangles, counter-clockwise [F, 3, 2], [mm], and the polygon of each [F], ascending.
+    Returns the corners of the triangles, counter-clockwise [F, 3, 2], [mm], and the polygon of each triangle [F], in
+    ascending order.
     """
     shapely = library("shapely", "scenes")
     parts, polygon = shapely.get_parts(shapely.constrained_delaunay_triangles(polygons), return_index=True)

@@ -30,10 +30,11 @@ OPENINGS: Final = frozenset({"door", "window"})
 """Types that replace the wall on which they are drawn."""
 
 THICKNESS: Final = (0.0005, 3.0)
-"""Smallest and largest thickness of a wall [m]; other values suggest that thickness and coordinates differ in unit."""
+"""Smallest and largest thickness of a wall [m]; other values suggest that the units of thickness and coordinates
+differ."""
 
 USUAL_EXTENT: Final = (2.0, 300.0)
-"""Range of usual plan extents [m], outside which a warning asks for the unit; large halls are 300 m long."""
+"""Usual range of plan extents [m], outside which a warning recommends stating the unit; large halls are 300 m long."""
 
 VECTOR_SUFFIXES: Final = (".dxf", ".geojson", ".json", ".gpkg", ".shp", ".fgb", ".gdb")
 """Extensions of vector files; any other file is read as CSV."""
@@ -92,11 +93,12 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
     """Read a floor plan.
 
     Args:
-        path: A text table with the columns x0, y0, x1, y1 and type. Instead of the coordinates, a column wkt may give
-            lines, polylines or outlines; thickness, bottom and height are optional. Similar names are recognized, and a
-            unit of length in a name, as in `width_cm`, applies to its column. The file can also be a DXF, GeoJSON or
-            other vector file in the plan's coordinates, with attributes of exactly these names, with or without a unit.
-            Without an attribute type, the DXF layer is the type. Points and texts in vector files are ignored.
+        path: A text table with the columns x0, y0, x1, y1 and type. Instead of the coordinates, a column wkt can
+            contain lines, polylines or outlines; the columns thickness, bottom and height are optional. Similar names
+            are recognized, and a unit of length in a name, as in `width_cm`, applies to that column. The file can also
+            be a DXF, GeoJSON or other vector file in the plan's coordinates. Its attributes must have exactly these
+            names, with or without a unit. Without an attribute type, the DXF layer is the type. Points and texts in
+            vector files are ignored.
         height: Height of the top of segments without a height [m].
         unit: The plan's unit of length [m], such as 0.001 for millimetres; if None, the unit stated in a DXF file, or
             metres.
@@ -200,7 +202,7 @@ def _read_vector(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
     blocks = pd.Series(features.columns.get("BlockName", []), dtype=object).dropna()
     if len(blocks):
         _LOG.warning(
-            "floor plan %s: blocks are not read (%d inserted: %s); explode them in a CAD program if they have walls",
+            "floor plan %s: blocks are not read (%d inserted: %s); explode them in a CAD program if they contain walls",
             path, len(blocks), shortened(", ".join(map(str, blocks.unique()))),
         )  # fmt: skip
     names = [f"feature {number}" for number in range(1, len(lines) + 1)]
@@ -216,7 +218,7 @@ def _read_vector(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
 def _with_known_names(
     path: Path, frame: pd.DataFrame, unit: float, others: Mapping[str, Sequence[str]]
 ) -> pd.DataFrame:
-    """Rename known columns to the names in this module; convert lengths in a stated unit to the plan's unit [m]."""
+    """Rename known columns to the names in this module, and convert lengths with a stated unit to the plan's unit."""
     known = _known_names(map(str, frame), others)
     frame = frame.rename(columns=known)
     for column, name in known.items():
@@ -253,7 +255,7 @@ def _known_names(columns: Iterable[str], other_names: Mapping[str, Sequence[str]
 
 
 def _parts(geometry: Any) -> list[NDArray[np.float64]]:
-    """The points [n, 2] of each line of a geometry; the outlines of areas count as lines."""
+    """The points [n, 2] of each line of a geometry; outlines of areas are treated as lines."""
     shapely = library("shapely", "scenes")
     parts = shapely.get_parts(geometry)
     is_area = shapely.get_dimensions(parts) == 2
@@ -263,7 +265,7 @@ def _parts(geometry: Any) -> list[NDArray[np.float64]]:
 
 
 def _numbers(path: str | Path, frame: pd.DataFrame, name: str) -> NDArray[np.float64]:
-    """A column as numbers [n]; NaN if it is empty or absent."""
+    """A column as numbers [n]; empty cells and absent columns become NaN."""
     if name not in frame:
         return np.full(len(frame), np.nan)
     column = frame[name]

@@ -44,19 +44,19 @@ TYPES: Final = {
     "floor": SurfaceMaterial("floor", "concrete", 0.2),
     "ceiling": SurfaceMaterial("ceiling", "concrete", 0.2),
 }
-"""Materials for types whose names are not ITU-R P.2040 materials."""
+"""Materials of types that are not named after ITU-R P.2040 materials."""
 
 LIDS: Final = ("floor", "ceiling")
 """Level sheets over the whole area of a plan."""
 
 WALL_THICKNESS: Final = 0.12
-"""Thickness of a wall of an ITU material if the plan does not state it [m]."""
+"""Thickness of a wall made of an ITU material if the plan states no thickness [m]."""
 
 STOREY: Final = 1.8
 """Smallest height of a storey [m]; lower parts of walls, such as parapets, do not count as storeys."""
 
 ROUNDING: Final = 2.0
-"""Largest distance [mm] by which rounding moves a corner, where crossing walls are cut, away from the wall's line."""
+"""Largest distance [mm] by which rounding moves a corner at crossing walls away from the line of its wall."""
 
 _REACH: Final = 0.03  # largest distance from a wall's face at which the end of another wall meets it [m]
 
@@ -85,9 +85,9 @@ def make_plan_scene(
         types: Materials by type, which extend or replace those in `TYPES`. A type that is an ITU-R P.2040 material,
             such as `brick`, becomes the material `brick_wall`. If the plan states several thicknesses for one type,
             each becomes a separate material.
-        lids: Which of `LIDS` to make: sheets over the whole area that walls enclose, the floor at the lowest bottom
-            and the ceiling at the highest top.
-        merge: Whether two parallel lines are merged into one wall (`merge_faces`).
+        lids: Which of `LIDS` to make: sheets over the whole area that walls enclose, with the floor at the lowest
+            bottom and the ceiling at the highest top.
+        merge: Whether to merge two parallel lines into one wall (`merge_faces`).
         overwrite: Whether to replace files that Calibray did not write.
 
     Raises:
@@ -102,8 +102,9 @@ def make_plan_scene(
     sheets = merged.sheets
     if lids and (level := _separation(sheets)) is not None:
         raise InputError(
-            f"floor plan: a storey begins at {level:g} m, where the scene would have no floor; make a scene of each "
-            "storey, or omit floor and ceiling (--no-floor --no-ceiling) and add the floors to the scene yourself"
+            f"floor plan: a storey begins at {level:g} m, where the scene would have no floor; make a separate scene "
+            "of each storey, or omit floor and ceiling (--no-floor --no-ceiling) and add the floors to the scene "
+            "yourself"
         )
     materials = _materials(sheets, types)
     pieces = _pieces(_extend_to_walls(sheets), [material.name for material in materials])
@@ -137,7 +138,7 @@ def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) 
         options = " ".join(f"--material {shlex.quote(kind)}=concrete" for kind in listed)
         raise InputError(
             f"floor plan: no material for {', '.join(map(repr, listed))}; assign the closest ITU-R P.2040 material to "
-            f"each, as in {options}; or correct it, {did_you_mean(listed[0], sorted({*types, *ITU_NAMES}))}"
+            f"each, as in {options}; or correct the type, {did_you_mean(listed[0], sorted({*types, *ITU_NAMES}))}"
         )
     materials = []
     for sheet in sheets:
@@ -206,7 +207,7 @@ def _extend(
 
 
 def _pieces(sheets: Sequence[Segment], materials: Sequence[str]) -> Pieces:
-    """Cut lines where they cross; over each piece, doors and windows replace walls, and shorter lines longer ones."""
+    """Cut lines at crossings; on each piece, doors and windows replace walls, and shorter lines replace longer ones."""
 
     def priority(number: int) -> tuple[bool, float, int]:
         return sheets[number].kind not in OPENINGS, round(sheets[number].length, 3), number
@@ -259,6 +260,6 @@ def _enclosed(pieces: Pieces) -> Any:
 
 
 def _lid(outline: Any, height: float) -> NDArray[np.int64]:
-    """A level sheet over an area, counter-clockwise seen from above [F, 3, 3], [mm]."""
+    """A level sheet over an area, counter-clockwise when seen from above [F, 3, 3], [mm]."""
     flat, _ = triangulate(library("shapely", "scenes").get_parts(outline))
     return np.concatenate([flat, np.full((len(flat), 3, 1), to_millimetres(height))], axis=2)

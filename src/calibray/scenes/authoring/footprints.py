@@ -1,8 +1,8 @@
 """Footprints: the outlines of buildings in the scene's frame, with bottom and top heights, read from files.
 
-OpenStreetMap extracts are read with pyosmium, OpenStreetMap's own library. It assembles multipolygon relations with
-holes by OpenStreetMap's rules, reads .osm and .pbf files, and returns all tags, whereas GDAL's driver puts
-`building:levels` into a text with other tags. Nothing is downloaded.
+OpenStreetMap extracts are read with pyosmium, OpenStreetMap's own library. Pyosmium assembles multipolygon relations
+with holes by OpenStreetMap's rules, reads .osm and .pbf files, and returns all tags. GDAL's driver, in contrast,
+combines `building:levels` with other tags in one text. Nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SMALLEST: Final = 1.0
 """Smallest area of a building [m^2]."""
 
 HIGHEST: Final = 1000.0
-"""Largest height of a building or of a part of a building [m]; the tallest building is 828 m high."""
+"""Largest height of a building or of a part of a building [m]; the world's tallest building is 828 m high."""
 
 HeightSource = Literal["height", "levels", "default"]
 
@@ -52,7 +52,7 @@ class HeightRule:
 
     Attributes:
         storey: Height of one storey [m].
-        default: Height of a building whose number of storeys is not given either [m].
+        default: Height of a building without a stated height or number of storeys [m].
 
     Raises:
         InputError: A height is not a finite number greater than 0.
@@ -69,9 +69,9 @@ class HeightRule:
     def heights(self, tags: Mapping[str, str]) -> tuple[float, float, HeightSource]:
         """Derive a building's bottom [m], top [m] and the source of its top from OpenStreetMap tags.
 
-        `height` and `min_height` have priority, then `building:levels` and `building:min_level` times `storey`, then
-        `default`. All heights are above the ground. Heights above `HIGHEST` are ignored, as is a stated top that is not
-        above the bottom. Roof shapes are ignored: the roof is flat at `height`.
+        `height` and `min_height` have priority, followed by `building:levels` and `building:min_level` times `storey`,
+        and then `default`. All heights are above the ground. Heights above `HIGHEST` are ignored, as is a stated top
+        that is not above the bottom. Roof shapes are ignored: the roof is flat at `height`.
 
         Example:
             >>> HeightRule().heights({"building": "yes", "building:levels": "4"})
@@ -117,7 +117,8 @@ class Footprints:
         top: Height of the top of each building above the ground [n], [m].
         name: Name of each building [n].
         height_from: Source of each top [n].
-        part: Whether each is a part of a building, which takes precedence over the building's outline [n].
+        part: Whether each outline is a part of a building; parts take precedence over the outline of the whole building
+            [n].
         repairs: Number of outlines that were changed or left out, by reason.
     """
 
@@ -191,7 +192,7 @@ def _check_heights(raw: Footprints, keep: NDArray[np.int64]) -> None:
 
 
 def _check_extent(polygons: NDArray[Any], names: Sequence[str]) -> None:
-    """Refuse a building that is far from the others, for example at (0, 0), or on the other side of 180 degrees."""
+    """Refuse a building that is far from the others, for example at (0, 0) or across 180 degrees of longitude."""
     if not len(polygons):
         return
     bounds = library("shapely", "scenes").bounds(polygons)
@@ -206,7 +207,7 @@ def _check_extent(polygons: NDArray[Any], names: Sequence[str]) -> None:
         problem = f"is {size[furthest] / 1000:,.0f} km wide"
     raise InputError(
         f"building {names[furthest]!r} {problem}, but scenes may be at most {WIDEST / 1000:g} km wide; remove it, or "
-        "cut out the area that you need (if the map crosses 180 degrees of longitude, an area on one side)"
+        "cut out the area that you need (if the map crosses 180 degrees of longitude, an area on one side of it)"
     )
 
 
@@ -233,8 +234,8 @@ def read_openstreetmap(
 ) -> tuple[Footprints, Frame]:
     """Read the buildings of an extract: closed ways and multipolygon relations tagged `building` or `building:part`.
 
-    Returns the footprints and their frame, by default a local one centred on the buildings. `rule` gives the heights
-    that the map does not state.
+    Returns the footprints and their frame, by default a local frame centred on the buildings. `rule` contains the
+    assumptions for heights that the map does not state.
 
     Raises:
         InputError: The file does not exist, is not an extract or contains no building, or pyosmium is not installed.
@@ -287,7 +288,7 @@ class FootprintColumns:
 
     Attributes:
         bottom: Column with the heights of the bottoms of buildings [m], or one height for all.
-        name: Column with the names of buildings; without it, or where a name is missing, buildings are numbered.
+        name: Column with the names of buildings; buildings without a name are numbered.
         levels: Column with the numbers of storeys, for buildings without a height.
     """
 
@@ -311,7 +312,7 @@ def read_footprints(
             reference system.
         height: Column with the heights of the buildings above the ground, in metres or the unit in its name
             (`height_ft`), or one height for all [m]. Text that is both a number and the name of a column is read as the
-            name. None if `columns` gives the numbers of storeys.
+            name. None if `columns` names a column with the numbers of storeys.
         columns: Additional columns.
         layer: Layer of the file, if it has more than one.
         frame: The scene's frame; by default a local frame centred on the footprints.
@@ -327,9 +328,9 @@ def read_footprints(
     count = len(outlines)
     if height is None and named.levels is None:
         raise InputError(
-            f"footprints {path}: the heights of the buildings are not given; give their column in --height or a column "
-            f"with numbers of storeys in --levels (columns: {', '.join(map(str, table)) or 'none'}), or give one "
-            "height for all in --height"
+            f"footprints {path}: the heights of the buildings are not given; give a column of heights or one height "
+            "for all buildings in --height, or a column of numbers of storeys in --levels (columns: "
+            f"{', '.join(map(str, table)) or 'none'})"
         )
     bottoms = _numbers(path, table, named.bottom, count)
     tops = np.full(count, np.nan) if height is None else _numbers(path, table, height, count)
@@ -401,7 +402,7 @@ def _numbers(
 ) -> NDArray[np.float64]:
     """Read numbers [count] from a column, or repeat a constant; NaN where the column has no value.
 
-    Numbers are in metres, or in the unit that the column's name states. Texts are parsed as lengths.
+    Numbers are in metres, or in the unit stated in the name of the column. Texts are parsed as lengths.
 
     Raises:
         InputError: There is no such column, or a value in it is not a height.

@@ -1,8 +1,8 @@
 """Opening vector files and height models with a fixed list of drivers.
 
 GDAL has drivers that fetch URLs, open other files or run pipelines named in a file (VRT, WMS, WFS, GDALG), and it
-chooses the driver by the file's content. This module opens only formats without references to other files. They are
-recognized by their first bytes, and the sizes that they declare are checked before the data are read.
+chooses the driver by the file's content. This module opens only formats without references to other files. A file is
+recognized by its first bytes, and the sizes that it declares are checked before the data are read.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ TEXT_GROWTH: Final = 15
 """Memory needed to parse GeoJSON or DXF, as a multiple of the file size [1]."""
 
 HEIGHTS: Final = (-1000.0, 10_000.0)
-"""Range of heights on land [m]; values outside it, such as -32768 and -9999, mark gaps that a file does not declare."""
+"""Range of heights on land [m]; values outside this range, such as -32768, usually mark gaps that the file does not
+declare."""
 
 _MAGIC: Final = (
     (b"SQLite format 3\0", "GPKG"),
@@ -86,7 +87,7 @@ class Features:
 
 
 def read_features(path: Path, layer: str | None) -> Features:
-    """Read the features of a vector file in one of the `VECTOR_FORMATS`, or those in one of its layers.
+    """Read the features of a vector file in one of the `VECTOR_FORMATS`, or of one of its layers.
 
     Raises:
         InputError: The file does not exist, has another format, is damaged, or does not fit into memory.
@@ -204,7 +205,7 @@ def _read_geojson(path: Path) -> Features:
 
 
 def _column(values: list[Any]) -> NDArray[Any]:
-    """A column as numbers if all its values are numbers or missing, otherwise as objects."""
+    """A column as numbers if all values are numbers or missing, otherwise as objects."""
     if all(
         value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in values
     ):
@@ -222,7 +223,7 @@ class HeightModel:
         path: The file.
         dataset: The raster, as opened by rasterio.
         crs: Horizontal coordinate reference system as WKT.
-        metres: Unit in which the heights are stored, after scale and offset are applied [m].
+        metres: Unit of the stored heights after scale and offset are applied [m].
     """
 
     path: Path
@@ -234,7 +235,7 @@ class HeightModel:
         """Read heights [rows, columns], [m], from the first to the last row and column, inclusive; gaps are masked.
 
         Raises:
-            InputError: There are too many heights, they cannot be read, or one is not a height on land.
+            InputError: There are too many heights, they cannot be read, or a value is not a height on land.
         """
         rasterio = library("rasterio", "scenes")
         rows, columns = (last - first + 1).tolist()
@@ -296,7 +297,7 @@ def open_height_model(path: Path) -> Iterator[HeightModel]:
 
 
 def _check_sidecars(path: Path) -> None:
-    """Refuse a model if a file next to it, which is not read, changes its heights."""
+    """Refuse a model with auxiliary files that would change its heights, because these files are not read."""
     mask, auxiliary = Path(f"{path}.msk"), Path(f"{path}.aux.xml")
     if mask.exists():
         raise InputError(f"height model {path}: its mask {mask.name} is not read; write it into the GeoTIFF")
@@ -357,7 +358,7 @@ def _systems(path: Path, dataset: Any) -> tuple[str, float]:
         declared.add(factor)
     if len(declared) > 1 and not np.allclose(list(declared), min(declared), rtol=1e-4):
         raise InputError(
-            f"height model {path}: its band states heights in {unit!r}, its reference system in another unit; "
+            f"height model {path}: its band states heights in {unit!r}, but its reference system states another unit; "
             "correct one of them"
         )
     return horizontal.to_wkt(), max(declared, default=1.0)

@@ -55,7 +55,7 @@ class SurfaceMaterial:
 
     Attributes:
         name: Name of the material; ITU-R P.2040 names are not allowed, because Sionna RT reserves them.
-        itu: ITU-R P.2040 material that gives the constants.
+        itu: ITU-R P.2040 material from which the constants are taken.
         thickness: Thickness of the slab [m].
 
     Raises:
@@ -70,7 +70,7 @@ class SurfaceMaterial:
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
             raise InputError(
-                f"material {self.name!r}: must consist of letters, digits, '_' and '-', a letter first"
+                f"material {self.name!r}: must consist of letters, digits, '_' and '-' and begin with a letter"
             )
         if is_itu_name(self.name):
             suggestion = f"{self.name.removeprefix('itu_').removeprefix('itu-')}_wall"
@@ -94,7 +94,7 @@ class SurfaceMaterial:
 
 
 def material_name(kind: str) -> str:
-    """Make a material name from a type of wall, which may contain any characters.
+    """Make a material name from a type of wall, which can contain any characters.
 
     Example:
         >>> material_name("tür 2"), material_name("brick"), material_name("2 x drywall")
@@ -112,7 +112,7 @@ class Palette:
     Attributes:
         wall: Material of walls.
         window: Material of windows.
-        roof: Material of roofs and undersides; None for the walls' material, which makes eaves diffract.
+        roof: Material of roofs and undersides. If None, they have the material of the walls, so that eaves diffract.
         ground: Material of the ground.
     """
 
@@ -173,7 +173,7 @@ def write_made_scene(
 ) -> None:
     """Write a scene and its assumptions; with `overwrite`, replace files that Calibray did not write.
 
-    Materials that no object uses and repeated materials are ignored.
+    Unused and repeated materials are ignored.
 
     Raises:
         InputError: Two different materials, or a material and a mesh, have the same name; or a file must not be
@@ -222,14 +222,15 @@ def make_scene(
         terrain: The ground; by default, it is level at z = 0 and extends `margin` beyond the buildings. With terrain,
             the heights of a building and of its parts are measured from the lowest ground under its walls.
         palette: The materials.
-        windows: Division of walls into wall and window; None for walls without windows.
+        windows: Division of walls into strips of wall and window; None for walls without windows.
         margin: Distance by which level ground extends beyond the buildings [m].
-        ground: Whether to make ground; without it, buildings are closed at the bottom.
+        ground: Whether to make the ground; without ground, buildings are closed at the bottom.
         per_building: Whether to make one mesh per building and material, named `BUILDING-MATERIAL`, instead of one per
-            material. A study can then give individual buildings a separate material. Tracing many meshes takes longer.
+            material. A study can then assign separate materials to individual buildings. Tracing many meshes takes
+            longer.
         overwrite: Whether to replace files that Calibray did not write.
-        trees: Trees; those within `margin` of the buildings are written next to the scene, as `TREES_FILE`; needs
-            `frame`.
+        trees: Trees. If `frame` is given, those within `margin` of the buildings are written to `TREES_FILE` next to
+            the scene.
 
     Raises:
         InputError: There is no building, the margin is out of range, the folder cannot be written to, or a file in it

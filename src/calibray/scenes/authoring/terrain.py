@@ -22,7 +22,7 @@ MAX_POINTS: Final = 4_000_000
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Heights of the ground on a grid; each cell is two triangles, divided from south-west to north-east.
+    """Heights of the ground on a grid; each cell is divided into two triangles from south-west to north-east.
 
     Attributes:
         x: Eastings of the grid, ascending [nx], [m].
@@ -37,7 +37,7 @@ class Terrain:
     repairs: dict[str, int] = field(default_factory=dict)
 
     def heights(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Interpolate heights [n], [m], on the triangles; outside the grid, use the height at the nearest border."""
+        """Interpolate heights [n], [m], on the triangles; outside the grid, use the nearest height on its border."""
         x = np.clip(np.asarray(x, dtype=float), self.x[0], self.x[-1])
         y = np.clip(np.asarray(y, dtype=float), self.y[0], self.y[-1])
         column = np.clip(np.searchsorted(self.x, x, side="right") - 1, 0, len(self.x) - 2)
@@ -52,7 +52,7 @@ class Terrain:
         return np.where(u >= v, lower, upper)
 
     def mesh(self) -> Mesh:
-        """The ground as triangles, counter-clockwise seen from above."""
+        """The ground as triangles, counter-clockwise when seen from above."""
         east, north = np.meshgrid(self.x, self.y)
         columns, rows = len(self.x), len(self.y)
         southwest = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
@@ -79,14 +79,15 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
     """Read the ground from a height model.
 
     Args:
-        path: A GeoTIFF that states its reference system; its scale, offset, unit and missing heights are respected.
+        path: A GeoTIFF that states its reference system; its scale, offset, unit and missing heights are taken into
+            account.
         frame: The scene's frame.
-        bounds: The area to cover in the frame: west, south, east and north [4], [m].
+        bounds: West, south, east and north bounds of the area to cover, in the frame [4], [m].
         spacing: Width of the grid's cells [m]; by default, the cell width of the model, but at least 1 m.
 
     Returns:
-        The terrain, interpolated linearly between the centres of the model's cells. Where the model has no height, such
-        as on water, the height of the nearest cell is used; such cells are counted.
+        The terrain, interpolated linearly between the centres of the model's cells. Where the model has no height, for
+        example on water, the height of the nearest cell with a height is used; cells without a height are counted.
 
     Raises:
         InputError: The file does not exist, cannot be read or used (see `open_height_model`), does not cover the bounds
@@ -145,7 +146,7 @@ def pixels(
 
 
 def _fill(path: Path, heights: np.ma.MaskedArray) -> tuple[NDArray[np.float64], dict[str, int]]:
-    """Fill gaps with the height of the nearest cell that has one, and count them."""
+    """Fill each gap with the height of the nearest cell that has a height, and count the filled cells."""
     values = heights.filled(np.nan)
     missing = np.ma.getmaskarray(heights) | ~np.isfinite(values)
     if missing.all():

@@ -21,7 +21,7 @@ from calibray.support.lazy_imports import library
 from calibray.support.output_files import write_text
 
 TREES_FILE: Final = "trees.geojson"
-"""Name of the file of trees next to a scene."""
+"""Name of the file with the trees of a scene."""
 
 KINDS: Final = {
     ("natural", "tree"): "tree",
@@ -32,18 +32,18 @@ KINDS: Final = {
 """Kinds of trees by OpenStreetMap tag."""
 
 HEIGHTS: Final = {"tree": 10.0, "tree row": 10.0, "wood": 15.0, "forest": 15.0}
-"""Assumed heights [m], because few maps state heights. The mean height was 15 m in the wood where the largest loss in
-ITU-R P.833 was measured."""
+"""Assumed heights [m] of trees without a stated height. In the wood with the largest loss in ITU-R P.833, the mean
+height was 15 m."""
 
 CROWN: Final = 6.0
 """Assumed diameter of a crown [m]."""
 
 CLEARANCE: Final = 2.5
-"""Height of the bottom of the crowns of single trees and rows [m], high enough for people to pass; woods begin at the
-ground."""
+"""Height of the bottom of the crowns of single trees and tree rows [m], high enough for people to pass; woods extend to
+the ground."""
 
 TALLEST: Final = 120.0
-"""Largest height of a tree [m]; the tallest tree is 116 m high."""
+"""Largest height of a tree [m]; the world's tallest tree is 116 m high."""
 
 WIDEST_CROWN: Final = 60.0
 """Largest diameter of a crown [m]."""
@@ -77,13 +77,13 @@ class Trees:
         return dict(Counter(f"{name}s" for name in self.kind.tolist())) | assumed
 
     def within(self, bounds: NDArray[np.float64]) -> Trees:
-        """The trees wholly or partly within the bounds west, south, east and north [4], [m]."""
+        """The trees wholly or partly within the west, south, east and north bounds [4], [m]."""
         shapely = library("shapely", "scenes")
         here = shapely.intersects(self.outline, shapely.box(*bounds)) if len(self) else slice(None)
         return replace(self, **{item.name: getattr(self, item.name)[here] for item in fields(self)})
 
     def write(self, folder: Path, frame: Frame) -> None:
-        """Write `TREES_FILE`, with the outline (longitude, latitude), kind and both heights of each polygon."""
+        """Write `TREES_FILE`, with the outline (longitude, latitude), kind, bottom and top of each polygon."""
         shapely = library("shapely", "scenes")
 
         def degrees(corner: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -163,7 +163,8 @@ LEAST: Final = 2.0
 """Smallest height of vegetation that counts as trees [m], as in canopy models from laser scans."""
 
 STEP: Final = 1.0
-"""Step to which heights are rounded so that adjacent cells form polygons [m]; canopy models have errors of metres."""
+"""Step to which canopy heights are rounded [m], so that adjacent cells form polygons; canopy models have errors of
+metres."""
 
 
 def read_canopy(
@@ -175,7 +176,7 @@ def read_canopy(
         path: A GeoTIFF of heights above the ground, with the same requirements and limits as a height model
             (`open_height_model`); gaps have no trees.
         frame: The scene's frame.
-        bounds: West, south, east and north in the frame [4], [m].
+        bounds: West, south, east and north bounds in the frame [4], [m].
 
     Returns:
         Shapely polygons in the frame [n], [m], and the height of the trees in each [n], [m].
@@ -212,6 +213,7 @@ def read_canopy(
     inside = shapely.intersects(outline, shapely.box(*bounds)) if polygons else np.zeros(0, dtype=bool)
     if not inside.any():
         raise InputError(
-            f"canopy {path}: has no trees of {LEAST:g} m or more within the scene; give a canopy model that covers it"
+            f"canopy {path}: has no trees of {LEAST:g} m or more within the scene; give a canopy model that covers "
+            "the scene"
         )
     return outline[inside], np.array([top for _, top in polygons])[inside]

@@ -1,10 +1,10 @@
-"""Wall alignment: walls that would lie in one plane but for the rounding of coordinates are moved into one plane.
+"""Wall alignment: walls whose planes differ only because of rounding are moved into one plane.
 
-Coordinates are rounded: in OpenStreetMap to a centimetre, and in Calibray to a millimetre. The front of a row of
-houses, or a wall cut where another wall meets it, then consists of several planes that almost coincide. Sionna RT
-treats planes that differ by much less than 1 cm as different planes, so it finds the same reflection several times.
-Therefore, one straight line is fitted to collinear edges by least squares, and corners are moved onto the lines of
-their walls. Input is in whole millimetres, output in metres.
+Coordinates are rounded to a centimetre in OpenStreetMap and to a millimetre in Calibray. The front of a row of houses,
+or a wall divided where another wall meets it, then consists of several planes that almost coincide. Sionna RT treats
+planes that are much less than 1 cm apart as different planes, so it finds the same reflection several times. Therefore,
+one straight line is fitted to collinear edges by least squares, and corners are moved onto the lines of their walls.
+Inputs are in whole millimetres, and outputs are in metres.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 TOLERANCE: Final = 25.0
-"""Distance from a straight line that rounding can cause, for collinear walls a few metres long [mm]."""
+"""Largest deviation from a straight line that rounding can cause, for collinear walls a few metres long [mm]."""
 
 REACH: Final = 30_000.0
 """Largest gap between two collinear walls, such as the width of a street [mm]."""
 
 TURN: Final = 0.05
-"""Sine of the largest angle between two collinear walls; rounding can turn short walls by this much."""
+"""Sine of the largest angle between two collinear walls; rounding can rotate short walls by this angle."""
 
 CROSSING: Final = 0.2
 """Sine of the smallest angle at which the crossing of two lines defines a corner."""
@@ -39,7 +39,7 @@ class Alignment:
     moved: NDArray[np.float64]
 
     def positions(self, corners: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Positions [n, 3], [m], of corners [n, 3], [mm], each of which is one of `points` at some height."""
+        """New positions [n, 3], [m], of corners [n, 3], [mm]; in plan, each corner is one of `points`."""
         every = np.concatenate([self.points, corners[:, :2]])
         unique, index = np.unique(every, axis=0, return_inverse=True)
         moved = np.empty((len(unique), 2))
@@ -50,8 +50,8 @@ class Alignment:
 def align(triangles: NDArray[np.int64], tolerance: float = TOLERANCE) -> Alignment:
     """Align collinear walls; the triangles [F, 3, 3], [mm], are vertical or level.
 
-    Corners within `tolerance` [mm] of a straight line are moved onto it, unless that would reverse an edge or a level
-    triangle.
+    Corners within `tolerance` [mm] of a straight line are moved onto this line, unless that would reverse an edge or a
+    level triangle.
     """
     points, index = np.unique(triangles[..., :2].reshape(-1, 2), axis=0, return_inverse=True)
     faces = index.reshape(-1, 3)
@@ -104,7 +104,7 @@ def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 def _lines(segments: NDArray[np.float64], edges: NDArray[np.int64], tolerance: float) -> NDArray[np.int64]:
-    """Number of the line of each edge, from 0; -1 for edges that are not collinear with any other [E].
+    """Number of the line of each edge, from 0; -1 for edges that are not collinear with any other edge [E].
 
     Edges that share a corner are first joined into runs; then, nearby runs are joined into lines.
     """
@@ -199,7 +199,7 @@ def _across(
 def _fit_lines(
     segments: NDArray[np.float64], line: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """A point on each line, its direction (by total least squares of its segments' ends), and its segments' length."""
+    """A point on each line, the line's direction (by total least squares), and the total length of its segments."""
     used = line >= 0
     ends, number = segments[used], np.repeat(line[used], 2)
     length = np.hypot(*(ends[:, 1] - ends[:, 0]).T)

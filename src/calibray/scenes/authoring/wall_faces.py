@@ -32,7 +32,7 @@ class MergedPlan:
     Attributes:
         sheets: One sheet for each wall, door and window.
         lines: Number of lines that were merged as faces.
-        report: Sentences that state what was merged, kept and left out.
+        report: Sentences that state which lines were merged, kept and left out.
     """
 
     sheets: Sequence[Segment]
@@ -44,17 +44,18 @@ def merge_faces(segments: Sequence[Segment]) -> MergedPlan:
     """Merge the two faces of each wall into one sheet.
 
     Two lines are faces of one wall if they have the same type, bottom and top, are parallel, and overlap over a length
-    that exceeds both their distance and half of the shorter line. No closer line may be the opposite face of either.
-    Their distance is at most `THICKEST`; it differs from a given thickness by at most a fifth of it, or 2 cm. Where one
-    long face is opposite several short ones, as between a corridor and its rooms, each pair gives a sheet, and gaps of
-    up to `THICKEST` between the sheets are closed. Sheets end midway between the faces' ends, so that corners meet.
+    that exceeds both their distance and half of the shorter line. Neither line may have a closer opposite face. Their
+    distance is at most `THICKEST`; it differs from a given thickness by at most a fifth of that thickness, or 2 cm if
+    that is more. Where one long face is opposite several short faces, as between a corridor and its rooms, each pair
+    becomes a sheet, and gaps of up to `THICKEST` between the sheets are closed. Sheets end midway between the faces'
+    ends, so that corners meet.
 
     Where one face is longer than the opposite face, the remaining part is kept as a sheet in the same plane. The short
-    lines that close the outline of a wall are left out. All walls of a type without a given thickness get the median
-    distance between their faces, weighted by length.
+    lines that close the outline of a wall are left out. If the walls of a type have no given thickness, their thickness
+    is the median distance between their faces, weighted by length.
 
-    If less than half of the total length of a type's lines has an opposite face, each line of the type is taken as a
-    wall: two lines that are close together are separate walls, and both are kept.
+    If less than half of the total length of a type's lines has an opposite face, each line of the type is treated as a
+    wall. Two lines that are close together are then separate walls, and both are kept.
 
     Returns the sheets, followed by the lines without an opposite face.
     """
@@ -75,7 +76,7 @@ def merge_faces(segments: Sequence[Segment]) -> MergedPlan:
         *_described("kept from a face that is longer than the opposite face", rest),
         *_described("ends of outlined walls left out", [segments[index] for index in sorted(closing)]),
         *_described(
-            "not merged with a parallel line, as most lines of this type have no opposite face",
+            "not merged with a parallel line, because most lines of this type have no opposite face",
             [segments[one] for one, _ in separate],
             [abs(_offset(segments[one], segments[other])) for one, other in separate],
         ),
@@ -126,7 +127,7 @@ def _types_drawn_as_faces(segments: Sequence[Segment], pairs: Sequence[tuple[int
 
 
 def _face_distance(one: Segment, other: Segment) -> float | None:
-    """Distance between two lines that may be faces of one wall [m]; None if they cannot be."""
+    """Distance between two lines that can be the faces of one wall [m]; otherwise None."""
     if (one.kind, one.bottom, one.top) != (other.kind, other.bottom, other.top):
         return None
     if abs(one.direction @ other.direction) < _PARALLEL:
@@ -168,7 +169,7 @@ def _part(segment: Segment, start: float, end: float, offset: float) -> Segment:
 
 
 def _merge_pair(one: Segment, other: Segment) -> Segment:
-    """The sheet between two faces, over their overlap; where the faces' ends are close, the sheet ends midway."""
+    """The sheet between two overlapping faces; where the faces' ends are close, the sheet ends midway between them."""
     low, high = sorted(_relative(one, other)[0].tolist())
     # At a corner, one face ends a wall's thickness before the other. The point midway between these ends is on the
     # centre line of the other wall.
@@ -229,7 +230,7 @@ def _close_gaps(sheets: Sequence[Segment]) -> list[Segment]:
 
 
 def _thicknesses(sheets: Sequence[Segment], distances: Sequence[float]) -> dict[str, float]:
-    """Thickness of the walls of each type without a given one [m]: the median distance of faces, weighted by length."""
+    """Thickness by type of walls without a given thickness [m]: the median distance of faces, weighted by length."""
     thickness = {}
     for kind in sorted({sheet.kind for sheet in sheets if sheet.thickness is None} - OPENINGS):
         walls = sorted(

@@ -1,4 +1,4 @@
-"""Checks of positions against a scene (roofs, ground, bounds, walls), and moving positions out of buildings."""
+"""Checks of positions against a scene (roofs, ground, bounds, walls), and relocation of positions inside buildings."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ KERB: Final = 2.0
 """Height above the lowest point of a scene up to which objects, such as kerbs, do not count as buildings [m]."""
 
 CLEARANCE: Final = 0.05
-"""A surface counts as above an antenna if it is higher by more than this [m]."""
+"""A surface counts as above an antenna if it is higher by more than this distance [m]."""
 
 CONTACT: Final = 0.01
-"""An antenna closer than this to a level surface counts as touching it [m]. At a distance of 1 mm, Sionna RT misses
-reflections from the surface on all links; at 3 mm, on most links; at 10 mm, on none."""
+"""An antenna closer than this distance to a level surface counts as touching the surface [m]. At a distance of 1 mm,
+Sionna RT misses reflections from the surface on all links; at 3 mm, on most links; at 10 mm, on none."""
 
 BEYOND: Final = "outside the scene"
 UNDER: Final = "under the ground"
@@ -52,7 +52,7 @@ def _is_wall(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class SceneSurfaces:
-    """The faces of a scene; walls are separate from ground, floors and roofs.
+    """The faces of a scene, with walls separate from ground, floors and roofs.
 
     Attributes:
         level: Corners of the faces that are not walls [F, 3, 3], [m].
@@ -195,7 +195,7 @@ def count_crossings(corners: NDArray[np.float64], start: ArrayLike, end: ArrayLi
 def building_outlines(source: str | Path) -> Any:
     """The area that buildings and other bodies of a scene cover in plan, as a shapely geometry [m]; may be empty.
 
-    Faces less than `KERB` above the scene's lowest point are ignored: kerbs, floors, the ground.
+    Faces less than `KERB` above the scene's lowest point, such as kerbs, floors and the ground, are ignored.
 
     Raises:
         InputError: The scene cannot be read, or shapely is not installed.
@@ -219,7 +219,8 @@ def move_outside(
         points: Positions [n, 3], [m]; heights do not change.
         outlines: The area that buildings cover, from `building_outlines`.
         clearance: Distance of a moved position from the wall [m].
-        furthest: Positions that would have to move farther than this become NaN [m].
+        furthest: Largest distance by which a position is moved [m]; positions that would have to move farther become
+            NaN.
 
     Returns:
         The positions [n, 3], [m], NaN where the distance exceeds `furthest`; and the distance moved [n], [m].
@@ -256,8 +257,8 @@ def move_outside(
 def locate(triangles: Triangles, points: NDArray[np.float64]) -> NDArray[np.str_]:
     """The location of each point [n, 3], [m]: `BEYOND`, `UNDER` or `INSIDE`; empty in the open.
 
-    A point is inside a building if a vertical ray upwards crosses an odd number of surfaces, as in any closed body.
-    Surfaces that belong to `Triangles.ground` are ground.
+    A point is inside a building if an upward vertical ray crosses an odd number of surfaces, as it does inside any
+    closed body. The surfaces in `Triangles.ground` are ground.
     """
     if not len(triangles.face):
         return np.full(len(points), "")

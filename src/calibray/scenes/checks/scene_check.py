@@ -26,15 +26,16 @@ Severity = Literal["error", "warning", "note"]
 _FLAT: Final = 1e-10  # area below which a face counts as empty [m^2]
 
 CLOSE: Final = 0.01
-"""Distance below which Sionna RT confuses parallel faces [m]. At 10 m from the origin, it reflected twice from sheets
-1 mm apart and found no path through walls 0.1 to 5 mm apart; a gap of 10 mm was enough. At 900 m, it needed 100 mm."""
+"""Distance below which Sionna RT confuses parallel faces [m]. At 10 m from the origin, it reflected twice from sheets 1
+mm apart and found no path through walls 0.1 to 5 mm apart; a gap of 10 mm was enough. At 900 m, a gap of 100 mm was
+necessary."""
 
 _PARALLEL: Final = 0.999  # smallest cosine of the angle between the normals of parallel faces
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One fault in a scene, or in positions in a scene.
+    """A fault in a scene, or in positions within a scene.
 
     Attributes:
         severity: "error" if Sionna RT or Calibray refuses the scene, "warning" if results may be wrong, otherwise
@@ -61,7 +62,7 @@ class MeshFaults:
         faces: Number of triangles.
         open_edges: Edges that belong to one face only, even if vertices at the same position are merged.
         unwelded_edges: Edges at which two faces meet without sharing vertices, so that no wedge is found.
-        crowded_edges: Edges that more than two faces share, so that no wedge is found.
+        crowded_edges: Edges shared by more than two faces, so that no wedge is found.
         flipped_faces: Faces whose normals point inward, or opposite to those of their neighbours.
         empty_faces: Faces with zero area.
         repeated_faces: Faces with the same corners as another face.
@@ -145,7 +146,7 @@ def _mesh_findings(item: MeshFaults) -> list[Finding]:
         (
             item.crowded_edges,
             "note",
-            "edges that more than two faces share: no diffraction there",
+            "edges shared by more than two faces: no diffraction there",
             "remove inner walls, or separate bodies that touch",
         ),
         (
@@ -194,7 +195,7 @@ def _material_findings(root: ElementTree.Element, objects: Sequence[MeshFaults])
             )
     for item in objects:
         if item.material not in defined:
-            problem = f"refers to no material of the scene ({item.material!r})"
+            problem = f"refers to a material that the scene does not contain ({item.material!r})"
             yield Finding("error", item.name, problem, "give it a material")
         if item.name in defined:
             problem = "has the name of a material, which Sionna RT refuses"
@@ -202,13 +203,13 @@ def _material_findings(root: ElementTree.Element, objects: Sequence[MeshFaults])
 
 
 def scale_findings(low: NDArray[np.float64], high: NDArray[np.float64]) -> Iterator[Finding]:
-    """Faults in unit and origin, found from the lower and upper corners [3] of the scene's bounds."""
+    """Faults in units and heights, derived from the lower and upper corners [3] of the scene's bounds."""
     extent = high - low
     width = float(extent[:2].max())
     size = f"{extent[0]:.4g} x {extent[1]:.4g} x {extent[2]:.4g}"
     if width < 1 and np.abs([*low[:2], *high[:2]]).max() <= 180:
         problem = f"the scene measures {size}, as if in degrees of longitude and latitude"
-        yield Finding("error", "", problem, "project it to metres (calibray scene does)")
+        yield Finding("error", "", problem, "project it to metres, as calibray scene does")
         return
     if width > WIDEST:
         problem = f"the scene measures {size} m, as if in millimetres"
@@ -250,7 +251,8 @@ def find_covers(corners: NDArray[np.float64]) -> NDArray[np.int64]:
     """For each face, the index of a parallel face that is closer than `CLOSE` to its centroid [F]; -1 if none.
 
     Faces are [F, 3, 3], [m]. Faces that rays cannot reach from outside get -1: walls between touching buildings, and
-    floors of buildings on the ground. A straight line from a point in the open crosses an even number of faces.
+    floors of buildings on the ground. They are recognized by the rule that a straight line from a point in the open
+    crosses an even number of faces.
     """
     cover = np.full(len(corners), -1)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -366,7 +368,9 @@ def _open_above(
 
 
 def _orient(faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Sign of each face, +1 or -1, so that neighbours have the same orientation [F], and its connected piece [F]."""
+    """Sign of each face, +1 or -1, so that neighbours have the same orientation [F]; and connected piece of each face
+    [F].
+    """
     count = len(faces)
     sides, edge, uses = _edges(faces)
     order = np.argsort(edge, kind="stable")
