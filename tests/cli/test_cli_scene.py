@@ -77,7 +77,7 @@ def test_the_remedy_for_types_without_a_material_works_as_printed(tmp_path):
     plan.write_text(text, encoding="utf-8")
     status, _, err = scene_command("plan", plan, "-o", tmp_path / "flat")
     assert status == 2
-    words = shlex.split(re.search(r"as in (.*); or correct it", err)[1])
+    words = shlex.split(re.search(r"as in (.*); or correct the type", err)[1])
     status, out, _ = scene_command(
         "plan", plan, "-o", tmp_path / "flat", *words, "--material", "concrete=brick"
     )

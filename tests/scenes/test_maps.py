@@ -461,7 +461,7 @@ LOCAL = 'ENGCRS["site",EDATUM["site"],CS[Cartesian,2],AXIS["x",east],AXIS["y",no
     ("change", "message"),
     [
         ({"unit": "cubits"}, "the unit 'cubits' of its heights is not known"),
-        ({"unit": "m", "crs": "EPSG:32632+8228"}, "in another unit"),
+        ({"unit": "m", "crs": "EPSG:32632+8228"}, "states another unit"),
         ({"crs": LOCAL}, "has no position on the globe"),
         ({"crs": "EPSG:5773"}, "has no position on the globe|no coordinate reference system"),
         ({"transform": Affine(0, 0, 5, 0, 0, 6)}, "is not a grid|cannot be read|no reference|does not cover"),

@@ -472,7 +472,7 @@ def test_many_and_long_faults_make_a_short_message():
         Study.from_content(content)
     lines = str(caught.value).splitlines()
     assert len(lines) == 21
-    assert lines[-1] == "study.toml: and 480 more errors of this kind; correct these first"
+    assert lines[-1] == "study.toml: and 480 more errors; correct those above first"
     assert max(map(len, lines)) < 250
 
 

@@ -97,9 +97,7 @@ class Region:
     def _over_ground(
         self, spans: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """The parts of spans (line, lower, upper, prism) at heights above ground inside their prisms, found in
-        steps.
-        """
+        """The parts of spans (line, lower, upper, prism) at heights above ground inside the prism, found in steps."""
         if self.ground is None:
             return spans
         step = (end - start)[spans[:, 0].astype(np.int64)]

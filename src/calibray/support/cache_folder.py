@@ -1,7 +1,7 @@
-"""Calibray's cache folder: data that is kept between runs and can be computed again.
+"""Calibray's cache folder: data that are kept between runs and can be recomputed.
 
-The folder is given by the environment variable `CALIBRAY_CACHE`, otherwise it is `calibray` in the user's cache folder.
-An empty `CALIBRAY_CACHE` disables caching.
+The environment variable `CALIBRAY_CACHE` sets the folder; by default, it is `calibray` in the user's cache folder. An
+empty `CALIBRAY_CACHE` disables caching.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class Store:
     Attributes:
         path: The folder, which need not exist.
         suffix: The file extension of the entries.
-        limit: Limit on the total size [bytes]. Above it, the least recently read entries are removed, on about one
-            write in `_PRUNED_AT`.
+        limit: Limit on the total size [bytes]. Above this limit, the least recently read entries are removed, during
+            about one in `_PRUNED_AT` writes.
     """
 
     path: Path
@@ -57,7 +57,7 @@ class Store:
 
     @property
     def trusted(self) -> bool:
-        """Whether the folder, created if needed, belongs to the user and no other user can write to it."""
+        """Whether the folder, which is created if needed, belongs to the user and is not writable by others."""
         with suppress(OSError), self._folder():
             return True
         return False
@@ -98,14 +98,14 @@ class Store:
     def _folder(self) -> Iterator[int | None]:
         """Open the folder, creating it if needed, and check who can write to it.
 
-        The check applies to the opened folder. If others can write to a parent folder, they may replace the folder at
+        The check applies to the opened folder. If others can write to a parent folder, they can replace the folder at
         this path afterwards.
 
         Yields:
-            The folder's descriptor; None on Windows, which keeps other users out of a user's folders.
+            The folder's descriptor; None on Windows, where other users have no access to a user's folders.
 
         Raises:
-            OSError: The folder cannot be opened, is a link, belongs to another user, or others can write to it.
+            OSError: The folder cannot be opened, is a link, belongs to another user, or is writable by others.
         """
         self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
         if os.open not in os.supports_dir_fd:

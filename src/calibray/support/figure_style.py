@@ -30,10 +30,10 @@ BLUE: Final = "#0072b2"
 ORANGE: Final = "#d55e00"
 GREEN: Final = "#009e73"
 PALETTE: Final = ("#cc79a7", "#e69f00", "#56b4e9", "#8c5a3c", "#882255", "#6f7f2e", "#5c6bc0", "#777777")
-"""Additional line colours, after the named colours."""
+"""Additional line colours, used after the named colours."""
 
 COLORS: Final = {"gwo": GREEN, "sgwo-im": BLUE, "space-mapping": FAINT, "auto": ORANGE}
-"""Colour of each optimizer: the paper's methods, and Calibray's own."""
+"""Colour of each optimizer: the methods of the paper, and Calibray's own methods."""
 
 _VARIABLES: Final = {INK: "--ink", FAINT: "--faint", LINE: "--line", PAPER: "--paper", BLUE: "--accent"}
 _SETTINGS: Final[dict[Any, Any]] = {
@@ -110,9 +110,9 @@ def write(figure: Figure, path: Path) -> Path:
 
 
 def inline(figure: Figure, name: str) -> str:
-    """Make an SVG element from a figure; it takes its colours and font from the surrounding page.
+    """Make an SVG element from a figure; the element takes its colours and font from the surrounding page.
 
-    Its ids begin with `name`, and it has no external references.
+    All ids in the element begin with `name`, and it has no external references.
     """
     written = StringIO()
     figure.patch.set_visible(False)

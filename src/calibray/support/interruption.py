@@ -1,4 +1,4 @@
-"""Handling of Ctrl-C in compiled code, where a library may convert it to another error or drop it."""
+"""Handling of Ctrl-C in compiled code, where a library can convert it to another error or drop it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ INTERRUPTED: Final = 128 + signal.SIGINT
 """Exit status after Ctrl-C: 128 plus the number of the signal, as in shells."""
 
 GRACE: Final = 1.0
-"""Time for an interruption to reach the code that saves results, before it is raised again [s]."""
+"""Time for an interruption to reach the code that saves results, before the interruption is raised again [s]."""
 
 
 @contextmanager
@@ -26,7 +26,7 @@ def unwrap_interruption() -> Iterator[None]:
 
     Raises:
         KeyboardInterrupt: Ctrl-C caused the library's error.
-        RuntimeError: The block raised it for another reason.
+        RuntimeError: The block raised this error for another reason.
         SystemError: As for RuntimeError.
         ImportError: As for RuntimeError.
     """
@@ -46,15 +46,16 @@ def unwrap_interruption() -> Iterator[None]:
 def ensure_interruption() -> Iterator[None]:
     """Ensure that Ctrl-C ends the block, even if a library handles or drops the interruption.
 
-    Compiled code may drop an interruption that occurs in its callbacks, or raise another error. Within this context,
-    `raise_pending_interruption` raises a dropped interruption again, and any error after Ctrl-C is treated as one.
+    Compiled code can drop an interruption that occurs in its callbacks, or raise another error. Within this context,
+    `raise_pending_interruption` raises a dropped interruption again, and any error after Ctrl-C is treated as an
+    interruption.
 
     Yields:
         Nothing. Outside the main thread, or if another handler for Ctrl-C is set, the block runs unchanged.
 
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed; its cause is the error that followed, if any.
-        Exception: The block raised it, and Ctrl-C was not pressed.
+        Exception: The block raised this exception, and Ctrl-C was not pressed.
     """
     handled = (
         threading.current_thread() is threading.main_thread()

@@ -1,4 +1,4 @@
-"""Imports on first use: the names in a package, so that importing the package is fast, and optional libraries."""
+"""Imports on first use, of the names in a package (so that its import is fast) and of optional libraries."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def lazy_attributes(
 ) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
     """Make `__all__`, `__getattr__` and `__dir__` for a package (PEP 562) from the names that its modules define.
 
-    `modules` maps each module to its names, separated by spaces; an empty text stands for the module itself.
+    `modules` maps each module to its names, separated by spaces; an empty text means the module itself.
     """
     homes = {name: module for module, words in modules.items() for name in words.split() or [module]}
 

@@ -1,4 +1,4 @@
-"""Limits on the resources that the process may use: memory, and BLAS threads."""
+"""Limits on the resources that the process may use: memory and BLAS threads."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LEAST_ADDRESS_SPACE: Final = 2_900_000_000
 """Smallest limit on the address space [bytes]; below it, libraries fail to load or terminate the process."""
 
 CONTROL_GROUP = Path("/sys/fs/cgroup")
-"""Control group (version 2) of a container, which states its memory limit."""
+"""Control group (version 2) of a container, which contains the memory limit."""
 
 
 def check_address_space() -> None:
@@ -63,7 +63,7 @@ def available_memory() -> int:
 
 
 def single_blas_thread(wanted: bool = True) -> AbstractContextManager[object]:
-    """Make a context in which linear algebra uses a single thread; it has no effect if `wanted` is False."""
+    """Make a context in which linear algebra uses a single thread; the context has no effect if `wanted` is False."""
     return _libraries().limit(limits=1, user_api="blas") if wanted else nullcontext()
 
 
@@ -81,7 +81,7 @@ SECONDS: Final = 20.0
 """Time limit for reading a small file [s]; on a busy machine, most of the time is spent on starting the process."""
 
 REFUSED: Final = 3
-"""Exit status of code that refuses its input file; it prints the reason to stdout."""
+"""Exit status of code that refuses its input file; the code prints the reason to stdout."""
 
 _LIMITS: Final = """
 import sys

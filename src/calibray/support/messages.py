@@ -11,7 +11,7 @@ from typing import Final
 MAX_LENGTH: Final = 80
 """Number of characters above which a value is shortened in a message."""
 MAX_LISTED: Final = 20
-"""Number of names, or of errors, above which a message does not list them all."""
+"""Largest number of names or errors that a message lists."""
 MAX_COMPARED: Final = 2_000
 """Largest number of valid names with which an unknown name is compared."""
 
@@ -49,7 +49,7 @@ def shortened(text: str, longest: int = MAX_LENGTH) -> str:
 
 
 def printable(text: str, keep: str = "") -> str:
-    r"""Escape the characters of a text that a terminal or an editor would interpret, because names come from files.
+    r"""Escape the characters of a text that a terminal or an editor would interpret; texts can quote names from files.
 
     Characters in `keep`, for instance line breaks, are kept; others become Python escape sequences.
 
@@ -99,7 +99,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def command(*words: object) -> str:
-    """Format a command for a terminal, with quotes where a shell needs them.
+    """Format a command for a terminal, with quotes where a shell requires them.
 
     Example:
         >>> command("report", "my result")

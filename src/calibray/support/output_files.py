@@ -1,7 +1,8 @@
 """Output files, which are checked before any computation starts and are always written completely.
 
-An output never replaces an input, a link or a device, nor, by default, a file that Calibray did not write or that has
-changed since. Calibray signs its files: `.calibray` in the same folder lists the digest and the name of each.
+An output never replaces an input, a link or a device. By default, it also never replaces a file that Calibray did not
+write, or that has changed since Calibray wrote it. Calibray signs its files: `.calibray` in the same folder lists the
+digest and the name of each file.
 
 `replacing` writes each file under a random name in the same folder, creates it without following links, and then moves
 it into place in one step.
@@ -50,7 +51,7 @@ def as_path(name: object, role: str) -> Path:
 
 
 def exists(file: str | Path) -> bool:
-    """Whether a file exists; links are followed. Folders, devices and invalid names give False."""
+    """Whether a file exists; links are followed. The result is False for folders, devices and invalid names."""
     try:
         return Path(file).is_file()
     except (OSError, ValueError):
@@ -84,7 +85,8 @@ def check_outputs(
     did not write are replaced.
 
     Raises:
-        InputError: As for `check_folder` and `check_replaceable`; or `.calibray` in the folder is not Calibray's.
+        InputError: As for `check_folder` and `check_replaceable`; or Calibray did not write the file `.calibray` in the
+            folder.
     """
     target, sources = check_folder(folder), list(inputs)
     _check_signature_file(target)
@@ -94,7 +96,7 @@ def check_outputs(
 
 
 def check_file(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = False) -> Path:
-    """Refuse a file that cannot be written; it need not exist, but its folder must. See also `check_outputs`.
+    """Refuse a file that cannot be written; the file need not exist, but its folder must. See also `check_outputs`.
 
     Raises:
         InputError: The file is a folder; its folder does not exist or cannot be written to; or as for `check_outputs`.
@@ -114,11 +116,11 @@ def check_file(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = 
 
 
 def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool = False) -> None:
-    """Refuse to replace a file that must be kept; a file that does not exist passes.
+    """Refuse to replace a file that must be kept; a file that does not exist is accepted.
 
     Raises:
-        InputError: The file is an input, a link, a device or a folder; or, unless `overwrite`, Calibray did not write
-            it, or it has changed since.
+        InputError: The file is an input, a link, a device or a folder; or, without `overwrite`, Calibray did not write
+            the file, or the file has changed since.
     """
     status = _status(file, "output file")
     if status is None:
@@ -152,7 +154,7 @@ def check_unchanged(file: Path) -> None:
 
 
 def is_unchanged_output(file: Path) -> bool:
-    """Whether a file is unchanged since Calibray signed it; path files have a seal of their own."""
+    """Whether a file is unchanged since Calibray signed it; path files, which have their own seal, always pass."""
     if _signature(file, file.name) in _signatures(file.parent):
         return True
     with file.open("rb") as stream:
@@ -160,7 +162,7 @@ def is_unchanged_output(file: Path) -> bool:
 
 
 def _valid_name(path: str | Path, role: str) -> Path:
-    """Convert the name of an output to a path; refuse a name that no file can have."""
+    """Convert the name of an output to a path, and refuse an invalid name."""
     target = as_path(path, role)
     _status(target, role)
     return target
@@ -180,7 +182,7 @@ def _status(path: Path, role: str) -> os.stat_result | None:
 
 
 def _signatures(folder: Path) -> list[str]:
-    """The lines of a folder's signature file; empty if there is no such file or it is not Calibray's."""
+    """The lines of a folder's signature file; empty if there is no such file or Calibray did not write it."""
     try:
         with _open_signatures(folder, os.O_RDONLY) as stream:
             return stream.read().decode("utf-8", errors="replace").splitlines()
@@ -189,7 +191,7 @@ def _signatures(folder: Path) -> list[str]:
 
 
 def _check_signature_file(folder: Path) -> None:
-    """Refuse a folder whose signature file is not Calibray's, because files there could not be signed."""
+    """Refuse a folder with a signature file that Calibray did not write, because files there could not be signed."""
     # If it cannot be read, writing fails later with the same message as for any other file.
     with suppress(OSError), _open_signatures(folder, os.O_RDONLY):
         pass
@@ -254,13 +256,13 @@ def file_digest(file: Path) -> str:
 
 @contextmanager
 def replacing(path: Path, signed: bool = True) -> Iterator[Path]:
-    """Write a file under a temporary name; sign it and move it into place once it is complete.
+    """Write a file under a temporary name, and sign it and move it into place once it is complete.
 
     Files with their own seal need not be signed. Yields the temporary file, which is empty and in the same folder; it
     is removed if writing fails.
 
     Raises:
-        InputError: The file is a link, a device or a folder, `.calibray` is not Calibray's, or another program
+        InputError: The file is a link, a device or a folder, Calibray did not write `.calibray`, or another program
             replaced the temporary file.
     """
     check_replaceable(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 Progress = Callable[[str, int, int | None], None]
-"""Called with the stage ("tracing", "calibrating", ...), the amount done, and the total amount or None if unknown.
+"""A function of the stage ("tracing", "calibrating", ...), the amount done, and the total amount (None if unknown).
 
 An interim result follows the name of the stage after a colon: "calibrating: best RMSE 3.10 dB".
 """

@@ -13,7 +13,7 @@ from calibray.errors import InputError
 from calibray.support.messages import MAX_LISTED, did_you_mean, shortened
 
 CLOSED: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-"""No unknown keys, no type conversions, only finite numbers."""
+"""Unknown keys, type conversions, and numbers that are not finite are refused."""
 
 Text = Annotated[str, Field(min_length=1)]
 
@@ -59,7 +59,7 @@ def explain(
 ) -> InputError:
     """Combine all errors in one message, with one line per error: file, dotted key, value, bound.
 
-    The message suggests valid keys for misspelled ones. `tagged` lists the tables that exist in several kinds, which
+    The message suggests valid keys for misspelled keys. `tagged` lists the tables that exist in several kinds, which
     are distinguished by the key `name`.
     """
     lines: dict[str, str] = {}
@@ -85,12 +85,12 @@ def explain(
             lines[key] += f", or {text}"
     listed = list(lines.values())[:MAX_LISTED]
     if len(lines) > len(listed):
-        listed.append(f"and {len(lines) - len(listed)} more errors of this kind; correct these first")
+        listed.append(f"and {len(lines) - len(listed)} more errors; correct those above first")
     return InputError("\n".join(f"{source}: {line}" for line in listed))
 
 
 def describe_fault(fault: Mapping[str, Any]) -> str:
-    """The message, without the value, for an error reported by Pydantic."""
+    """The message for an error reported by Pydantic, without the value."""
     context = fault.get("ctx") or {}
     if isinstance(cause := context.get("error"), InputError):
         return str(cause)
@@ -143,7 +143,7 @@ def _keys(model: Any, path: Sequence[str | int]) -> list[str]:
 
 
 def _annotation(model: Any, key: str) -> Any:
-    """The type of a key in a model, or of the values in a mapping; None if it is neither."""
+    """The type of a key in a model, or of the values in a mapping; None if `model` is neither."""
     if annotations := _annotations(model):
         return annotations.get(key)
     arguments = get_args(model)
@@ -157,6 +157,6 @@ def _annotations(model: Any) -> dict[str, Any]:
 
 
 def _tables(annotation: Any) -> list[Any]:
-    """The types that the value of a key may have, except None."""
+    """The types that the value of a key can have, except None."""
     options = get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
     return [option for option in options if option is not type(None)]

@@ -1,4 +1,4 @@
-"""Tracing: finds the paths of links, by default with Sionna RT, which is imported only when a scene is opened.
+"""Tracing: finding the paths of links, by default with Sionna RT, which is imported only when a scene is opened.
 
 `protocol` defines the interface of a ray tracer; only the subpackage `tracing.sionna` imports Sionna RT.
 """
@@ -30,7 +30,7 @@ class SionnaFactory:
         tx_antenna: Antenna,
         rx_antenna: Antenna,
     ) -> Tracer:
-        """Open a scene; see `TracerFactory`. It fails on a machine without a usable GPU or LLVM library."""
+        """Open a scene; see `TracerFactory`. The call fails on a machine without a usable GPU or LLVM library."""
         from calibray.tracing.sionna import Tracer as SionnaTracer
 
         return SionnaTracer(scene, frequency, settings, tx_antenna, rx_antenna)

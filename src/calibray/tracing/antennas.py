@@ -5,7 +5,8 @@ slant angle in every direction of the antenna's frame (3GPP TR 38.901, eq. 7.3-4
 the gain.
 
 The geometry of paths does not depend on the antennas. Paths traced with isotropic vertical antennas store the frames of
-their first and last interactions. Their fields with any pattern and orientation therefore need no new trace.
+their first and last interactions. Therefore, the fields of these paths with any pattern and orientation need no new
+trace.
 """
 
 from __future__ import annotations
@@ -75,8 +76,8 @@ class AntennaPattern:
     ) -> Any:
         """Amplitude of the field in a direction, with electrical downtilt and horizontal steering [rad].
 
-        Both steer the beam of an array by the phases of its elements. For a single antenna, the downtilt shifts the
-        pattern downwards. An array's amplitude has its phase reference at the array's centre and can be negative.
+        For an array, both steer the beam through the phases of the elements. For a single antenna, the downtilt shifts
+        the pattern downwards. An array's amplitude has its phase reference at the array's centre and can be negative.
         """
         if not self.antenna.is_array:
             # Zenith angles increase downwards, so the shifted pattern is the given one at `zenith - downtilt`.
@@ -88,7 +89,7 @@ class AntennaPattern:
     def jones_vectors(self, direction: NDArray[np.float64], arriving: bool = False) -> NDArray[np.complex128]:
         """Jones vectors [P, ports, 2] in the wave's basis (theta, phi), for directions seen from the antenna [P, 3].
 
-        The waves depart in this direction or, if `arriving`, come from it.
+        The waves depart in these directions or, if `arriving`, come from them.
         """
         to_world = rotation_matrix(self.antenna.orientation)
         local = direction @ to_world
@@ -131,10 +132,11 @@ def tr38901(zenith: Any, azimuth: Any, xp: Any = np) -> Any:
 def array_factor(
     antenna: Antenna, zenith: Any, azimuth: Any, downtilt: Any = 0.0, steering: Any = 0.0, xp: Any = np
 ) -> Any:
-    """Field of a planar array of isotropic elements of equal amplitude, with the total power of one antenna.
+    """Field of a planar array of isotropic elements with equal amplitudes, and with the total power of one antenna.
 
-    Its main direction is `downtilt` below the horizon and `steering` from the x axis towards the y axis [rad]. `xp` has
-    cosine and sine. Mutual coupling of the elements is neglected, as in Sionna RT and 3GPP TR 38.901, section 7.3.
+    Its main direction is `downtilt` below the horizon and `steering` from the x axis towards the y axis [rad]. `xp`
+    provides the cosine and the sine. Mutual coupling of the elements is neglected, as in Sionna RT and 3GPP TR 38.901,
+    section 7.3.
     """
     horizontal, vertical = (2 * np.pi * distance for distance in antenna.spacing)
     # Phase between neighbours: 2 pi d / lambda times the direction cosine along y or z relative to the main direction.
@@ -179,7 +181,7 @@ def rotation_matrix(orientation: tuple[float, float, float]) -> NDArray[np.float
 
 
 def rotate_jones(field: NDArray, rotation: NDArray[np.float64]) -> NDArray:
-    """Express Jones vectors [P, ports, 2] in a frame rotated by the angles with (cos, sin) `rotation` [P, 2]."""
+    """Express Jones vectors [P, ports, 2] in a rotated frame; `rotation` is the (cos, sin) of each angle [P, 2]."""
     cos, sin = rotation[:, None, 0], rotation[:, None, 1]
     return np.stack(
         [cos * field[..., 0] + sin * field[..., 1], cos * field[..., 1] - sin * field[..., 0]], axis=-1
@@ -187,7 +189,7 @@ def rotate_jones(field: NDArray, rotation: NDArray[np.float64]) -> NDArray:
 
 
 POSE: Final = "tx:"
-"""Prefix of the names of transmit antennas' parameters."""
+"""Prefix of the parameter names of transmit antennas."""
 FIELDS: Final = ("azimuth", "downtilt", "gain")
 EVERY: Final = "*"
 """Name of the transmitter that represents all transmitters."""
@@ -198,7 +200,7 @@ NEW: Final = "new transmitters"
 
 
 def concerned(names: NDArray[np.str_], label: str, own: Collection[str]) -> NDArray[np.bool_]:
-    """Mask of the transmitters that a parameter of transmitter `label` affects; `own` have their own parameter."""
+    """Mask of the transmitters that a parameter of transmitter `label` affects; those in `own` have own parameters."""
     if label == EVERY:
         return np.ones(len(names), dtype=bool)
     return ~np.isin(names, list(own)) if label == NEW else names == label
@@ -216,7 +218,7 @@ class Pose(NamedTuple):
         yaw: Rotation about z [rad], from the scene's x axis towards its y axis.
         downtilt: Mechanical downtilt [rad]: the antenna is tilted forward after its rotation by `yaw`.
         electrical_downtilt: Downward shift of the pattern in the antenna's own frame [rad].
-        steering: Azimuth to which phases steer the beam of an array in the antenna's own frame, from its x axis
+        steering: Azimuth to which the phases of an array steer its beam, in the antenna's own frame and from its x axis
             towards its y axis [rad].
     """
 
@@ -258,7 +260,7 @@ class Mounting:
 
 
 def mount(paths: Paths, mountings: Mapping[str, Mounting]) -> Paths:
-    """Replace isotropic vertical antennas by the antennas mounted at "tx" or "rx" in the fields of paths.
+    """In the fields of paths, replace isotropic vertical antennas by the antennas mounted at "tx" or "rx".
 
     The fields at ends without a mounting are unchanged.
     """
@@ -275,8 +277,8 @@ def mount(paths: Paths, mountings: Mapping[str, Mounting]) -> Paths:
 def theta_axis(paths: Paths, mounting: Mounting) -> NDArray[np.float64]:
     """Theta vector of departing paths in the frame of their first interaction [P, 2], from mounted transmit antennas.
 
-    A path that departs in a perfect null of its antenna has no defined theta vector. The result is then 0, so the path
-    has no power with any antenna.
+    A path that departs in a perfect null of its antenna has no defined theta vector. In this case, the result is 0, so
+    the path has no power with any antenna.
     """
     theta, phi = stated_jones(mounting.of_paths(paths.link), paths.departure)[:, 0].T
     field = paths.tx_field[:, 0].real
@@ -287,7 +289,7 @@ def theta_axis(paths: Paths, mounting: Mounting) -> NDArray[np.float64]:
 
 
 def stated_jones(mounting: Mounting, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Jones vectors [P, ports, 2] of mounted antennas, each in one direction, by zenith and azimuth [P, 2], [rad]."""
+    """Jones vectors [P, ports, 2] of mounted antennas, each in one direction given as zenith and azimuth [P, 2], [rad]."""
     jones = np.zeros((len(angles), mounting.antennas[0].ports, 2))
     for number, antenna in enumerate(mounting.antennas):
         chosen = mounting.index == number
@@ -299,7 +301,7 @@ def stated_jones(mounting: Mounting, angles: NDArray[np.float64]) -> NDArray[np.
 def wave_basis(angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Unit vectors of waves in the scene frame [3, 3, P]: direction, theta, phi (3GPP TR 38.901, eq. 7.1-12, 7.1-13).
 
-    Angles are zenith and azimuth of the direction [P, 2], [rad].
+    `angles` are the zenith and azimuth of the direction [P, 2], [rad].
     """
     (sin_z, sin_a), (cos_z, cos_a) = np.sin(angles.T), np.cos(angles.T)
     zero = np.zeros_like(sin_z)
@@ -323,9 +325,9 @@ def antenna_response(
 ) -> tuple[Any, Any, Any]:
     """Response of a mounted antenna: amplitude, and components (cos, sin) of its theta vector in the waves' basis.
 
-    Each result is [P]; the basis is that of `wave_basis`. There is one pose for each path or, with `index` [P], poses
-    that paths share. `xp` is the array library: NumPy, or `jax.numpy` within a JAX function that is differentiated with
-    respect to the pose. `stored` keeps intermediate values from being computed again at each use.
+    Each result is [P]; the basis is that of `wave_basis`. There is one pose for each path; if `index` [P] is given,
+    paths share poses. `xp` is the array library: NumPy, or `jax.numpy` within a JAX function that is differentiated
+    with respect to the pose. `stored` prevents intermediate values from being computed again at each use.
     """
     cos_yaw, sin_yaw = xp.cos(pose.yaw), xp.sin(pose.yaw)
     cos_tilt, sin_tilt = xp.cos(pose.downtilt), xp.sin(pose.downtilt)

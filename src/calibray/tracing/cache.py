@@ -74,7 +74,7 @@ def files_digest(scene: Scene, antennas: tuple[Antenna, Antenna]) -> str:
 
 
 def load_trace(digest: str) -> Paths | None:
-    """Load the trace with a given fingerprint; None if there is none, or if another user may have written it.
+    """Load the trace with a given fingerprint; None if there is no such trace, or if another user may have written it.
 
     A file that cannot be read is removed.
     """
@@ -104,7 +104,7 @@ def load_trace(digest: str) -> Paths | None:
 
 
 def _is_trusted(status: os.stat_result) -> bool:
-    """Whether a file belongs to the user or root and nobody else can write to it, since results depend on its paths."""
+    """Whether a file belongs to the user or root and is not writable by others, because results depend on its paths."""
     if not stat.S_ISREG(status.st_mode):
         return False
     if not hasattr(os, "geteuid"):  # Windows keeps other users out of a user's folders
@@ -113,7 +113,7 @@ def _is_trusted(status: os.stat_result) -> bool:
 
 
 def store_trace(digest: str, paths: Paths) -> None:
-    """Store a trace under its fingerprint; nothing happens if the cache folder cannot be written."""
+    """Store a trace under its fingerprint; nothing happens if the cache folder cannot be written to."""
     path = _path(digest)
     if path is not None:
         with suppress(OSError, InputError):

@@ -1,7 +1,7 @@
 """Checks whether a trace launched enough rays, by tracing again with twice as many rays and a different seed.
 
 Rays find paths by chance. With more rays, fewer paths are missed, and diffuse reflection, an average over rays, has
-less sampling noise. The change from a trace to one with more rays estimates the error of the first trace.
+less sampling noise. The change from a trace to a trace with more rays is an estimate of the error of the first trace.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from calibray.paths import Paths
 from calibray.tracing.settings import RANGES, TraceSettings
 
 PathLoss = Callable[[Paths], NDArray[np.float64]]
-"""A function such as `calibray.path_loss`, which gives the path loss of every link of a path program [L], [dB]."""
+"""A function such as `calibray.path_loss`, which returns the path loss of every link of a path program [L], [dB]."""
 
 
 @dataclass(frozen=True)
 class Convergence:
-    """The changes from a trace to one with more rays.
+    """The changes from a trace to a trace with more rays.
 
     Attributes:
         samples: Number of rays per transmitter in the trace that was checked.
@@ -53,9 +53,9 @@ class Convergence:
         return np.argsort(-np.abs(self.change_db), kind="stable")
 
     def quantile(self, share: float) -> float:
-        """Quantile of the magnitude of the change over the links [dB]; `share` 0.5 is the median.
+        """Quantile of the magnitude of the change over the links [dB]; a `share` of 0.5 gives the median.
 
-        It is +inf if too many links have a path in only one trace.
+        The quantile is +inf if too many links have a path in only one trace.
         """
         return float(np.quantile(np.abs(self.change_db), share, method="higher"))
 
@@ -94,9 +94,9 @@ def check(
 
     Args:
         settings: Settings with which `before` was traced.
-        trace: Traces the same links with other settings.
+        trace: Function that traces the same links with other settings.
         before: The paths to check.
-        path_loss: Path loss of every link [L], [dB].
+        path_loss: Function that returns the path loss of every link [L], [dB].
 
     Raises:
         InputError: `before` contains other links, or its rays were added in rounds; the last round is then the check.

@@ -2,7 +2,7 @@
 
 Between grid points, the gain is interpolated bilinearly in decibels, also across the end of the azimuth axis. In
 decibels, main lobes are nearly parabolas (as in 3GPP TR 38.901, Table 7.3-1), so the error is smallest where the
-antenna radiates most. Nulls that are narrower than the grid become shallower.
+antenna radiates most. Nulls that are narrower than the grid spacing become shallower.
 
 Planning tools export a horizontal and a vertical cut in MSI Planet's text format (`TwoCuts`). Attenuations are relative
 to the gain in the header. Horizontal angles are measured clockwise from the main direction, as seen from above.
@@ -28,7 +28,7 @@ TWO_CUT_SUFFIXES: Final = (".msi", ".pln", ".ant")
 DIPOLE_GAIN_DBI: Final = 2.15
 """Gain of a half-wave dipole, the reference of dBd [dBi]."""
 CUT_RANGES: Final = {"GAIN": (-30.0, 60.0), "angle": (-180.0, 360.0), "attenuation": (-0.5, 100.0)}
-"""Ranges of gain [dBi], angles [deg] and attenuations [dB]; rounded attenuations may be slightly negative."""
+"""Ranges of gain [dBi], angles [deg] and attenuations [dB]; rounded attenuations can be slightly negative."""
 LARGEST_STEP_DEG: Final = 15.0
 _NUMBER: Final = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?")
 
@@ -48,7 +48,7 @@ class TwoCuts:
     vertical_db: NDArray[np.float64]
 
     def gain(self, azimuth_deg: ArrayLike, elevation_deg: ArrayLike) -> NDArray[np.float64]:
-        """Gain in any direction of the antenna's frame [...], [dBi]; azimuths counter-clockwise from the x axis.
+        """Gain in any direction of the antenna's frame [...], [dBi]; azimuths are counter-clockwise from the x axis.
 
         Between the cuts, the gain is interpolated by horizontal projection, which preserves both cuts exactly (Gil et
         al., "A 3D interpolation method for base-station-antenna radiation patterns", IEEE Antennas and Propagation
@@ -70,11 +70,11 @@ def read_two_cuts(path: str | Path) -> TwoCuts:
     """Read an MSI file (also .pln, .ant): header lines, then the cuts HORIZONTAL and VERTICAL.
 
     Each cut states its number of lines. Each line has an angle [deg] and an attenuation [dB]; the lines, in any order,
-    cover a full turn in steps of at most 15 degrees. Blanks, tabs or semicolons are separators; decimal commas are
+    cover a full turn in steps of at most 15 degrees. Blanks, tabs and semicolons are separators; decimal commas are
     accepted. GAIN is in dBd unless its line contains dBi, as the format defines.
 
     Raises:
-        InputError: The file cannot be read, lacks the gain or a cut, or has a malformed line, which the message names.
+        InputError: The file cannot be read, lacks the gain or a cut, or has a malformed line, which the message states.
     """
     try:
         lines = Path(path).read_text(encoding="latin-1").splitlines()
@@ -170,7 +170,7 @@ def _cut_in_range(place: str, name: str, value: float) -> float:
 COLUMNS: Final = ("azimuth_deg", "elevation_deg", "gain_dbi")
 RANGES: Final = {"azimuth_deg": (-180.0, 360.0), "elevation_deg": (-90.0, 90.0), "gain_dbi": (-200.0, 60.0)}
 LARGEST_EFFICIENCY: Final = 1.5
-"""Largest ratio of radiated to accepted power for which the values can be absolute gains."""
+"""Largest ratio of radiated to accepted power at which the values are accepted as absolute gains [1]."""
 SEAM_TOLERANCE_DB: Final = 0.1
 """Largest difference between the gain at the first azimuth and that of the same direction a full turn later [dB]."""
 _STEP_TOLERANCE: Final = 0.01
@@ -184,7 +184,7 @@ class GainTable:
     Attributes:
         first_azimuth_deg: Azimuth of the first column [deg], from the antenna's x axis towards its y axis.
         gain_dbi: Gain [elevations, azimuths], [dBi]. Elevations run from -90 to 90 degrees in equal steps, including
-            the ends; azimuths run in equal steps around a full turn, whose end is not repeated.
+            the ends; azimuths run in equal steps around a full turn, the end of which is not repeated.
 
     Example:
         >>> GainTable(-180.0, np.zeros((181, 360))).efficiency
@@ -236,16 +236,17 @@ class GainTable:
 
 
 def is_gain_file(pattern: str) -> bool:
-    """Whether a pattern is the name of a gain file: it ends in ".csv", ".msi", ".pln" or ".ant"."""
+    """Whether a pattern is the name of a gain file, which ends in ".csv", ".msi", ".pln" or ".ant"."""
     return pattern.lower().endswith((".csv", *TWO_CUT_SUFFIXES))
 
 
 def read_gain_table(path: str | Path) -> GainTable:
-    """Read the gain of an antenna: a CSV file of all directions, or an MSI file of two cuts (`read_two_cuts`).
+    """Read the gain of an antenna from a CSV file of all directions, or from an MSI file of two cuts (`read_two_cuts`).
 
-    The CSV file has the columns azimuth_deg, elevation_deg and gain_dbi, one row per direction, in any order. Azimuths
-    cover a full turn (-180 to 180 or 0 to 360, with or without the end), and elevations -90 to 90, both in equal steps
-    of at most 15 degrees; every pair of azimuth and elevation has a row. Principal cuts alone are not sufficient.
+    The CSV file has the columns azimuth_deg, elevation_deg and gain_dbi, with one row per direction in any order.
+    Azimuths cover a full turn (-180 to 180 or 0 to 360, with or without the end), and elevations -90 to 90, both in
+    equal steps of at most 15 degrees; every pair of azimuth and elevation has a row. Principal cuts alone are not
+    sufficient.
 
     Raises:
         InputError: The file or a column is missing or malformed, a number is out of range, a direction is missing or

@@ -1,10 +1,11 @@
-"""Chooses the compiler library of the ray tracer: which libLLVM, or which GPU, Dr.Jit uses.
+"""Chooses the libLLVM or the GPU that Dr.Jit uses to compile the ray tracer.
 
 Without CUDA, Dr.Jit compiles its kernels with the newest libLLVM that it finds, and an incompatible version aborts the
 whole process. The choice is therefore made here, before Dr.Jit is imported. Every library is opened in a separate
 process, and `DRJIT_LIBLLVM_PATH` is set to the best library.
 
-`python -m calibray.tracing.llvm` prints what the ray tracer will use, or what to install, and then exits with 2.
+`python -m calibray.tracing.llvm` prints the library that the ray tracer will use. If there is none, it prints the
+command that installs one, and exits with status 2.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ class Llvm:
     Attributes:
         path: The file, or a bare name that the dynamic loader resolves.
         version: Major, minor and patch number, as far as known; empty if unknown.
-        problem: The reason why Dr.Jit cannot use it; None if Dr.Jit can use it.
+        problem: The reason why Dr.Jit cannot use the library; None if it can.
     """
 
     path: str
@@ -120,17 +121,17 @@ def version_in_name(path: str) -> tuple[int, ...]:
 
 
 def judge(path: str, reported: tuple[int, ...]) -> Llvm:
-    """Decide whether Dr.Jit can use a library that can be opened; `reported` is empty if it reports no version."""
+    """Decide whether Dr.Jit can use a library that opens; `reported` is the library's version, empty if unreported."""
     version = reported or version_in_name(path)
     if not reported and (not version or version[0] >= 16):
-        return Llvm(path, (), "it reports no LLVM version, as every libLLVM since 16 does")
+        return Llvm(path, (), "it reports no LLVM version, unlike every libLLVM since version 16")
     if version[0] < OLDEST_MAJOR:
         return Llvm(path, version, f"LLVM {version[0]} is too old, Dr.Jit needs {OLDEST_MAJOR} or newer")
     return Llvm(path, version, None)
 
 
 def inspect(path: str) -> Llvm:
-    """Open a library, given by path or bare name, in a separate process, because a broken library may abort it."""
+    """Open a library, given by path or bare name, in a separate process, which a broken library can abort."""
     output, problem = _probe(_VERSION_PROBE, path)
     if problem is not None:
         return Llvm(path, version_in_name(path), f"it cannot be opened ({problem})")
@@ -157,14 +158,14 @@ def installed_libraries() -> tuple[Llvm, ...]:
 
 
 def select() -> Llvm:
-    """Set Dr.Jit's libLLVM and return it; call this before Dr.Jit is imported.
+    """Set Dr.Jit's libLLVM and return it; call this function before Dr.Jit is imported.
 
     A library named by `DRJIT_LIBLLVM_PATH` is either used or refused, never ignored. If the variable is not set, the
     best installed library is chosen, and the variable is set to it for this process and its children.
 
     Raises:
-        InputError: No library is usable, `DRJIT_LIBLLVM_PATH` names one that is missing or unusable, Dr.Jit has
-            already been imported without a usable one, or libatomic is missing.
+        InputError: No library is usable, `DRJIT_LIBLLVM_PATH` names a library that is missing or unusable, Dr.Jit has
+            already been imported without a usable library, or libatomic is missing.
     """
     require_libatomic()
     requested = os.environ.get(PATH_VARIABLE)
@@ -181,7 +182,7 @@ def select() -> Llvm:
         if not libraries or not libraries[0].usable:
             problems = "; ".join(f"{other.path}: {other.problem}" for other in libraries) or "none found"
             raise InputError(
-                f"Without a CUDA GPU the ray tracer needs libLLVM {OLDEST_MAJOR} or newer ({problems}). "
+                f"Without a CUDA GPU, the ray tracer needs libLLVM {OLDEST_MAJOR} or newer ({problems}). "
                 f"To install it: {install_command()}"
             )
         library = libraries[0]
@@ -256,7 +257,7 @@ def _refuse_loaded() -> None:
 
 
 def _loader_cache() -> list[Path]:
-    """Files in the dynamic loader's cache that may be a libLLVM; empty if there is no such cache."""
+    """Files in the dynamic loader's cache that might be a libLLVM; empty if there is no such cache."""
     # On some distributions, ldconfig is not on the PATH of ordinary users.
     ldconfig = shutil.which("ldconfig", path=f"{os.environ.get('PATH', '')}:/sbin:/usr/sbin")
     if ldconfig is None:
@@ -266,7 +267,7 @@ def _loader_cache() -> list[Path]:
 
 
 def _probe(code: str, *arguments: str) -> tuple[str, str | None]:
-    """Run Python code in an interpreter without site packages; return its output and its error, if any."""
+    """Run Python code in an interpreter without site packages; return the output and the error, if any."""
     command = [sys.executable, "-I", "-S", "-c", code, *arguments]
     try:
         run = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_TIMEOUT, check=False)

@@ -1,4 +1,4 @@
-"""The interface to ray tracers: what Calibray calls, and how a tracer returns its paths.
+"""The interface to ray tracers: the methods that Calibray calls, and the form in which a tracer returns its paths.
 
 A tracer only has to compute the geometry. It returns its paths as `calibray.paths.chains.Chains`, with the material of
 every interaction. `compile_paths` combines them with the antennas into the path program that all further computations
@@ -96,7 +96,7 @@ class Tracer(Protocol):
     def trace(
         self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None
     ) -> Paths:
-        """Find the paths of every link; `materials` replace the scene's by name.
+        """Find the paths of every link; `materials` replace those of the scene by name.
 
         `progress` is called with ("tracing", receivers traced, number of receivers).
 
@@ -111,7 +111,7 @@ class Tracer(Protocol):
         """Find the paths of every link and compute their gains with the tracer's own field computation.
 
         A tracer without its own field computation can replay the paths with `calibray.path_gains`. `materials` replace
-        the scene's by name.
+        those of the scene by name.
 
         Raises:
             InputError: As for `trace`.
@@ -141,7 +141,7 @@ class TracerFactory(Protocol):
         rx_antenna: Antenna,
         /,
     ) -> Tracer:
-        """Open a scene, which has the materials for the trace.
+        """Open a scene, which contains the materials for the trace.
 
         Raises:
             InputError: The tracer cannot load the scene, or does not support a setting or an antenna.
@@ -161,7 +161,7 @@ def compile_paths(
     """Compile the paths that a tracer found, in any order, into a path program.
 
     The order of `materials` defines the material indices in `chains`. `link` [P] is the link of every path, and `ends`
-    has the positions of all links. The program's paths are ordered by link, and within a link as given.
+    contains the positions of all links. The program's paths are ordered by link, and within a link as given.
     """
     geometry = compile_chains(chains)
     departure, arrival = geometry.departure_direction, geometry.arrival_direction
@@ -230,7 +230,8 @@ class EnclosedAntennas:
     Attributes:
         tx: Rows of the source file whose transmitter is enclosed.
         rx: Rows of the source file whose receiver is enclosed.
-        indoors: Whether most links are enclosed, as in an indoor scene; then no enclosed antenna is suspicious.
+        indoors: Whether most links have an enclosed antenna, as in an indoor scene; enclosed antennas are then not
+            suspicious.
     """
 
     tx: tuple[int, ...] = ()

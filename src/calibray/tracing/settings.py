@@ -1,4 +1,4 @@
-"""How a scene is traced: the tracer's settings and the antennas at both ends."""
+"""Settings of a trace, and the antennas at both ends of its links."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RAYS_PER_ROUND: Final = 250_000
 """Number of rays per launch if rays are added in rounds."""
 
 RANGES: Final = {"max_depth": (0, 100), "samples": (1, 10**12), "seed": (0, 2**32 - 1)}
-"""Allowed ranges of the numbers: no machine can trace more, and Sionna RT's seeds have 32 bits."""
+"""Allowed ranges of the numbers; no machine can trace more rays or interactions, and Sionna RT's seeds have 32 bits."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class TraceSettings:
         specular_reflection: Follow specular reflections.
         refraction: Follow transmission through surfaces.
         diffraction: Follow first-order diffraction at wedges.
-        edge_diffraction: Whether free edges diffract as well.
-        diffraction_lit_region: Keep diffraction also at targets in the lit region, not only in the shadow.
+        edge_diffraction: Also follow diffraction at free edges.
+        diffraction_lit_region: Keep diffraction at targets in the lit region, not only at those in the shadow.
         diffuse_reflection: Follow diffuse reflections.
         samples: Rays per transmitter, 1 to 10^12; with "auto", rays are added in rounds until path loss converges,
-            which excludes diffuse reflection.
+            which is not possible with diffuse reflection.
         seed: Seed of the tracer's random numbers, 0 to 2^32 - 1.
 
     Raises:
@@ -87,7 +87,7 @@ class TraceSettings:
 
     @property
     def rays(self) -> int:
-        """Number of rays per transmitter; per launch if rays are added in rounds."""
+        """Number of rays per transmitter, or per launch if rays are added in rounds."""
         return RAYS_PER_ROUND if self.samples == "auto" else self.samples
 
     def record(self) -> dict[str, int | bool | str]:
@@ -104,7 +104,7 @@ class Antenna:
         polarization: "V", "H", or dual "VH" or "cross". The field has this polarization in every direction of the
             antenna's frame (3GPP TR 38.901, eq. 7.3-4/5), with the gain of the pattern.
         orientation: Rotation about z, y and x [rad]: yaw, pitch, roll.
-        rows: Number of rows of a planar array of these antennas along its z axis; one signal feeds all of them.
+        rows: Number of rows of a planar array of these antennas along its z axis; one signal feeds all antennas.
         columns: Number of columns along its y axis.
         spacing: Horizontal and vertical spacing of its antennas [wavelengths].
 
@@ -160,7 +160,7 @@ class Antenna:
 
     @property
     def is_array(self) -> bool:
-        """Whether it is an array of several antennas."""
+        """Whether this is an array of several antennas."""
         return self.rows * self.columns > 1
 
     @property

@@ -2,7 +2,7 @@
 
 A launch sends rays from one transmitter and searches for paths to several receivers, or the other way round
 (`starts_at_receivers`); below, *transmitter* means the end that sends the rays. The tracer stores data for every
-combination of ray, interaction and receiver, a *lane*. The receivers of a transmitter are therefore split over
+combination of ray, interaction and receiver, called a *lane*. The receivers of a transmitter are therefore split over
 launches; if one receiver needs too many lanes, the rays are split as well. Sionna's rays form a lattice of directions
 that does not depend on the seed. Each launch gets a share of the lattice, so all launches together send the same rays
 as a single launch.
@@ -37,7 +37,7 @@ ADAPTIVE_SECONDS: Final = 3.0
 SMALL_LAUNCH: Final = 5_000_000
 """Largest number of lanes of a small launch, which finds at most a few thousand candidates and takes at most 0.4 s."""
 POINT_TOLERANCE: Final = 0.01
-"""Distance below which interaction points are equal [m]; points of different paths are seldom so close."""
+"""Distance below which interaction points count as equal [m]; points of different paths are seldom so close."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +62,12 @@ class Launch:
 
 
 class Launches(Sequence[Launch]):
-    """The launches of a trace, each made on request: 10^12 rays need too many launches to be stored.
+    """The launches of a trace, each made on request, because 10^12 rays need too many launches to be stored.
 
     Args:
         receivers: Transmitter [3], [m], and links [n] of each set of receivers that are traced together.
         settings: The tracer's settings.
-        shares: Number of launches that share the rays to each set of receivers.
+        shares: Number of launches among which the rays to each set of receivers are divided.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class TracePlan:
 def starts_at_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64], settings: TraceSettings) -> bool:
     """Whether the receivers send the rays: they do if there are fewer receivers than transmitters.
 
-    A path is the same in both directions, so it can be reversed after it was found. Diffuse reflection is not
+    A path is the same in both directions, so it can be reversed after it has been found. Diffuse reflection is not
     reversible: the scattered direction, and the probability with which the tracer chose it, belong to one direction of
     travel. Traces with diffuse reflection therefore start at the transmitters.
     """
@@ -149,9 +149,9 @@ def starts_at_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64], settin
 
 
 def plan_trace(source: NDArray[np.float64], settings: TraceSettings, lanes: int, buffer: int) -> TracePlan:
-    """Split a trace into launches, given the end of every link that sends the rays [L, 3], [m].
+    """Split a trace into launches; `source` is the end that sends the rays, for every link [L, 3], [m].
 
-    A launch may have up to `lanes` rays x interactions x receivers; its buffer initially has room for `buffer` paths.
+    A launch can have up to `lanes` rays x interactions x receivers; its buffer initially has room for `buffer` paths.
     """
     depth = max(settings.max_depth, 1)
     rays, adaptive = settings.rays, settings.adaptive
@@ -198,8 +198,8 @@ def lattice_directions(first: int, count: int, samples: int) -> NDArray[np.float
 def pad_receivers(position: NDArray[np.float64], lanes_per_receiver: int) -> NDArray[np.float64]:
     """Repeat the last receiver [n, 3], so that few different numbers of receivers occur in launches.
 
-    The tracer compiles its code for each number, which takes 1 to 3 s. The number becomes a power of two, or a multiple
-    of the largest power of two for which a launch is small.
+    The tracer compiles its code for each number of receivers, which takes 1 to 3 s. The number is increased to a power
+    of two, or a multiple of the largest power of two for which a launch is small.
 
     Example:
         >>> [len(pad_receivers(np.zeros((n, 3)), 1_000_000)) for n in (1, 2, 3, 4, 5, 6)]
@@ -221,9 +221,9 @@ def find_repeats(
 ) -> NDArray[np.bool_]:
     """Find the paths that an earlier launch to the same receivers has already found [P].
 
-    A deterministic path is the same for any ray that finds it: it meets the same objects at the same points. Paths with
-    a diffuse reflection are random samples, and all of them count. Launch indices are ascending [P]; kinds of
-    interaction are 0 after the last interaction [P, D]; interaction points are [P, D, 3], [m].
+    A deterministic path is the same for any ray that finds it: it interacts with the same objects at the same points.
+    Paths with a diffuse reflection are random samples and never count as repeats. Launch indices are ascending [P];
+    kinds of interaction are 0 after the last interaction [P, D]; interaction points are [P, D, 3], [m].
     """
     repeats = np.zeros(len(link), dtype=bool)
     rows = np.flatnonzero(~is_sample)

@@ -368,9 +368,7 @@ def _open_above(
 
 
 def _orient(faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Sign of each face, +1 or -1, so that neighbours have the same orientation [F]; and connected piece of each face
-    [F].
-    """
+    """Sign of each face, +1 or -1, that gives neighbours the same orientation [F]; and its connected piece [F]."""
     count = len(faces)
     sides, edge, uses = _edges(faces)
     order = np.argsort(edge, kind="stable")
