@@ -245,7 +245,7 @@ TRACE = "max_depth = 4"
         ("ness = 0.3", "ness = 0", "materials.walls: thickness = 0.0: must be"),
         ('itu = "concrete", ', "", "materials.walls: revision = 'P.2040-1' without itu"),
         ('itu = "concrete"', 'itu = "concret"', "materials.walls: 'concret' is not a material of"),
-        ('itu = "concrete"', 'itu = "floorboard"', "gives 'floorboard' for 50 to 100 GHz, not for 4"),
+        ('itu = "concrete"', 'itu = "floorboard"', "covers 'floorboard' at 50 to 100 GHz, not at 4"),
         ("[1.5, 12.0]", "[12.0, 1.5]", "bounds = [12.0, 1.5] are reversed"),
         ("[1.5, 12.0]", "[0.5, 12.0]", "walls.relative_permittivity: bounds = [0.5, 12.0]: 0.5 must be"),
         ("[1.5, 12.0]", "[1.5, 4.0]", "start = 5.31 lies outside bounds = [1.5, 4]"),

@@ -200,7 +200,7 @@ NEW: Final = "new transmitters"
 
 
 def concerned(names: NDArray[np.str_], label: str, own: Collection[str]) -> NDArray[np.bool_]:
-    """Mask of the transmitters that a parameter of transmitter `label` affects; those in `own` have own parameters."""
+    """Mask of the transmitters that a parameter of transmitter `label` affects; those in `own` have their own."""
     if label == EVERY:
         return np.ones(len(names), dtype=bool)
     return ~np.isin(names, list(own)) if label == NEW else names == label
@@ -289,7 +289,7 @@ def theta_axis(paths: Paths, mounting: Mounting) -> NDArray[np.float64]:
 
 
 def stated_jones(mounting: Mounting, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Jones vectors [P, ports, 2] of mounted antennas, each in one direction given as zenith and azimuth [P, 2], [rad]."""
+    """Jones vectors [P, ports, 2] of mounted antennas, each in one direction: zenith and azimuth [P, 2], [rad]."""
     jones = np.zeros((len(angles), mounting.antennas[0].ports, 2))
     for number, antenna in enumerate(mounting.antennas):
         chosen = mounting.index == number

@@ -1,4 +1,4 @@
-"""Path tracing with Sionna RT; the only package that imports it."""
+"""Path tracing with Sionna RT, which only this package imports."""
 
 from calibray.tracing import llvm
 

@@ -1,9 +1,9 @@
 """Rays are added in rounds until path loss converges (`trace.samples = "auto"`).
 
-Each round launches as many rays as all earlier rounds together, in other directions. The interaction sequences that
-they find belong to the source; new sequences are tried for every receiver by the method of images (`image_method`). The
-search ends after two successive rounds in which no link's path loss changes by more than `CONVERGED_DB`. The last round
-is equivalent to a second trace with twice as many rays (`calibray.tracing.convergence`).
+Each round launches as many rays as all earlier rounds together, in other directions. The interaction sequences that the
+rays find depend only on the source; new sequences are tried for every receiver by the method of images
+(`image_method`). The search ends after two successive rounds in which no link's path loss changes by more than
+`CONVERGED_DB`. The last round is equivalent to a second trace with twice as many rays (`calibray.tracing.convergence`).
 """
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
@@ -40,11 +40,11 @@ from calibray.tracing.trace_plan import Launch, TracePlan, lattice_directions, l
 CONVERGED_DB: Final = 0.05
 """Largest change of a link's path loss in a round that counts as converged [dB]."""
 QUIET_ROUNDS: Final = 2
-"""Number of consecutive rounds without a larger change that ends the search."""
+"""Number of consecutive rounds without a larger change after which the search ends."""
 MAX_LAUNCHES: Final = 256
 """Largest number of launches per source: 64 million rays."""
 GEOMETRY_BATCH: Final = 500_000
-"""Largest number of pairs of sequence and receiver whose geometry is computed together; it limits the memory."""
+"""Largest number of pairs of sequence and receiver whose geometry is computed together, which limits memory use."""
 
 _LOG: Final = logging.getLogger(__name__)
 
@@ -68,7 +68,7 @@ class SequenceCache:
     def of_source(
         self, solver: Solver, source: NDArray[np.float64], materials: Mapping[str, Material]
     ) -> SourceSequences:
-        """The sequences of a source [3], [m], for these materials, because materials determine how rays continue."""
+        """The sequences of a source [3], [m], for these materials, which determine how rays continue."""
         key = source.tobytes(), solver.settings, tuple(materials.items())
         if key not in self._sequences:
             while len(self._sequences) >= 4:  # the latest four are kept for the next links
@@ -78,7 +78,7 @@ class SequenceCache:
 
 
 class SourceSequences:
-    """The interaction sequences that rays from one source [3], [m], find, launch by launch."""
+    """The interaction sequences found by rays from one source [3], [m], launch by launch."""
 
     def __init__(self, solver: Solver, source: NDArray[np.float64]) -> None:
         self.meshes = Meshes(solver.mitsuba_scene)
@@ -87,7 +87,7 @@ class SourceSequences:
         self._new_by_launch: list[PathsBuffer | None] = []
 
     def new_in_launch(self, number: int, max_paths: int) -> PathsBuffer | None:
-        """The sequences that launch `number` finds first, or None; run the launch if needed."""
+        """The sequences that launch `number` is the first to find, or None; the launch is run if needed."""
         while len(self._new_by_launch) <= number:
             sequences = self._launch(len(self._new_by_launch), max_paths)
             self._keys, new = _merge(self._keys, sequence_keys(sequences, self.meshes))
@@ -226,7 +226,7 @@ class _SourceSearch:
         return self._trace_candidates(candidates)
 
     def _paths_of(self, sequences: PathsBuffer) -> list[TracedBuffer]:
-        """Find the paths to all receivers that follow interaction sequences."""
+        """Find the paths with the given interaction sequences to all receivers."""
         unfolded = unfold_sequences(sequences, self._launch.source, self._sequences.meshes)
         pairs = list(possible_pairs(unfolded, self._targets))
         sequence, target = (np.concatenate(part) for part in zip(*pairs, strict=True))

@@ -32,7 +32,7 @@ def aligned(values: NDArray[Any], dtype: type) -> NDArray[Any]:
 
 
 def to_points(position: NDArray[np.float64]) -> mi.Point3f:
-    """Convert positions [n, 3], [m], to opaque points, so that no kernel is compiled for their values."""
+    """Convert positions [n, 3], [m], to opaque Dr.Jit points, so that no kernel is compiled for their values."""
     points = mi.Point3f(*(aligned(axis, np.float32) for axis in position.T))
     dr.make_opaque(points)
     return points
@@ -64,7 +64,7 @@ def vertices_of(buffer: PathsBuffer) -> NDArray[np.float64]:
 
 
 def normals_at(buffer: PathsBuffer, step: int, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Read the normals of the surfaces that paths meet at interaction `step` [P, 3]; undefined outside the mask [P]."""
+    """Read the surface normals at interaction `step` of paths [P, 3]; values outside the mask [P] are undefined."""
     depth, active = dr.opaque(mi.UInt, step + 1), mi.Bool(aligned(mask, np.bool_))
     return to_numpy(buffer.get_primitive_props(depth, True, False, active))
 
@@ -131,9 +131,10 @@ def reverse(buffer: PathsBuffer, sources: mi.Point3f) -> PathsBuffer:
     """Reverse candidate paths, so that paths found from the receivers start at the transmitters.
 
     Mirror images, straight lines through walls and the shortest path over an edge are the same in both directions, so
-    candidates for one direction are also candidates for the other. They are reversed before their geometry is computed,
-    so that paths searched from either end are identical to the last digit. Three things depend on the direction: the
-    order of the interactions, the two ends, and the faces of an edge, because Sionna's 0-face is the illuminated face.
+    candidates for one direction are also candidates for the other. Candidates are reversed before their geometry is
+    computed, so that paths searched from either end are identical to the last digit. Three properties depend on the
+    direction: the order of the interactions, the two ends, and the faces of an edge, because Sionna's 0-face is the
+    illuminated face.
     """
     if not buffer.buffer_size:
         return buffer

@@ -1,13 +1,14 @@
 """The method of images for all receivers of one source.
 
-Sionna keeps an interaction sequence (the objects that a path meets in order) only if a receiver sees the point that a
-ray hit, so it compares every hit of every ray with every receiver. Here rays are launched in a scene where nothing
-hides a receiver (`Unobstructed`), so the sequences depend only on the source and apply to all receivers.
+Sionna keeps an interaction sequence (the objects with which a path interacts, in order) only if a receiver is visible
+from the point that a ray hit. Sionna therefore tests every hit of every ray with every receiver. Here, rays are
+launched in a scene in which nothing obstructs a receiver (`Unobstructed`), so the sequences depend only on the source
+and apply to all receivers.
 
-Unfolding a sequence gives the points at which its paths must aim. By the method of images, a path with reflections is a
-straight line to the image of the source (ITU-R P.1411). An edge is mirrored in the planes that follow it; the
+Unfolding a sequence yields the points at which its paths must aim. By the method of images, a path with reflections is
+a straight line to the image of the source (ITU-R P.1411). An edge is mirrored in the planes that follow it; the
 diffraction point minimizes the length of the unfolded path (Keller, J. Opt. Soc. Am. 52(2), 1962). Most pairs of
-sequence and receiver can be excluded immediately, because the line would meet a plane where the scene has no surface.
+sequence and receiver can be excluded immediately, because the line would cross a plane where the scene has no surface.
 Sionna's own image method computes the paths of the remaining pairs.
 """
 
@@ -34,15 +35,17 @@ from calibray.tracing.sionna.buffers import aligned, per_interaction, to_numpy
 from calibray.tracing.sionna.scene import shape_ids
 
 SAME_PLANE: Final = 2e-3
-"""Largest difference between the offsets of equal planes [m]; their normals differ by at most a fiftieth of it."""
+"""Largest difference between the offsets of equal planes [m]; their normals differ by at most a fiftieth of this
+number."""
 CONFUSABLE_PLANE: Final = 0.05
-"""The same limit for planes that the tracer may confuse in single precision."""
+"""The same limit for planes that the tracer can confuse in single precision."""
 MARGIN: Final = 0.1
-"""Largest distance of a valid point outside a surface [m]; it allows for single precision and rounded corners."""
+"""Largest distance of a valid point outside a surface [m]; this margin allows for single precision and rounded
+corners."""
 NEAR_PLANE: Final = 0.01
-"""Distance from a plane below which a point may be on either side of the plane [m]."""
+"""Distance from a plane below which a point can be on either side of the plane [m]."""
 PAIRS_PER_BATCH: Final = 8_000_000
-"""Largest number of pairs of sequence and receiver that are tested together; it limits the memory."""
+"""Largest number of pairs of sequence and receiver that are tested together, which limits memory use."""
 
 
 class Surfaces:
@@ -69,9 +72,9 @@ class Surfaces:
         self._tree = KDTree(np.vstack([self._feature, -self._feature])) if len(grid) else None
 
     def bounding_boxes(self, plane: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Smallest and largest coordinates [n, 3], [m], of boxes around all surfaces in or very near to planes [n].
+        """Smallest and largest coordinates [n, 3], [m], of boxes around all surfaces in or very close to planes [n].
 
-        The tracer may confuse surfaces that are this close.
+        The tracer can confuse surfaces that are this close together.
         """
         if self._tree is None:
             return np.zeros((0, 3)), np.zeros((0, 3))
@@ -139,7 +142,8 @@ def unfold(
 ) -> Unfolded:
     """Unfold the interaction sequences of a source at `source` [3], [m].
 
-    Kinds of interaction [C, D] are 0 after the last interaction; `triangle` [C, D] is arbitrary if none is met.
+    Kinds of interaction [C, D] are 0 after the last interaction; `triangle` [C, D] is arbitrary for an interaction
+    without a triangle.
     """
     mirrors = kind == Kind.SPECULAR
     met = np.where(mirrors, triangle, 0)
@@ -173,13 +177,13 @@ def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class Unobstructed:
-    """A Mitsuba scene in which nothing hides a receiver from the points that rays hit."""
+    """A Mitsuba scene in which every receiver is visible from every point that rays hit."""
 
     def __init__(self, scene: Any) -> None:
         self.ray_intersect = scene.ray_intersect
 
     def ray_test(self, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.Bool:
-        """Report that nothing blocks any ray."""
+        """Report that no ray is blocked."""
         return mi.Bool(False) & active
 
 
@@ -209,22 +213,22 @@ class Meshes:
         self.surfaces = Surfaces(np.concatenate(corners) if corners else np.zeros((0, 3, 3)))
 
     def triangles(self, shape: NDArray[np.int64], primitive: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Indices of triangles in the scene [...], from their shapes and their indices in these; 0 without a shape."""
+        """Indices of triangles in the scene [...], from their shapes and indices within the shapes; 0 without a shape."""
         distinct, position = np.unique(shape, return_inverse=True)
         starts = np.array([self._first.get(key, -1) for key in distinct.tolist()], dtype=np.int64)
         first = starts[position.reshape(shape.shape)]
         return np.where(first >= 0, first + primitive, 0)
 
     def triangles_of(self, sequences: PathsBuffer) -> NDArray[np.int64]:
-        """Indices in the scene of the triangles that sequences meet [C, D]; 0 if none is met."""
+        """Indices in the scene of the triangles at which sequences interact [C, D]; 0 without a triangle."""
         return self.triangles(per_interaction(sequences, "shapes"), per_interaction(sequences, "primitives"))
 
 
 def sequence_keys(sequences: PathsBuffer, meshes: Meshes) -> NDArray[np.int64]:
     """Keys of interaction sequences: integers [C, k] that are equal for equal sequences.
 
-    A key contains the types of interaction, the reflecting planes and the faces of a diffracting edge. It omits walls
-    through which a ray passes, because they do not bend the path.
+    A key contains the types of interaction, the reflecting planes and the faces of a diffracting edge. The key omits
+    walls through which a ray passes, because these walls do not change the direction of the path.
     """
     kind = per_interaction(sequences, "interaction_types")
     plane = np.where(kind == Kind.SPECULAR, meshes.surfaces.plane[meshes.triangles_of(sequences)], 0)
@@ -256,7 +260,7 @@ def unfold_sequences(sequences: PathsBuffer, source: NDArray[np.float64], meshes
 def possible_pairs(
     unfolded: Unfolded, targets: NDArray[np.float64]
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Find the sequences that may connect the source to each receiver [R, 3], [m].
+    """Find the sequences that can connect the source to each receiver [R, 3], [m].
 
     Yields the indices of the sequence and the receiver of each pair, each [n]; pairs that are not yielded have no path.
     """

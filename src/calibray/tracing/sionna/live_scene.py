@@ -1,4 +1,4 @@
-"""Reads scenes loaded in plain Sionna RT, sets their materials, and compares them with an export."""
+"""Reads scenes loaded in plain Sionna RT, sets their materials, and verifies exported scenes."""
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false
@@ -37,7 +37,7 @@ from calibray.tracing.sionna.tracer import Tracer
 _LOG: Final = logging.getLogger(__name__)
 
 DIRECTIONS: Final = 64
-"""Number of directions in which a pattern is compared with the known ones."""
+"""Number of directions in which a pattern is compared with the known patterns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,8 @@ class LiveScene:
         """Read a scene with its transmitters, receivers and arrays.
 
         Raises:
-            InputError: It is not a scene of Sionna RT, or has a property that a study cannot state.
+            InputError: The object is not a scene of Sionna RT, or the scene has a property that a study cannot
+                describe.
         """
         live = _checked(scene)
         if not (live.transmitters and live.receivers and live.tx_array and live.rx_array):
@@ -91,11 +92,12 @@ class LiveScene:
 def apply_materials(scene: object, materials: Mapping[str, Material], frequency: float | None = None) -> None:
     """Set the constants of a scene's materials by name.
 
-    The constants are valid at one carrier, `frequency` [Hz]; a different carrier of the scene causes a warning. After
-    this, setting `scene.frequency` no longer replaces the constants of ITU materials.
+    The constants are valid at one carrier, `frequency` [Hz]; a different carrier of the scene causes a warning.
+    After this call, setting `scene.frequency` does not replace the constants of ITU materials.
 
     Raises:
-        InputError: The object is not a scene of Sionna RT, or the scene lacks a material; then nothing is set.
+        InputError: The object is not a scene of Sionna RT, or the scene lacks a material; in both cases, nothing is
+            set.
     """
     live = _checked(scene)
     for name in materials:
@@ -147,7 +149,7 @@ def _objects(item: Any) -> Iterator[MeshObject]:
 
 
 def _check_precision(objects: Iterable[MeshObject]) -> None:
-    """Raise an error if a scene is so far from its origin that Sionna RT's single precision rounds it noticeably."""
+    """Refuse a scene so far from its origin that single precision rounds coordinates noticeably, or log a warning."""
     furthest = max((float(np.abs(item.mesh.vertices).max()) for item in objects), default=0.0)
     step = float(np.spacing(np.float32(furthest)))
     where = f"the scene reaches {furthest:.0f} m from its origin"
@@ -163,7 +165,8 @@ def _check_precision(objects: Iterable[MeshObject]) -> None:
 def _material(material: Any) -> Material:
     if not isinstance(material, rt.RadioMaterial):
         raise InputError(
-            f"material {material.name!r} is a {type(material).__name__}; a study needs a RadioMaterial, with constants"
+            f"material {material.name!r} is a {type(material).__name__}; a study requires a RadioMaterial with "
+            "constants"
         )
     pattern = material.scattering_pattern
     lobes = {
@@ -224,19 +227,21 @@ def _vector(value: Any) -> NDArray[np.float64]:
 
 
 LARGEST_DIFFERENCE_DB: Final = 0.01
-"""Largest path loss difference at which two traces of one scene agree [dB]; the file has rounded constants."""
+"""Largest path loss difference at which two traces of one scene count as equal [dB]; the constants in the file are
+rounded."""
 
 SAMPLES: Final = 20_000
 """Number of rays for the comparison; both scenes use the same rays."""
 
 
 def verify_export(tracer: Tracer, materials: Mapping[str, Material], target: Path, links: Links) -> None:
-    """Load an exported scene into plain Sionna RT; compare materials, surfaces and the path loss of `links`.
+    """Load an exported scene into plain Sionna RT, and compare materials, surfaces and the path loss of `links`.
 
-    `tracer` has the original scene. The comparison uses few rays, at most two interactions and no diffuse reflection.
+    `tracer` contains the original scene. The comparison uses few rays, at most two interactions and no diffuse
+    reflection.
 
     Raises:
-        InputError: Sionna RT cannot load the exported scene, or the exported scene differs.
+        InputError: Sionna RT cannot load the exported scene, or the exported scene differs from the original scene.
     """
     scene, names = tracer.scene, exported_names(materials)
     try:

@@ -1,4 +1,4 @@
-"""Scenes, materials and antenna patterns in the form that Sionna RT needs."""
+"""Scenes, materials and antenna patterns in the form that Sionna RT requires."""
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false
@@ -79,8 +79,8 @@ def _load(xml: str, path: Path) -> rt.Scene:
 def _check_surfaces(mitsuba_scene: Any, scene: Scene) -> None:
     """Raise an error if the bounds or areas of surfaces in Mitsuba's memory differ from those in the files.
 
-    Mitsuba reads mesh files itself; a type or layout that it misreads would remove reflections without a message. It
-    merges the objects of a material into one mesh, so the comparison is by material.
+    Mitsuba reads mesh files itself; a type or layout that it misreads would remove reflections without a message.
+    Mitsuba merges the objects of a material into one mesh, so the comparison is by material.
 
     Raises:
         InputError: A surface differs.
@@ -184,7 +184,7 @@ def _array_pattern(
 
 
 def tabulated_pattern(table: GainTable) -> Callable[[mi.Float, mi.Float], mi.Complex2f]:
-    """Make a function of zenith and azimuth [rad]: the field amplitude, interpolated as in `GainTable.gain`."""
+    """Make a function that interpolates the field amplitude at zenith and azimuth [rad], as `GainTable.gain` does."""
     (rows, columns), (elevation_step, azimuth_step) = table.gain_dbi.shape, np.radians(table.steps_deg)
     first_azimuth = np.radians(table.first_azimuth_deg)
     gain = mi.Float(aligned(table.gain_dbi.ravel(), np.float32))

@@ -1,4 +1,4 @@
-"""Sionna RT's solver, stage by stage: candidate paths by rays, exact geometry by the method of images, fields.
+"""Sionna RT's solver, stage by stage: candidate paths from rays, exact geometry from the method of images, and fields.
 
 The first two stages depend on the material constants only through the choice of a ray's next interaction, so their
 result is kept and compiled into a path program. The field stage is the reference against which replay is tested.
@@ -52,8 +52,8 @@ from calibray.tracing.trace_plan import SMALL_LAUNCH
 HASHES: Final = (16_777_213, 67_108_859)
 """Number of entries in Sionna's hash table for small and for large launches. Sionna drops candidates whose hashes
 collide. Of 31,430 candidates in a launch to 25 receivers, it drops 1,067 with its default of one million entries, 36
-with 16 million, and 4 with 67 million, which take 0.5 GB and 0.3 s per launch. The numbers are primes, because the
-lowest bits of the hashes vary least."""
+with 16 million, and 4 with 67 million. A table of 67 million entries takes 0.5 GB and 0.3 s per launch. The numbers are
+primes, because the lowest bits of the hashes vary least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +116,7 @@ class Solver:
         return other
 
     def set_materials(self, materials: Mapping[str, Material]) -> dict[str, Material]:
-        """Set the constants of Sionna's materials: those given by name, otherwise the scene's; return all constants."""
+        """Set the constants of Sionna's materials, as given or otherwise from the scene, and return all constants."""
         for name in materials:
             check_material_name(name, self.scene.materials, "materials")
         constants = {**self.scene.materials, **materials}
@@ -226,7 +226,7 @@ class Solver:
         return np.array([[to_numpy_complex(gain) for gain in row] for row in fields.a]).transpose(2, 0, 1)
 
     def compile(self, traced: TracedBuffer, ends: Links, materials: Mapping[str, Material]) -> Paths:
-        """Compile the paths of one buffer; the ends of all links are local [L, 3], [m]."""
+        """Compile the paths of one buffer; the ends of all links [L, 3], [m], are in the local frame."""
         chains = self._chains(traced, ends)
         paths = compile_paths(
             chains, traced.link, ends, frequency=self.frequency, materials=materials, antennas=self._patterns

@@ -1,8 +1,8 @@
 """Sionna RT as a `Tracer`: finds the paths of links and compiles them.
 
-Receivers, and rays if needed, are split over launches (`calibray.tracing.trace_plan`), because all receivers of a
-source share Sionna's path buffer, whose memory grows with samples x depth x receivers (NVlabs/sionna#1172). A launch
-that fills its buffer is repeated with a larger buffer.
+All receivers of a source share Sionna's path buffer, the memory of which grows with samples x depth x receivers
+(NVlabs/sionna#1172). Receivers, and rays if needed, are therefore split over launches (`calibray.tracing.trace_plan`).
+A launch that fills its buffer is repeated with a larger buffer.
 """
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
@@ -89,7 +89,9 @@ class Trace:
         return np.concatenate(delays)[self._order()]
 
     def path_gains(self, materials: Mapping[str, Material] | None = None) -> NDArray[np.complex128]:
-        """Path gains [P, R, T] from Sionna's field stage, in the order of `paths()`; `materials` replace by name."""
+        """Path gains [P, R, T] from Sionna's field stage, in the order of `paths()`; `materials` replace those of the
+        trace.
+        """
         self.solver.set_materials({**self.materials, **(materials or {})})
         return np.concatenate([self.solver.compute_fields(part) for part in self.buffers])[self._order()]
 
@@ -173,7 +175,7 @@ class Tracer:
     def find_paths(
         self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None
     ) -> Trace:
-        """Find the paths of every link and keep them in Sionna's buffers; arguments as for `trace`."""
+        """Find the paths of every link and keep them in Sionna's buffers; the arguments are those of `trace`."""
         tx, rx = link_positions(links)
         backwards = starts_at_receivers(tx, rx, self.settings)
         targets = (tx if backwards else rx) - self.solver.origin
@@ -234,9 +236,9 @@ class Tracer:
     def enclosed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether points [n, 3], [m], lie inside closed bodies of the scene, such as buildings [n].
 
-        A ray from inside a closed body crosses its surface an odd number of times. Scenes have gaps, so the
-        majority of rays in several directions decides. All rays point upwards, because buildings often lack a floor.
-        A room is a closed body as well.
+        A ray from inside a closed body crosses its surface an odd number of times. Because scenes have gaps, rays are
+        sent in several directions, and the majority of them decides. All rays point upwards, because buildings often
+        lack a floor. A room is also a closed body.
         """
         azimuth, elevation = np.meshgrid(np.linspace(0.1, 2 * np.pi, 6), np.radians([25.0, 50.0, 75.0]))
         directions = np.stack(
