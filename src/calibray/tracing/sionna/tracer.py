@@ -89,7 +89,10 @@ class Trace:
         return np.concatenate(delays)[self._order()]
 
     def path_gains(self, materials: Mapping[str, Material] | None = None) -> NDArray[np.complex128]:
-        """Path gains [P, R, T] from Sionna's field stage, in the order of `paths()`; `materials` replace the trace's."""
+        """Path gains [P, R, T] from Sionna's field stage, in the order of `paths()`.
+
+        `materials` replace constants of the trace by name.
+        """
         self.solver.set_materials({**self.materials, **(materials or {})})
         return np.concatenate([self.solver.compute_fields(part) for part in self.buffers])[self._order()]
 
