@@ -151,7 +151,7 @@ def test_an_edge_where_two_houses_meet_has_the_stated_material(tmp_path: Path) -
 
 WRONG = {
     "points of the path missing": (lambda t: t.drop(t.index[t.point == 3][0] - 1), "increase by 1"),
-    "a receiver missing": (lambda t: t[t.type != "receiver"], "the last its receiver"),
+    "a receiver missing": (lambda t: t[t.type != "receiver"], "and the last its receiver"),
     "an unknown type": (lambda t: t.replace({"type": {"reflection": "R"}}), "'R'"),
     "an unknown material": (
         lambda t: t.assign(material="wood"),

@@ -1,4 +1,4 @@
-"""Replay evaluates stored paths for any candidate, with derivatives; it has one program per carrier."""
+"""Replay evaluates stored paths and their derivatives for any candidate, with one program per carrier."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MOST_DERIVATIVES: Final = 2_000_000
 """Largest number of derivatives with respect to material constants in one call; more would fill the memory."""
 
 MAY_TABULATE: Final = 30_000
-"""Number of interactions above which coefficients may come from tables."""
+"""Number of interactions above which coefficients can be taken from tables."""
 
 MOST_NODES: Final = 0.25
 """Largest number of table nodes per interaction; filling more nodes takes longer than the tables save."""
@@ -31,7 +31,7 @@ TABLE_TOLERANCE: Final = 1e-4
 """Largest error of a tabulated coefficient."""
 
 TABLE_CANDIDATES: Final = 32
-"""Number of candidates spread over the bounds; these and the start values determine how fine tables must be."""
+"""Number of candidates spread over the bounds; these and the start values determine the resolution of the tables."""
 
 BATCH: Final = 32
 """Largest number of candidates in one call."""
@@ -42,12 +42,12 @@ OBSERVED_SIZE: Final = 64
 
 @dataclass(frozen=True)
 class Computation:
-    """How stored paths are evaluated.
+    """Settings for the evaluation of stored paths.
 
     Attributes:
         dtype: Precision, `numpy.float64` or `numpy.float32`; if None, single precision for large programs whose paths
-            combine by power.
-        tabulate: Whether coefficients come from tables; if None, whenever that is faster.
+            are combined by power, and double precision otherwise.
+        tabulate: Whether coefficients are taken from tables; if None, tables are used when they are faster.
         batch: Largest number of candidates in one call; the program is compiled for this number.
     """
 
@@ -63,13 +63,13 @@ class Replay:
     Args:
         paths: The path program.
         parameters: The parameters whose values a candidate contains.
-        combining: How a link's paths combine: "power", "coherent" or "band".
+        combining: How a link's paths are combined: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
         effects: Effects on the paths, in the order of `paths`.
         computation: Precision, tables and batch size.
 
     Raises:
-        InputError: A parameter's material is not in the paths, or this kind of combining cannot be used.
+        InputError: A parameter's material is not in the paths, or the paths cannot be combined in this way.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class Replay:
 
     @cached_property
     def _channel(self) -> fields.Channel:
-        """The paths in the form that further observables need."""
+        """The paths in the form that is needed to compute further observables."""
         plan = fields.layout(self.paths)
         return fields.Channel(
             plan.program,
@@ -253,7 +253,7 @@ class Replay:
         return tables, of_effects
 
     def _table_intervals(self, force: bool) -> NDArray[np.int64] | None:
-        """Intervals of the tables by material and mode; None if evaluating every coefficient is faster."""
+        """Number of intervals of each table, by material and mode; None if evaluating every coefficient is faster."""
         if not force and self.interactions <= MAY_TABULATE:
             return None
         from scipy.stats import qmc  # the import takes 0.4 s
@@ -265,7 +265,7 @@ class Replay:
         return intervals if force or intervals.sum() <= MOST_NODES * self.interactions else None
 
     def _refine_tables(self, too_coarse: NDArray[np.bool_]) -> None:
-        """Refine the tables in the mask [M, 3] for this and all later candidates; beyond the finest, use no tables."""
+        """Refine the tables in the mask [M, 3] for all further candidates; beyond the finest, stop using tables."""
         if self._intervals is not None:
             finer = np.where(too_coarse, 2 * self._intervals, self._intervals)
             self._intervals = finer if finer.max() <= fields.FINEST else None
@@ -277,7 +277,7 @@ class Replay:
         return plan.program
 
     def _batch_size(self) -> int:
-        """Candidates in one call: a power of two within the limits."""
+        """Number of candidates in one call: a power of two within the limits."""
         per_candidate = self.paths.num_links * len(self.materials) * len(self._used_columns)
         most = max(MOST_DERIVATIVES // max(per_candidate, 1), 1)
         return min(self._batch, 1 << most.bit_length() - 1)
@@ -300,17 +300,17 @@ class CarrierPaths:
 
 @final
 class ReplayCarriers:
-    """Stored paths, evaluated at several carriers; parameters may be coefficients of frequency laws.
+    """Stored paths, evaluated at several carriers; parameters can be coefficients of frequency laws.
 
     Args:
         carriers: The carriers; together they contain every link once.
         parameters: The parameters whose values a candidate contains.
         materials: The scene's materials before calibration, at the carrier of the trace.
-        combining: How a link's paths combine: "power", "coherent" or "band".
+        combining: How a link's paths are combined: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
 
     Raises:
-        InputError: A parameter's material is not in the paths, or this kind of combining cannot be used.
+        InputError: A parameter's material is not in the paths, or the paths cannot be combined in this way.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The engine section of a study file, and the opened study that an engine works on."""
+"""The engine section of a study file, and the interface of the opened study that an engine requires."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class RadioSettings:
     """Radio settings that all links of a study share.
 
     Attributes:
-        frequency: Carrier frequency [Hz] of links without their own.
+        frequency: Carrier frequency [Hz] of links that state none.
         bandwidth: Bandwidth [Hz], or None.
-        combining: How a link's paths combine: "power", "coherent" or "band".
-        antennas: Transmit and receive antenna.
+        combining: How a link's paths are combined: "power", "coherent" or "band".
+        antennas: Transmit and receive antennas.
         observables: Observables other than path loss.
     """
 
@@ -48,7 +48,7 @@ class RadioSettings:
 
 
 class OpenedStudy(Protocol):
-    """A study whose files have been read, as engines need it; `calibray.Setup` is one."""
+    """A study whose files have been read, with everything that engines require; `calibray.Setup` implements it."""
 
     @property
     def links(self) -> Measurements:
@@ -77,7 +77,7 @@ class OpenedStudy(Protocol):
 
     @property
     def known_antennas(self) -> tuple[Antenna, Antenna] | None:
-        """Transmit and receive antenna, if the study states them."""
+        """Transmit and receive antennas; None if the study does not state them."""
         ...
 
     @property
@@ -150,7 +150,7 @@ class EngineSection(Section, ABC):
     Attributes:
         name: The kind's name in study files.
         expensive: Whether a call takes longer than reading a stored answer, so that a ledger stores the calls.
-        external: Whether an external program answers, so that no ray tracer is needed.
+        external: Whether an external program computes the answers, so that no ray tracer is needed.
         chunked: Whether chunks of links can be traced and replayed on workers.
     """
 
@@ -161,7 +161,7 @@ class EngineSection(Section, ABC):
 
     @property
     def exports_rays(self) -> bool:
-        """Whether an external program answers with rays, so that a replay can replace it."""
+        """Whether an external program returns rays, so that a replay can replace it."""
         return self.external and getattr(self, "rays", False) is True
 
     @abstractmethod
@@ -172,7 +172,7 @@ class EngineSection(Section, ABC):
     def open(
         self, study: OpenedStudy, paths: Paths | None, progress: Progress | None, workers: Workers | None
     ) -> Engine:
-        """The engine for all links of a study; it uses `paths` if they have already been traced.
+        """The engine for all links of a study; `paths` contains the paths if they have already been traced.
 
         Workers run the calls of a batch if the kind is `external`, and keep chunks of links if it is `chunked`.
 

@@ -1,8 +1,8 @@
 """Seeded ask/tell optimizers that minimise over a box; they use NumPy arrays and do not depend on the radio model.
 
 Every class is an `Optimizer`. It states which parts of an evaluation it uses, how it respects a budget and whether it
-takes starting points. `METHODS` lists the classes by their names in study files, and `make` constructs one. Optional
-libraries are imported only when a class that needs them is constructed.
+uses starting points. `METHODS` lists the classes by their names in study files, and `make` constructs an optimizer.
+Optional libraries are imported only when a class that needs them is constructed.
 """
 
 from __future__ import annotations
@@ -129,8 +129,9 @@ def make(
         seed: Seed.
         budget: Number of evaluations; the method's default if None. Methods that stop by themselves ignore it.
         start: Starting points, [d] or [k, d], for methods that use them.
-        starts: Number of starting points that such a method adds to `start`; the method's default if None.
-        objective: Function from residuals to the value, for methods that use residuals; root mean square if None.
+        starts: Number of starting points that these methods add to `start`; the method's default if None.
+        objective: Function that maps residuals to the objective, for methods that use residuals; the root mean square
+            if None.
         cheap_model: A cheap model of the engine, for methods that use one.
         options: Settings of the method, which override the arguments above.
 

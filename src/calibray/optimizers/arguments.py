@@ -1,4 +1,4 @@
-"""Checked constructor arguments: numbers, names, and the search box with its map to and from the unit cube."""
+"""Checks of constructor arguments, and the search box with its map to and from the unit cube."""
 
 from __future__ import annotations
 
@@ -66,7 +66,8 @@ class Box:
         """Build a box from lower and upper bounds [d], which are copied.
 
         Raises:
-            InputError: The bounds are not finite vectors of equal length >= 1, or not lower < upper.
+            InputError: The bounds are not finite vectors of equal length >= 1, or a lower bound is not below its upper
+                bound.
 
         Example:
             >>> Box.between([1.0, 0.0], [9.0, 1.0]).to_unit([[5.0, 0.25]])

@@ -5,14 +5,14 @@ at random points if they converge before their budget is used up.
 
 POUNDERS: S. M. Wild, "Solving Derivative-Free Nonlinear Least Squares Problems with POUNDERS", in Advances and Trends
 in Optimization with Engineering Applications, SIAM (2017), ch. 40. It is implemented here because the authors' package
-IBCDFO needs a solver (MINQ) that no package index offers. Each residual is modelled by the quadratic of least curvature
-through evaluated points near the best one. The sum of squares of these models, to second order, is minimised in a
-box-shaped trust region. Points that span all directions within the region are chosen first, because they make the
-models fully linear. If a direction is missing and the step failed, a point along it is evaluated before the region
-shrinks.
+IBCDFO needs a solver (MINQ) that is not in any package index. Each residual is modelled by the quadratic of least
+curvature through evaluated points near the best one. The sum of squares of these models, to second order, is minimised
+in a box-shaped trust region. Points that span all directions within the region are chosen first, because they make the
+models fully linear. If a direction is missing and the step failed, a point along this direction is evaluated before the
+region shrinks.
 
-Gauss-Newton is what a user with a least squares solver but no derivatives would run. Every accepted point requires one
-further evaluation per parameter, all in one batch. `descent.py` computes the steps.
+Gauss-Newton is the usual method of users with a least-squares solver but without derivatives. Every accepted point
+requires one further evaluation per parameter, all in one batch. `descent.py` computes the steps.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from calibray.optimizers.evaluations import Archive, Evaluations, Objective, roo
 from calibray.optimizers.protocol import Optimizer, Search, Session, first_start, limited
 
 SPANNING: Final = (1.75, 10.0)
-"""Largest distance of a spanning point, in units of radius x sqrt(d): for a fully linear model, then for any model."""
+"""Largest distances of spanning points, in units of radius x sqrt(d), for a fully linear model and for any model."""
 
 NEW_DIRECTION: Final = 1e-3
-"""A point spans a new direction if its component along this, divided by max(distance, radius), reaches theta_1."""
+"""Smallest component of a point along a new direction, divided by max(distance, radius), to span it (theta_1)."""
 
 INDEPENDENT: Final = 1e-3
 """Smallest pivot (see `_pivot`) at which a further point is included in the model (theta_2)."""
@@ -42,7 +42,7 @@ ACCEPTED: Final = 0.05
 """A step that achieves this share of the predicted decrease is successful; the trust region then does not shrink."""
 
 LARGEST: Final = 0.5
-"""Largest trust-region radius, as a share of the box."""
+"""Largest trust-region radius, as a share of the box width."""
 
 
 @final
@@ -52,8 +52,8 @@ class POUNDERS(Optimizer):
     Args:
         seed: Seed of the random points at which searches restart.
         budget: Number of evaluations.
-        radius: Initial trust-region radius, as a share of the box.
-        tolerance: Trust-region radius at which a search has converged, as a share of the box.
+        radius: Initial trust-region radius, as a share of the box width.
+        tolerance: Trust-region radius at which a search has converged, as a share of the box width.
 
     Raises:
         InputError: An argument is out of range.
@@ -146,7 +146,8 @@ def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: 
 def _spanning(points: _Points, best: int, radius: float) -> tuple[list[int], NDArray[np.float64] | None]:
     """Indices of points that span the directions around the best point, and the missing directions [k, d].
 
-    Directions are missing if near points do not span them; the model is then not fully linear. None if none is missing.
+    A direction is missing if nearby points do not span it; the model is then not fully linear. The second value is None
+    if no direction is missing.
     """
     offset = (points.unit - points.unit[best]) / radius
     distance = np.linalg.norm(offset, axis=1)
@@ -173,7 +174,7 @@ def _spanning(points: _Points, best: int, radius: float) -> tuple[list[int], NDA
 def _enriched(points: _Points, best: int, chosen: list[int], radius: float) -> NDArray[np.int64]:
     """Indices of the best point, the spanning points, and further points that determine the curvature well.
 
-    There are at most 2 d + 1 points, as in the paper's experiments.
+    There are at most 2 d + 1 points, as in Wild's experiments.
     """
     offset = (points.unit - points.unit[best]) / radius
     near = np.flatnonzero(np.linalg.norm(offset, axis=1) <= SPANNING[1] * np.sqrt(offset.shape[1]))
@@ -187,7 +188,7 @@ def _enriched(points: _Points, best: int, chosen: list[int], radius: float) -> N
 
 
 def _pivot(offset: NDArray[np.float64]) -> float:
-    """Smallest singular value of the quadratic kernel, projected onto what linear functions cannot represent."""
+    """Smallest singular value of the quadratic kernel, projected onto the complement of the linear functions."""
     plane = np.hstack([np.ones((len(offset), 1)), offset])
     # Weights of the points with which the values of every linear function sum to zero.
     q = np.linalg.qr(plane, mode="complete")[0][:, plane.shape[1] :]
@@ -202,7 +203,7 @@ def _quadratic(offset: NDArray[np.float64]) -> NDArray[np.float64]:
 def _step(
     points: _Points, best: int, kept: NDArray[np.int64], radius: float
 ) -> tuple[NDArray[np.float64], float]:
-    """The step [d] that minimises the model in the trust region, and the predicted decrease of the value."""
+    """The step [d] that minimises the model in the trust region, and the predicted decrease in the value."""
     offset = (points.unit[kept] - points.unit[best]) / radius
     count, d = offset.shape
     plane = np.hstack([np.ones((count, 1)), offset])
@@ -235,9 +236,9 @@ def improving_point(
 ) -> NDArray[np.float64]:
     """A point of the unit cube [d] that improves the model around `centre` [d].
 
-    It lies within the radius along a missing direction [k, d], opposite to one, or along an axis towards the farther
-    face. The point with the largest component along missing directions is chosen; in a corner, these may all lead
-    outside.
+    The point lies within the radius along a missing direction [k, d], opposite to a missing direction, or along an axis
+    towards the farther face. Of these points, the one with the largest component along missing directions is chosen. In
+    a corner, all missing directions can lead out of the cube.
     """
     directions = np.vstack([missing, -missing, np.diag(np.where(centre <= 0.5, 1.0, -1.0))])
     edge = np.where(directions > 0, 1.0 - centre, centre)
@@ -255,8 +256,8 @@ class GaussNewton(Optimizer):
     Args:
         seed: Seed of the random points at which searches restart.
         budget: Number of evaluations.
-        step: Finite-difference step, as a share of the box.
-        tolerance: Relative decrease in cost, or step as a share of the box, below which a search has converged.
+        step: Finite-difference step, as a share of the box width.
+        tolerance: Relative decrease in cost, or step as a share of the box width, below which a search has converged.
 
     Raises:
         InputError: An argument is out of range.

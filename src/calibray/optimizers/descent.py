@@ -2,8 +2,8 @@
 
 A step minimises the damped quadratic model g.p + p.(H + mu I) p / 2 within the cube, where H and g are J^T J and J^T r
 divided by the number of residuals. Components that would leave the cube are fixed at its face, and the system is solved
-again for the rest, until none leaves the cube. The damping mu is updated from the gain ratio as in H. B. Nielsen
-(Damping Parameter in Marquardt's Method, IMM-REP-1999-05, Technical University of Denmark).
+again for the rest, until no component leaves the cube. The damping mu is updated from the gain ratio as in H. B.
+Nielsen (Damping Parameter in Marquardt's Method, IMM-REP-1999-05, Technical University of Denmark).
 
 `descend` is a generator, so its caller decides how points are evaluated: `least_squares.py` calls the engine, and
 `descend_all` calls a model.
@@ -25,8 +25,9 @@ MERGE_DISTANCE = 1e-3
 """Distance in the unit cube below which two searches are assumed to approach the same minimum."""
 
 Residuals = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Residuals [s, m] and their Jacobian with respect to unit-cube coordinates [s, m, d]; a row of residuals that is not
-finite marks a failed evaluation."""
+"""Residuals [s, m] and their Jacobian with respect to unit-cube coordinates [s, m, d]; a row with a residual that is
+not finite marks a failed evaluation.
+"""
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Starts:
         curvature: Gauss-Newton matrix H of the cost [s, d, d].
         damping: Damping mu [s].
         growth: Factor by which the next rejection increases the damping [s].
-        searches: Number of searches merged into each one, including itself [s].
+        searches: Number of searches merged into each search, including itself [s].
     """
 
     unit: NDArray[np.float64]
@@ -130,10 +131,10 @@ def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> St
 
 
 def merge(starts: Starts, settled: Starts) -> tuple[Starts, Starts, NDArray[np.bool_]]:
-    """Find searches that are close to a better one and would only reach the same minimum.
+    """Find searches that are close to a better search and would only reach the same minimum.
 
-    Returns the moving and the settled searches, whose counts `searches` include the searches merged into them, and a
-    mask of the moving searches that can be dropped [s].
+    Returns the moving searches, the settled searches, and a mask of the moving searches that can be dropped [s]. The
+    counts `searches` include the merged searches.
     """
     number, cost = len(settled.cost), np.concatenate([settled.cost, starts.cost])
     # Ties are broken by index, so that exactly one of two close searches is better.
@@ -160,9 +161,10 @@ def descend(
 
     Each search takes at most `iterations` steps. It has converged if its model predicts a relative decrease in cost, or
     a step, below `tolerance`. A search is abandoned if its cost exceeds the lowest one by more than `catch_up` times
-    its predicted decrease. Searches that come close to the end of a better `earlier` one are merged with it. Only the
-    `followed` starting points with the lowest cost are used; all if None. Yields points to evaluate [s, d]. Returns the
-    earlier searches, then those that converged or were still moving at the end, then the abandoned ones.
+    its predicted decrease. A search that comes close to the end of a better search in `earlier` is merged with it. Only
+    the `followed` starting points with the lowest cost are used; all are used if None. Yields points to evaluate [s,
+    d]. Returns the earlier searches, then the searches that converged or were still moving at the end, and then the
+    abandoned searches.
     """
     starts = begin(unit, (yield unit))
     # Searches do not start at failed evaluations.
@@ -206,7 +208,7 @@ def descend_all(
 
 
 def distinct(starts: Starts, separation: float) -> Starts:
-    """Keep the best of the searches that ended within `separation` of each other, lowest cost first."""
+    """Keep only the best of searches that ended within `separation` of each other, and sort them by cost."""
     order = np.argsort(starts.cost, kind="stable")
     near = cdist(starts.unit[order], starts.unit[order]) < separation
     kept = np.zeros(len(order), dtype=bool)

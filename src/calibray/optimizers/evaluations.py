@@ -12,10 +12,10 @@ from calibray.errors import InputError
 from calibray.optimizers.arguments import Box
 
 Objective = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""Function from residuals [n, m] to values [n], which must rise with the mean square of the residuals."""
+"""Function that maps residuals [n, m] to values [n], which must increase with the mean square of the residuals."""
 
 OBJECTIVE_TOLERANCE = 1e-4
-"""Largest accepted relative difference between a value and the one computed from its residuals; allows for float32."""
+"""Largest accepted relative difference between a value and its computation from the residuals; allows for float32."""
 
 DECIMALS = 9
 """Number of decimals to which unit-cube coordinates are rounded before repeated points are merged."""
@@ -36,7 +36,7 @@ class Evaluations:
     Attributes:
         x: Points [n, d].
         y: Values [n], +inf for a failed evaluation.
-        residuals: Residuals [n, m], or None; their mean square rises and falls with y.
+        residuals: Residuals [n, m], or None; their mean square increases with y.
         jacobian: Derivatives of the residuals with respect to the parameters [n, m, d], or None.
     """
 
@@ -126,7 +126,7 @@ class Archive:
 
     @property
     def lowest(self) -> float:
-        """Root mean square of the residuals of `leading`; +inf if none succeeded. `y` may have a different scale."""
+        """Root mean square of the residuals of `leading`; +inf if all failed. `y` can have a different scale."""
         succeeded = self._leading is not None and np.isfinite(self._leading.y[0])
         return float(root_mean_square(self.leading.errors)[0]) if succeeded else np.inf
 
@@ -142,9 +142,9 @@ class Archive:
         return self._parts[0]
 
     def leaders(self, count: int) -> NDArray[np.float64]:
-        """The best distinct points of the whole run [count, d], best first, ties in the order of `tell`.
+        """The best distinct points of the whole run [count, d], best first, with ties in the order of `tell`.
 
-        If there are fewer than `count`, the last one is repeated.
+        If there are fewer than `count` points, the last point is repeated.
         """
         evaluations = self.all()
         chosen: list[NDArray[np.float64]] = []
@@ -156,9 +156,9 @@ class Archive:
         return np.array(chosen + [chosen[-1]] * (count - len(chosen)))
 
     def imputed(self, evaluations: Evaluations) -> Evaluations:
-        """Give failed evaluations the value and residuals of the worst successful one, so that models avoid them.
+        """Assign the value and residuals of the worst success to failed evaluations, so that models avoid them.
 
-        Both are zero while every evaluation of the run has failed.
+        Both are zero if every evaluation so far has failed.
         """
         run = self.all()
         failed, good = ~np.isfinite(evaluations.y), np.flatnonzero(np.isfinite(run.y))
@@ -182,7 +182,8 @@ def checked_evaluations(
     """Validate and copy evaluations: points x [n, d], values y [n], and the residuals and Jacobian in `parts`.
 
     A value of +inf marks a failed evaluation, whose residuals and derivatives are ignored. Parts that the optimizer
-    does not use are checked and dropped. Values are compared with the `objective` of the residuals unless it is None.
+    does not use are checked and dropped. Values are compared with the objective of the residuals unless `objective` is
+    None.
 
     Raises:
         InputError: A shape is wrong, a number is not finite, a point is outside the box, a part that the optimizer uses
@@ -225,7 +226,7 @@ def checked_evaluations(
 
 
 def check_order(evaluations: Evaluations, archive: Archive) -> None:
-    """Check that a lower value means a lower mean square, among the new evaluations and the best one so far.
+    """Check that a lower value means a lower mean square for the new evaluations and the best one so far.
 
     Raises:
         InputError: An evaluation has a lower value than another one, but a higher mean square.
@@ -257,7 +258,7 @@ def root_mean_square(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
 def merge_repeated(
     unit: NDArray[np.float64], values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Merge repeated points [n, d] in the unit cube: distinct points [k, d], and the means of their values [k, ...]."""
+    """Merge repeated points [n, d] in the unit cube into distinct points [k, d] with mean values [k, ...]."""
     points, group = np.unique(np.round(unit, DECIMALS), axis=0, return_inverse=True)
     # Each row averages the repeats of one point.
     share = (np.arange(len(points))[:, None] == group) / np.bincount(group)[:, None]

@@ -1,6 +1,6 @@
-"""Bayesian optimization: a Gaussian process models the value, and its expected improvement selects candidates.
+"""Bayesian optimization: a Gaussian process models the value, and the expected improvement selects candidates.
 
-This method models one number, whereas `VectorSurrogate` models every residual; both use `regression.py`. A run begins
+This method models one value, whereas `VectorSurrogate` models every residual; both use `regression.py`. A run begins
 with a maximin Latin hypercube. Every further candidate maximises the log expected improvement (D. R. Jones, M.
 Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15; the logarithm as in S. Ament et al., NeurIPS 2023,
 arXiv:2310.20708). A failed evaluation enters the model with the worst successful value.
@@ -21,7 +21,7 @@ from calibray.optimizers.regression import Kriging, fit, solve
 from calibray.optimizers.sampling import SEPARATION, distance_to_nearest, draw_around, maximin_design
 
 CANDIDATES = 300
-"""Number of candidates drawn over the whole box, and number of candidates drawn around the best points."""
+"""Number of candidates drawn over the whole box, and also of candidates drawn around the best points."""
 
 
 @final
@@ -30,7 +30,7 @@ class GaussianProcess(Optimizer):
 
     Args:
         budget: Number of evaluations; 20 d if None.
-        initial: Size of the initial design; 2 (d + 1) if None. Points already passed to `tell` count.
+        initial: Size of the initial design; 2 (d + 1) if None. Points already passed to `tell` are included.
 
     Raises:
         InputError: An argument is out of range.
@@ -77,7 +77,7 @@ class GaussianProcess(Optimizer):
             yield self.box.from_unit(x[None])
 
     def _promising(self, model: Kriging, taken: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The point [d] with the largest expected improvement; `taken` are the evaluated points, best first."""
+        """The point [d] with the largest expected improvement; `taken` contains the evaluated points, best first."""
         d, best = self.box.dimension, float(model.residuals.min())
         around = draw_around(taken[:5], CANDIDATES, -3.0, self._rng)
         candidates = np.vstack([self._rng.random((CANDIDATES, d)), around])
@@ -93,7 +93,7 @@ class GaussianProcess(Optimizer):
 
 
 def log_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDArray[np.float64]:
-    """Logarithm [k] of the expected improvement of the value over the best one, at points x [k, d]."""
+    """Logarithm [k] of the expected improvement over the best value, at points x [k, d]."""
     mean, share = model.predict(x)
     spread = np.sqrt(np.maximum(share * model.variance[0], 1e-300))
     z = (best - mean[:, 0]) / spread

@@ -15,25 +15,26 @@ following choices apply where descriptions and common implementations differ:
 
 SGWO-IM, the Surrogate-assisted Grey Wolf Optimizer with Individual Memory: X. Zou, P. Tang, P. Liu, C. Tai, "Efficient
 and Accurate Surrogate-Assisted Electromagnetic Parameter Calibration for 6G Digital Twin Channels", Algorithm 1 and
-eqs. 2 to 4. Defaults are its Table II: N = 30, T = 20, cosine convergence, memory weight 0.1 to 0.3, 5 full iterations,
-then K = 5 real evaluations per iteration: 5 * 30 + 15 * 5 = 225 evaluations.
+eqs. 2 to 4. The defaults are those of its Table II: N = 30, T = 20, cosine convergence, memory weight 0.1 to 0.3, 5
+full iterations, and K = 5 real evaluations in each later iteration. A run thus takes 5 * 30 + 15 * 5 = 225 evaluations.
 
 The following choices apply where the paper is silent, in addition to those of GWO:
 
 - "RBF model is available" means t > `full_iterations`. The model is refitted in every iteration on all real evaluations
   of the run, including those that were not requested.
 - Wolves that the surrogate does not select still move; only their real evaluations change their memory.
-- Each memory starts at the initial position with a score of infinity, and is replaced only by a strictly lower score.
+- Each memory starts at the initial position with a score of infinity, and is replaced only by an evaluation with a
+  strictly lower score.
 - The K elites are evaluated in ascending order of their predictions; ties keep the order of the pack.
 - Memory fusion (eq. 3) uses the unclipped X_GWO; the fused position is clipped.
 - Predictions only determine which wolves are evaluated: leaders, memories and the best point come from the archive of
   real evaluations.
 
-With `w_min = w_max = 0`, linear convergence and no surrogate, SGWO-IM equals GWO bit for bit.
+With `w_min = w_max = 0`, linear convergence and no surrogate, SGWO-IM gives the same results as GWO, bit for bit.
 
 The surrogate is SciPy's `RBFInterpolator`, cubic with a linear tail, on inputs scaled to the unit cube, with smoothing
-1e-6. Repeated points are merged and their objectives averaged. A failed evaluation counts as the worst successful one,
-so that the model avoids it and is not distorted by infinity.
+1e-6. Repeated points are merged and their objectives averaged. A failed evaluation is assigned the worst successful
+value, so that the model avoids its point and is not distorted by infinity.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ def encircle(
 def whole_iterations(budget: int) -> dict[str, int]:
     """The settings of GWO for a budget: 30 wolves, and as many complete iterations as the budget allows.
 
-    There are fewer wolves if the budget does not allow two iterations of 30.
+    There are fewer wolves if the budget does not allow two iterations of 30 wolves.
 
     Example:
         >>> whole_iterations(600), whole_iterations(45)
@@ -106,7 +107,7 @@ def whole_iterations(budget: int) -> dict[str, int]:
 
 @final
 class GWO(Optimizer):
-    """Grey Wolf Optimizer. Uses only objective values; 600 evaluations at the paper's settings.
+    """Grey Wolf Optimizer. Uses only objective values; 600 evaluations with the paper's settings.
 
     Args:
         population: N, number of wolves.
@@ -173,7 +174,8 @@ CONVERGENCE = {"cosine": cosine_decay, "linear": linear_decay}
 def screened_iterations(budget: int) -> dict[str, int]:
     """The settings of SGWO-IM for a budget: the paper's schedule for 225 evaluations, scaled for other budgets.
 
-    At most two thirds go to 5 full iterations of at most 30 wolves, and the rest to iterations of at most 5 elites.
+    At most two thirds of the budget are spent on 5 full iterations of at most 30 wolves. The rest is spent on
+    iterations of at most 5 elites.
 
     Example:
         >>> screened_iterations(225)
@@ -187,7 +189,7 @@ def screened_iterations(budget: int) -> dict[str, int]:
 
 @final
 class SGWOIM(Optimizer):
-    """The paper's optimizer. Uses only objective values; 225 evaluations at the paper's settings.
+    """The paper's optimizer. Uses only objective values; 225 evaluations with the paper's settings.
 
     Args:
         population: N, number of wolves.
@@ -248,7 +250,7 @@ class SGWOIM(Optimizer):
 
     @property
     def memory(self) -> Evaluations:
-        """The best evaluation of each wolf; its initial position and +inf if it has not been evaluated yet.
+        """The best evaluation of each wolf; before its first evaluation, its initial position and the value +inf.
 
         Raises:
             InputError: `ask` has not been called yet.
@@ -274,7 +276,7 @@ class SGWOIM(Optimizer):
             positions = self.box.clip((1.0 - w) * guided + w * memory.x)  # eq. 3
 
     def _screen(self, archive: Archive, positions: NDArray[np.float64], iteration: int) -> NDArray[np.intp]:
-        """The wolves to evaluate: all of them in full iterations, then the K that the surrogate ranks best."""
+        """The wolves to evaluate: all wolves in full iterations, then the K wolves that the surrogate ranks best."""
         if not self.surrogate or iteration <= self.full_iterations:
             return np.arange(self.population)
         predicted = predict(archive, positions)
@@ -290,7 +292,7 @@ def remember(memory: Evaluations, wolves: NDArray[np.intp], answers: Evaluations
 
 
 def predict(archive: Archive, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Predict the objective at candidates [n, d] from all real evaluations; zero while all have failed.
+    """Predict the objective at candidates [n, d] from all real evaluations; zero if all of these failed.
 
     The archive must contain more than d distinct points that span the box.
     """

@@ -1,11 +1,11 @@
-"""Multi-start least squares with exact derivatives: projected Levenberg-Marquardt on all starts at once.
+"""Multi-start least squares with exact derivatives: projected Levenberg-Marquardt from all starts in parallel.
 
 Local searches are cheap if the engine returns derivatives, and a batch of candidates takes little longer than one
 candidate. Many searches therefore run in parallel, and each `ask` returns the next trial point of every search still in
-progress. RMSE as a function of permittivities is multimodal (slab resonances), so one starting point is not enough. A
-search that comes close to a better one is merged with it. A search too far behind the best one to catch up is
-abandoned, and its last point is kept as a further minimum (`minima`). Minima that fit nearly as well show how ambiguous
-the best one is. `descent.py` computes the steps.
+progress. Because of slab resonances, RMSE is a multimodal function of the permittivities, so one starting point is not
+enough. A search that comes close to a better one is merged with it. A search that is too far behind the best one to
+catch up is abandoned, and its last point is kept as a further minimum (`minima`). Minima that fit nearly as well show
+how ambiguous the best one is. `descent.py` computes the steps.
 
 Starting points are used in rounds, until `RETURNS` searches have ended in the best minimum. If another minimum fitted
 better and had an equally wide basin, all searches would have missed it with a probability of e^-k after k returns. All
@@ -43,10 +43,11 @@ NEARER = 10.0
 """The same multiple for searches from combined minima, which start near the minima that they reach."""
 
 COMBINATIONS = 32
-"""Number of combinations of minima tried at a time, or the number of starting points if that is smaller."""
+"""Largest number of combinations of minima that are tried at a time; the number of starting points is a further limit.
+"""
 
 FOLLOWED = 0.2
-"""Share of the combinations from which searches start: the best-fitting ones."""
+"""Share of the combinations, namely of those that fit best, from which searches start."""
 
 PARENTS = 12
 """Number of lowest minima that are combined."""
@@ -58,23 +59,24 @@ ROUND = 64
 """Number of starting points per round."""
 
 HOPS = 8
-"""Number of starting points per search in a round of basin hopping."""
+"""Each round of basin hopping has one search for every group of this number of starting points."""
 
 PATIENCE = 6
 """Number of successive rounds without a lower minimum after which basin hopping ends. In 24 development problems that
-use all starting points, 14 runs ended above the lowest known minimum with a patience of 0, nine with 3, two with 6."""
+use all starting points, 14 runs ended above the lowest known minimum with a patience of 0, nine with 3, and two with 6.
+"""
 
 RETURNS = 10
 """Number of searches that must end in the best minimum before the method stops starting new ones."""
 
 LEVEL = 1e-4
-"""Relative difference in mean square below which two minima fit equally well, for example along a valley."""
+"""Relative difference in mean square below which two minima are considered to fit equally well, as along a valley."""
 
 NOISELESS = 1e-9
-"""Share of the largest mean square added to this difference: without noise, low mean squares are rounding errors."""
+"""Share of the largest mean square added to this difference, because noiseless mean squares are rounding errors."""
 
 APART = 0.01
-"""Distance in the unit cube below which two searches count as having ended in the same minimum."""
+"""Distance in the unit cube below which two searches are considered to have ended in the same minimum."""
 
 
 @final
@@ -84,15 +86,16 @@ class LeastSquares(Optimizer):
     Args:
         seed: Seed of the scrambled Sobol points from which searches start, and of basin hopping.
         starts: Largest number of these points; powers of two cover the box most evenly. Each costs about ten
-            evaluations. If all are used, combinations of the minima and basin hopping need about as many evaluations
-            again. The best point passed to `tell` before the first `ask`, if any, is a further starting point.
+            evaluations. If all are used, combinations of the minima and basin hopping need about the same number of
+            evaluations again. The best point passed to `tell` before the first `ask`, if any, is a further starting
+            point.
         x0: Further starting points, [d] or [k, d].
         iterations: Largest number of steps of each search.
         tolerance: A search has converged if its model predicts a relative decrease in mean square below this tolerance,
-            or a step shorter than this in the unit cube.
+            or a step shorter than the tolerance in the unit cube.
         catch_up: A search is abandoned if its cost exceeds the lowest one by more than this multiple of its predicted
-            decrease. Use a smaller number if some starting points are already minima and the others only need to show
-            whether they lead to a better one.
+            decrease. Use a smaller number if some starting points are already minima and the others are only checked
+            for a better minimum.
 
     Raises:
         InputError: An argument is out of range.
@@ -193,21 +196,21 @@ class LeastSquares(Optimizer):
 
 
 def returns(ended: Starts) -> int:
-    """Number of searches that ended in the best minimum or in one that fits equally well, including merged ones."""
+    """Number of searches that ended in the best minimum or in an equally good one, including merged searches."""
     if not len(ended.cost):
         return 0
     return int(ended.searches[ended.cost <= ended.cost.min() + _slack(ended)].sum())
 
 
 def recombine(minima: NDArray[np.float64], number: int) -> NDArray[np.float64]:
-    """Combine minima [k, d], best first, into at most `number` points from which other minima may be reached.
+    """Combine minima [k, d], best first, into at most `number` points from which searches can reach other minima.
 
-    The best minimum is shifted by the difference between two others, or takes one coordinate from another. Shifts help
-    because one cause, such as a resonating slab, repeats minima at equal distances whatever the other parameters are;
-    they are the mutation of differential evolution (Storn and Price, Journal of Global Optimization 11, 1997).
-    Exchanges, its crossover, help if parameters act nearly independently, such as those of materials that rarely occur
-    on the same path. Points within `SPACE` of a minimum are excluded. Shifts and exchanges alternate, starting with
-    those of the lowest minima.
+    The best minimum is shifted by the difference between two minima, or one of its coordinates is replaced with that of
+    another minimum. Shifts help because one cause, such as a resonating slab, repeats minima at equal distances,
+    regardless of the other parameters. They correspond to the mutation of differential evolution (Storn and Price,
+    Journal of Global Optimization 11, 1997). Exchanges correspond to its crossover. They help if parameters act nearly
+    independently, such as those of materials that rarely occur on the same path. Points within `SPACE` of a minimum are
+    excluded. Shifts and exchanges alternate, starting with those of the lowest minima.
     """
     best, low, dimension = minima[0], minima[:PARENTS], minima.shape[1]
     target, source = np.nonzero(~np.eye(len(low), dtype=bool))

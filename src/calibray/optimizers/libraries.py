@@ -1,4 +1,4 @@
-"""Minimisers from other libraries as ask-and-tell searches: CMA-ES, DFO-LS and SciPy's differential evolution.
+"""Minimisers from other libraries as ask/tell searches: CMA-ES, DFO-LS and SciPy's differential evolution.
 
 - CMA-ES, in its author's package `cma`: N. Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772. It
   starts in the middle of the unit cube with a step size of 0.3.
@@ -8,8 +8,8 @@
 - Differential evolution: R. Storn, K. Price, J. Global Optim. 11 (1997) 341. Each batch is one generation. SciPy's
   final polish, which would need derivatives, is omitted.
 
-All start at the best point already passed to `tell`, if any. They restart from a random point or population if they
-converge before their budget is used up.
+All methods start at the best point already passed to `tell`, if any. They restart from a random point or population if
+they converge before their budget is used up.
 
 A minimiser that calls its objective runs in a separate thread, and waits inside the objective for the evaluation. Only
 one of the two threads runs at a time, so a run is as reproducible as the library. If a search is dropped before its
@@ -38,7 +38,7 @@ Evaluate = Callable[[NDArray[np.float64]], Evaluations]
 
 
 class _AbandonedError(BaseException):
-    """Ends a minimiser whose search was dropped; not an `Exception`, because a library might catch that."""
+    """Ends a minimiser whose search was dropped; it is not an `Exception`, because a library might catch that."""
 
 
 def inverted(minimise: Callable[[Evaluate], None]) -> Search:
@@ -138,8 +138,8 @@ class DFOLS(Optimizer):
     Args:
         seed: Seed of the random points at which searches restart.
         budget: Number of evaluations.
-        radius: Initial trust-region radius, as a share of the box.
-        tolerance: Trust-region radius at which a search has converged, as a share of the box.
+        radius: Initial trust-region radius, as a share of the box width.
+        tolerance: Trust-region radius at which a search has converged, as a share of the box width.
 
     Raises:
         InputError: An argument is out of range, or `DFO-LS` is not installed.

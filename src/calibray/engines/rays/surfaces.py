@@ -1,4 +1,4 @@
-"""The surface of every interaction of a ray table: its normal, its material, and the diffracting edge."""
+"""The surface of every interaction in a ray table, with its normal and material, and the edge of every diffraction."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from calibray.scenes import Scene
 from calibray.scenes.shapes import read_surface
 
 TOLERANCE: Final = 0.02
-"""Largest distance of an interaction from its surface [m]; coordinates rounded to centimetres lie within 0.009 m."""
+"""Largest distance of an interaction from its surface [m]; rounding to centimetres moves a point by at most 0.009 m."""
 
 SAME: Final = 1e-3
-"""Faces coincide at a point if their distances from it differ by less than this [m]."""
+"""Faces are considered coincident at a point if their distances from the point differ by less than this value [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ class Surfaces:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Interactions with their directions and, if the table states it, their material.
+    """Interactions with their directions and, if the table states them, their materials.
 
     Attributes:
         point: Positions [n, 3], [m].
@@ -97,7 +97,7 @@ class Hits:
         leaving: Unit vectors of propagation after the interaction [n, 3].
         length: Length of the shorter of the two adjacent segments [n], [m].
         reflects: Whether the law of reflection must hold [n].
-        diffracts: Whether an edge diffracts the wave; the edge's faces may have different materials [n].
+        diffracts: Whether an edge diffracts the wave; the edge's faces can have different materials [n].
         material: Index of the stated material; -1 if none is stated [n].
         label: Names of the interactions in messages [n].
     """
@@ -119,14 +119,15 @@ class Hits:
 
 
 def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.int64], float]:
-    """Index of every interaction's face [n], and the largest distance between them [m]; `names` are the materials.
+    """Index of every interaction's face [n], and the largest distance of an interaction from its face [m].
 
-    A reflection gets the nearest face with which it obeys the law of reflection, any other interaction the nearest
-    face. Except for diffractions, the face must have the stated material.
+    A reflection is assigned to the nearest face at which it obeys the law of reflection. Any other interaction is
+    assigned to the nearest face. Except for diffractions, the face must have the stated material. `names` contains the
+    names of the materials.
 
     Raises:
-        InputError: A point is on no surface (of its material), faces of different materials coincide there, or no
-            surface reflects the wave in the direction of the path.
+        InputError: A point is not on a surface (of its material), faces of different materials coincide at a point, or
+            no surface reflects the wave in the direction of the path.
     """
     index, face, distance = surfaces.near(hits.point, TOLERANCE)
     free = (hits.material < 0) | hits.diffracts
@@ -155,15 +156,15 @@ def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.
 
 
 def _off_surface(surfaces: Surfaces, hits: Hits, lost: NDArray[np.int64], names: list[str]) -> InputError:
-    """The error for points that are on no surface."""
+    """The error for points that are not on a surface."""
     number = lost[0]
     stated = hits.material[number]
     faces = np.ones(len(surfaces.material), bool) if stated < 0 else surfaces.material == stated
     surface = "surface of the scene" if stated < 0 else f"surface of {names[stated]!r}"
     return InputError(
-        f"{hits.label[number]}: lies {surfaces.distance(hits.point[number], faces):.3g} m from the nearest {surface}, "
-        f"must lie within {TOLERANCE} m ({len(lost)} of {len(hits.point)} interactions do not); check units [m], axes "
-        "(argument axes), scene and material"
+        f"{hits.label[number]}: lies {surfaces.distance(hits.point[number], faces):.3g} m from the nearest {surface} "
+        f"but must lie within {TOLERANCE} m ({len(lost)} of {len(hits.point)} interactions do not); check units [m], "
+        "axes (argument axes), scene and material"
     )
 
 
@@ -204,10 +205,10 @@ class Edge:
 
 
 def find_edge(surfaces: Surfaces, hits: Hits, number: int) -> Edge:
-    """The edge of a diffraction: of all pairs of faces at the point, the one that satisfies Keller's law best.
+    """The edge of a diffraction: the pair of faces at the point that satisfies Keller's law best.
 
     Raises:
-        InputError: No two faces form an edge there that diffracts the wave in the direction of the path.
+        InputError: No two faces at the point form an edge that diffracts the wave in the direction of the path.
     """
     _, faces, _ = surfaces.near(hits.point[[number]], TOLERANCE)
     edges = [_edge(surfaces, hits, number, (a, b)) for a in faces.tolist() for b in faces.tolist() if a != b]

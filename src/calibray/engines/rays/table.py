@@ -1,7 +1,7 @@
 """A ray table: one row for each point of a path, from the transmitter via the interactions to the receiver.
 
-`docs/reference/ray-table.md` documents the columns. Rows may be in any order, because every row states its path and its
-position on this path. Files are CSV, Parquet, JSON or HDF5, distinguished by their extension.
+`docs/reference/ray-table.md` documents the columns. Rows can be in any order, because every row states its path and its
+position on the path. Files are in CSV, Parquet, JSON or HDF5, depending on their extension.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ ENDS: Final = ("transmitter", "receiver")
 REQUIRED: Final = ("path", "point", "type", "x", "y", "z")
 POWERS: Final = ("power_db", "gain_real", "gain_imag")
 OPTIONAL: Final = ("material", "object", "link", "delay", *POWERS)
-"""Optional columns of a table; without a check, a misspelt name would be ignored."""
+"""Optional columns of a table; unknown names are compared with these, because a misspelt name would be ignored."""
 
 QUANTITIES: Final = {
     "power": "power_db", "gain": "power_db", "loss": "power_db", "delay": "delay", "material": "material",
 }  # fmt: skip
-"""Beginnings of column names, with the column that each one probably means."""
+"""Beginnings of column names, and the column that each probably refers to."""
 
 MISSPELT: Final = 0.8
-"""Smallest similarity at which an unknown column counts as misspelt: `line` does not count as a misspelt `link`."""
+"""Smallest similarity at which an unknown column is considered misspelt; `line` is not considered a misspelt `link`."""
 
 MOST_POINTS: Final = RANGES["max_depth"][1] + 2
 """Largest number of points of a path: the largest number of interactions of a trace, plus both ends."""
@@ -58,7 +58,7 @@ NO_POWER: Final = {"power_db": "-inf", "gain_real": "0", "gain_imag": "0"}
 """Values of the columns for a path without power."""
 
 POWER_ZERO_DB: Final = -10_000.0
-"""Level used instead of -inf [dB]: its power is 0 in double precision."""
+"""Level used instead of -inf [dB]; the corresponding power is 0 in double precision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class RayTable:
     Attributes:
         source: Name of the table, for messages.
         path: Number or label of every path [P].
-        link: Number or label of every path's link [P]; None if the ends of the paths distinguish the links.
+        link: Number or label of every path's link [P]; None if links are distinguished by the ends of their paths.
         tx: Transmitter position of every path [P, 3], [m].
         rx: Receiver position of every path [P, 3], [m].
         vertex: Interaction points [P, D, 3], [m].
@@ -93,7 +93,7 @@ class RayTable:
 
     @classmethod
     def of(cls, table: SourceTable, axes: str = "x y z") -> RayTable:
-        """Read paths from rows; `axes` names the table's axes that are the scene's x, y and z, such as "x -z y".
+        """Read paths from rows; `axes` lists the table's axes for the scene's x, y and z, such as "x -z y".
 
         Raises:
             InputError: A column is missing or malformed, a path is incomplete, or a value is impossible.
@@ -109,8 +109,8 @@ class RayTable:
         kind = _kinds(table, row_path, step, count)
         if wrong := np.flatnonzero((point[order] - point[order][first][row_path]) != step).tolist():
             raise InputError(
-                f"{table.cell(wrong[0], 'point')}: the points of path {label[row_path[wrong[0]]]} must increase by 1 "
-                "without gaps or repetitions; complete the path"
+                f"{table.cell(wrong[0], 'point')}: the point numbers of path {label[row_path[wrong[0]]]} must increase by "
+                "1 without gaps or repetitions; complete the path"
             )
         position = _positions(table, axes)
         inner = kind != 0
@@ -184,7 +184,7 @@ def _checked_rows(table: SourceTable) -> SourceTable:
 
 
 def _with_known_names(table: SourceTable) -> SourceTable:
-    """The table with its known columns named as documented; refuses a name that seems to be misspelt."""
+    """The table with the documented names of its known columns; names that seem to be misspelt are refused."""
     known = (*REQUIRED, *OPTIONAL)
     given = [str(name) for name in table.frame]
     names = [name if (name := text.strip().casefold()) in known else text for text in given]
@@ -203,7 +203,7 @@ def _with_known_names(table: SourceTable) -> SourceTable:
 
 
 def _meant(name: str, absent: set[str]) -> str | None:
-    """The absent column that an unknown name probably means, or None."""
+    """The absent column that an unknown name probably refers to, or None."""
     quantity = re.match(rf"(?:path_?|received_?)?({'|'.join(QUANTITIES)})", name)
     if quantity and (known := QUANTITIES[quantity[1]]) in absent:
         return known
@@ -213,7 +213,7 @@ def _meant(name: str, absent: set[str]) -> str | None:
 def _kinds(
     table: SourceTable, row_path: NDArray[np.int64], step: NDArray[np.int64], count: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Kind of every row, 0 at the ends [rows]; refuses unknown types, and paths without their ends."""
+    """Kind of every row, 0 at the ends [rows]; unknown types and paths without their ends are refused."""
     stated = table.labels("type")
     kinds = np.char.lower(np.char.strip(stated))
     known = [*ENDS, *TYPES]
@@ -237,7 +237,7 @@ def _kinds(
         row = int(np.argmax(wrong))
         raise InputError(
             f"{table.cell(row, 'type')}: {str(kinds[row])!r} at point {step[row]} of {count[row_path[row]]} of its "
-            f"path; the first point of a path is its transmitter, the last its receiver, with at most "
+            f"path; the first point of a path is its transmitter and the last its receiver, with at most "
             f"{MOST_POINTS - 2} interactions between them"
         )
     codes = {**dict.fromkeys(ENDS, 0), **TYPES}
@@ -248,7 +248,7 @@ def _positions(table: SourceTable, axes: str) -> NDArray[np.float64]:
     words = axes.split() if isinstance(axes, str) else []
     if sorted(word.lstrip("-") for word in words) != ["x", "y", "z"] or not re.fullmatch("[-xyz ]*", axes):
         raise InputError(
-            f"axes = {axes!r}: must name the table's axes that are x, y and z of the scene, such as 'x y z' or 'x -z y'"
+            f"axes = {axes!r}: must list the table's axes for x, y and z of the scene, such as 'x y z' or 'x -z y'"
         )
     sign = [-1.0 if word.startswith("-") else 1.0 for word in words]
     return np.stack([table.numbers(word.lstrip("-")) for word in words], axis=1) * sign
@@ -271,7 +271,7 @@ def _link(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray | None:
 
 
 def _names(table: SourceTable, name: str) -> NDArray:
-    """Whole numbers of a column, which sort as numbers, or otherwise its labels [rows]."""
+    """Values of a column as integers, which sort as numbers, or otherwise as labels [rows]."""
     column = table.column(name)
     if pd.api.types.is_integer_dtype(column) and not column.isna().any():
         return column.to_numpy()
@@ -331,13 +331,13 @@ def _power(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray[np.float6
 
 
 LARGEST_JSON: Final = 2**26
-"""Largest JSON file [bytes]; in memory, its numbers take about twenty times as much."""
+"""Largest JSON file [bytes]; in memory, its numbers occupy about twenty times as much."""
 
 HDF5: Final = b"\x89HDF"
 """First bytes of an HDF5 file."""
 
 LARGEST_ARRAYS: Final = 2**30
-"""Largest size of datasets or matrices in memory [bytes]; kilobytes may decompress to gigabytes."""
+"""Largest size of datasets or matrices in memory [bytes], because kilobytes can decompress to gigabytes."""
 
 
 def read_ray_file(file: str | Path) -> SourceTable:
@@ -380,7 +380,7 @@ def columns_table(columns: Mapping[Any, Any], source: str) -> SourceTable:
     """The rows of a table in memory, given as one list per column.
 
     Raises:
-        InputError: The columns have different lengths, or no rows.
+        InputError: The columns have different lengths, or there are no rows.
     """
     return _parsed(columns, source)
 
