@@ -397,7 +397,7 @@ def test_diffuse_paths_need_their_power(yard: Tracer) -> None:
     np.testing.assert_allclose(
         path_loss(read(table, yard), changed), path_loss(scattered, changed), atol=1e-4
     )
-    with pytest.raises(InputError, match="need the power of the path"):
+    with pytest.raises(InputError, match="require the power of the path"):
         read(table.drop(columns="power_db"), yard)
 
 

@@ -59,7 +59,7 @@ ROUND = 64
 """Number of starting points per round."""
 
 HOPS = 8
-"""Each round of basin hopping has one search for every group of this number of starting points."""
+"""Ratio of the number of starting points to the number of searches in a round of basin hopping."""
 
 PATIENCE = 6
 """Number of successive rounds without a lower minimum after which basin hopping ends. In 24 development problems that

@@ -2,11 +2,12 @@
 
 Every candidate is stored in the trial that receives it. A new sampler with the same seed on a stored study therefore
 repeats the same candidates, uses their stored answers, and continues where the study stopped. Trials that the sampler
-did not propose (enqueued, or from another sampler) join the archive and can become leaders of the pack. A failed trial
-counts as a failed evaluation.
+did not propose (enqueued, or from another sampler) are added to the archive and can become leaders of the pack. A
+failed trial is treated as a failed evaluation.
 
 The pack cannot move before the iteration is complete. If workers are evaluating every open candidate, a candidate of
-another process is returned again, because that process may have ended. If there is none, the trial is a random point.
+another process is returned again, because that process might have ended. If there is no such candidate, the trial is a
+random point.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class SGWOIMSampler(BaseSampler):
 
     Args:
         search_space: The parameters and their distributions, float or integer. If None, they are inferred from the
-            trials, which makes the first trial a random point; categorical parameters are sampled at random.
+            trials, so the first trial is a random point. Categorical parameters are then sampled at random.
         seed: Seed.
         **settings: Further settings of `SGWOIM`.
 
@@ -123,7 +124,7 @@ class SGWOIMSampler(BaseSampler):
     def sample_independent(
         self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
     ) -> Any:
-        """Draw at random the value of a parameter that the pack does not search."""
+        """Draw a random value for a parameter that the pack does not search."""
         return self._random.sample_independent(study, trial, param_name, param_distribution)
 
     def after_trial(
@@ -156,7 +157,7 @@ class SGWOIMSampler(BaseSampler):
         state: TrialState,
         values: Sequence[float] | None,
     ) -> None:
-        """Pass a finished trial to the optimizer, once."""
+        """Pass a finished trial to the optimizer, unless it was passed before."""
         if trial.number in self._told or optimizer.done:
             return
         self._told.add(trial.number)

@@ -2,7 +2,7 @@
 
 An algorithm is written as in its paper: a generator that yields the candidates [n, d] of each iteration and receives
 their evaluations. A `Session` suspends it between `ask` and `tell`, checks the evaluations, keeps the archive, and
-collects the answers to a batch, which may come in any order and in portions.
+collects the answers to a batch, which can arrive in any order and in portions.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Session:
         objective: Function that converts residuals to the value, if residuals are used.
 
     Attributes:
-        minima: Distinct minima that the algorithm keeps, the lowest first [k, d]; empty until it sets them.
+        minima: Distinct minima that the algorithm keeps, the lowest first [k, d]; empty until the algorithm sets them.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class Session:
 
     @property
     def done(self) -> bool:
-        """Whether the algorithm has ended; to determine this, the next candidates may be computed."""
+        """Whether the algorithm has ended; if necessary, the next candidates are computed to determine this."""
         # The algorithm does not start before the first `ask`, so that `tell` can still receive earlier evaluations.
         if self._asked is not None:
             self._advance()
@@ -141,10 +141,10 @@ def first_start(archive: Archive) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Schedule:
-    """How a method respects a budget.
+    """Settings with which a method respects a budget.
 
     Attributes:
-        settings: Function from a number of evaluations to the constructor arguments that respect it.
+        settings: Function that maps a number of evaluations to constructor arguments that respect it.
         least: Smallest budget with which the method can run.
     """
 
@@ -163,18 +163,18 @@ class Optimizer(ABC):
     settings in the constructor, passes its algorithm to a `Session`, sets the attributes below whose defaults do not
     apply, and overrides nothing else.
 
-    The value may be any number, such as an error or a negative log likelihood. A method that uses residuals minimises
-    their mean square, so the value must rise and fall with it. For a likelihood, pass deviance residuals sign(r) sqrt(2
-    (l(r) - l(0))) to `tell`, where r are residuals with negative log likelihood l.
+    The value can be any number, such as an error or a negative log likelihood. A method that uses residuals minimises
+    their mean square, so the value must increase with the mean square. For a likelihood, pass deviance residuals
+    sign(r) sqrt(2 (l(r) - l(0))) to `tell`, where r are residuals with negative log likelihood l.
 
     Every constructor takes `lower` and `upper`, the bounds [d], and `seed`, the seed of the random generator. If
-    residuals are used, it also takes `objective`, a function from residuals [n, m] to the value [n]; the default is
-    their root mean square. `tell` checks that values agree with this function and rise with the mean square.
+    residuals are used, it also takes `objective`, a function that maps residuals [n, m] to the value [n]; the default
+    is the root mean square. `tell` checks that values agree with this function and increase with the mean square.
 
     Attributes:
         uses: The parts of an evaluation that the method uses: "value", "residuals", "jacobian".
         schedule: How the method respects a budget; None if it stops by itself.
-        takes_starts: Whether its constructor takes `x0`, starting points, and `starts`, the number of its own starting
+        takes_starts: Whether the constructor takes `x0`, starting points, and `starts`, the number of further starting
             points. Most methods also use the points passed to `tell` before the first `ask`.
     """
 
@@ -225,7 +225,7 @@ class Optimizer(ABC):
 
     @property
     def minima(self) -> NDArray[np.float64]:
-        """The best point, then the distinct minima that the method keeps, which may include the best point [k, d].
+        """The best point, then the distinct minima that the method keeps, which can include the best point [k, d].
 
         Raises:
             InputError: No evaluation has been passed to `tell` yet.
@@ -254,15 +254,15 @@ class Optimizer(ABC):
     ) -> None:
         """Pass evaluations to the optimizer; all arrays are copied.
 
-        Requested candidates may come in any order and in portions; the search continues when the batch is complete.
-        Points that were not requested, for instance those of an earlier run, join the archive. They can become the best
-        point, a leader or data for a surrogate, but they do not count as answers to candidates.
+        Requested candidates can be passed in any order and in portions; the search continues when the batch is
+        complete. Points that were not requested, for instance those of an earlier run, are added to the archive. They
+        can become the best point, a leader or data for a surrogate, but they are not treated as answers to candidates.
 
         Args:
             x: Points [n, d] inside the bounds.
             y: Values [n]; +inf for a failed evaluation.
-            residuals: Residuals [n, m], weighted so that y = sqrt(mean(residuals**2)), or the value that the
-                constructor's `objective` gives. Residuals are checked but not used if the method uses only the value.
+            residuals: Residuals [n, m], weighted so that y = sqrt(mean(residuals**2)), or so that the constructor's
+                `objective` returns y. Residuals are checked but not used if the method uses only the value.
             jacobian: Derivatives of the residuals with respect to the parameters [n, m, d].
 
         Raises:
@@ -288,10 +288,10 @@ class CheapAnswer(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Constants:
-    """Constants of a cheap model that the search does not change and that may be wrong.
+    """Constants of a cheap model that the search does not change and that might be wrong.
 
     Attributes:
-        centre: Assumed values [q]; q may be 0.
+        centre: Assumed values [q]; q can be 0.
         spread: Standard deviations of the errors of the assumed values [q].
         lower: Lower bounds [q].
         upper: Upper bounds [q].
@@ -313,7 +313,7 @@ class Constants:
         return self.upper - self.lower
 
     def draw(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Constants [k, q] drawn from their prior and clipped to the bounds, from standard normal numbers [k, q]."""
+        """Constants [k, q] drawn from the prior with standard normal numbers [k, q] and clipped to the bounds."""
         return np.clip(self.centre + self.spread * normal, self.lower, self.upper)
 
 

@@ -4,20 +4,21 @@
 
 M is the Matern-5/2 kernel with one rate (inverse length scale) per coordinate of the unit cube. h(x) is the response of
 a cheap model at x, if there is one. v_0 allows for an offset, v_1 for a change in response and v_2 for a smooth
-remainder. All residuals share K, so one factorization serves any number of residuals. With a linear trend, the
+remainder. All residuals share K, so one factorization suffices for any number of residuals. With a linear trend, the
 coefficients of 1 and x are unknown and have no prior (universal kriging).
 
 One derivation covers regression with and without a trend. The columns of C [n, f] are orthonormal combinations of the
 points for which the trend vanishes; without a trend, C is the identity. C^T y has covariance A = C^T K C, and P = C
-A^-1 C^T takes the place of K^-1.
+A^-1 C^T replaces K^-1.
 
 C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, MIT Press 2006, eqs. 2.25, 2.26, 2.41,
 2.42, 4.17, 5.9 and sec. 9.9; closed-form leave-one-out errors: S. Rippa, Adv. Comput. Math. 11 (1999) 193.
 
-`Kriging` interpolates all residuals with length scales learned from them: every residual is a linear trend plus a
-weighted sum of Matern-5/2 functions centred at the evaluated points. All residuals share the input scales (one per
-parameter, so a parameter without influence drops out). The scales maximise the restricted log likelihood summed over
-all residuals: with tens of links, a dozen points determine them well. Each residual's own variance is profiled out.
+`Kriging` interpolates all residuals with length scales that are estimated from them. Every residual is a linear trend
+plus a weighted sum of Matern-5/2 functions centred at the evaluated points. All residuals share the input scales (one
+per parameter, so a parameter without influence drops out). The scales maximise the restricted log likelihood summed
+over all residuals. With tens of links, a dozen points determine the scales well. The variance of each residual is
+profiled out.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ class Kernel:
         return Kernel(scale**2 * np.exp(hyper[:3]), np.exp(hyper[3:-1]), float(scale**2 * np.exp(hyper[-1])))
 
     def logarithms(self, scale: float = 1.0) -> NDArray[np.float64]:
-        """The logarithms that `of` takes; -inf for a variance of 0."""
+        """The logarithms that `of` accepts; -inf for a variance of 0."""
         with np.errstate(divide="ignore"):
             variances = np.log(self.variances / scale**2)
         return np.concatenate([variances, np.log(self.rates), [np.log(self.nugget / scale**2)]])
@@ -114,7 +115,7 @@ class Trend(NamedTuple):
 
     @staticmethod
     def of(unit: NDArray[np.float64], linear: bool) -> Trend:
-        """The trend at points [n, d]: a linear one, or none."""
+        """The trend at points [n, d]: a linear trend, or no trend."""
         if not linear:
             return Trend(np.eye(len(unit)), np.zeros((0, len(unit))))
         basis = trend_basis(unit)
@@ -133,7 +134,7 @@ class Process:
         values: Values of every residual at these points [n, m].
         kernel: The kernel.
         linear: Whether there is a linear trend.
-        freedom: Degrees of freedom of the prior of a residual's variance; 0 if the variance is profiled out.
+        freedom: Degrees of freedom of the prior on a residual's variance; 0 if the variance is profiled out.
         trend: The trend at the points.
         lower: Cholesky factor of A [f, f].
         whitened: Inverse of `lower` times C^T y [f, m].
@@ -191,7 +192,7 @@ class Process:
         return mean + trend_basis(at.unit) @ self.coefficients if self.linear else mean
 
     def slope(self, at: Inputs, response_slope: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """Derivatives of the mean by unit-cube coordinates [k, m, d], given those of the responses [k, r, d]."""
+        """Derivatives [k, m, d] of the mean in unit-cube coordinates, given those of the responses [k, r, d]."""
         rates, variances = self.kernel.rates, self.kernel.variances
         # dM / dx_j = M'(r) / r x rate_j^2 x (difference along j).
         toward = (at.unit[:, :, None] - self.inputs.unit.T) * rates[:, None] ** 2
@@ -227,7 +228,7 @@ def condition(
 class Likelihood:
     """Negative log likelihood of kernels, restricted to the contrasts, up to a constant.
 
-    Without a prior on the variances, each variance takes its most likely value; with a prior, the residuals follow a
+    Without a prior on the variances, each variance has its most likely value; with a prior, the residuals follow a
     multivariate t distribution. The arguments are described in `Process`.
     """
 
@@ -322,7 +323,7 @@ def most_probable(
 
 
 def matern(distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The Matern kernel of smoothness 5/2 at distances [...] in units of length scales (eq. 4.17)."""
+    """The Matern kernel with smoothness 5/2 at distances [...] in units of length scales (eq. 4.17)."""
     a = np.sqrt(5.0) * distance
     return (1.0 + a + a * a / 3.0) * np.exp(-a)
 
@@ -346,7 +347,7 @@ NUGGET = 1e-8
 """Nugget that keeps the matrix regular, as a share of the prior variance; negligible for any engine."""
 
 LENGTH = 0.3
-"""Prior median of a length scale, as a share of the unit cube; its logarithm has a standard deviation of 1."""
+"""Prior median of a length scale, as a share of the cube's edge; its logarithm has a standard deviation of 1."""
 
 LOG_RATE_BOUNDS = (-3.0, 5.0)
 """Bounds of the logarithm of a rate: length scales from 20 down to 0.007."""
@@ -355,7 +356,8 @@ NOISE_PRIOR = (np.log(1e-4), 3.0)
 """Mean and standard deviation of the logarithm of the nugget if it is estimated."""
 
 CONSTANT = 1e-9
-"""A residual does not affect the scales if its standard deviation is below this share of the largest one."""
+"""A residual does not affect the scales if its standard deviation is below this share of the largest of all residuals.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -405,8 +407,8 @@ def fit(
 ) -> Kriging:
     """Fit a model and its input scales to residuals [n, m] at distinct points of the unit cube [n, d].
 
-    There must be at least d + 2 points that span the cube. If `noisy`, the nugget is estimated too, for an engine with
-    noisy answers; otherwise the model interpolates. `guess` is an additional starting point of the kernel search.
+    There must be at least d + 2 points that span the cube. If `noisy`, the nugget is also estimated, for an engine with
+    noisy answers; otherwise, the model interpolates. `guess` is an additional starting point of the kernel search.
     """
     spread = residuals.std(axis=0)
     varying = residuals[:, spread > CONSTANT * max(spread.max(), 1e-300)]

@@ -20,8 +20,8 @@ from calibray.support.interruption import defer_interruption
 def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Draw points of the unit cube [count, dimension].
 
-    Kinds are "random" (independent and uniform), "latin-hypercube" (one point in each of `count` slices of every
-    dimension) and "sobol" (scrambled; the first `count` of the next power of two).
+    The kinds are "random" (independent and uniform), "latin-hypercube" (one point in each of `count` slices of every
+    dimension) and "sobol" (scrambled; the first `count` points of the next power of two).
     """
     if kind == "random":
         return rng.random((count, dimension))
@@ -39,7 +39,7 @@ def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> N
 def maximin_design(
     count: int, dimension: int, rng: np.random.Generator, tries: int = 50
 ) -> NDArray[np.float64]:
-    """Of `tries` Latin hypercubes [count, dimension], the one with the largest minimum distance between points."""
+    """The Latin hypercube [count, dimension] with the largest minimum distance between points, out of `tries`."""
     drawn = [design("latin-hypercube", count, dimension, rng) for _ in range(tries)]
     spacing = [pdist(points).min(initial=np.inf) for points in drawn]
     return drawn[int(np.argmax(spacing))]
@@ -58,7 +58,7 @@ def draw_around(
 
 
 SEPARATION: Final = 1e-4
-"""Distance in the unit cube below which a point counts as already evaluated."""
+"""Distance in the unit cube below which a point is considered already evaluated."""
 
 
 def distance_to_nearest(x: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -75,7 +75,7 @@ def not_evaluated(
 
 
 class Sampling(Optimizer):
-    """A search that evaluates a design and learns nothing from it; subclasses define the kind of design.
+    """A search that evaluates one design and then ends; subclasses define the kind of design.
 
     Args:
         seed: Seed of the design.

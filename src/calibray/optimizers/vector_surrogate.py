@@ -1,27 +1,27 @@
 """The vector surrogate models every residual instead of their root mean square, and searches this model globally.
 
 The objective is a sum over links, so an evaluation that returns the residual of every link contains far more
-information than that sum. Residuals are smoother than the objective, and tens of them share one kernel over the
+information than this sum. Residuals are smoother than the objective, and tens of them share one kernel over the
 parameters (`regression.py`).
 
 A run begins with a maximin Latin hypercube. The design needs few points even for many parameters, because residuals can
-be modelled as soon as the points determine a linear trend. After the design, three kinds of step alternate on a model
+be modelled as soon as the points determine a linear trend. After the design, three kinds of steps alternate on a model
 that is updated after every batch:
 
 - *exploration*: the point with the largest expected improvement in the mean square of the residuals, over draws from
   the model (R. Astudillo, P. Frazier, ICML 2019). Assuming a normal distribution of the mean square instead (D. R.
   Jones, M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15) would give weight to impossibly low values.
-  In many dimensions, it would waste steps on the emptiest corner of the box;
+  In many dimensions, this assumption would waste steps on the emptiest corner of the box;
 - *exploitation*: the lowest minimum of the predicted objective that has not been evaluated yet, found by many local
   searches with exact derivatives of the model;
-- *another basin*: the lowest minimum of the predicted objective where the model is still uncertain, so that refining
-  one basin does not keep the search from exploring the next.
+- *another basin*: the lowest minimum of the predicted objective where the model is still uncertain, so that the
+  refinement of one basin does not prevent the exploration of the next.
 
 Input scales are estimated at every step up to `OFTEN` points, and then whenever the number of points has grown by a
 tenth. In between, points are only added to the model, which saves most of the computing time.
 
-In a batch, every further candidate is chosen as if the earlier ones had been evaluated exactly as predicted. A failed
-evaluation enters the model with the residuals of the worst successful one.
+In a batch, every further candidate is chosen as if the answers to the earlier candidates had equalled their
+predictions. A failed evaluation enters the model with the residuals of the worst successful one.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ FIRST = 5
 """Largest excess of the number of points in the initial design over the number of parameters."""
 
 CANDIDATES = 600
-"""Number of candidates drawn over the whole box, and number of candidates drawn around the best points."""
+"""Number of candidates drawn over the whole box, and also of candidates drawn around the best points."""
 
 DRAWS = 256
 """Number of draws of the residuals for the expected improvement."""
@@ -64,7 +64,7 @@ SEARCHES = 16
 """Number of local searches on the model."""
 
 UNCERTAIN = 1e-3
-"""A predicted minimum counts as another basin if its variance exceeds this share of the prior variance."""
+"""A predicted minimum is treated as another basin if its variance exceeds this share of the prior variance."""
 
 
 @final
@@ -74,9 +74,10 @@ class VectorSurrogate(Optimizer):
     Args:
         budget: Number of evaluations; 20 d if None.
         initial: Size of the initial design; the smaller of 2 (d + 1) and d + 5 if None. Points already passed to `tell`
-            count, except that points closer together than half the design's spacing count as one.
+            are included; points closer together than half the design's spacing are counted as one point.
         batch: Number of candidates per batch after the initial design, for engines that run in parallel.
-        noisy: Whether the engine's answers are noisy; the model then smooths instead of interpolating.
+        noisy: Whether the engine's answers are noisy; if so, the model smooths the answers instead of interpolating
+            them.
 
     Raises:
         InputError: An argument is out of range.
@@ -140,7 +141,7 @@ class VectorSurrogate(Optimizer):
             left, turn = left - count, turn + count
 
     def _design(self, earlier: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The initial design [k, d], without the points that earlier evaluated points [n, d] replace."""
+        """The initial design [k, d], without the points that are replaced by earlier evaluated points [n, d]."""
         points = maximin_design(self.initial, self.box.dimension, self._rng)
         spacing, counted = 0.5 * float(pdist(points).min()), earlier[:0]
         for point in earlier:
@@ -165,7 +166,7 @@ class VectorSurrogate(Optimizer):
     def _choose(
         self, model: Kriging, taken: NDArray[np.float64], best: float, turn: int, count: int
     ) -> NDArray[np.float64]:
-        """The next batch [count, d]; `taken` are the evaluated points, best first."""
+        """The next batch [count, d]; `taken` contains the evaluated points, best first."""
         d = self.box.dimension
         starts = np.vstack([taken[: SEARCHES // 2], self._rng.random((SEARCHES, d))])[:SEARCHES]
         minima = predicted_minima(model, starts)
@@ -205,10 +206,10 @@ class VectorSurrogate(Optimizer):
 def mean_square(model: Kriging, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Expectation and standard deviation [k] of the mean square Q of the residuals at points [k, d].
 
-    Let r be the prediction and s^2 V the predictive covariance: V is the prior covariance of the residuals, and s^2
-    grows with the distance from evaluated points. Q then has mean (r^T r + s^2 tr V) / m and variance (4 s^2 r^T V r
-    + 2 s^4 tr V^2) / m^2. Errors of different links are correlated: treating them as independent would stop
-    exploration too early.
+    Let r be the prediction and s^2 V the predictive covariance. V is the prior covariance of the residuals, and s^2
+    grows with the distance from evaluated points. Q then has mean (r^T r + s^2 tr V) / m and variance (4 s^2 r^T V r +
+    2 s^4 tr V^2) / m^2. Errors of different links are correlated; treating them as independent would stop exploration
+    too early.
     """
     mean, share = model.predict(x)
     root, links = model.root, model.root.shape[1]
@@ -220,7 +221,7 @@ def mean_square(model: Kriging, x: NDArray[np.float64]) -> tuple[NDArray[np.floa
 def improvement(
     mean: NDArray[np.float64], share: NDArray[np.float64], draws: NDArray[np.float64], best: float
 ) -> NDArray[np.float64]:
-    """Expected improvement [k] in the mean square of the residuals over the best one, by Monte Carlo.
+    """Expected improvement [k] in the mean square of the residuals over the best value, by Monte Carlo.
 
     `mean` contains predictions [k, m], `share` their variances relative to the prior [k], and `draws` random vectors
     with the prior covariance [n, m]. The result is 0 if no draw improves. `best` is the lowest root mean square so far.

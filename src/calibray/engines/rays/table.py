@@ -109,8 +109,8 @@ class RayTable:
         kind = _kinds(table, row_path, step, count)
         if wrong := np.flatnonzero((point[order] - point[order][first][row_path]) != step).tolist():
             raise InputError(
-                f"{table.cell(wrong[0], 'point')}: the point numbers of path {label[row_path[wrong[0]]]} must increase by "
-                "1 without gaps or repetitions; complete the path"
+                f"{table.cell(wrong[0], 'point')}: the point numbers of path {label[row_path[wrong[0]]]} must "
+                "increase by 1 without gaps or repetitions; complete the path"
             )
         position = _positions(table, axes)
         inner = kind != 0

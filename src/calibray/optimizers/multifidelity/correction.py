@@ -1,4 +1,4 @@
-"""Corrects a cheap model until it agrees with the engine: first its constants, then the remaining discrepancy.
+"""Correction of a cheap model until it agrees with the engine: first the constants, then the remaining discrepancy.
 
 *Input mapping*: the constants of the cheap model are set to the values that best explain the engine's answers. Errors
 are whitened with the covariance of the discrepancy, which is mostly an offset common to all points. A link's offset
@@ -6,11 +6,11 @@ therefore does not distort the constants. The constants have a prior around thei
 mapping (J. W. Bandler, Q. S. Cheng, N. K. Nikolova, M. A. Ismail, IEEE Trans. Microw. Theory Tech. 52 (2004) 378).
 *Output mapping*: `discrepancy.py` models the offset, the slope and the remainder.
 
-Slabs resonate, so there are many minima. A kernel that was fitted with wrong constants attributes their errors to the
-discrepancy, and then favours these constants. An input mapping therefore proceeds in rounds. A round tries many sets of
+Slab resonances cause many minima. A kernel that was fitted with wrong constants attributes the resulting errors to the
+discrepancy and then favours these constants. An input mapping therefore proceeds in rounds. A round tries many sets of
 constants, most of which differ from the present set in one or two constants. Each set is judged with the scale of the
 discrepancy that suits it best. Rounds alternate between the fitted kernel and the kernel at the mean of the prior. A
-round descends from the likeliest sets and fits the kernel to the best results. It accepts a result that makes the
+round descends from the most likely sets and fits the kernel to the best results. It accepts a result that makes the
 answers more probable.
 
 A few answers do not determine the constants of a cheap model. Several sets of constants explain the answers equally
@@ -41,7 +41,7 @@ ROUNDS: Final = 4
 """Largest number of rounds of an input mapping."""
 
 GAINED: Final = 1.0
-"""A round that decreases the negative log density by less than this has gained nothing."""
+"""Decrease in the negative log density below which a round is considered to have gained nothing."""
 
 TRIALS: Final = 300
 """Largest number of sets of constants tried in a round."""
@@ -50,7 +50,7 @@ COMPARED: Final = 3000
 """Largest product of the number of sets tried in a round and the number of answers."""
 
 FOLLOWED: Final = 4
-"""Number of sets, in addition to the present one, from which a round descends: those that explain the answers best."""
+"""Number of sets from which a round descends, in addition to the present one; they explain the answers best."""
 
 REFITTED: Final = 2
 """Number of results of a round for which the kernel is fitted again."""
@@ -88,7 +88,7 @@ class UnitModel:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """How the residuals of a cheap model vary over the box.
+    """Variation of the residuals of a cheap model over the box.
 
     Attributes:
         known: Mask of the residuals that the model predicts [m].
@@ -102,7 +102,7 @@ class Response:
 
     @staticmethod
     def of(residuals: NDArray[np.float64], known: NDArray[np.bool_]) -> Response:
-        """The response, from residuals [k, m] at points spread over the box; `known` [m] marks predicted columns."""
+        """The response, given residuals [k, m] at points spread over the box; `known` [m] marks predicted columns."""
         centre = residuals.mean(axis=0)
         scale = float(np.sqrt(np.mean((residuals - centre)[:, known] ** 2))) if known.any() else 0.0
         return Response(known, centre, max(scale, 1e-6 * max(float(np.abs(residuals).max()), 1e-6)))
@@ -145,7 +145,7 @@ class Corrected:
         return self.discrepancy.root
 
     def predict(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Predicted mean [k, m] at points [k, d], and predictive variance [k] relative to that of each residual."""
+        """Predicted mean [k, m] at points [k, d], and predictive variance [k] relative to each residual's variance."""
         cheap, inputs = self.base(unit)
         mean, share = self.discrepancy.predict(inputs)
         return cheap + mean, share
@@ -172,14 +172,14 @@ class Corrected:
         return cheap, slope, self.response.inputs(unit, cheap), self.response.scaled(slope)
 
     def with_point(self, point: NDArray[np.float64], residuals: NDArray[np.float64]) -> Corrected:
-        """Add a point of the unit cube [d] as if its evaluation had these residuals [1, m]."""
+        """Add a point of the unit cube [d] as if its evaluation had returned the given residuals [1, m]."""
         unit, answers = np.vstack([self.unit, point]), np.vstack([self.residuals, residuals])
         cheap, inputs = self.base(unit)
         process = discrepancy.solve(inputs, answers - cheap, self.discrepancy.kernel)
         return replace(self, residuals=answers, discrepancy=process)
 
     def with_constants(self, constants: NDArray[np.float64], kernel: Kernel | None = None) -> Corrected:
-        """The model with other constants [q] and a discrepancy through the same answers; the kernel is kept if None."""
+        """The model with other constants [q] and a discrepancy through the same answers; None keeps the kernel."""
         moved = replace(self, constants=constants)
         cheap, inputs = moved.base(self.unit)
         process = discrepancy.solve(inputs, self.residuals - cheap, kernel or self.discrepancy.kernel)
@@ -229,7 +229,7 @@ def with_discrepancy(
     noisy: bool = False,
     guess: Corrected | None = None,
 ) -> Corrected:
-    """Fit only the discrepancy, with given constants [q]; see `correct`. `guess` provides another initial kernel."""
+    """Fit only the discrepancy, with given constants [q]; see `correct`. `guess` provides a further initial kernel."""
     unit, residuals = answers
     response = Response.of(cheap.residuals(cloud, constants), cheap.model.known)
     base = cheap.residuals(unit, constants)
@@ -243,7 +243,7 @@ def with_discrepancy(
 
 
 def _own_misfit(corrected: Corrected) -> float:
-    """The misfit of a model's constants with the model's own kernel."""
+    """The misfit of a model's constants, computed with the model's kernel."""
     return float(misfit(corrected, corrected.constants[None]).value[0])
 
 
@@ -253,8 +253,8 @@ def constants_fit(
     """The least squares problem for the constants, with a fixed covariance of the discrepancy.
 
     The prior is centred at `centre` [q], or at the cheap model's centre if None. `noise` [n m] perturbs the whitened
-    answers. Returns a function from constants, scaled to the unit cube by their bounds [s, q], to whitened errors and
-    their Jacobian. Half the sum of squared errors is the negative log density, up to a constant.
+    answers. Returns a function that maps constants, scaled to the unit cube by their bounds [s, q], to whitened errors
+    and their Jacobian. Half the sum of squared errors is the negative log density, up to a constant.
     """
     model, process, prior = corrected.cheap.model, corrected.discrepancy, corrected.cheap.constants
     points, width = corrected.cheap.box.from_unit(corrected.unit), prior.width
@@ -281,7 +281,7 @@ def constants_fit(
 
 
 class Misfit(NamedTuple):
-    """How poorly sets of constants explain the answers.
+    """Misfit of sets of constants to the answers.
 
     Attributes:
         value: Negative log density of the answers and the constants, up to a constant [s].
@@ -293,7 +293,7 @@ class Misfit(NamedTuple):
 
 
 def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> Misfit:
-    """The misfit of constants [s, q]; the discrepancy's kernel is known up to its scale.
+    """The misfit of constants [s, q], given the discrepancy's kernel up to its scale.
 
     The variances of the links are integrated out. A link that the present constants do not explain therefore keeps its
     full weight for other constants.
@@ -309,7 +309,7 @@ def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> Misfit:
 
 
 def _likelier(corrected: Corrected, random: np.random.Generator) -> NDArray[np.float64]:
-    """The best constants that one round finds [k, q], with the kernel of `corrected`."""
+    """The best constants [k, q] from one round with the kernel of `corrected`."""
     prior, present = corrected.cheap.constants, corrected.constants
     trials = np.vstack([present, _trials(corrected, random)])
     tried = misfit(corrected, trials)
@@ -335,9 +335,10 @@ def _trials(corrected: Corrected, random: np.random.Generator) -> NDArray[np.flo
 
 
 UNLIKELY: Final = 30.0
-"""A member is left out if its excess in negative log density, divided by the number of constants plus 3, reaches this.
+"""Excess in negative log density, divided by the number of constants plus 3, at which a member is omitted.
 
-Links share errors, so the true posterior is wider than this density, which assumes independent links.
+The limit is high because links share errors. The true posterior is therefore wider than this density, which assumes
+independent links.
 """
 
 CAPPED: Final = 100.0
@@ -345,7 +346,7 @@ CAPPED: Final = 100.0
 
 
 class Prediction(NamedTuple):
-    """The prediction of an averaged model at points.
+    """The prediction of an averaged model at given points.
 
     Attributes:
         mean: Residuals, averaged over the members [k, m].
@@ -396,11 +397,11 @@ class ErrorRecord:
 
     @property
     def stretch(self) -> float:
-        """Factor that scales predicted variances; the prior counts as one step with a ratio of 1."""
+        """Factor that scales predicted variances; the prior is equivalent to one step with a ratio of 1."""
         return (1.0 + sum(self.ratios)) / (1.0 + len(self.ratios))
 
     def add(self, mean: NDArray[np.float64], variance: float, residuals: NDArray[np.float64]) -> None:
-        """Add a step: predicted residuals [m], their averaged variance before scaling, observed residuals [m]."""
+        """Add a step: predicted residuals [m], their averaged variance before scaling, and observed residuals [m]."""
         ratio = float(np.mean((residuals - mean) ** 2)) / max(variance, 1e-12)
         self.ratios.append(min(ratio, CAPPED))
 

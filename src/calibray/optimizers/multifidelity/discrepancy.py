@@ -4,8 +4,8 @@ The discrepancy consists of an offset, a change in response and a remainder: v_0
 is the scaled deviation of the cheap model's residuals from their mean over the box. Links respond similarly to the
 parameters, so paths that the cheap model lacks respond like those of other links. The v_1 term is therefore the slope
 of a link's output mapping, and also helps with links that the cheap model does not predict. Each residual has its own
-variance, which is integrated out with an inverse gamma prior. A few links that the cheap model predicts badly do not
-affect the others.
+variance, which is integrated out with an inverse gamma prior. Links that the cheap model predicts badly therefore do
+not affect the others.
 
 M. C. Kennedy, A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, sec. 4.
 
@@ -47,7 +47,7 @@ VARIANCE_SPREAD: Final = 2.0
 LOG_VARIANCE_BOUNDS: Final = (-14.0, 6.0)
 
 LENGTH: Final = 0.5
-"""Prior median of a length scale, as a share of the unit cube."""
+"""Prior median of a length scale, as a share of the edge of the unit cube."""
 
 LENGTH_SPREAD: Final = 0.7
 """Prior standard deviation of the logarithm of a length scale."""
@@ -69,10 +69,10 @@ def fit(
     noisy: bool = False,
     guess: Kernel | None = None,
 ) -> Process:
-    """Fit the process to discrepancies [n, m], with the hyperparameters of largest posterior density.
+    """Fit the process to discrepancies [n, m], with the hyperparameters that have the largest posterior density.
 
-    The prior is relative to `scale`, the root mean square of the cheap model's response. If `noisy`, the nugget is
-    estimated too. `guess` is an additional starting point of the kernel search.
+    The prior is relative to `scale`, the root mean square of the cheap model's response. If `noisy`, the nugget is also
+    estimated. `guess` is an additional starting point of the kernel search.
     """
     likelihood = Likelihood(inputs, values, freedom=FREEDOM)
     prior = _prior(inputs.unit.shape[1], noisy)

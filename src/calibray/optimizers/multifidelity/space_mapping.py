@@ -1,28 +1,30 @@
-"""Space mapping searches an expensive model with the help of a cheap one, which is corrected after every call.
+"""Space mapping minimises an expensive model with the help of a cheap one, which is corrected after every call.
 
 If you know the physics, you already have a cheap approximation of the expensive model, possibly with wrong constants.
-The first call is at its minimum. After every call, the cheap model is corrected until it agrees with all answers
-(`correction.py`). Many local searches then find its minima in all basins. Steps are of two kinds:
+The first call is at the minimum of this approximation. After every call, the cheap model is corrected until it agrees
+with all answers (`correction.py`). Many local searches then find its minima in all basins. There are two kinds of
+steps:
 
 - *exploitation*: of the minima of the corrected model within a trust region, the one with the lowest expected mean
   square is evaluated; the expectation includes the uncertainty. The trust region is a box around the best point. It is
-  halved after a step that does not improve and doubled after one that does;
+  halved after a step without an improvement and doubled after a step with an improvement;
 - *exploration*: the point with the largest expected improvement over the whole box is evaluated. The improvement is
   computed from draws of the discrepancy, as in `vector_surrogate.py`. Minima of the corrected model in other basins are
-  among the candidates. An exploration follows an exploitation that gained almost nothing, and replaces one without a
-  new minimum.
+  among the candidates. An exploration follows an exploitation that gained almost nothing. It also replaces an
+  exploitation if there is no new minimum.
 
-Both account for constants that a few answers cannot determine, and for the errors of earlier predictions
-(`correction.py`). Otherwise, on synthetic districts, steps jump across half the box to predicted minima that do not
+Both kinds account for constants that a few answers cannot determine, and for the errors of earlier predictions
+(`correction.py`). Otherwise, steps on synthetic districts jump across half the box to predicted minima that do not
 exist.
 
-The cheap model is used only while it helps. Each point is predicted from all other points, once by the corrected model
-and once by the same process without a cheap model; `error_ratio` compares the squared errors of the median link. The
-first two checks, after three and four calls, fail if the ratio exceeds `HELPFUL`; later ones fail if it exceeds
+The cheap model is used only as long as it helps. Each point is predicted from all other points, once by the corrected
+model and once by the same process without a cheap model; `error_ratio` compares the squared errors of the median link.
+The first two checks, after three and four calls, fail if the ratio exceeds `HELPFUL`; later checks fail if it exceeds
 `MISLED`. After two failed checks in a row, the vector surrogate continues with all evaluations so far. It also runs
 from the first call if there is no cheap model. The median link decides, because a few links dominate the sum over all
 links. Of twelve synthetic problems, eight had their own cheap model, and four had random sinusoids instead. After four
-calls, the ratio was at most 0.66 with the right model (once 1.9 after three), and at least 1.01 with sinusoids.
+calls, the ratio was at most 0.66 with the right model (in one case, 1.9 after three calls), and at least 1.01 with
+sinusoids.
 
 J. W. Bandler et al., "Space mapping: the state of the art", IEEE Trans. Microw. Theory Tech. 52 (2004) 337.
 """
@@ -61,7 +63,9 @@ SEARCHES: Final = 16
 """Number of local searches on each corrected model that start from Sobol points."""
 
 KEPT: Final = 8
-"""Number of earlier minima, of best points and of random points in the trust region from which local searches start."""
+"""Largest number of local searches from each of three sets: earlier minima, best points, and random points in the trust
+region.
+"""
 
 SEARCH_STEPS: Final = 30
 """Largest number of steps of a local search on a model."""
@@ -70,22 +74,22 @@ CONVERGED: Final = 1e-6
 """Relative decrease in cost, or step in the unit cube, below which a local search has converged."""
 
 CANDIDATES: Final = 300
-"""Number of candidates drawn over the whole box, and number of candidates drawn around the best points."""
+"""Number of candidates drawn over the whole box, and also of candidates drawn around the best points."""
 
 DRAWS: Final = 512
 """Number of draws of the discrepancy for the expected improvement, in total over all members."""
 
 APART: Final = 0.003
-"""Distance in the unit cube below which two minima count as one."""
+"""Distance in the unit cube below which two minima are considered to be the same."""
 
 MEMBERS: Final = 8
 """Largest number of models with other constants that are averaged with the corrected model in the first steps."""
 
 AVERAGED: Final = 10
-"""Largest number of calls with which predictions are averaged over these models."""
+"""Largest number of calls up to which predictions are averaged over these models."""
 
 SEPARATION: Final = 1e-3
-"""Distance in the unit cube below which a point counts as already evaluated."""
+"""Distance in the unit cube below which a point is considered already evaluated."""
 
 REACHES: Final = (0.02, 1.0)
 """Smallest and largest half width of the trust region, in the unit cube."""
@@ -112,7 +116,7 @@ class SpaceMapping(Optimizer):
 
     Args:
         budget: Number of evaluations; 20 d if None.
-        cheap_model: The cheap model; without one, `VectorSurrogate` is used instead.
+        cheap_model: The cheap model; if None, `VectorSurrogate` is used instead.
         batch: Number of candidates per batch, for engines that run in parallel.
         noisy: Whether the engine's answers are noisy.
 
@@ -152,7 +156,7 @@ class SpaceMapping(Optimizer):
 
     @property
     def corrected(self) -> Corrected | None:
-        """The cheap model as corrected with all evaluations before the last step; None if it is not used."""
+        """The cheap model, corrected with all evaluations before the last step; None if it is not used."""
         return self._corrected
 
     def _search(self, archive: Archive) -> Search:
@@ -189,7 +193,7 @@ class SpaceMapping(Optimizer):
             left, turn = left - count, turn + count
 
     def _without(self, archive: Archive, left: int) -> Search:
-        """Continue with the vector surrogate, from all evaluations so far."""
+        """Continue with the vector surrogate and all evaluations so far."""
         surrogate = VectorSurrogate(
             self.box.lower, self.box.upper, seed=self._seed, budget=left, batch=self.batch, noisy=self.noisy,
             objective=self._objective,
@@ -202,7 +206,7 @@ class SpaceMapping(Optimizer):
             surrogate.tell(answers.x, answers.y, residuals=answers.residuals)
 
     def _first(self, model: CheapModel, count: int, turn: int) -> NDArray[np.float64]:
-        """The lowest minima [count, d] of the uncorrected cheap model, without the first `turn`; then random points."""
+        """The next minima [count, d] of the uncorrected cheap model after the first `turn` ones, then random points."""
         d = self.box.dimension
 
         def evaluate(unit: NDArray[np.float64]) -> Residuals:
@@ -260,7 +264,7 @@ class SpaceMapping(Optimizer):
     def _explore(
         self, model: Averaged, taken: NDArray[np.float64], fresh: NDArray[np.float64], best: float
     ) -> NDArray[np.float64]:
-        """The point [d] with the largest expected improvement; `taken` are the evaluated points, best first."""
+        """The point [d] with the largest expected improvement; `taken` contains the evaluated points, best first."""
         d, stretch = self.box.dimension, self._errors.stretch
         around = draw_around(taken[:5], CANDIDATES, -2.5, self._rng)
         candidates = np.vstack([fresh, self._rng.random((CANDIDATES, d)), around])
