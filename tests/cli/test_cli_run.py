@@ -229,6 +229,19 @@ def test_predict_takes_the_measured_table_and_the_results_own(folder, ran, tmp_p
         assert "its column 'path_loss_db' is written as 'input_path_loss_db'" in outcome.stderr
 
 
+def test_a_validation_is_not_written_into_a_result_of_changed_links(folder, ran):
+    """The refusal comes before the validation, even if the measured values are the same."""
+    file = folder / "links.csv"
+    before = file.read_text()
+    try:
+        pd.read_csv(file).eval("rx_y = rx_y + 0.1").to_csv(file, index=False)
+        outcome = run("validate", folder / "study.toml", "--out", folder / "out")
+    finally:
+        file.write_text(before)
+    assert (outcome.exit_code, outcome.stdout) == (2, "")
+    assert "links.csv changed since its result was calibrated; run the study again" in outcome.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -283,6 +283,29 @@ def test_impossible_suggestions_are_refused(result, table):
         cb.suggest(changed(result, files={name: "0" * 64 for name in result.provenance.files}), table)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda t: t.iloc[:-1],
+        lambda t: t.assign(path_loss_db=t.path_loss_db + 0.1),
+        lambda t: t.assign(rx_x=t.rx_x + 0.1),
+    ],
+)
+def test_links_that_changed_since_the_calibration_are_refused(folder, result, table, change):
+    """The draws are those of the old links."""
+    file = folder / "links.csv"
+    before = file.read_text()
+    try:
+        change(pd.read_csv(file)).to_csv(file, index=False)
+        with pytest.raises(InputError, match=r"links\.csv: its links changed since the calibration"):
+            cb.suggest(result, table)
+        if len(pd.read_csv(file)) < len(result.links):
+            with pytest.raises(InputError, match="has 13 links, but 14 were calibrated"):
+                cb.suggest(result, table, allow_changed_inputs=True)
+    finally:
+        file.write_text(before)
+
+
 def test_fewer_candidates_than_requested_are_counted_in_a_warning(result, table, caplog):
     assert len(cb.suggest(result, table.iloc[:2], 2)) == 2
     assert "suggestions instead" not in caplog.text

@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calibray.cli.console import Overwrite, Pool, StudyFile, echo, log, option, progress_bars, with_groups
+from calibray.errors import InputError
 from calibray.support.messages import command
+
+if TYPE_CHECKING:
+    from calibray.study import Setup
 
 
 @dataclass(frozen=True)
@@ -67,9 +71,12 @@ def validate(
         if out is not None:
             check_outputs(out, (VALIDATION_FILE,), study.files(), overwrite)
             check_same_study(study, out)
+        setup = study.opened() if division.by is None else None
+        if setup is not None and out is not None and (out / RESULT_FILE).is_file():
+            _check_same_inputs(setup, out)
         with open_workers(pool.workers, pool.scheduler) as workers:
             validation = run_validation(
-                study, blocks=division.blocks, by=division.by, workers=workers, progress=progress
+                setup or study, blocks=division.blocks, by=division.by, workers=workers, progress=progress
             )
     echo(json.dumps(validation.content(), indent=2) if as_json else render(*validation.summary()))
     if out is not None:
@@ -77,6 +84,26 @@ def validate(
         write_validation(validation, study, out, validation.content())
         following = f"; next: {command('report', out)}" if (out / RESULT_FILE).is_file() else ""
         echo(f"Written to {out / VALIDATION_FILE}{following}", err=True)
+
+
+def _check_same_inputs(setup: Setup, folder: Path) -> None:
+    """Refuse a folder whose result was calibrated with another scene or other links, before time is spent.
+
+    Raises:
+        InputError: A file of the scene or an antenna, or the links have changed since the calibration.
+    """
+    from calibray.calibration.result import Result
+    from calibray.prediction.predict import changed_files, has_links
+
+    result = Result.load(folder, allow_changed_inputs=True)
+    changed = changed_files(result, setup)
+    if not has_links(result, setup.links):
+        changed = [*changed, str(setup.links.source)]
+    if changed:
+        raise InputError(
+            f"{folder}: {', '.join(changed[:5])} changed since its result was calibrated; run the study again, or give "
+            "another folder"
+        )
 
 
 @dataclass(frozen=True)

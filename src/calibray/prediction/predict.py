@@ -430,19 +430,33 @@ def check_inputs(result: Record, setup: Setup, allow_changed: bool) -> None:
     Raises:
         InputError: A file has changed.
     """
-    if allow_changed or not result.provenance.files:
-        return
+    if not allow_changed and (changed := changed_files(result, setup)):
+        raise InputError(
+            f"{result.study.path}: {', '.join(changed[:5])} changed since the calibration, which may be invalid for "
+            "the changed file; calibrate again, or give --allow-changed-inputs (allow_changed_inputs=True)"
+        )
+
+
+def changed_files(result: Record, setup: Setup) -> list[str]:
+    """Names of the files of the scene and antennas that have changed since the calibration."""
+    if not result.provenance.files:
+        return []
     # Files are compared by name and content, because the whole folder may have moved.
     calibrated, current = (
         sorted((Path(file).name, digest) for file, digest in files.items())
         for files in (result.provenance.files, setup.files)
     )
-    changed = sorted({name for name, _ in set(calibrated) ^ set(current)})
-    if changed:
-        raise InputError(
-            f"{result.study.path}: {', '.join(changed[:5])} changed since the calibration, which may be invalid for "
-            "the changed file; calibrate again, or give --allow-changed-inputs (allow_changed_inputs=True)"
-        )
+    return sorted({name for name, _ in set(calibrated) ^ set(current)})
+
+
+def has_links(result: Record, links: Measurements) -> bool:
+    """Whether a calibration has these links, with their measured values and positions, within rounding in files."""
+    table, ends = result.links, result.ends
+    pairs = [(table["measured_db"].to_numpy(float), links.path_loss_db)]
+    pairs += [] if ends is None else [(ends, np.hstack([links.tx, links.rx]))]
+    return len(table) == len(links) and all(
+        np.allclose(calibrated, current, rtol=1e-8, atol=1e-3) for calibrated, current in pairs
+    )
 
 
 def add_remarks(result: Record, setup: Setup, predictions: pd.DataFrame) -> pd.DataFrame:

@@ -32,6 +32,7 @@ from calibray.prediction.predict import (
     NEIGHBOURS,
     as_links,
     check_inputs,
+    has_links,
     refuse_far_links,
     traced_materials,
     warn_of_carriers,
@@ -78,7 +79,8 @@ def suggest(
         candidates: Possible measurements: links, or a table, as for `Result.predict`.
         count: Largest number of suggestions; a warning in the log says if there are fewer.
         progress: Called with the stage "tracing" after every launch.
-        allow_changed_inputs: Continue even if a file of the scene or an antenna has changed since the calibration.
+        allow_changed_inputs: Continue even if a file of the scene or an antenna, or the links have changed since the
+            calibration.
         observables: Also report which further observable is worth measuring at each suggestion.
 
     Returns:
@@ -112,6 +114,16 @@ def suggest(
     # The calibration links and the candidates share one loaded tracer.
     setup = calibrated.at(links)
     check_inputs(result, setup, allow_changed_inputs)
+    if not allow_changed_inputs and not has_links(result, calibrated.links):
+        raise InputError(
+            f"{calibrated.links.source}: its links changed since the calibration, and suggestions need the calibrated "
+            "ones; calibrate again, or give --allow-changed-inputs (allow_changed_inputs=True)"
+        )
+    if len(result.links) != len(calibrated.links):
+        raise InputError(
+            f"{calibrated.links.source}: has {len(calibrated.links)} links, but {len(result.links)} were calibrated; "
+            "calibrate again"
+        )
     refuse_far_links(result, links, read_triangles(setup.scene))
     announce(result, len(links), "candidates")
     setup = with_constants(result, setup)
