@@ -1,1 +1,1 @@
-"""Fitting: what a calibration minimizes, and the search for its optimum."""
+"""Fitting: the objective of a calibration, and the search for its optimum."""

@@ -50,7 +50,7 @@ class _Task:
 
 
 def batch_size(setup: Setup, workers: Workers | None) -> int:
-    """Number of links to predict together, so that memory does not grow with the number of links."""
+    """Number of links to predict together, so that memory use does not grow with the number of links."""
     if workers is not None:
         return CHUNKS_PER_BATCH * _chunk_size(setup)
     return DIFFUSE_BATCH if setup.study.trace.diffuse_reflection else BATCH
@@ -67,8 +67,8 @@ def predict_links(
 ) -> pd.DataFrame:
     """Predict path loss, intervals and remarks, in this process or on workers.
 
-    The result is the table of `interval` with a column `remark`, which is empty for links without a remark, and for all
-    links without `with_remarks`. The stage of `progress` is "tracing".
+    The result is the table of `interval` with a column `remark`, which is empty for links without a remark. It is empty
+    for all links if `with_remarks` is False. The stage of `progress` is "tracing".
 
     Raises:
         InputError: `interval` refuses the input.
@@ -98,7 +98,7 @@ def predict_batches(
     *,
     allow_changed_inputs: bool = False,
 ) -> Iterator[tuple[Measurements, pd.DataFrame]]:
-    """Predict the links of a table batch by batch, so that memory does not grow with their number.
+    """Predict the links of a table batch by batch, so that memory use does not grow with their number.
 
     All rows are checked before the first one is traced. The table has the columns that `predict` reads. The stages of
     `progress` are "checking" and "tracing".
@@ -159,7 +159,7 @@ LOG: Final = logging.getLogger(__name__)
 
 
 def announce(result: Record, links: int, what: str = "links") -> None:
-    """Log how many links are traced, and roughly how long this takes."""
+    """Log the number of links to trace and the approximate duration."""
     counted = f"{links:,} {what.removesuffix('s') if links == 1 else what}"
     if result.prediction.model.parameters is None:
         LOG.info("%s, predicted without a trace: the log-distance model uses no scene", counted)
@@ -182,7 +182,7 @@ def announce(result: Record, links: int, what: str = "links") -> None:
 def _seconds(result: Record, links: int) -> float:
     """Estimated duration of a trace [s].
 
-    The calibration may have read its trace from the cache, so the estimate is at least that from the number of rays.
+    The calibration may have read its trace from the cache, so an estimate from the number of rays is a lower limit.
     """
     settings = result.study.trace
     lanes = 0 if settings.adaptive else settings.rays * max(settings.max_depth, 1) * links

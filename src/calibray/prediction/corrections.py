@@ -6,8 +6,7 @@ with the interval of that model, and the prediction is marked.
 The residual field is the correlated part of the calibration residuals, kriged to nearby links. Clutter that the scene
 lacks affects neighbouring links in the same way, so the residual near a measured link is partly known. The correlated
 part has an exponential covariance whose range and variance maximize the restricted likelihood
-(`uncertainty.residual_correlation.fit_correlation`). Far from all measured links, the field is zero and explains
-nothing.
+(`uncertainty.residual_correlation.fit_correlation`). Far from all measured links, the kriged field is zero.
 """
 
 from __future__ import annotations
@@ -34,14 +33,14 @@ from calibray.validation.held_out_statistics import interval_half_width
 from calibray.validation.models import without_scene
 
 MOST_EXACT: Final = 1000
-"""Largest number of measured links of which all are used at every new link; if there are more, only the nearest ones
-are used."""
+"""Largest number of measured links that are all used at every new link; if there are more, only the nearest ones are
+used."""
 
 NEAREST: Final = 50
 """Number of nearest measured links used at each new link."""
 
 TOGETHER: Final = 500
-"""Number of new links whose kriging equations are solved together; each needs about 150 kB."""
+"""Number of new links whose kriging equations are solved together; each requires about 150 kB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,11 +102,12 @@ def nuisance_shift(
     *,
     new_groups: bool = False,
 ) -> Shift:
-    """The contribution of nuisance terms to the path loss of new links; `draws` has posterior draws by coefficient.
+    """The contribution of nuisance terms to the path loss of new links.
 
-    A group without a coefficient gets the mean of the n coefficients. Its spread is the standard deviation s between
-    groups, enlarged by the uncertainty of the mean: s sqrt(1 + 1 / n). With `new_groups`, such groups are also allowed
-    in terms whose spread is not estimated; new transmitters, which no column names, are always allowed.
+    A group without a coefficient is assigned the mean of the n coefficients. Its spread is the standard deviation s
+    between groups, enlarged by the uncertainty of the mean: s sqrt(1 + 1 / n). With `new_groups`, such groups are also
+    allowed in terms without an estimated spread. New transmitters are always allowed, because no column names them.
+    `draws` contains posterior draws by coefficient.
 
     Raises:
         InputError: A group has no coefficient, and `new_groups` is False.
@@ -134,7 +134,8 @@ def nuisance_shift(
             new_label = str(labels[int(np.argmax(group < 0))])
             raise InputError(
                 f"{links.source}: group {new_label!r} has no calibrated {term.name}; the calibrated groups are "
-                f"{', '.join(term.coefficients)}; with an interval (--level, predict_interval), new groups get the mean"
+                f"{', '.join(term.coefficients)}; with an interval (--level, predict_interval), the mean is used for "
+                "new groups"
             )
         mean = coefficients.mean(axis=1, keepdims=True)
         value += term.column * np.where(group >= 0, coefficients[:, group], mean)

@@ -1,8 +1,8 @@
 """Coverage maps: path loss over an area, predicted with the calibrated scene, and its interval.
 
 The link to the centre of each cell is predicted like any other link. Sionna's radio map solver instead averages over
-each cell, from the rays that cross it. In the demo district, the two differ by more than 0.05 dB in 70 % of the cells,
-and by more than 0.7 dB in 10 % of them (`python benchmarks/coverage_map.py --solver`).
+the rays that cross each cell. In the demo district, the two differ by more than 0.05 dB in 70 % of the cells, and by
+more than 0.7 dB in 10 % of them (`python benchmarks/coverage_map.py --solver`).
 """
 
 from __future__ import annotations
@@ -70,9 +70,10 @@ def coverage_map(
         power_dbm: Transmitted power for a map of received power [dBm]; if None, the map shows path loss. After a
             calibration on RSRP, the default is 0, because the offset contains the power.
         samples: Number of rays; that of the study if None. Too few rays miss paths, and the time taken is proportional
-            to the number of rays. "auto" adds rays until path loss has converged, which takes less time than many rays.
+            to the number of rays. "auto" adds rays until path loss has converged, which takes less time than a large
+            number of rays from the start.
         columns: Values of the study's columns of groups, carriers or nuisances for this transmitter, by column name.
-            The group of an offset comes from the links measured at this transmitter, if they share a group.
+            The group of an offset is taken from the links measured at this transmitter, if they share a group.
         progress: Called with the stage "tracing" after every launch.
         workers: Workers that trace and predict chunks of cells (`engines.open_workers`); this process if None.
         allow_changed_inputs: Predict even if a file of the scene or an antenna has changed since the calibration.
@@ -97,7 +98,7 @@ def coverage_map(
         _check_number("power_dbm", power_dbm, -np.inf)
     if power_dbm and study.links.quantity == "rsrp":
         _LOG.warning(
-            "power %g dBm: after a calibration on RSRP the offset contains the transmitted power, so the map differs "
+            "power %g dBm: after a calibration on RSRP, the offset contains the transmitted power, so the map differs "
             "from RSRP by %+g dB; leave the power out for RSRP", power_dbm, power_dbm,
         )  # fmt: skip
     frame = known_frame(study)
@@ -212,7 +213,7 @@ def _column_values(
 def _measured_values(
     study: Study, tx: NDArray[np.float64], columns: Sequence[str], stated: Mapping[str, object]
 ) -> dict[str, object]:
-    """Values of columns, such as antennas and carriers, where all links measured at this transmitter have one value."""
+    """Values of columns, such as antennas and carriers, for which all links measured at this transmitter agree."""
     if not set(columns) - set(stated):
         return {}
     links = study.measurements()
@@ -243,8 +244,8 @@ def _grid(
         ends = _numbers(bounds)
     if ends.shape != (4,) or not np.isfinite(ends).all() or not (ends[:2] < ends[2:]).all():
         raise InputError(
-            f"bounds = {ends.tolist() if bounds is None else bounds!r}: must be west, south, east and north [m], west "
-            "less than east and south less than north"
+            f"bounds = {ends.tolist() if bounds is None else bounds!r}: must be west, south, east and north [m], with "
+            "west less than east and south less than north"
         )
     # The tolerance keeps rounding errors from adding a cell.
     count = np.maximum(np.ceil((ends[2:] - ends[:2]) / cell - 1e-6), 1.0)

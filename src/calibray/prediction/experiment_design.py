@@ -1,27 +1,27 @@
 """Design of the next measurements: candidates ranked by the uncertainty expected after measuring them.
 
-The posterior draws represent the possible values. In turn, each draw is taken as the truth, and the other draws are
-weighted by their agreement with the measurement that this truth would give. A candidate is ranked by the mean logarithm
-of the remaining standard deviations over draws and parameters (an A-optimal design in relative units, averaged over the
-posterior; K. Chaloner and I. Verdinelli, Bayesian experimental design: a review, Statistical Science 10, 1995). The
-standard deviations are computed in two ways, and their logarithms are added:
+The posterior draws represent the possible values. Each draw in turn is assumed to be the true value, and the other
+draws are weighted by their agreement with the measurement that this value would produce. A candidate is ranked by the
+mean logarithm of the remaining standard deviations over draws and parameters (an A-optimal design in relative units,
+averaged over the posterior; K. Chaloner and I. Verdinelli, Bayesian experimental design: a review, Statistical Science
+10, 1995). The standard deviations are computed in two ways, and their logarithms are added:
 
-- by scatter, from the weighted draws: this distinguishes separate minima, but resolves a parameter only relative to its
-  whole range;
-- by curvature at each draw: this shows how much a single minimum narrows.
+- from the scatter of the weighted draws, which distinguishes separate minima but resolves a parameter only relative to
+  its whole range;
+- from the curvature at each draw, which shows how much a single minimum narrows.
 
-Scatter shows little if a range of a parameter contains few draws. If separate ranges of a parameter fit, the
-probability of ruling out all but one is therefore added to the rank. In each range, there are values that explain the
-links measured so far. The excess of a value is its sum of squares minus that of the best value. At a candidate, the
-squared difference from the truth is added to this excess. The smallest total in a range is the sum of squares that a
-fit would reach there with all other parameters free. A range is ruled out if its smallest total exceeds that of the
-true range by the quantile of an interval. For two models, this is the T-optimal design of A. C. Atkinson and V. V.
-Fedorov, The design of experiments for discriminating between two rival models, Biometrika 62, 1975, with the
-expectation over the truth of G. E. P. Box and W. J. Hill, Discrimination among mechanistic models, Technometrics 9,
-1967.
+The scatter is uninformative if a range of a parameter contains few draws. If separate ranges of a parameter fit, the
+probability of ruling out all but one of them is therefore added to the rank. In each range, there are values that
+explain the links measured so far. The excess of a value is its sum of squares minus that of the best value. At a
+candidate, the squared difference from the true value is added to this excess. The smallest total in a range is the sum
+of squares that a fit would reach there with all other parameters free. A range is ruled out if its smallest total
+exceeds that of the true range by the quantile of an interval. For two models, this is the T-optimal design (A. C.
+Atkinson and V. V. Fedorov, The design of experiments for discriminating between two rival models, Biometrika 62, 1975)
+with an expectation over the true value (G. E. P. Box and W. J. Hill, Discrimination among mechanistic models,
+Technometrics 9, 1967).
 
 Candidates are chosen one at a time. Part of their errors is common, caused by an unknown offset or by common clutter.
-Conditioning after each choice removes this part, so that a second measurement at the same point gains less.
+Conditioning after each choice removes this part, so a second measurement at the same point adds less information.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from scipy.spatial.distance import cdist
 from scipy.special import ndtr
 
 UNIFORM_INFORMATION: Final = 12.0
-"""Inverse variance of the uniform distribution over the unit interval: the information before any link."""
+"""Inverse variance of the uniform distribution over the unit interval: the information before any link is measured."""
 
 LEAST_VARIANCE: Final = 1e-5
 """Variance in the unit cube that the scatter of about a hundred draws cannot resolve."""
 
 SEPARATION_WEIGHT: Final = 8.0
-"""Weight of ruling out all ranges of a parameter but one, compared with narrowing it by a factor e."""
+"""Weight of ruling out all ranges of a parameter but one, relative to narrowing the parameter by a factor of e."""
 
 RULED_OUT: Final = 4.3
 """Excess of the sum of squares, in noise variances, above which a range is ruled out: F(0.95; 1, about 20)."""
@@ -92,9 +92,11 @@ class Outlook:
 
     Attributes:
         index: The candidate.
-        narrowed: Standard deviation of every parameter relative to its value before any candidate [d]; at most 1.
-        range_probability: Probability that the separate range in which a parameter lies is known [d]; 1 for one range.
-        information: Information matrix of all links measured by then, at every draw [n, d, d].
+        narrowed: Standard deviation of every parameter relative to its value before any candidate is measured [d]; at
+            most 1.
+        range_probability: Probability that the separate range in which a parameter lies is known [d]; 1 if there is
+            only one range.
+        information: Information matrix of all links measured up to this candidate, at every draw [n, d, d].
     """
 
     index: int
@@ -135,8 +137,8 @@ def choose_candidates(
         count: Number of candidates to choose.
 
     Returns:
-        The candidates in the order of their choice, each with the uncertainty expected after measuring this candidate
-        and the earlier ones.
+        The candidates in the order of their choice, each with the uncertainty expected after measuring this and the
+        earlier candidates.
     """
     prior_information = UNIFORM_INFORMATION * np.eye(beliefs.point.shape[1])
     beliefs = replace(beliefs, information=beliefs.information + prior_information)
@@ -198,11 +200,11 @@ def separation_probability(
 ) -> NDArray[np.float64]:
     """Probability of ruling out all ranges of a parameter but one, after a candidate is measured [candidates].
 
-    The probability is averaged over draws and parameters; a parameter with one range adds nothing. `excess` is the sum
-    of squares of every value minus the smallest sum, in noise variances [m]; the first n values are the draws. `piece`
-    is the range of each parameter [m, d]. `squares` are squared differences between draws and values at the candidates
-    chosen so far [n, m]. `predicted` is the candidates' path loss for every value, in standard deviations of their
-    errors [m, candidates].
+    The probability is averaged over draws and parameters; a parameter with a single range contributes 0. `excess` is
+    the sum of squares of every value minus the smallest sum, in noise variances [m]; the first n values are the draws.
+    `piece` is the range of each parameter [m, d]. `squares` are squared differences between draws and values at the
+    candidates chosen so far [n, m]. `predicted` is the candidates' path loss for every value, in standard deviations of
+    their errors [m, candidates].
     """
     draws, candidates = len(squares), predicted.shape[1]
     ambiguous = [column for column in piece.T if np.ptp(column)]
@@ -245,7 +247,7 @@ def _rank_by_scatter(
 
 
 def _rank_by_curvature(information: NDArray[np.float64], slope: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean logarithm of the standard deviations by curvature after a candidate is measured [candidates]."""
+    """Mean logarithm of the standard deviations from curvature after a candidate is measured [candidates]."""
     covariance = np.linalg.inv(information)
     # Sherman-Morrison: the inverse after adding one row of slopes.
     gain = slope @ covariance
@@ -274,6 +276,6 @@ def _range_probability(piece: NDArray[np.int64], squares: NDArray[np.float64]) -
 
 
 def _weights(squares: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weights of the draws [..., n, n]; each row takes its own draw as the truth."""
+    """Weights of the draws [..., n, n]; each row assumes that its own draw is the true value."""
     weight = np.exp(-0.5 * squares)
     return weight / weight.sum(axis=-1, keepdims=True)

@@ -32,7 +32,8 @@ GEOTIFF, PICTURE, TABLE = FILES
 LOSS_COLORS: Final = "viridis_r"
 POWER_COLORS: Final = "viridis"
 WIDTH_COLORS: Final = "cividis"
-"""Matplotlib colour scales whose order remains clear to colour-blind readers and in grey; strong signals are bright."""
+"""Matplotlib colour scales with an order that is clear to colour-blind readers and in greyscale; strong signals are
+bright."""
 
 QUANTILES: Final = (0.02, 0.98)
 """Quantiles of the cells' values at which the colour scale ends, so that a few extreme values do not compress it."""
@@ -54,7 +55,7 @@ class CoverageMap:
             NaN at the transmitter and, in an outdoor study, for cells inside buildings that have no path.
         lower_db: Lower end of the interval [ny, nx], [dB]; NaN without a prediction or without a level.
         upper_db: Upper end of the interval [ny, nx], [dB].
-        no_path: Cells predicted by the log-distance model, because they have no path [ny, nx].
+        no_path: Mask of the cells predicted by the log-distance model because they have no path [ny, nx].
         level: Probability that the interval contains a measurement; None for a map without intervals.
         power_dbm: Transmitted power of a map of received power [dBm]; None for a map of path loss.
         frame: Geographic frame of the scene; None if unknown.
@@ -118,7 +119,7 @@ class CoverageMap:
             overwrite: Replace files that Calibray did not write.
 
         Returns:
-            Names of the files; without rasterio there is no GeoTIFF.
+            Names of the files that were written; without rasterio, there is no GeoTIFF.
 
         Raises:
             InputError: The folder cannot be written, or a file there must not be replaced.
@@ -139,10 +140,11 @@ class CoverageMap:
 
 
 def geotiff(coverage: CoverageMap, path: Path) -> None:
-    """Write a map as a GeoTIFF, north up: a band per layer and observable, and one that is 1 for cells without a path.
+    """Write a map as a north-up GeoTIFF with a band per layer and observable, and a band that is 1 without a path.
 
     Args:
-        coverage: The map. Without a frame, coordinates are those of the scene, and no reference system is declared.
+        coverage: The map. Without a frame, coordinates are those of the scene, and no coordinate reference system is
+            declared.
         path: The file.
 
     Raises:

@@ -31,7 +31,7 @@ draws has an error of 9 %."""
 
 
 class Replayed(NamedTuple):
-    """An engine for new links, and parameter values: of the prediction model, then of every draw [1 + draws, d].
+    """An engine for new links, and the parameter values of the prediction model, then of every draw [1 + draws, d].
 
     If path loss is averaged over two sets of values, both precede the draws, and `averaged` is 2. `answers` is the
     path loss that an external program returns for the values before the draws [averaged, links], [dB].
@@ -55,7 +55,7 @@ def observable_columns(study: Study, level: float | None) -> tuple[str, ...]:
 def further_observables(
     result: Record, replayed: Replayed | None, level: float | None = None
 ) -> dict[str, NDArray[np.float64]]:
-    """Further observables at opened links [links], without device biases, by column name.
+    """Further observables at the links of an opened study [links], without device biases, by column name.
 
     The interval has two parts: the errors of single values, from held-out links if there are any, and the scatter of
     the draws. The result is empty if the study has no further observables, or if the prediction model uses no scene.
@@ -90,14 +90,14 @@ CHOICES: Final = (DELAY_SPREAD, EXCESS_DELAY, K_FACTOR, DEPARTURE_SPREAD, ARRIVA
 
 RELATIVE_ERROR: Final = 0.1
 """Expected error of a spread or an excess delay that the study does not contain, relative to the RMS of its values. In
-downtown Boulder, delay spreads vary by 3 % in sight and by 15 % out of sight when the receiving array turns."""
+downtown Boulder, delay spreads vary by 3 % in sight and by 15 % out of sight when the receiving array rotates."""
 
 ERROR_DB: Final = 1.0
 """Expected error of a K-factor that the study does not contain [dB]."""
 
 
 class Worth(NamedTuple):
-    """The observable most worth measuring at a suggestion and at those above it.
+    """The most informative observable at a suggestion and the suggestions above it.
 
     `narrowed` is the standard deviation expected for every parameter, relative to that with path loss alone [d].
     """
@@ -115,8 +115,8 @@ def worth_measuring(
 ) -> list[Worth]:
     """The most informative observable at every suggested link [suggestions], the best link first.
 
-    Draws of the parameters, and their derivatives with respect to the coordinates of the unit cube, are [n, d].
-    Information matrices include the path loss of each suggestion and of those above it [suggestions, n, d, d].
+    Draws of the parameters, and their derivatives with respect to the coordinates of the unit cube, have the shape [n,
+    d]. Information matrices include the path loss of each suggestion and of those above it [suggestions, n, d, d].
     """
     own = {section.kind: (name, section) for name, section in result.study.observables.items()}
     statistics = tuple(own[kind][1].statistic if kind in own else Statistic(kind) for kind in CHOICES)

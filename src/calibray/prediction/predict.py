@@ -46,14 +46,15 @@ from calibray.validation.models import without_scene
 _LOG: Final = logging.getLogger(__name__)
 
 NEIGHBOURS: Final = (0.125, 0.5)
-"""Displacements at which antennas are traced, as shares of the largest displacement: 1 m and 4 m of 8 m."""
+"""Displacements at which antennas are traced, as shares of the largest displacement: 1 m and 4 m if the largest is 8
+m."""
 
 NEAR_SHARE: Final = 0.1
 """Share of the residual field's variance explained by measured links above which a link counts as near them."""
 
 WEAKER_DB: Final = 10.0
-"""Excess over the largest measured path loss above which a prediction gets a remark [dB]. In a synthetic town with
-wrong heights of buildings, such predictions were wrong by up to 46 dB."""
+"""Excess over the largest measured path loss above which a prediction has a remark [dB]. In a synthetic town with wrong
+building heights, the errors of such predictions were up to 46 dB."""
 
 
 def predict(
@@ -84,12 +85,12 @@ def predict_interval(
 ) -> pd.DataFrame:
     """Predict path loss at new links, with an interval for a measurement there; see `Result.predict_interval`.
 
-    The width of the interval has three parts: the residuals of single links, on held-out links if the calibration has
-    any; the scatter of the draws, unless blocks were held out, whose residuals include it; and for groups without
-    measurements, the spread between groups.
+    The width of the interval has up to three parts. The first is the size of single links' residuals, on held-out links
+    if the calibration has any. The second is the scatter of the draws; it is omitted if blocks were held out, because
+    their residuals include it. The third is the spread between groups, for links of a group without measurements.
 
     Raises:
-        InputError: `predict` would refuse the input for another reason than unknown groups; the level is not between 0
+        InputError: `predict` would refuse the input for a reason other than unknown groups; the level is not between 0
             and 1; or the calibration had too few links to estimate the size of residuals.
     """
     setup = open_for_links(result, as_links(result, links), allow_changed_inputs=allow_changed_inputs)
@@ -120,7 +121,7 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
 
 
 def _with_measured_spellings(model: PredictionModel, links: Measurements) -> Measurements:
-    """The links with labels spelled as measured: 007, for example, which is read as 7 in a purely numeric column."""
+    """The links with labels spelled as in the measurements: for example 007, which is read as 7 in a numeric column."""
     for term in model.terms:
         spelling: dict[str, set[str]] = {}
         for label in term.coefficients:
@@ -176,10 +177,12 @@ def warn_of_carriers(result: Record, links: Measurements) -> None:
         low, high = result.links["frequency"].min(), result.links["frequency"].max()
         beyond = (links.frequency < 0.99 * low) | (links.frequency > 1.01 * high)
         if beyond.any():
-            where = f"other than {hertz(low)}" if low == high else f"outside {hertz(low)} to {hertz(high)}"
+            measured = f"other than the measured {hertz(low)}"
+            if low < high:
+                measured = f"outside the measured range of {hertz(low)} to {hertz(high)}"
             _LOG.warning(
-                "%s: %d of %d links have carriers %s, the measured carriers; materials are extrapolated, which the "
-                "intervals do not account for", links.source, beyond.sum(), len(links), where,
+                "%s: %d of %d links have carriers %s; materials are extrapolated, which the intervals do not "
+                "account for", links.source, beyond.sum(), len(links), measured,
             )  # fmt: skip
 
 
@@ -200,7 +203,7 @@ def refuse_far_links(result: Record, links: Measurements, triangles: Triangles) 
 
 
 def traced_materials(result: Record, materials: dict[str, Material] | None) -> dict[str, Material] | None:
-    """The materials to trace with if the paths depend on them; otherwise None, because one trace serves all materials.
+    """The materials for the trace if the paths depend on them; otherwise None, because one trace is valid for all.
 
     The tracer's sampling depends on the materials only with refraction or diffuse reflection. The powers of a program's
     rays always depend on them.
@@ -299,10 +302,10 @@ def interval(
 
 
 def _quantiles(model: PredictionModel, level: float) -> tuple[float, float]:
-    """Quantile of Student's t for errors of links, and the ratio of the quantile for errors of blocks to it.
+    """Quantile of Student's t for errors of links, and the ratio of the quantile for blocks to this one.
 
-    Both variances are estimates with their own degrees of freedom. Blocks have as many degrees of freedom as there are
-    blocks, because their mean errors are deviations from zero.
+    Both variances are estimates with their own degrees of freedom. Errors of blocks have as many degrees of freedom as
+    there are blocks, because they are deviations from zero, not from an estimated mean.
     """
     count = 0 if model.blocks is None else model.blocks.blocks
     factor = float(stdtrit(max(model.links - count, 1), (1 + level) / 2))
@@ -313,8 +316,9 @@ def _residual_db(result: Record, links: Measurements, ratio: float) -> NDArray[n
     """Standard deviation of the prediction model's errors at new links [links], [dB]; `ratio` scales the blocks' part.
 
     Farther than `BlockErrors.reach_m` from all calibration links, the variance between blocks is raised by a factor of
-    up to two: a place that far away differs from the blocks as these differ from each other. The contribution of random
-    effects to these errors is subtracted, because `nuisance_shift` adds their spread where a link's group is new.
+    up to two, because such a distant place differs from the blocks as much as these differ from each other. The
+    contribution of random effects to these errors is subtracted, because `nuisance_shift` adds their spread for links
+    of a new group.
     """
     model, ends = result.prediction.model, result.ends
     if model.blocks is None or ends is None:
@@ -460,7 +464,7 @@ def has_links(result: Record, links: Measurements) -> bool:
 
 
 def add_remarks(result: Record, setup: Setup, predictions: pd.DataFrame) -> pd.DataFrame:
-    """Predictions with a column of remarks on the ends of each link, or otherwise on its path loss; empty if none.
+    """Predictions with a column of remarks on the ends of each link or, if there are none, on its path loss.
 
     If most calibrated receivers are inside a building, remarks on ends inside a building are omitted.
     """
@@ -479,7 +483,7 @@ def add_remarks(result: Record, setup: Setup, predictions: pd.DataFrame) -> pd.D
 
 
 def _weak(result: Record, path_loss_db: NDArray[np.float64]) -> list[str]:
-    """The remark on links far weaker than every measured one [links]: the model was never compared with such links."""
+    """The remark on links far weaker than every measured link [links]; the model was never compared with such links."""
     measured_db = result.links["measured_db"].to_numpy(float)
     if "faint" in result.links:
         measured_db = measured_db[~result.links["faint"].to_numpy(bool)]

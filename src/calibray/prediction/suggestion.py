@@ -55,7 +55,7 @@ VALUES_PER_RANGE: Final = 24
 """Number of further values in each separate range of a parameter, because some ranges contain few draws."""
 
 LEAST_GAIN: Final = 0.02
-"""Smallest relative narrowing of an interval, and smallest gain in probability, that is reported as text."""
+"""Smallest relative narrowing of an interval, and smallest gain in probability, that are reported as text."""
 
 
 def suggest(
@@ -70,29 +70,31 @@ def suggest(
     """Suggest where to measure next, by the expected narrowing of the parameters' intervals.
 
     Each candidate is traced and replayed for draws from the posterior. If the draws predict the same path loss, a
-    measurement adds nothing; if they differ by more than the error of a link, it rules out some draws. Candidates are
-    chosen one at a time, each as the best addition to the earlier ones. Candidates whose mean predicted power is not
-    above the study's noise floor are left out, and a warning in the log states their number.
+    measurement adds no information. If they differ by more than the error of a link, a measurement rules out some
+    draws. Candidates are chosen one at a time, each as the best addition to the earlier ones. Candidates with a mean
+    predicted power that is not above the study's noise floor are left out, and a warning in the log states their
+    number.
 
     Args:
         result: The calibration, with the engine "replay" or "retrace" and with draws from the posterior.
         candidates: Possible measurements: links, or a table, as for `Result.predict`.
-        count: Largest number of suggestions; a warning in the log says if there are fewer.
+        count: Largest number of suggestions; a warning is logged if there are fewer.
         progress: Called with the stage "tracing" after every launch.
         allow_changed_inputs: Continue even if a file of the scene or an antenna, or the links have changed since the
             calibration.
         observables: Also report which further observable is worth measuring at each suggestion.
 
     Returns:
-        One row per suggestion, the best first: the candidate's row, its positions [m] and group; path_loss_db and
-        spread_db, mean and standard deviation of the draws' predictions [dB]; NAME_width for every parameter, the
-        expected width of its 95 % interval once this candidate and those above are measured; NAME_sure, where several
-        ranges fit, the expected probability of knowing the right one; and gain, a summary as text. With `observables`,
-        also observable, the quantity that narrows the intervals most if it is measured in addition to path loss at this
-        candidate and those above, and observable_gain, a summary as text.
+        One row per suggestion, best first. The columns are the candidate's row, its positions [m] and group;
+        path_loss_db and spread_db, the mean and the standard deviation of the draws' predictions [dB]; NAME_width for
+        every parameter, the expected width of its 95 % interval once this candidate and those above are measured;
+        NAME_sure for a parameter with several ranges, the expected probability that the right range is known; and gain,
+        a summary as text. With `observables`, there are also the columns observable, the quantity that narrows the
+        intervals most if it is measured in addition to path loss at this candidate and those above, and
+        observable_gain, a summary as text.
 
     Raises:
-        InputError: `Result.predict` would refuse the input for another reason than unknown groups; the calibration has
+        InputError: `Result.predict` would refuse the input for a reason other than unknown groups; the calibration has
             no draws; or no candidate has a path and a predicted power above the study's noise floor.
     """
     if isinstance(count, bool) or not (isinstance(count, Integral) and count >= 1):
@@ -100,7 +102,7 @@ def suggest(
     study = result.study
     if study.engine.external:
         raise InputError(
-            f"{study.path}: the engine {study.engine.name!r} gives no derivatives, which suggestions need; "
+            f"{study.path}: the engine {study.engine.name!r} gives no derivatives, which suggestions require; "
             "calibrate on the engine 'replay'"
         )
     if not result.uncertainty.draws:
@@ -160,7 +162,7 @@ def suggest(
 def _received(
     result: Record, links: Measurements, path_loss_db: NDArray[np.float64], reached: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """The candidates with a path, `reached`, whose predicted power is above the study's noise floor.
+    """The candidates among `reached`, which have a path, with a predicted power above the study's noise floor.
 
     All remain if the study has no noise floor, or if the transmitted power of the candidates is unknown.
 
@@ -228,7 +230,7 @@ class _ReplayedDraws:
         return Beliefs(unit, information, self._pieces(self.values), square - square.min())
 
     def at(self, setup: Setup) -> tuple[NDArray[np.float64], NDArray[np.float64], Errors]:
-        """Predict the candidates.
+        """Predict the path loss of the candidates and the errors of their measurements.
 
         The results are path loss for every draw and further value [m, candidates], [dB]; its derivatives with respect
         to the unit cube's coordinates, for the draws [n, candidates, d], [dB]; and the expected errors of measurements.
@@ -255,7 +257,7 @@ class _ReplayedDraws:
         section = setup.study.engine
         if not isinstance(engine, Observing) or getattr(section, "compress_db", None) is not None:
             raise InputError(
-                f"{setup.study.path}: further observables need paths that engine.compress_db does not keep; suggest "
+                f"{setup.study.path}: further observables require paths that engine.compress_db omits; suggest "
                 "without them"
             )
         unit_slope = self.problem.parameters.search_slope(values) * self.width
@@ -344,7 +346,7 @@ class _ReplayedDraws:
         return share * at_links.value[:, None], unknown
 
     def _errors(self, candidates: Measurements, common: NDArray[np.float64]) -> Errors:
-        """Expected errors of candidates. Candidates have no weights, so all calibration links count equally.
+        """Expected errors of candidates. Candidates have no weights, so all calibration links are weighted equally.
 
         `common` is as in `Errors`. Residuals of neighbouring links may be correlated, unless the study rules this out.
         """

@@ -1,1 +1,1 @@
-"""Uncertainty: how far the calibrated values can be trusted."""
+"""Uncertainty: credible intervals, verdicts and remarks on the calibrated values."""

@@ -36,7 +36,7 @@ SEARCHES: Final = 16
 """Number of local searches for the model's optimum, in addition to the search from the calibrated optimum."""
 
 MOST_ERRORS: Final = 400
-"""Largest number of absolute errors that are stored with the model; if there are more, quantiles are stored."""
+"""Largest number of absolute errors that are stored with the model; if there are more, quantiles are stored instead."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class HeldOutResiduals:
         basis: Description of the links to which the residuals belong.
         links: Number of these links, or degrees of freedom if they are calibration links.
         errors_db: The residuals on held-out links [n], [dB]; empty if the residuals belong to calibration links.
-        blocks: Standard deviations within and between blocks; None if no links or too few were held out.
+        blocks: Standard deviations within and between blocks; None if no links, or too few links, were held out.
     """
 
     rms_db: float | None
@@ -66,7 +66,7 @@ class FittedModel:
         model: The model.
         materials: Materials of the scene with the model's parameters; None if the model uses no scene.
         path_loss_db: Path loss of the model, with nuisances [links], [dB].
-        scene_db: Path loss of the model's scene alone, or of the calibrated scene if it uses none [links], [dB].
+        scene_db: Path loss of the model's scene alone, or of the calibrated scene if the model uses none [links], [dB].
     """
 
     model: PredictionModel
@@ -146,7 +146,7 @@ def fit_prediction_model(
 
 @dataclass(frozen=True, eq=False)
 class FittedVariant:
-    """A variant fitted to the links with a weight: its values [d], objective, and path loss without nuisance [L]."""
+    """A variant fitted to the links with a weight: parameters [d], objective, and path loss without nuisance [L]."""
 
     candidate: NDArray[np.float64]
     objective: Objective
@@ -154,7 +154,7 @@ class FittedVariant:
 
 
 def fit_variant(problem: Problem, trail: Trail, name: Model) -> FittedVariant:
-    """Fit a variant, by a search from the calibrated optimum and new starting points if a search is needed."""
+    """Fit a variant; a search, if needed, starts from the calibrated optimum and from new starting points."""
     if name == Model.INITIAL:
         objective = models.initial_objective(problem.objective, problem.setup)
         return FittedVariant(problem.parameters.start, objective, problem.before)
@@ -170,8 +170,8 @@ def fit_variant(problem: Problem, trail: Trail, name: Model) -> FittedVariant:
 def averaged_terms(few: tuple[FittedTerm, ...], more: tuple[FittedTerm, ...]) -> tuple[FittedTerm, ...]:
     """The mean of the terms of two models, of which the second has all terms of the first.
 
-    The coefficients of a term that the first model lacks are halved. A group without a coefficient in one model gets
-    that of the other model.
+    The coefficients of a term that the first model lacks are halved. If a group has no coefficient in one model, that
+    of the other model is used.
     """
     known, averaged = {term.name: term for term in few}, []
     for term in more:
@@ -190,8 +190,8 @@ def averaged_terms(few: tuple[FittedTerm, ...], more: tuple[FittedTerm, ...]) ->
 def with_prior_mean(terms: tuple[FittedTerm, ...], study: StudyModel) -> tuple[FittedTerm, ...]:
     """The terms of the log-distance model with obstruction, with the mean of the prior added to the loss out of sight.
 
-    The fit treats that mean as known, even if no link out of sight has a weight. A nuisance of the study in the same
-    column has no such prior.
+    The fit treats that mean as known, even if no link out of sight has a weight. A nuisance that the study declares for
+    the same column has no such prior.
     """
     if any(term.by == OUT_OF_SIGHT for term in study.nuisance.values()):
         return terms
@@ -210,7 +210,7 @@ def quantiles(absolute_errors: NDArray[np.float64]) -> tuple[float, ...]:
         absolute_errors: The errors, ascending [n], [dB].
 
     Returns:
-        All of them, or `MOST_ERRORS` quantiles of them if there are more, ascending.
+        All errors, or `MOST_ERRORS` quantiles if there are more errors, ascending.
     """
     if len(absolute_errors) > MOST_ERRORS:
         absolute_errors = np.quantile(absolute_errors, (np.arange(MOST_ERRORS) + 0.5) / MOST_ERRORS)

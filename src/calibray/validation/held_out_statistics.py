@@ -1,14 +1,14 @@
 """Statistics of held-out errors: spatial blocks, comparison of two models, and width of a prediction interval.
 
-The interval is conformal: among n + 1 exchangeable errors, a new one has any rank with the same probability. The
+The interval is conformal: among n + 1 exchangeable errors, a new error has every rank with the same probability. The
 absolute value of a new error is therefore at most the ((n + 1) p)-th smallest of the n observed absolute errors with
 probability p, whatever their distribution (V. Vovk, A. Gammerman, G. Shafer, Algorithmic Learning in a Random World,
 2005; R. J. Barber et al., Ann. Statist. 49, 2021, for held-out links). Errors of links have heavier tails than a
 Gaussian, so an interval from their root mean square would be too wide at 90 %. If there are few errors, the largest
 ones are too uncertain, and Student's t is used instead.
 
-For further observables, one baseline is linear in distance for times of flight, and otherwise in the logarithm of
-distance. Models and baselines include device biases, which are fitted to the links that are not held out.
+For further observables, one baseline is linear in distance for times of flight, and linear in the logarithm of distance
+otherwise. Models and baselines include device biases, which are fitted to the links that are not held out.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from calibray.result.held_out import (
 from calibray.study.model import StudyModel
 
 Errors = Mapping[Any, NDArray[np.float64]]
-"""Residuals by model, a `Model` or its name [n], [dB]."""
+"""Residuals [n], [dB], by model; a key is a `Model` or its name."""
 
 CLUSTER_LINKS: Final = 4
 """Number of neighbouring links that are resampled together, because they share part of their noise."""
@@ -49,7 +49,8 @@ RESAMPLES: Final = 2000
 
 LEAST_GAIN: Final = 0.05
 """Smallest relative decrease of the RMSE for which another model is chosen. In Boulder, smaller decreases came from one
-block, and the fitted model lost up to 3 dB in clusters kept apart; with planted misfits, no decrease was this small."""
+block, and the fitted model was up to 3 dB worse on separately held-out clusters. With planted misfits, every decrease
+was larger."""
 
 REACHED: Final = 0.9
 """Share of the held-out links that are at most `BlockErrors.reach_m` from a link outside their block."""
@@ -59,7 +60,8 @@ AVERAGE_LINKS: Final = 8
 links out of sight contain little information about their errors."""
 
 FEWEST_FOR_RANKS: Final = 40
-"""Smallest number of errors whose ranks give an interval; for fewer errors, Student's t distribution is assumed."""
+"""Smallest number of errors whose ranks determine an interval; for fewer errors, Student's t distribution is
+assumed."""
 
 
 def spatial_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]:
@@ -82,7 +84,7 @@ def spatial_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int6
 
 
 def moving_end(links: Measurements) -> NDArray[np.float64]:
-    """Positions of the receivers, or of the transmitters if these are at more places [links, 3], [m]."""
+    """Positions of the receivers, or of the transmitters if these have more distinct positions [links, 3], [m]."""
     tx_places, rx_places = (len(np.unique(end, axis=0)) for end in (links.tx, links.rx))
     return links.tx if tx_places > rx_places else links.rx
 
@@ -105,8 +107,8 @@ def place_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]
 def compare(errors: NDArray[np.float64], baselines: Errors, position: NDArray[np.float64]) -> Judgement:
     """Compare a model with its best baseline, by residuals on the same held-out links [n], [dB].
 
-    The error of the difference comes from resampling clusters of links whose positions [n, 3], [m], are close together,
-    with the same clusters for both models. Links with a non-finite residual are left out.
+    The standard error of the difference is estimated by resampling clusters of links with neighbouring positions [n,
+    3], [m]. Both models use the same clusters. Links with a non-finite residual are left out.
     """
     table = np.stack([errors, *baselines.values()])
     finite = np.isfinite(table).all(axis=0)
@@ -134,8 +136,8 @@ def compare(errors: NDArray[np.float64], baselines: Errors, position: NDArray[np
 def choose(errors: Errors, position: NDArray[np.float64]) -> str:
     """Choose the model for predictions by held-out residuals [n], [dB], which include those of `Model.INITIAL`.
 
-    The initial materials are kept until another model is better by more than the bootstrap error of the difference, and
-    by more than `LEAST_GAIN`. The calibrated model is chosen only if it is significantly better than the one with a
+    The initial materials are kept unless another model is better by more than both the bootstrap error of the
+    difference and `LEAST_GAIN`. The calibrated model is chosen only if it is significantly better than the model with a
     prior. Kriging is never chosen, because it predicts well only near the measured links.
     """
     chosen: str = Model.INITIAL
@@ -173,9 +175,9 @@ def two_levels(
     """Variance of held-out errors [n], [dB], within and between blocks (analysis of variance of random effects).
 
     Each new street has its own error, so a few blocks contain less information than their number of links suggests.
-    `position` [n, k], [m], has the positions of the links' ends, and `fitted` [m, k] those of the links to which the
-    models were fitted: the other blocks if None. The result is None if there are fewer than two blocks, or no more
-    links than blocks.
+    `position` [n, k], [m], contains the positions of the links' ends. `fitted` [m, k] contains the positions of the
+    links to which the models were fitted; if None, these are the links of the other blocks. The result is None if there
+    are fewer than two blocks, or no more links than blocks.
 
     Example:
         >>> blocks = two_levels(np.array([3.0, 4, -4, -3, 1, 0]), np.array([0, 0, 1, 1, 2, 2]), np.eye(6))
@@ -203,7 +205,7 @@ def out_of_sight_ratio(errors: NDArray[np.float64], blocked: NDArray[np.bool_]) 
     """Root mean square error of links out of sight divided by that of all links, from residuals [n], [dB].
 
     The ratio is at least 1, so that links in sight keep the interval of all links. With few links out of sight, it is
-    drawn towards 1 (`AVERAGE_LINKS`).
+    shrunk towards 1 (`AVERAGE_LINKS`).
 
     Example:
         >>> errors, blocked = np.array([1.0, -1, 1, 5, -5, 5, 5, -5, 5, -5, 5]), np.arange(11) > 2
@@ -243,10 +245,10 @@ MODELS: Final = ("calibrated", "mean", "law of distance")
 def held_out_gaps(
     problem: Problem, best: NDArray[np.float64], held_out: NDArray[np.bool_]
 ) -> dict[str, NDArray[np.float64]]:
-    """Predicted minus measured values of every observable on held-out links, by `MODELS` [3, L], in its unit.
+    """Predicted minus measured values of every observable on held-out links, by `MODELS` [3, L].
 
-    Biases are fitted to the other links. The optimum `best` [d] is in the parameters' units. A link that is not judged
-    gets NaN.
+    The unit is that of the observable. Biases are fitted to the other links. The optimum `best` [d] is in the
+    parameters' units. The values of a link that is not judged are NaN.
     """
     if not problem.observed:
         return {}
@@ -286,7 +288,7 @@ def _law(observable: Observed, links: Measurements) -> NDArray[np.float64]:
 def _with_biases(
     observable: Observed, feature: NDArray[np.float64], weight: NDArray[np.float64], *, slope: bool
 ) -> NDArray[np.float64]:
-    """The feature, or a fitted multiple of it, plus fitted biases; other groups get the mean bias."""
+    """The feature, or a fitted multiple of it, plus fitted biases; groups without used links have the mean bias."""
     used = observable.used(weight)
     used = used[np.isfinite(feature[used])]
     # The model has a bias only where the study states one; the mean and the law always have a constant.

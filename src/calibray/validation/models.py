@@ -5,8 +5,8 @@ The baselines are the log-distance model, the same model with the obstruction of
 The variants are the study's own model, the initial materials, the model with a prior around the initial values, and the
 model with this prior and offsets per transmitter and out of sight. An engineer would try these models by hand. The best
 variant differs between campaigns, so held-out links decide (`validate.py`). Both offsets have a prior around zero,
-which keeps them small where the links do not need them. One variant therefore has both. Further variants make the
-choice worse (docs/measurements/predictions.md).
+which keeps them small where the links do not require them. A single variant with both offsets is therefore sufficient.
+Further variants make the choice worse (docs/measurements/predictions.md).
 """
 
 from __future__ import annotations
@@ -47,24 +47,26 @@ from calibray.uncertainty.residual_correlation import fit_correlation
 
 OUT_OF_SIGHT_DB: Final = (10.0, 10.0)
 """Mean and standard deviation of the prior of the loss out of sight [dB]: 3GPP TR 38.901 (UMi) gives 10 dB at 20 m and
-20 dB at 100 m. Without a prior, links in sight alone would contain no information about those out of sight."""
+20 dB at 100 m. If all fitted links are in sight, only the prior contains information about this loss."""
 
 WALL_DB: Final = 2.0
-"""Standard deviation of the prior of the loss per wall crossed, around zero [dB]. Indoors, walls dominate with any
-prior. Outdoors, waves go around buildings; with 5 dB, the error on one held-out cluster of Boulder was 17 dB."""
+"""Standard deviation of the prior of the loss per wall crossed, around zero [dB]. Indoors, the loss of walls dominates
+with any prior. Outdoors, waves travel around buildings; with 5 dB, the error on one held-out cluster of Boulder was 17
+dB."""
 
 ROUNDS: Final = 4
-"""Rounds in which the errors, and then the losses with their priors, are fitted; more change results by 0.01 dB."""
+"""Number of rounds in which the errors, and then the losses with their priors, are fitted. Further rounds change
+results by 0.01 dB."""
 
 LEAST_NOISE_DB: Final = 1.0
-"""Smallest error of the log-distance model against which priors are weighed [dB]."""
+"""Lower limit of the error of the log-distance model that sets the weight of the priors [dB]."""
 
 MOST_KRIGED: Final = 1000
-"""Largest number of links for kriging: fitting the correlation factorizes their covariance a few hundred times."""
+"""Largest number of links for kriging: the fit of the correlation factorizes their covariance a few hundred times."""
 
 
 def without_scene(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
-    """The part of path loss [links], [dB], that needs no scene: its increase with the carrier, minus antenna gains.
+    """The part of path loss [links], [dB], that requires no scene: its increase with the carrier, minus antenna gains.
 
     Path loss increases by 20 log10(f / f0) from the study's carrier f0, as in free space. The gains are those of the
     stated antennas along the straight line, in the directions that the columns of the links state.
@@ -89,7 +91,7 @@ class Baseline(NamedTuple):
     known_db: NDArray[np.float64]
 
     def path_loss_db(self) -> NDArray[np.float64]:
-        """Path loss at all links [links], [dB]; a group whose links have no weight gets the mean of the others."""
+        """Path loss at all links [links], [dB]; a group without links with weight has the mean of the others."""
         return self.objective.with_nuisance(self.known_db)
 
 
@@ -103,7 +105,7 @@ def log_distance(links: Measurements, objective: Objective, known_db: NDArray[np
         EngineError: Fewer than two links have a nonzero weight.
     """
     if np.count_nonzero(objective.weight) < 2:
-        raise EngineError("the log-distance model needs at least two calibration links")
+        raise EngineError("the log-distance model requires at least two calibration links")
     # Bounds and priors of an offset or a slope do not apply to the law's intercept and slope; groups may deviate from
     # these as much as the study allows.
     terms = [
@@ -211,10 +213,10 @@ PRIOR_SPREAD: Final = 0.3
 
 OFFSET_PRIOR_DB: Final = 10.0
 """Standard deviation of the priors around zero of a transmitter's offset, relative to the offset of all links, and of
-the offset of links out of sight [dB]; in downtown Boulder, the latter is 11.7 dB."""
+the offset of links out of sight [dB]. In downtown Boulder, the latter offset is 11.7 dB."""
 
 MOST_STARTS: Final = 4
-"""Number of known minima from which a search starts."""
+"""Largest number of known minima from which a search starts."""
 
 NEW_STARTS: Final = 4
 """Largest number of additional starting points, if minima are known."""
@@ -223,7 +225,7 @@ MOST_NEW_STARTS: Final = 128
 """Largest number of starting points if no minimum is known."""
 
 TOLERANCE: Final = 1e-6
-"""Relative decrease of the mean square below which a search has converged; predictions change by less."""
+"""Relative decrease of the mean square below which a search has converged; predictions then change by less."""
 
 NO_MINIMA: Final[Mapping[Model, NDArray[np.float64]]] = {}
 
@@ -239,7 +241,7 @@ def fit_variants(
             study's own model, the whole ranges of its parameters are searched.
 
     Returns:
-        Problem and minima of each variant by name; the best minimum is the first [k, d].
+        Problem and minima of each variant by name; the best minimum comes first [k, d].
     """
     if Model.CALIBRATED in known_minima:
         calibrated = find_minima(part, known_minima[Model.CALIBRATED], _new_starts(part))
@@ -264,7 +266,7 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
 
     Args:
         part: The problem; held-out links have weight 0.
-        best: The optimum of the problem [d]; its residuals give the noise that scales the priors.
+        best: The optimum of the problem [d]; its residuals determine the noise that scales the priors.
 
     Returns:
         The problems by name. For `Model.INITIAL`, only the nuisance is fitted.
@@ -288,7 +290,7 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
 
 
 def find_minima(problem: Problem, starts: NDArray[np.float64], new_starts: int) -> NDArray[np.float64]:
-    """Find minima of a problem [m, d], the best first, by local searches from given and new starting points [k, d]."""
+    """Find minima of a problem [m, d], best first, by local searches from given and new starting points [k, d]."""
     # If minima are known, the other searches only have to show whether they lead to a lower minimum.
     catch_up = NEARER if len(starts) else CATCH_UP
     return least_squares(
@@ -312,10 +314,10 @@ def _searches(problem: Problem) -> int:
 
 
 def _new_starts(problem: Problem) -> int:
-    """Number of additional starting points, if minima of the same variant over more links are known.
+    """Number of additional starting points if minima of the same variant, fitted to more links, are known.
 
     A large program has fewer points, because its calibration has fewer searches. With one point instead of four, errors
-    on held-out links in Auckland are the same to 0.001 dB; in small programs, more points often find a lower minimum.
+    on held-out links in Auckland agree within 0.001 dB. On small programs, more points often lead to a lower minimum.
     """
     return min(max(_searches(problem) // STARTS[0], 1), NEW_STARTS)
 

@@ -1,4 +1,4 @@
-"""Refit several models without each block of links in turn, and compare them on the block that was held out."""
+"""Refit several models without each block of links in turn, and compare them on the held-out block."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from calibray.validation.validation import Validation
 _LOG: Final = logging.getLogger(__name__)
 
 TX: Final = "tx"
-"""Label that stands for the transmitter's position, unless the table has a column of this name."""
+"""Name that selects the transmitter's position, unless the table has a column of this name."""
 
 
 def validate(
@@ -57,17 +57,18 @@ def validate(
 
     Args:
         study: The study, opened or not, with the engine "replay".
-        blocks: Number of spatial blocks, each held out in turn; if None and `by` is None, the study's number, or 4.
+        blocks: Number of spatial blocks, each held out in turn; if None and `by` is None, the study's number, or 4 if
+            the study states none.
         by: Column whose labels are held out in turn; "tx" for the position of the transmitter.
         workers: Workers that trace and replay chunks of links (`engines.open_workers`); this process if None.
         progress: Called with the name of each stage, the work done and the total.
-        tracer: Opens the scene in a ray tracer; an opened study has its own.
+        tracer: Opens the scene in a ray tracer; an opened study has its own tracer.
 
     Returns:
         Held-out errors of every model, with a table and a conclusion.
 
     Raises:
-        InputError: The study has another engine, or its links cannot be divided into these blocks.
+        InputError: The study has a different engine, or its links cannot be divided into these blocks.
         EngineError: The engine failed.
     """
     if by is not None and isinstance(study, Study):
@@ -78,7 +79,8 @@ def validate(
         raise InputError("validate: give blocks or by, not both")
     if blocks is not None and not (isinstance(blocks, Integral) and 2 <= blocks <= MOST_BLOCKS):
         raise InputError(
-            f"validate: blocks = {blocks!r}; must be a whole number from 2 to {MOST_BLOCKS}; each takes a calibration"
+            f"validate: blocks = {blocks!r}; must be a whole number from 2 to {MOST_BLOCKS}, because each block "
+            "requires a calibration"
         )
     # Links that the study holds out are held out in turn like all others.
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
@@ -100,8 +102,8 @@ def check_engine(study: StudyModel) -> None:
     """
     if not study.allows_blocks:
         raise InputError(
-            f"{study.path}: each block that is held out takes a calibration, which is too expensive on the engine "
-            f"{study.engine.name!r}; set engine.name to 'replay', or hold links out by [holdout] where"
+            f"{study.path}: each held-out block requires a calibration, which is too expensive on the engine "
+            f"{study.engine.name!r}; set engine.name to 'replay', or hold out links with holdout.where"
         )
 
 
@@ -112,11 +114,11 @@ def validate_problem(
     progress: Progress | None = None,
     known_minima: Mapping[Model, NDArray[np.float64]] = NO_MINIMA,
 ) -> Validation:
-    """Compare models on all links of a problem, each block held out in turn.
+    """Compare models on all links of a problem, with each block held out in turn.
 
-    There are `blocks` spatial blocks, or one block for each label of the column `by`; the study states the blocks if
-    both are None. `known_minima` has minima of fits to all links, by model [k, d]; minima of the study's own model are
-    searched if absent. The stage of `progress` is "validating".
+    There are `blocks` spatial blocks, or one block for each label of the column `by`; if both are None, the study's
+    blocks are used. `known_minima` contains minima of fits to all links, by model [k, d]. If the minima of the study's
+    own model are missing, they are searched for. The stage of `progress` is "validating".
 
     Raises:
         InputError: The links cannot be divided into these blocks.
@@ -202,7 +204,8 @@ def fit_models(
 ) -> dict[str, NDArray[np.float64]]:
     """Path loss at all links by model [links], [dB]; the models are fitted to the links with a weight.
 
-    Kriging is left out if it is impossible. `fits` has the fitted variants that use the scene, from `fit_variants`.
+    Kriging is left out if it is impossible. `fits` contains the fitted variants that use the scene, from
+    `fit_variants`.
     """
     setup, objective = part.setup, part.objective
     # If paths are traced around calibrated positions, replay only interpolates path loss at the stated positions.

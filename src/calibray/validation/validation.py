@@ -1,11 +1,11 @@
 """Validation: accuracy of several models on blocks of links, each held out in turn, and the choice between them.
 
-Predictions use the initial materials with fitted offsets until another model is better by more than the bootstrap error
-of the difference (the one-standard-error rule, L. Breiman et al., Classification and Regression Trees, 1984) and by 5 %
-of the RMSE. The best calibrated model is tried first, then the log-distance model, which uses no scene. A few blocks
-hardly distinguish models of similar accuracy, and a fitted model loses more if its fit does not apply elsewhere. The
-calibrated model without a prior must therefore be significantly better than the one with a prior. The chosen model is
-averaged with a second one, because the best model on a few blocks is often not the best elsewhere.
+Predictions use the initial materials with fitted offsets unless another model is better by more than both the bootstrap
+error of the difference (the one-standard-error rule, L. Breiman et al., Classification and Regression Trees, 1984) and
+5 % of the RMSE. The best calibrated model is tried first, then the log-distance model, which uses no scene. A few
+blocks hardly distinguish models of similar accuracy, and a fitted model has larger errors if its fit does not apply
+elsewhere. The calibrated model without a prior must therefore be significantly better than the model with a prior. The
+chosen model is averaged with a second model, because the best model on a few blocks is often not the best elsewhere.
 """
 
 from __future__ import annotations
@@ -102,12 +102,12 @@ class Validation(HeldOutErrors):
 
     @cached_property
     def chosen(self) -> str:
-        """The prediction model; never kriging or the residual field, which only help near measured links."""
+        """The prediction model; never kriging or the residual field, which help only near measured links."""
         return predicting(self._on(self.judged), self.position[self.judged])
 
     @cached_property
     def nested_rmse_db(self) -> float:
-        """RMSE when each block is predicted by the model that the other blocks choose [dB]."""
+        """RMSE if each block is predicted by the model that is chosen on the other blocks [dB]."""
         errors = np.full(len(self.block), np.nan)
         for block in self._blocks():
             others = self.judged & ~block
@@ -122,12 +122,12 @@ class Validation(HeldOutErrors):
 
     @property
     def sentence(self) -> str:
-        """Whether calibration improved on the best baseline on held-out blocks, by how much, and how certainly."""
+        """A sentence on the improvement of calibration over the best baseline, if any, and on its certainty."""
         return judgement_text(self.judgement)
 
     @property
     def choice(self) -> str:
-        """Which model is chosen for predictions on the blocks, with the reason."""
+        """A sentence that names the model chosen for predictions, with the reason."""
         errors = self._on(self.judged)
         best = least(errors, (Model.INITIAL, *FITTED, *WITHOUT_MATERIALS))
         chosen = choose(errors, self.position[self.judged])
@@ -139,7 +139,7 @@ class Validation(HeldOutErrors):
         return float(np.sqrt(np.nanmean(self.errors[name][self.judged] ** 2)))
 
     def levels(self, name: str, links: Measurements) -> BlockErrors | None:
-        """Standard deviations of a model's held-out residuals within and between blocks; None if links are too few."""
+        """Standard deviations of a model's held-out residuals within and between blocks; None for too few links."""
         position = np.hstack([links.tx, links.rx])[self.judged]
         return two_levels(self.errors[name][self.judged], self.block[self.judged], position)
 
@@ -160,7 +160,8 @@ class Validation(HeldOutErrors):
         )  # fmt: skip
         title = f"{len(self.labels)} blocks held out in turn, {np.count_nonzero(self.judged)} links"
         nested = (
-            f"If the other blocks choose the model for each block, the RMSE is {self.nested_rmse_db:.2f} dB."
+            "If each block is predicted by the model that is chosen on the other blocks, the RMSE is "
+            f"{self.nested_rmse_db:.2f} dB."
         )
         further = (observables_table(self.observables),) if self.observables else ()
         return (
