@@ -367,7 +367,7 @@ def test_a_worker_that_dies_costs_its_candidate_alone(tmp_path):
     ("workers", "scheduler", "message"),
     [
         (0, None, "must be at least 1"),
-        (2, "tcp://here:1", "give only one of them"),
+        (2, "tcp://here:1", "give only one of the two"),
         *(
             (None, address, "--scheduler .*: not an address; give a host and a port, for example tcp://")
             for address in (

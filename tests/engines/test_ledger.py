@@ -122,10 +122,10 @@ def test_the_first_failed_call_is_reported_with_its_reason_and_where_to_list_the
         engine.path_loss(CANDIDATES)
     (message,) = [record.getMessage() for record in caplog.records]
     assert message.startswith(
-        "an RT call failed, so all its links count as links without a path; list failed "
+        "an RT call failed, so all its links are treated as links without a path; list failed "
     )
     assert f"calibray ledger {ledger.path.parent}" in message
-    assert message.endswith("The call: it failed")
+    assert message.endswith("The failed call: it failed")
 
 
 def test_an_engine_that_never_worked_leaves_nothing_behind(ledger):

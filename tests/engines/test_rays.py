@@ -166,7 +166,7 @@ WRONG = {
         lambda t: t.drop(columns="power_db").assign(
             gain_real=np.where(t.path == 1, 40.0, 1e-9), gain_imag=0.0
         ),
-        "the magnitude 40, must be at most 1",
+        "the magnitude 40; it must be at most 1",
     ),
     "received power in dBm": (lambda t: t.assign(power_db=t.power_db + 30), "30.0 dB above free space"),
     "delays in nanoseconds": (lambda t: t.assign(delay=t.delay * 1e9), "give the total delay in seconds"),

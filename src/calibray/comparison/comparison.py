@@ -281,12 +281,12 @@ def compare(
     Args:
         open_problem: Function that makes the problem. With several workers, it must be picklable, and each worker calls
             it once.
-        methods: Methods with their budgets (`parse_methods`).
+        methods: Methods with their budgets, as returned by `parse_methods`.
         seeds: Number of runs of each method.
         out: Folder that keeps the runs.
         workers: Number of processes.
         progress: Called after every run.
-        announce: Called with the numbers of runs and RT calls, as text, before the first run.
+        announce: Called before the first run, with a text that states the numbers of runs and RT calls.
 
     Raises:
         InputError: A method, the number of seeds or workers, or the folder is invalid.
@@ -334,7 +334,7 @@ def compare(
 
 
 def _plan(methods: Sequence[BudgetedMethod], seeds: int, out: str | Path) -> str:
-    """A text with the numbers of runs and RT calls."""
+    """A text that states the numbers of runs and RT calls."""
     calls = seeds * sum(method.budget for method in methods if not method.stops_by_itself)
     free = "".join(f", not counting {method.name}" for method in methods if method.stops_by_itself)
     return (

@@ -210,7 +210,7 @@ class MethodRun:
     failure: str = ""
 
     def at(self, calls: int) -> float:
-        """The best objective after a number of RT calls [dB]; +inf before the first."""
+        """The best objective after a number of RT calls [dB]; +inf before the first RT call."""
         index = bisect_right(self.calls, calls)
         return self.best[index - 1] if index else np.inf
 

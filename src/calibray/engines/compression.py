@@ -44,7 +44,7 @@ TRAINING: Final = 16
 """The first fit uses TRAINING * (d + 1) random candidates for d parameters, in addition to corners of the bounds."""
 
 CORNER_PARAMETERS: Final = 5
-"""Largest number of parameters whose bounds define the corners; other parameters have their middle value there."""
+"""Largest number of parameters whose bounds define the corners; other parameters are in the middle of their range."""
 
 CHECKED: Final = 48
 """Number of new candidates in every check."""

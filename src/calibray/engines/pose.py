@@ -50,7 +50,7 @@ class PoseError:
     """Deviations of T transmit antennas from their stated directions and gains, for P paths and M poses.
 
     Attributes:
-        basis: Directions of departure with their basis vectors [3, 3, P], see `wave_basis`.
+        basis: Directions of departure and their basis vectors [3, 3, P]; see `wave_basis`.
         axis: Theta vector of every path in the frame of its first interaction [P, 2].
         pose: Stated directions, each shared by several paths [M].
         mounted: Index of every path's pose [P].

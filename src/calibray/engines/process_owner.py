@@ -14,8 +14,8 @@ import psutil
 CLOCK_TOLERANCE: Final = 2.0
 """Largest accepted difference between two readings of a process's start time [s].
 
-A time since 1970 changes if the system clock is corrected between the readings. The system does not reuse a process
-number within this time, because it first uses all other numbers.
+A start time since 1970 changes if the system clock is corrected between the readings. The system does not reuse a
+process number within this time, because it first uses all other numbers.
 """
 
 
@@ -27,9 +27,10 @@ class ProcessOwner:
         host: The machine.
         namespace: The process namespace, in which a container numbers its own processes; empty if unknown.
         pid: The process number.
-        started: Start time of the process [s since boot, or since 1970 if `boot` is unknown], because process numbers
-            are reused.
-        boot: Boot identifier, because the same numbers refer to other processes after a reboot. Empty if unknown.
+        started: Start time of the process [s since boot, or since 1970 if `boot` is unknown]; it is needed because
+            process numbers are reused.
+        boot: Boot identifier; it is needed because the same numbers refer to other processes after a reboot. Empty if
+            unknown.
     """
 
     host: str
@@ -70,7 +71,7 @@ class ProcessOwner:
 
     @property
     def is_gone(self) -> bool:
-        """Whether the process is known to have ended; processes on other machines or in containers are not checked."""
+        """Whether the process is known to have ended; processes of other machines or containers are not checked."""
         if (self.host, self.namespace) != _machine():
             return False
         if self.boot != _boot():

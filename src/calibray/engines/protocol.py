@@ -146,14 +146,14 @@ class Chunked(Differentiable, Protocol):
         ...
 
     def reducing(self, reductions: Sequence[Reduction]) -> Reduced:
-        """Make a function of candidates that reduces every chunk's path loss on its worker, to return little data.
+        """Make a function of candidates that reduces every chunk's path loss on its worker and returns little data.
 
         Every chunk has one reduction, which is sent to its worker once.
         """
         ...
 
     def ask(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
-        """Call a picklable function on every chunk's worker, and return the results by chunk.
+        """Call a picklable function on every chunk's worker, and return the results in the order of the chunks.
 
         The first argument is the chunk (`engines.cluster.chunks.Chunk`); the others are the same for all chunks.
         """
@@ -289,10 +289,10 @@ class Observable:
     Attributes:
         name: Name in messages.
         unit: Unit of the values.
-        measured: Function from links to measured values [L].
-        modelled: Function from an engine and candidates [n, d] to values [n, L]; +inf for a link without a path.
-        derivatives: Function from an engine and candidates to values [n, L] and their derivatives with respect to the
-            parameters [n, L, d]; None if there are no derivatives.
+        measured: Function that maps links to measured values [L].
+        modelled: Function that maps an engine and candidates [n, d] to values [n, L]; +inf for a link without a path.
+        derivatives: Function that maps an engine and candidates to values [n, L] and their derivatives with respect to
+            the parameters [n, L, d]; None if there are no derivatives.
     """
 
     name: str

@@ -143,9 +143,9 @@ class Openable(Protocol):
 class EngineSection(Section, ABC):
     """``[engine]``: the engine that computes the path loss of candidates; `name` states its kind.
 
-    To add a kind of engine, write one final subclass in a separate module in `engines.kinds`, where it is discovered.
-    The fields of the class are the keys of the section in the study file, and `name` is a literal. Put heavy imports
-    into `open`, because reading any study file imports all kinds.
+    To add a kind of engine, write one final subclass in a separate module in `engines.kinds`, where it is found
+    automatically. The fields of the class are the keys of the section in the study file, and `name` is a literal. Put
+    heavy imports into `open`, because reading any study file imports all kinds.
 
     Attributes:
         name: The kind's name in study files.

@@ -1,8 +1,8 @@
 """Seeded ask/tell optimizers that minimise over a box; they use NumPy arrays and do not depend on the radio model.
 
-Every class is an `Optimizer`. It states which parts of an evaluation it uses, how it respects a budget and whether it
-uses starting points. `METHODS` lists the classes by their names in study files, and `make` constructs an optimizer.
-Optional libraries are imported only when a class that needs them is constructed.
+Every class is an `Optimizer`. Each class states which parts of an evaluation it uses, how it respects a budget and
+whether it uses starting points. `METHODS` lists the classes by their names in study files, and `make` constructs an
+optimizer. Optional libraries are imported only when a class that needs them is constructed.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def make(
         lower: Lower bounds [d].
         upper: Upper bounds [d].
         seed: Seed.
-        budget: Number of evaluations; the method's default if None. Methods that stop by themselves ignore it.
+        budget: Number of evaluations; the method's default if None. Methods that stop by themselves ignore the budget.
         start: Starting points, [d] or [k, d], for methods that use them.
         starts: Number of starting points that these methods add to `start`; the method's default if None.
         objective: Function that maps residuals to the objective, for methods that use residuals; the root mean square

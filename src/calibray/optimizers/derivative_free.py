@@ -33,7 +33,7 @@ SPANNING: Final = (1.75, 10.0)
 """Largest distances of spanning points, in units of radius x sqrt(d), for a fully linear model and for any model."""
 
 NEW_DIRECTION: Final = 1e-3
-"""Smallest component of a point along a new direction, divided by max(distance, radius), to span it (theta_1)."""
+"""Smallest component along a new direction, divided by max(distance, radius), with which a point spans it (theta_1)."""
 
 INDEPENDENT: Final = 1e-3
 """Smallest pivot (see `_pivot`) at which a further point is included in the model (theta_2)."""

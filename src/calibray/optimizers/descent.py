@@ -208,7 +208,7 @@ def descend_all(
 
 
 def distinct(starts: Starts, separation: float) -> Starts:
-    """Keep only the best of searches that ended within `separation` of each other, and sort them by cost."""
+    """Keep only the best of the searches that ended within `separation` of each other, and sort them by cost."""
     order = np.argsort(starts.cost, kind="stable")
     near = cdist(starts.unit[order], starts.unit[order]) < separation
     kept = np.zeros(len(order), dtype=bool)

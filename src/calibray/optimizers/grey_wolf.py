@@ -83,7 +83,7 @@ def encircle(
 ) -> NDArray[np.float64]:
     """Move a pack under the guidance of its leaders (Mirjalili et al. 2014, eqs. 3.1 to 3.7).
 
-    `r1` and `r2` [n, 3, d] are independent uniform random numbers, and `leaders` are alpha, beta and delta [3, d].
+    `r1` and `r2` [n, 3, d] are independent uniform random numbers, and `leaders` contains alpha, beta and delta [3, d].
     Returns X_GWO, the mean of the three guided positions [n, d], not yet clipped.
     """
     a_coefficient = 2.0 * a * r1 - a  # A, eq. 3.3

@@ -47,7 +47,7 @@ COMBINATIONS = 32
 """
 
 FOLLOWED = 0.2
-"""Share of the combinations, namely of those that fit best, from which searches start."""
+"""Share of the combinations from which searches start; these are the combinations that fit best."""
 
 PARENTS = 12
 """Number of lowest minima that are combined."""
@@ -67,13 +67,13 @@ use all starting points, 14 runs ended above the lowest known minimum with a pat
 """
 
 RETURNS = 10
-"""Number of searches that must end in the best minimum before the method stops starting new ones."""
+"""Number of searches that must end in the best minimum before the method starts no further searches."""
 
 LEVEL = 1e-4
 """Relative difference in mean square below which two minima are considered to fit equally well, as along a valley."""
 
 NOISELESS = 1e-9
-"""Share of the largest mean square added to this difference, because noiseless mean squares are rounding errors."""
+"""Share of the largest mean square added to this difference; without noise, low mean squares are rounding errors."""
 
 APART = 0.01
 """Distance in the unit cube below which two searches are considered to have ended in the same minimum."""
@@ -85,7 +85,7 @@ class LeastSquares(Optimizer):
 
     Args:
         seed: Seed of the scrambled Sobol points from which searches start, and of basin hopping.
-        starts: Largest number of these points; powers of two cover the box most evenly. Each costs about ten
+        starts: Largest number of Sobol points; powers of two cover the box most evenly. Each costs about ten
             evaluations. If all are used, combinations of the minima and basin hopping need about the same number of
             evaluations again. The best point passed to `tell` before the first `ask`, if any, is a further starting
             point.

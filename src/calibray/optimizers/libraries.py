@@ -38,7 +38,7 @@ Evaluate = Callable[[NDArray[np.float64]], Evaluations]
 
 
 class _AbandonedError(BaseException):
-    """Ends a minimiser whose search was dropped; it is not an `Exception`, because a library might catch that."""
+    """Ends a minimiser whose search was dropped; it is not an `Exception`, because a library might catch one."""
 
 
 def inverted(minimise: Callable[[Evaluate], None]) -> Search:

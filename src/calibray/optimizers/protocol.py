@@ -91,7 +91,7 @@ class Session:
             links = evaluations.residuals.shape[1]
             if self._links not in (None, links):
                 raise InputError(
-                    f"residuals have {links} columns, earlier ones {self._links}; pass the same links"
+                    f"residuals have {links} columns, but earlier ones had {self._links}; pass the same links"
                 )
             if self._objective is not root_mean_square:
                 check_order(evaluations, self.archive)
@@ -123,7 +123,7 @@ class Session:
 
 
 def limited(search: Search, budget: int) -> Search:
-    """Shorten a search's last batch to the budget and end the search after it; the search must not end earlier."""
+    """Shorten a search's last batch to the budget and then end the search; the search must not end earlier."""
     with closing(search):
         x = next(search)
         while True:
@@ -173,7 +173,7 @@ class Optimizer(ABC):
 
     Attributes:
         uses: The parts of an evaluation that the method uses: "value", "residuals", "jacobian".
-        schedule: How the method respects a budget; None if it stops by itself.
+        schedule: Schedule with which the method respects a budget; None if the method stops by itself.
         takes_starts: Whether the constructor takes `x0`, starting points, and `starts`, the number of further starting
             points. Most methods also use the points passed to `tell` before the first `ask`.
     """

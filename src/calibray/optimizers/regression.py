@@ -192,7 +192,7 @@ class Process:
         return mean + trend_basis(at.unit) @ self.coefficients if self.linear else mean
 
     def slope(self, at: Inputs, response_slope: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """Derivatives [k, m, d] of the mean in unit-cube coordinates, given those of the responses [k, r, d]."""
+        """Derivatives [k, m, d] of the mean with respect to unit-cube coordinates; `response_slope` is [k, r, d]."""
         rates, variances = self.kernel.rates, self.kernel.variances
         # dM / dx_j = M'(r) / r x rate_j^2 x (difference along j).
         toward = (at.unit[:, :, None] - self.inputs.unit.T) * rates[:, None] ** 2

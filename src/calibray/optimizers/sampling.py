@@ -1,6 +1,6 @@
 """Designs of points in the unit cube, and searches that evaluate one design and stop.
 
-An optimizer that is not better than these searches at an equal budget has learned nothing from its evaluations.
+These searches are baselines: any optimizer that learns from its evaluations should be better at an equal budget.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def distance_to_nearest(x: NDArray[np.float64], points: NDArray[np.float64]) -> 
 def not_evaluated(
     candidates: NDArray[np.float64], points: NDArray[np.float64], separation: float
 ) -> NDArray[np.float64]:
-    """The candidates [k, d] farther than `separation` from all evaluated points [n, d]; if none, the farthest one."""
+    """The candidates [k, d] farther than `separation` from all evaluated points [n, d], or else the farthest one."""
     distance = distance_to_nearest(candidates, points)
     return candidates[distance > min(separation, np.nextafter(distance.max(), -np.inf))]
 

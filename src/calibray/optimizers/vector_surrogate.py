@@ -224,7 +224,8 @@ def improvement(
     """Expected improvement [k] in the mean square of the residuals over the best value, by Monte Carlo.
 
     `mean` contains predictions [k, m], `share` their variances relative to the prior [k], and `draws` random vectors
-    with the prior covariance [n, m]. The result is 0 if no draw improves. `best` is the lowest root mean square so far.
+    with the prior covariance [n, m]. The result is 0 if no draw is an improvement. `best` is the lowest root mean
+    square so far.
     """
     # |r + s v|^2 = r.r + 2 s r.v + s^2 v.v for prediction r and draw v.
     along, across = 2.0 * np.sqrt(share)[:, None] * (mean @ draws.T), np.sum(draws**2, axis=1)

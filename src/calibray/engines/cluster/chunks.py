@@ -45,7 +45,7 @@ Content = TypeVar("Content")
 Answer = TypeVar("Answer")
 
 CHUNK_LINKS: Final = 1000
-"""Default of the largest number of links per chunk; chunks are larger if there would be more than `MOST_CHUNKS`."""
+"""Default limit of the links per chunk; it is raised if there would otherwise be more than `MOST_CHUNKS` chunks."""
 
 MOST_CHUNKS: Final = 64
 """Largest number of chunks if the study does not set their size. The number is limited because every chunk compiles its

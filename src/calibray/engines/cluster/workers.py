@@ -83,10 +83,9 @@ class Workers(Protocol):
 class InProcess:
     """Runs the work in this process, one chunk at a time.
 
-    If `at_most` is given, at most this number of chunks is kept; other chunks are made again for each call. If
-    `at_most` is None and there is no cache folder, all chunks are kept. If there is a cache folder, chunks are kept
-    until they use a third of the memory that was free at the start, because objects derived from them need about as
-    much memory.
+    If `at_most` is given, at most this many chunks are kept; the others are made again for each call. If `at_most` is
+    None and there is no cache folder, all chunks are kept. If there is a cache folder, chunks are kept until they use a
+    third of the memory that was free at the start, because objects derived from them need about the same amount.
     """
 
     def __init__(self, at_most: int | None = None) -> None:
@@ -177,7 +176,7 @@ class _KeptInProcesses:
 
 @dataclass(eq=False)
 class _Worker:
-    """A process, the pipe to it, the objects that it has made, and its current chunk."""
+    """A process with its pipe, the keys of the objects that it has made, and its current chunk."""
 
     process: SpawnProcess
     pipe: Connection
@@ -332,7 +331,7 @@ class LocalWorkers:
         return answers
 
     def _replace(self, home: int) -> None:
-        """Start a process that replaces a dead one.
+        """Start a process to replace a dead one.
 
         Raises:
             EngineError: Too many processes died on the same chunk.
@@ -410,7 +409,7 @@ def open_workers(workers: int | None = None, scheduler: str | None = None) -> It
         InputError: Both arguments are given, the number is below 1, Dask is not installed, or no scheduler answers.
     """
     if workers is not None and scheduler is not None:
-        raise InputError("--workers and --scheduler: give only one of them; a cluster has its own workers")
+        raise InputError("--workers and --scheduler: give only one of the two; a cluster has its own workers")
     if workers is not None and workers < 1:
         raise InputError(f"--workers {workers}: must be at least 1")
     with ExitStack() as opened:

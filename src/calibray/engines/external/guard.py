@@ -103,7 +103,7 @@ def _signal_pipe() -> int:
 
 
 def _listen(process: subprocess.Popen, deadline: float, signals: int, outputs: dict[int, Output]) -> str:
-    """Read the program's output until there is a reason to end, and return the reason."""
+    """Read the program's output until there is a reason to stop, and return this reason."""
     parent, calibray = os.getppid(), sys.stdin.fileno()
     with selectors.DefaultSelector() as selector:
         for source in (signals, calibray, *outputs):

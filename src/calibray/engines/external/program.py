@@ -42,7 +42,7 @@ GUARD: Final = (
 
 
 Response = tuple[NDArray[np.float64], NDArray[np.float64]] | bytes
-"""Path loss [L], [dB], and further observables [K, L], in SI units; or a ray table."""
+"""Either path loss [L], [dB], and further observables [K, L] in SI units, or a ray table."""
 
 
 class Unstartable(Unusable):

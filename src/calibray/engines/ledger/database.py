@@ -42,7 +42,7 @@ SKEW: Final = 86_400.0  # largest difference between the clocks of two machines 
 RENEWAL: Final = EXPIRY / 5  # interval between renewals [s]; a few may fail
 _active_runs: set[str] = set()  # the runs of this process
 _observed: dict[tuple[str, bytes, str], tuple[float, float]] = {}
-"""For each claim of another run: its latest `expires`, and the time of that change on this process's clock [s]."""
+"""For each claim of another run: its latest `expires`, and the time when it changed, on this process's clock [s]."""
 
 
 def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Sequence[bytes]) -> list[bytes]:
@@ -175,7 +175,7 @@ class LedgerEntry:
 def read_entry(
     problem: str, candidate: bytes, columns: tuple[object, ...], num_links: int | None = None
 ) -> LedgerEntry | str:
-    """Read a ledger row (path loss as bytes, seconds, failure, digest, rays); a damaged row returns a description."""
+    """Read a ledger row (path loss as bytes, seconds, failure, digest, rays), or describe its damage."""
     blob, seconds, failure, digest, rays = columns
     if not (isinstance(problem, str) and isinstance(candidate, bytes) and isinstance(blob, bytes)):
         return "a value of the wrong type"
@@ -393,7 +393,7 @@ def rescue_files(ledger: Path) -> Iterator[Path]:
 
 
 def _folders(ledger: Path) -> Iterator[tuple[Path, str]]:
-    """Folders for rescue files, and the prefix of the ledger's files in each."""
+    """Folders for rescue files, and the prefix of the ledger's files in each folder."""
     yield ledger.parent, PREFIX
     prefix = f"{PREFIX}{hashlib.sha256(str(ledger).encode()).hexdigest()[:16]}-"
     state = user_state_path("calibray", appauthor=False)

@@ -270,7 +270,7 @@ class Ledger:
 
 
 def open_ledger(folder: str | Path) -> Ledger:
-    """The ledger of a folder that `calibray run` has written.
+    """Open the ledger in a folder that `calibray run` has written.
 
     Raises:
         InputError: The folder contains no ledger, or the ledger cannot be read.

@@ -26,7 +26,7 @@ from calibray.support.progress import Progress
 _LOG: Final = logging.getLogger(__name__)
 SHORTEST_WAIT: Final = 0.02
 LONGEST_WAIT: Final = 1.0
-"""Shortest and longest interval between checks for the answers of another run [s]."""
+"""Shortest and longest intervals between checks for the answers of another run [s]."""
 
 
 @final
@@ -103,8 +103,8 @@ class Recorded:
         elif failures and not self._warned:
             self._warned = True
             _LOG.warning(
-                "an RT call failed, so all its links count as links without a path; list failed calls with %s. The "
-                "call: %s", command("ledger", self._ledger.path.parent), printable(failures[0], keep="\n\t"),
+                "an RT call failed, so all its links are treated as links without a path; list failed calls with %s. "
+                "The failed call: %s", command("ledger", self._ledger.path.parent), printable(failures[0], keep="\n\t"),
             )  # fmt: skip
         return answers, first
 

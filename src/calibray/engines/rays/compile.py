@@ -39,7 +39,8 @@ accounts for its gain.
 
 FREE_SPACE_DB: Final = 1.0
 """Largest deviation of a direct path from free-space power if the antennas are known [dB]. Pattern tables of engines
-differ by tenths of a decibel. A wrong transmitted power, or watts instead of decibels, causes tens of decibels.
+differ by tenths of a decibel. A wrong transmitted power, or watts instead of decibels, causes errors of tens of
+decibels.
 """
 
 DIRECT_GAIN_DB: Final = 60.0
@@ -51,8 +52,7 @@ a few rounding errors of a field in single precision, as in Sionna RT.
 """
 
 HIGH_GAIN_DB: Final = 25.0
-"""Total gain of both antennas above which a warning is issued [dB], for example a sector antenna of 18 dBi plus 7 dBi.
-"""
+"""Total gain of both antennas above which a warning is issued [dB], such as 18 dBi of a sector antenna plus 7 dBi."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +155,7 @@ def _free_space(paths: Paths) -> NDArray[np.float64]:
 
 
 def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
-    """The paths with normals and materials of their surfaces, and the largest distance of a point from its surface."""
+    """The paths with normals and materials of their surfaces, and the largest distance from a surface [m]."""
     present = table.kind != 0
     stops = np.concatenate([table.tx[:, None], table.vertex, table.rx[:, None]], axis=1)
     stops[np.arange(len(stops)), present.sum(axis=1) + 1] = table.rx
@@ -219,8 +219,8 @@ def _stated_materials(table: RayTable, scene: Scene) -> NDArray[np.int64]:
         if name not in names:
             raise InputError(
                 f"{table.source}: material: the scene has no material {name!r}; {did_you_mean(name, names)}. Use "
-                "the scene's names of materials, or remove the column material; each interaction then has the material "
-                "of the nearest face"
+                "the names of the scene's materials, or remove the column material; each interaction then has the "
+                "material of the nearest face"
             )
         stated = table.material == name
         if (stated & (index >= 0) & (index != names[name])).any():
@@ -291,7 +291,7 @@ def _assign_links(
         )
         if lost.all():
             raise InputError(
-                f"{fault}; check units [m], export the rays of the study's links, or correct the argument axes"
+                f"{fault}; check units [m], export the rays of the given links, or correct the argument axes"
             )
         _LOG.warning("%s; these paths are omitted", fault)
     return LinkPositions(ends[:, :3], ends[:, 3:]), np.where(lost, -1, link), chosen.reshape(-1)

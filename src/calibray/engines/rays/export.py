@@ -95,7 +95,7 @@ class Exporting:
 
     @property
     def hits(self) -> int:
-        """Number of candidates answered by a ledger so far."""
+        """Number of candidates so far that were answered by the ledger."""
         return self._engine.hits if isinstance(self._engine, Recorded) else 0
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:

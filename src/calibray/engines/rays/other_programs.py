@@ -277,7 +277,7 @@ def _aodt_element(element: Any) -> Any:
 
 
 def _aodt_points(points: Any) -> NDArray[np.float64]:
-    """Points [n, 3] of a list of triples, or of dictionaries with the keys 1, 2 and 3."""
+    """Points [n, 3] from a list of triples, or from a list of dictionaries with the keys 1, 2 and 3."""
     try:
         return np.array(
             [list(item.values()) if isinstance(item, dict) else np.asarray(item) for item in points],

@@ -55,7 +55,7 @@ MOST_POINTS: Final = RANGES["max_depth"][1] + 2
 """Largest number of points of a path: the largest number of interactions of a trace, plus both ends."""
 
 NO_POWER: Final = {"power_db": "-inf", "gain_real": "0", "gain_imag": "0"}
-"""Values of the columns for a path without power."""
+"""Values in these columns for a path without power."""
 
 POWER_ZERO_DB: Final = -10_000.0
 """Level used instead of -inf [dB]; the corresponding power is 0 in double precision."""
@@ -324,8 +324,8 @@ def _power(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray[np.float6
     power = real**2 + imaginary**2
     if (power > 1).any():
         raise InputError(
-            f"{table.source}: gain_real and gain_imag have the magnitude {np.sqrt(power.max()):g}, must be at most 1; "
-            "give the received field divided by the transmitted one, not volts or decibels"
+            f"{table.source}: gain_real and gain_imag have the magnitude {np.sqrt(power.max()):g}; it must be at most "
+            "1: give the received field divided by the transmitted one, not volts or decibels"
         )
     return power
 
@@ -337,7 +337,8 @@ HDF5: Final = b"\x89HDF"
 """First bytes of an HDF5 file."""
 
 LARGEST_ARRAYS: Final = 2**30
-"""Largest size of datasets or matrices in memory [bytes], because kilobytes can decompress to gigabytes."""
+"""Largest size of datasets or matrices in memory [bytes]; a limit is needed because kilobytes can unpack to gigabytes.
+"""
 
 
 def read_ray_file(file: str | Path) -> SourceTable:

@@ -50,7 +50,7 @@ COMPARED: Final = 3000
 """Largest product of the number of sets tried in a round and the number of answers."""
 
 FOLLOWED: Final = 4
-"""Number of sets from which a round descends, in addition to the present one; they explain the answers best."""
+"""Number of sets from which a round descends, in addition to the present set; these explain the answers best."""
 
 REFITTED: Final = 2
 """Number of results of a round for which the kernel is fitted again."""
@@ -250,7 +250,7 @@ def _own_misfit(corrected: Corrected) -> float:
 def constants_fit(
     corrected: Corrected, centre: NDArray[np.float64] | None = None, noise: NDArray[np.float64] | None = None
 ) -> Callable[[NDArray[np.float64]], Residuals]:
-    """The least squares problem for the constants, with a fixed covariance of the discrepancy.
+    """The least-squares problem for the constants, with a fixed covariance of the discrepancy.
 
     The prior is centred at `centre` [q], or at the cheap model's centre if None. `noise` [n m] perturbs the whitened
     answers. Returns a function that maps constants, scaled to the unit cube by their bounds [s, q], to whitened errors

@@ -206,7 +206,7 @@ class SpaceMapping(Optimizer):
             surrogate.tell(answers.x, answers.y, residuals=answers.residuals)
 
     def _first(self, model: CheapModel, count: int, turn: int) -> NDArray[np.float64]:
-        """The next minima [count, d] of the uncorrected cheap model after the first `turn` ones, then random points."""
+        """The next minima [count, d] of the uncorrected cheap model after the first `turn`, and then random points."""
         d = self.box.dimension
 
         def evaluate(unit: NDArray[np.float64]) -> Residuals:
