@@ -63,22 +63,22 @@ def calibrate(
 ) -> Result:
     """Calibrate a scene's materials against measurements.
 
-    Suspicious positions and values of a study's links are logged as warnings. An opened study is not checked.
+    Suspicious positions and values of the links are logged as warnings. The links of an opened study are not checked.
 
     Args:
         study: The study, opened or not.
         method: Method to use instead of the study's: "auto", "sgwo-im", "gwo", ...
         seed: Seed to use instead of the study's.
-        out: Folder to save the result in. It is checked before any computation. The ledger of RT calls is written
-            there, so that an interrupted run repeats no call when it is started again.
-        engine: Engine over all links of the study; if None, it is made from the study, with a ledger.
-        workers: Workers (`engines.open_workers`) that run the calls of a batch on the engine "command", or chunks of
-            links on the engine "replay"; if None, this process runs them.
+        out: Folder to save the result in. It is checked before any computation. The ledger of RT calls is also written
+            there, so that a restarted run does not repeat completed calls.
+        engine: Engine for all links of the study; if None, the engine that the study specifies.
+        workers: Workers from `engines.open_workers`. They run the calls of a batch with the engine "command", or the
+            chunks of links with the engine "replay". If None, everything runs in this process.
         progress: Called with the name of each stage, the work done and the total.
-        tracer: Opens the scene in a ray tracer; an opened study has its own.
-        overwrite: Replace files in `out` that Calibray did not write; input files are never replaced.
-        cheap_model: A study with the same links and materials whose replay is the cheap model of an expensive engine;
-            if None, the study itself.
+        tracer: Function that opens the scene in a ray tracer; not used for an opened study.
+        overwrite: Replace files in `out` even if Calibray did not write them; input files are never replaced.
+        cheap_model: A study with the same links and materials. Its replay is used as the cheap model of an expensive
+            engine. If None, the study itself is replayed.
 
     Raises:
         InputError: The study, the method or the folder cannot be used.
@@ -96,10 +96,11 @@ def calibrate(
         )
     if not isinstance(engine, Engine | None):
         raise InputError(
-            f"engine: is {engine!r}, must be an engine over all links; a name is set by study.replace(engine=NAME)"
+            f"engine: is {engine!r}, must be an engine for all links; to choose one by name, use "
+            "study.replace(engine=NAME)"
         )
     if not isinstance(workers, Workers | None):
-        raise InputError(f"workers: is {workers!r}, must be the workers of engines.open_workers(NUMBER)")
+        raise InputError(f"workers: is {workers!r}, must be workers from engines.open_workers(NUMBER)")
     if not isinstance(cheap_model, Study | Setup | None):
         raise InputError(f"cheap_model: is {cheap_model!r}, must be a Study, such as Study.load(file)")
     replaced = study.replace(method=method, seed=seed)

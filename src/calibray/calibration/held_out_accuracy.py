@@ -1,8 +1,9 @@
-"""Accuracy on links held out by a filter or in blocks, the prediction model that they choose, and its fallback.
+"""Accuracy on links held out by a filter or in blocks, the prediction model chosen there, and its fallback.
 
-The fallback has the study's nuisances and is fitted to the calibration links, like the baseline in validation. Links
-without a path are behind obstacles, so their path loss exceeds the prediction of this fit. If the study has enough of
-these links, or else of links out of sight, their mean residual is added, and their scatter gives the fallback's errors.
+The fallback is a log-distance model with the study's nuisances. It is fitted to the calibration links, like the
+log-distance baseline in validation. Links without a path are behind obstacles, so their path loss usually exceeds the
+prediction of this fit. If enough of these links were measured, or else enough links out of sight, their mean residual
+is added to the prediction. Their scatter then determines the fallback's errors.
 """
 
 from __future__ import annotations
@@ -54,15 +55,15 @@ class Models:
 
 
 def rmse_of(problem: Problem, model: NDArray[np.float64], mask: NDArray[np.bool_]) -> float:
-    """RMSE of modelled path loss [L] over calibration links, selected by a mask [L], [dB], weighted as in the fit."""
+    """RMSE [dB] of modelled path loss [L] over the calibration links in a mask [L], weighted as in the fit."""
     weight = problem.objective.weight[mask]
     return float(np.sqrt(np.average((model - problem.objective.measured)[mask] ** 2, weights=weight)))
 
 
 def held_out_rmse(problem: Problem, model: NDArray[np.float64], mask: NDArray[np.bool_]) -> float | None:
-    """RMSE of modelled path loss [L] over held-out links, selected by a mask [L], [dB]; None if there are none.
+    """RMSE [dB] of modelled path loss [L] over the held-out links in a mask [L]; None if the mask is empty.
 
-    Links count equally, as in the judgement and in the intervals of predictions.
+    All links have equal weight, as in the judgement and in prediction intervals.
     """
     errors = (model - problem.objective.measured)[mask]
     return float(np.sqrt(np.mean(errors**2))) if len(errors) else None
@@ -71,7 +72,7 @@ def held_out_rmse(problem: Problem, model: NDArray[np.float64], mask: NDArray[np
 def on_held_out_links(
     problem: Problem, trail: Trail, models: Models
 ) -> tuple[Accuracy, str, HeldOutResiduals]:
-    """Accuracy on the links that a filter holds out, the model that they choose, and its residuals."""
+    """Accuracy on the links that a filter holds out, the prediction model chosen there, and its residuals."""
     objective, links = problem.objective, problem.setup.links
     fitted = bool(objective.nuisance.terms)
     reached = np.isfinite(problem.before) & np.isfinite(trail.best_modelled)
@@ -112,9 +113,9 @@ def _compared(problem: Problem, models: Models) -> dict[str, NDArray[np.float64]
 def _choice(
     problem: Problem, trail: Trail, modelled: dict[str, NDArray[np.float64]], judged: NDArray[np.bool_]
 ) -> tuple[str, HeldOutResiduals]:
-    """The model that held-out links choose, and its residuals there; with too few links, the calibrated model.
+    """The prediction model chosen on held-out links, and its residuals; with too few links, the calibrated model.
 
-    `modelled` is the path loss of the models that were compared; it is empty if no link is judged.
+    `modelled` contains the path loss of the compared models. It is empty if no held-out link can be judged.
     """
     objective, setup = problem.objective, problem.setup
     # Kriging is never chosen.
@@ -155,7 +156,7 @@ def _choice(
 def log_distance_errors(
     problem: Problem, models: Models, validation: Validation | None
 ) -> tuple[NDArray[np.float64], str]:
-    """Residuals of the log-distance model on held-out links with a path [n], [dB], and a description of these."""
+    """Residuals of the log-distance model on held-out links with a path [n], [dB], and their description."""
     if validation is not None:
         basis = f"errors on {len(validation.labels)} blocks held out in turn"
         return validation.errors[Model.LOG_DISTANCE][validation.judged], basis
@@ -169,7 +170,7 @@ def log_distance_errors(
 def on_blocks(
     validation: Validation, problem: Problem, initial_db: float | None, fitted: bool
 ) -> tuple[Accuracy, str, HeldOutResiduals]:
-    """Accuracy on blocks that were held out in turn, the model that they choose, and its residuals."""
+    """Accuracy on blocks held out in turn, the prediction model chosen there, and its residuals."""
     rmse = validation.table["rmse_db"]
     name, judged = validation.chosen, validation.judged
     levels = validation.levels(name, problem.setup.links)
@@ -196,12 +197,12 @@ def on_blocks(
 
 
 def _groups_db(problem: Problem, block: NDArray[np.int64], links: NDArray[np.int64]) -> float:
-    """Root mean square of the random effects of groups that are in one block only [L], at given links [n], [dB]."""
+    """RMS spread [dB], over given links [n], of the random effects of groups that occur in only one block [L]."""
     return float(np.sqrt(np.mean(problem.objective.nuisance.new_group_spread(block)[links] ** 2)))
 
 
 def _out_of_sight(problem: Problem, errors: NDArray[np.float64], links: NDArray[np.int64]) -> float:
-    """Factor by which errors of links out of sight exceed those of all links; 1 if the study states this difference."""
+    """Ratio of the errors of links out of sight to those of all links; 1 if a nuisance models the difference."""
     terms = problem.objective.nuisance.terms
     table = problem.setup.with_obstruction().links.table
     if any(term.around and term.by == OUT_OF_SIGHT for term in terms) or OUT_OF_SIGHT not in table.frame:
@@ -218,9 +219,10 @@ def fit_fallback(
 ) -> PredictionModel:
     """Fit the fallback, the log-distance model, to the calibration links.
 
-    Its errors come from links without a path; if these are too few, from links out of sight, some of which are near the
-    noise floor, like links without a path; if these are too few as well, from its residuals on held-out links [n],
-    [dB], which `basis` describes; and otherwise from the calibration links.
+    The errors of the fallback come from links without a path. If these are too few, they come from links out of sight,
+    some of which are near the noise floor, like links without a path. If these are also too few, the residuals on
+    held-out links [n], [dB], are used, which `basis` describes. Without enough held-out links, the residuals on the
+    calibration links are used.
     """
     setup, links = problem.setup, problem.setup.links
     objective, known_db = log_distance(links, problem.objective, without_scene(setup.study, links))

@@ -1,7 +1,8 @@
 """Diagnostics of the links of a finished calibration.
 
-They are leverage, depth, and power by material and interaction; the tracer settings that reach links without a path;
-and possible explanations of the residuals: a missing region, groups of links, or other antenna directions.
+The diagnostics are the leverage and depth of links, power by material and interaction, and tracer settings that find
+paths for links without one. Possible explanations of the residuals are a missing region, groups of links, and other
+antenna directions.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from calibray.uncertainty.missing_region import missing_region
 from calibray.validation.held_out_statistics import CLUSTER_LINKS, MOST_CLUSTERS, spatial_blocks
 
 DENSE: Final = 20_000_000
-"""Number of entries of a nuisance's design up to which leverage is computed; the dense matrix then takes 160 MB."""
+"""Largest number of entries in the nuisances' design matrix for which leverage is computed; it then takes 160 MB."""
 
 DIRECT: Final = "line of sight"
 """Name of the power share of paths without interactions."""
@@ -49,10 +50,11 @@ class LinkDiagnostics:
     """Diagnostics of the links of a finished calibration.
 
     Attributes:
-        columns: Columns for the table of links: `leverage`, NaN for a link of weight 0; `depth`, the number of
-            interactions of the strongest path, NaN for a link without a path.
-        power_shares: Mean share over the links of the power carried by paths with an interaction, by material and kind
-            of interaction. A path counts in full for each of its interactions, so the sum of the shares can exceed 1.
+        columns: Columns for the table of links: `leverage` (NaN for a link of weight 0) and `depth`, the number of
+            interactions of the strongest path (NaN for a link without a path).
+        power_shares: Share of the power carried by paths with an interaction, averaged over the links, by material and
+            kind of interaction. A path counts in full for each of its interactions, so the sum of the shares can exceed
+            1.
     """
 
     columns: dict[str, NDArray[np.float64]] = field(default_factory=dict)
@@ -62,7 +64,7 @@ class LinkDiagnostics:
 def diagnose_links(problem: Problem, best: NDArray[np.float64], paths: Paths | None) -> LinkDiagnostics:
     """Diagnostics of the links at calibrated values [d], without columns that the engine cannot provide.
 
-    `paths` are those of the calibration at the study's carrier, if available.
+    `paths` are the calibration's paths at the study's carrier, if available.
     """
     columns: dict[str, NDArray[np.float64]] = {}
     if problem.differentiable:
@@ -91,7 +93,7 @@ def diagnose_links(problem: Problem, best: NDArray[np.float64], paths: Paths | N
 
 
 def _at_one_carrier(problem: Problem) -> bool:
-    """Whether the problem replays all its paths, uncompressed, with the constants at the study's carrier."""
+    """Whether all paths are replayed, uncompressed, with the constants at the study's carrier."""
     compressed = getattr(problem.setup.study.engine, "compress_db", None) is not None
     return not (compressed or problem.parameters.has_laws or problem.setup.links.frequency is not None)
 
@@ -117,9 +119,10 @@ def _leverage(problem: Problem, best: NDArray[np.float64]) -> NDArray[np.float64
 def leverage(jacobian: NDArray[np.float64], design: NDArray[np.float64]) -> NDArray[np.float64]:
     """Leverage of each link [m]: how closely its modelled value follows its own measurement.
 
-    It is the diagonal of the projection onto the derivatives of the residuals, with the nuisance eliminated [m, d], and
-    the columns of the nuisance, scaled like the residuals [m, q]: 0 for a link without influence, 1 for a link that
-    alone determines an unknown. The sum is the number of unknowns that the rows, including those of priors, determine.
+    Leverage is the diagonal of the projection onto two sets of columns: the derivatives of the residuals, with the
+    nuisance eliminated [m, d], and the columns of the nuisance, scaled like the residuals [m, q]. It is 0 for a link
+    without influence and 1 for a link that alone determines an unknown. Its sum is the number of unknowns that all
+    rows, including those of priors, determine.
 
     Example:
         >>> leverage(np.array([[1.0], [1.0], [0.0]]), np.zeros((3, 0))).round(2).tolist()
@@ -140,8 +143,8 @@ class _Power(NamedTuple):
 
     Attributes:
         depth: Number of interactions of every link's strongest path [L].
-        power: Shares of the links' power by material and kind of interaction, summed over the links; then a row whose
-            first element is the share without interactions [M + 1, kinds].
+        power: Shares of the links' power by material and kind of interaction, summed over the links [M + 1, kinds]. The
+            first element of the last row is the share without interactions.
         reached: Number of links with power.
     """
 
@@ -179,10 +182,10 @@ FEWEST_CLUSTERS: Final = 8
 """Smallest number of clusters with links inside and outside a group."""
 
 MIXED: Final = 0.5
-"""Smallest share of the variance of membership within clusters; with less, a group is a place."""
+"""Smallest share of the variance of membership that lies within clusters; with less, the group is just a location."""
 
 SIGNIFICANCE: Final = 0.01
-"""Probability of a remark about any group of any column, or about any antenna direction, if none differs."""
+"""Probability of a false remark about any group of any column, or about any antenna direction."""
 
 SMALLEST_DB: Final = 0.05
 """Smallest improvement of the RMSE for which a group or a direction is reported [dB]; a smaller one does not change
@@ -195,10 +198,10 @@ class Difference:
 
     Attributes:
         column: The column.
-        label: The group's label in it.
+        label: Label of the group in this column.
         difference_db: Mean residual of the group minus that of its neighbours [dB].
         error_db: Standard error [dB].
-        chance: Probability of a difference this significant by chance, times the number of groups that were tested.
+        chance: Probability of a difference at least this significant by chance, times the number of tested groups.
     """
 
     column: str
@@ -211,13 +214,13 @@ class Difference:
 def differing_groups(
     residual_db: NDArray[np.float64], ends: NDArray[np.float64], columns: Mapping[str, NDArray[np.str_]]
 ) -> list[Difference]:
-    """The groups of links, such as those of one device, whose residuals differ significantly from those of neighbours.
+    """Find groups of links, such as those of one device, whose residuals differ significantly from those of neighbours.
 
-    Only links of one transmitter at one place are compared: residuals and membership are taken relative to their means
-    over clusters of neighbouring links. A column that is constant at a place, such as a street, therefore shows
-    nothing, and errors that neighbours share cancel. Each cluster is one observation of the difference, so that
-    correlated errors within it do not count as independent (K.-Y. Liang, S. L. Zeger, Biometrika 73, 1986). The most
-    significant group comes first.
+    Only neighbouring links of one transmitter are compared: residuals and membership are taken relative to their means
+    over clusters of such links. A column that is constant over a neighbourhood, such as the name of a street, therefore
+    shows no difference, and errors that neighbours share cancel. Each cluster counts as one observation of the
+    difference, so that correlated errors within a cluster are not treated as independent (K.-Y. Liang, S. L. Zeger,
+    Biometrika 73, 1986). The most significant group comes first.
 
     Args:
         residual_db: Residuals [n], [dB].
@@ -258,17 +261,17 @@ def differing_groups(
 
 
 SHARE: Final = 0.02
-"""Share of links without a path above which the switches are tried; with a smaller share, the fit hardly changes."""
+"""Smallest share of links without a path for which other tracer settings are tried; less hardly changes the fit."""
 
 FEWEST: Final = 5
-"""Number of links without a path above which the switches are tried; the table of rows shows smaller numbers."""
+"""Smallest number of links without a path for which other tracer settings are tried."""
 
 
 def unreached_remark(problem: Problem, progress: Progress | None = None) -> tuple[Remark, ...]:
-    """Count the links without a path, and test on a sample which switches of the tracer reach them.
+    """Count the links without a path, and test on a sample which tracer settings find a path for them.
 
-    There is no remark if nearly all links have a path, or nothing can be traced. The stage of `progress` is "links
-    without a path".
+    There is no remark if nearly all links have a path or if nothing can be traced. `progress` is called with the stage
+    "links without a path".
     """
     setup, usable = problem.setup, np.ones(len(problem.setup.links), dtype=bool)
     for excluded in (setup.links.censored, problem.faint):
@@ -300,7 +303,7 @@ def unreached_remark(problem: Problem, progress: Progress | None = None) -> tupl
 
 
 def _reached(setup: Setup, sample: NDArray[np.int64], change: dict[str, Any]) -> int:
-    """Number of links in the sample that have a path with other settings of the tracer."""
+    """Number of links in the sample that have a path with changed tracer settings."""
     mask = np.isin(np.arange(len(setup.links)), sample)
     changed = setup.with_trace(replace(setup.study.trace, **change))
     paths = changed.at(setup.links.select(mask)).trace()
@@ -308,16 +311,16 @@ def _reached(setup: Setup, sample: NDArray[np.int64], change: dict[str, Any]) ->
 
 
 MOST_NUMBERS: Final = 12
-"""Largest number of distinct numbers that are labels of groups, such as days or floors."""
+"""Largest number of distinct values of a numeric column that can be labels of groups, such as days or floors."""
 
 SIGNAL_CORRELATION: Final = 0.5
-"""Rank correlation with path loss above which whole numbers count as signal levels, such as channel quality."""
+"""Rank correlation with path loss above which whole numbers are treated as signal levels, such as channel quality."""
 
 FEWEST_OF_TRANSMITTER: Final = 2 * LINKS_PER_UNKNOWN
-"""Number of links per transmitter needed to test its direction, which has two angles."""
+"""Smallest number of links of a transmitter for which its direction, which has two angles, is tested."""
 
 MOST: Final = 50
-"""Number of transmitters that are tested, those with the most links: each takes three derivatives of all links."""
+"""Largest number of tested transmitters, those with the most links; each requires three derivatives of all links."""
 
 
 class Direction(NamedTuple):
@@ -332,7 +335,7 @@ class Direction(NamedTuple):
 def region_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
     """Test whether the loss of a region, such as unmapped trees, would explain the residuals of a calibration.
 
-    Positions of the links must be known. A common loss out of sight is fitted first.
+    The links must have positions. A common loss of links out of sight is fitted first.
     """
     links = problem.setup.links
     if not isinstance(links, Measurements) or not problem.differentiable:
@@ -349,15 +352,14 @@ def region_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
 
 
 def _excess_db(problem: Problem, trail: Trail) -> NDArray[np.float64]:
-    """Measured minus modelled path loss of all links at the optimum [L], [dB], without weights, unlike residuals."""
+    """Measured minus modelled path loss of all links at the optimum [L], [dB], without weights."""
     return problem.objective.measured - problem.objective.model(trail.best_modelled[None])[0]
 
 
 def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
-    """Name the column that no nuisance uses and whose groups, such as devices, explain the residuals of a calibration.
+    """Test whether the groups of a column without a nuisance, such as devices, explain the residuals of a calibration.
 
-    Labels are texts, carriers, or a few whole numbers that do not follow the measured value, unlike the levels of
-    a signal.
+    Labels are text, carriers, or a few whole numbers that do not correlate with path loss, as signal levels would.
     """
     setup, links = problem.setup, problem.setup.links
     if not isinstance(links, Measurements):
@@ -395,7 +397,7 @@ def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
 
 
 def _are_labels(cells: pd.Series, path_loss_db: NDArray[np.float64]) -> bool:
-    """Whether numbers may be labels of groups, and not the levels of a signal."""
+    """Whether numbers can be labels of groups rather than signal levels."""
     if cells.dtype.kind == "c" or not 2 <= cells.nunique() <= MOST_NUMBERS or (cells % 1 != 0).any():
         return False
     correlation = cells.corr(pd.Series(path_loss_db, cells.index), method="spearman")
@@ -403,10 +405,10 @@ def _are_labels(cells: pd.Series, path_loss_db: NDArray[np.float64]) -> bool:
 
 
 def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Remark, ...]:
-    """Test whether directions of transmit antennas other than the stated ones would explain the residuals.
+    """Test whether transmit antenna directions other than the stated ones would explain the residuals.
 
-    For each transmitter, this is an F test of two columns: the derivatives of path loss with respect to azimuth and
-    downtilt at the calibrated values [d], in addition to the parameters, the nuisance and a gain of that transmitter.
+    For each transmitter, an F test adds two columns to the parameters, the nuisance and a gain of the transmitter.
+    These columns are the derivatives of path loss with respect to azimuth and downtilt at the calibrated values [d].
     The problem must use stored paths; the remark names the transmitters.
     """
     setup, engine = problem.setup, problem.engine
@@ -445,7 +447,7 @@ def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Rema
 def _derivatives(
     problem: Problem, engine: Replay | Chunked, best: NDArray[np.float64], transmitters: list[str]
 ) -> tuple[Evaluation, dict[str, int]]:
-    """Residuals, and derivatives also by directions and gains of transmitters, at the calibrated values; columns."""
+    """Evaluation at calibrated values, with derivatives for the transmitters' directions and gains; columns by name."""
     content = problem.setup.study.content()
     poses = {
         f"{POSE}{label}.{field}": {"bounds": [-1.0, 1.0], "start": 0.0}
@@ -473,7 +475,7 @@ def _derivatives(
 
 @dataclass(frozen=True)
 class _Posed:
-    """Derives the replay of a chunk's paths for another opened study."""
+    """Makes the replay of a chunk's paths for another opened study."""
 
     study: Shared[Setup]
 

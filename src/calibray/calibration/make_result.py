@@ -59,12 +59,12 @@ from calibray.validation.models import log_distance, without_scene
 from calibray.validation.validation import Validation
 
 FAINT: Final = "predicted too near the noise floor, left out"
-"""Name, in the counts of rows, for links that the model predicts near the noise floor."""
+"""Label, in the row counts, of links that the model predicts near the noise floor."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Times taken by the search, without tracing, and by loading and tracing before it, and when the run began [s]."""
+    """Durations of the search and of the loading and tracing before it, and the start time of the run [s]."""
 
     search: float
     trace: float
@@ -265,7 +265,7 @@ def _nuisance(problem: Problem, coefficients: NDArray[np.float64]) -> Nuisance:
 
 
 def _obstruction(setup: Setup) -> dict[str, NDArray[np.float64]]:
-    """Obstruction of the straight lines of the links, as columns."""
+    """Columns that describe the obstruction of the straight line between the ends of each link."""
     table = setup.with_obstruction().links.table
     names = (OUT_OF_SIGHT, "obstruction_m", *([REGION] if setup.study.regions else []))
     return {name: table.numbers(name) for name in names}
@@ -299,8 +299,8 @@ def observable_fits(
 ) -> tuple[dict[str, ObservableFit], dict[str, NDArray[np.float64]]]:
     """The fit of every further observable by name, and its columns in the table of links.
 
-    The columns are measured, initial and calibrated values, and biases [L], in its unit. Draws from the posterior, by
-    name of the parameter, may be empty.
+    The columns are the measured, initial and calibrated values and the biases [L], in the unit of the observable. The
+    posterior draws, by name of the parameter, can be empty.
     """
     problem = run.problem
     if not problem.observed:
@@ -354,7 +354,7 @@ def observable_fits(
 
 
 def _observed_at_draws(run: Run, draws: Mapping[str, Sequence[float]]) -> tuple[NDArray[np.float64], ...]:
-    """Observables [K, L] at draws, for the errors of biases; an emulator replaces an expensive engine."""
+    """Observables [K, L] at posterior draws, for the errors of biases; an emulator replaces an expensive engine."""
     problem = run.problem
     if not draws or not any(observable.labels for observable in problem.observed):
         return ()

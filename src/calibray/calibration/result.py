@@ -43,8 +43,7 @@ class Result(Record):
         """Read a folder that `save` wrote; with `allow_changed_inputs`, even if its files were changed since.
 
         Raises:
-            InputError: The folder contains no result, or a result of another version, or one that was damaged or
-                edited.
+            InputError: The folder contains no result, or the result is from another version, damaged or edited.
         """
         return cls(**files.read(folder, allow_changed_inputs=allow_changed_inputs))
 
@@ -89,14 +88,14 @@ class Result(Record):
         """Predict path loss at new links.
 
         Args:
-            links: The links, or a table with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], or with the position
-                columns that the study names, and with its group column, if it has one. The study's column of
-                frequencies gives the carriers; without it, all links have the scene's carrier.
+            links: The links, or a table of links. Its columns are tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], or the
+                position columns that the study names, and the study's group column, if any. The study's frequency
+                column contains the carriers; without it, all links have the scene's carrier.
             progress: Called with the stage "tracing" after every launch.
             allow_changed_inputs: Predict even if a file of the scene or an antenna has changed since the calibration.
 
         Returns:
-            Path loss with nuisances [links], [dB]; that of the fallback for a link without a path.
+            Path loss with nuisances [links], [dB]; the prediction of the fallback for a link without a path.
 
         Raises:
             InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of
@@ -123,12 +122,13 @@ class Result(Record):
             allow_changed_inputs: Predict even if a file of the scene or an antenna has changed since the calibration.
 
         Returns:
-            One row per link: path_loss_db, lower_db, upper_db [dB]; basis, the source of the interval; the same in the
-            measured quantity if that is not path loss; and remark, a warning about an unlikely antenna position.
+            One row per link: path_loss_db, lower_db and upper_db [dB]; the same three in the measured quantity if that
+            is not path loss; basis, the source of the interval; and remark, a warning about an unlikely antenna
+            position.
 
         Raises:
-            InputError: `predict` would refuse the input, except for unknown groups; the level is not between 0 and 1;
-                or the calibration had too few links to estimate the size of residuals.
+            InputError: An error of `predict` other than an unknown group; the level is not between 0 and 1; or the
+                calibration had too few links to estimate the size of residuals.
         """
         from calibray.prediction.predict import predict_interval
 
@@ -187,11 +187,11 @@ class Result(Record):
     def apply(self, scene: object) -> None:
         """Set the calibrated materials in a `sionna.rt.Scene` in memory, at the study's carrier.
 
-        A warning names the carriers if the scene has a different one. The constants do not change when
-        `scene.frequency` is set, unlike those of ITU materials.
+        If the scene has a different carrier, a warning states both carriers. Unlike the constants of ITU materials, the
+        calibrated constants do not change when `scene.frequency` is set.
 
         Raises:
-            InputError: The object is not a scene of Sionna RT, or the scene lacks a material.
+            InputError: The object is not a Sionna RT scene, or the scene lacks a material.
         """
         from calibray.tracing.sionna.live_scene import apply_materials
 

@@ -3,8 +3,8 @@
 The gain of a path is a = (lambda / 4 pi) A E_rx^H J_K ... J_1 E_tx, with amplitude spreading A, antenna fields E and
 one Jones matrix J for each interaction.
 
-Programs use double precision by default and single precision on request. Functions compute under their own JAX settings
-(`calibray.fields.jax_settings`); importing the package does not change JAX's settings.
+Programs use double precision by default and single precision on request. Functions use JAX settings of their own while
+they run (`calibray.fields.jax_settings`); importing the package does not change JAX's settings.
 """
 
 from calibray.fields.coefficient_tables import FINEST as FINEST

@@ -1,7 +1,7 @@
 """Arithmetic of complex numbers stored as pairs of real arrays, and sums over segments.
 
-Compilers vectorize pairs of real arrays, which are therefore several times faster than complex types. All functions
-work element by element and can be differentiated.
+Compilers vectorize pairs of real arrays, which are therefore several times faster than complex types. All functions of
+pairs work element by element and are differentiable.
 
 Segments are the paths of a link, or the interactions of a link with a material. XLA scatters and adds one number at a
 time, which takes about 5 ns. Most numbers can be added in blocks instead: they are ordered so that each block belongs
@@ -49,7 +49,7 @@ _COSINE: Final = (
     -0.5,
     1.0,
 )
-"""Minimax polynomial for cos(x) on the same interval, likewise in powers of x^2."""
+"""Minimax polynomial for cos(x) on the same interval in powers of x^2, highest first."""
 
 
 def multiply(a: Pair, b: Pair) -> Pair:
@@ -78,8 +78,8 @@ def safe_sqrt(value: jax.Array) -> jax.Array:
 def materialize(values: Values, positive: jax.Array) -> Values:
     """The same values, computed once and stored; `positive` is any positive number that is unknown at compile time.
 
-    On the CPU, XLA fuses a computation into each of its uses, so it repeats sines and exponentials many times; it also
-    drops `optimization_barrier`. It cannot fuse across a branch on a value that is unknown at compile time.
+    On the CPU, XLA fuses a computation into each of its uses, so it repeats sines and exponentials many times. It also
+    removes `optimization_barrier`. It cannot fuse across a branch on a value that is unknown at compile time.
     """
     return jax.lax.cond(
         positive > 0, lambda kept: kept, lambda kept: jax.tree.map(jnp.negative, kept), values
@@ -88,11 +88,11 @@ def materialize(values: Values, positive: jax.Array) -> Values:
 
 @jax.custom_jvp
 def cosine_and_sine(angle: ArrayLike) -> tuple[jax.Array, jax.Array]:
-    """Cosine and sine of many angles [...], [rad], at once.
+    """Cosine and sine of angles [...], [rad].
 
-    In double precision, XLA on the CPU calls the system's functions for one number at a time, which takes about 30 ns
-    for both. Polynomials without branches are vectorized and take 2 ns. Each result is within 2.3e-16 of the true
-    value; beyond a million turns, the rounding error of the angle itself dominates.
+    In double precision, XLA on the CPU calls the system's mathematical functions for one number at a time, which takes
+    about 30 ns for both. Polynomials without branches are vectorized and take 2 ns. Each result is within 2.3e-16 of
+    the true value; beyond a million turns, the rounding error of the angle itself dominates.
     """
     angle_as_given = jnp.asarray(angle)
     angle = angle_as_given.astype(jnp.float64)
@@ -128,7 +128,7 @@ def _polynomial(factors: tuple[float, ...], x: jax.Array) -> jax.Array:
 
 
 BLOCK: Final = 32
-"""Numbers in a block."""
+"""Number of values in a block."""
 
 
 @jax.tree_util.register_dataclass

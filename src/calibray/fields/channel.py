@@ -47,11 +47,11 @@ class ChannelStatistics:
 
 @jax_settings()
 def channel_statistics(paths: Paths, materials: Mapping[str, Material] | None = None) -> ChannelStatistics:
-    """Delay spread, K-factor and angular spreads of every link for any materials.
+    """Delay spread, K-factor and angular spreads of every link for given materials.
 
     Args:
         paths: The path program.
-        materials: Constants by name; materials that are not named keep the constants of the trace.
+        materials: Material constants by name; the other materials keep the constants of the trace.
 
     Returns:
         The statistics, as NumPy arrays.
@@ -130,7 +130,7 @@ def power_delay_profile(
     Args:
         paths: The path program.
         delays: Edges of the delay bins, increasing [n + 1], [s].
-        materials: Constants by name; materials that are not named keep the constants of the trace.
+        materials: Material constants by name; the other materials keep the constants of the trace.
 
     Returns:
         Power gains [L, n]; paths outside all bins are ignored.
@@ -149,7 +149,7 @@ def power_delay_profile(
 
 
 def delay_profile(program: GroupedProgram, power: jax.Array, edges: jax.Array) -> jax.Array:
-    """Power gain of every link in each delay bin [L, n]: path powers [P], increasing bin edges [n + 1], [s]."""
+    """Power gain of every link in each delay bin [L, n], from path powers [P] and increasing bin edges [n + 1], [s]."""
     link, delay = program.phases
     num_bins = edges.shape[0] - 1
     index = jnp.searchsorted(edges, delay, side="right") - 1

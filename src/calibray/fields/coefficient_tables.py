@@ -1,13 +1,14 @@
 """Tables of the slab coefficients by angle of incidence, for programs with many interactions.
 
 A coefficient depends on the geometry only through the cosine of incidence. If a program has many more interactions than
-its tables have nodes, each candidate's coefficients are computed at the nodes. Cubics through four nodes then
-interpolate them, in about 10 ns per interaction instead of 100 ns. The position of an interaction in its table does not
-depend on the materials, so it is computed once. Each pair of material and mode has its own row of nodes.
+its tables have nodes, each candidate's coefficients are computed at the nodes. Cubic polynomials through four nodes
+then interpolate between the nodes, which takes about 10 ns per interaction instead of 100 ns. The position of an
+interaction in its table does not depend on the materials, so it is computed once. Each pair of material and mode has
+its own row of nodes.
 
 Nodes are evenly spaced in a root of the cosine: the square root, or the sixth root for metals, whose Brewster angle is
-within a thousandth of grazing incidence. A sheet of plasterboard at 2 GHz needs about a hundred intervals, and a thick
-slab at 60 GHz needs thousands. `table_intervals` chooses the number of intervals from a few representative candidates.
+very close to grazing incidence. A sheet of plasterboard at 2 GHz needs about a hundred intervals, and a thick slab at
+60 GHz needs thousands. `table_intervals` chooses the number of intervals from a few representative candidates.
 `table_error` then bounds every candidate's error, even at Brewster angles, grazing incidence and slab resonances.
 """
 
@@ -30,7 +31,7 @@ from calibray.fields.slab import FIELD_COLUMN, Mode, coefficients_of_materials, 
 from calibray.paths import Kind, Paths
 
 Intervals = int | NDArray[np.integer]
-"""Number of intervals: one for all rows, or by material and mode [M, 3]."""
+"""Number of intervals: one number for all rows, or one for each material and mode [M, 3]."""
 
 FINEST: Final = 65536
 """Largest number of intervals in a row of the tables."""
@@ -42,7 +43,7 @@ _STAGES: Final = (1024, 8192, FINEST)
 """Successive limits of the search for a number of intervals; each is tried only if the previous one fails."""
 
 _TOLERANCE_SHARE: Final = 0.1
-"""Largest error of the representative candidates, as a share of the tolerance."""
+"""Largest permitted error for the representative candidates, as a share of the tolerance."""
 
 _METAL_LOSS: Final = 1e3
 """Loss term above which a material is treated as a metal."""
@@ -55,7 +56,7 @@ _EXTRA_NODES: Final = 3
 interval, and one after it."""
 
 _STENCIL: Final = 3
-"""Nodes on either side that `table_error` needs."""
+"""Number of nodes that `table_error` requires on either side of a node."""
 
 
 @jax.tree_util.register_dataclass
@@ -86,9 +87,9 @@ class CoefficientTables:
     """Tables of coefficients. The numbers of a cell are adjacent, so that a look-up reads one or two cache lines.
 
     Attributes:
-        values: Cubic polynomials in the fraction, from every node to the next [N + 4, 16]. For each power, lowest
-            first: real and imaginary part for the transverse electric, then for the transverse magnetic coefficient.
-            The coefficient at the last four nodes is 1.
+        values: Coefficients of cubic polynomials in the fraction, from every node to the next [N + 4, 16]. Powers are
+            in ascending order, each with the real and imaginary part for the transverse electric coefficient, then for
+            the transverse magnetic coefficient. At the last four nodes, both coefficients are 1.
     """
 
     values: jax.Array
@@ -201,9 +202,9 @@ def interpolate(tables: CoefficientTables, cell: jax.Array, fraction: jax.Array)
 def table_error(tables: CoefficientTables, layout: TableLayout, num_materials: int) -> jax.Array:
     """Upper bound of the interpolation error of any real or imaginary part, by material and mode [M, 3].
 
-    Every inner node is compared with the cubic through the nodes one and three steps away, whose step is twice as
-    large. The error of a cubic scales with the fourth power of the step, so the tables' error is a sixteenth of the
-    largest difference. The bound is twice that.
+    The value at every inner node is compared with the cubic through the nodes one and three steps away, which has twice
+    the step. The error of a cubic scales with the fourth power of the step, so the tables' error is about a sixteenth
+    of the largest difference. The bound is twice this error.
     """
     value = tables.values[: len(layout.cosine), :4]
 
@@ -220,8 +221,8 @@ def table_error(tables: CoefficientTables, layout: TableLayout, num_materials: i
 def table_intervals(paths: Paths, tables: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
     """Number of intervals by material and mode [M, 3] for coefficients with an error within `tolerance` [1].
 
-    The numbers are powers of two up to `FINEST`; 0 if no coefficient has this material and mode. `tables` [n, M, 8] has
-    the constants of representative candidates.
+    The numbers are powers of two up to `FINEST`; 0 if no coefficient has this material and mode. `tables` [n, M, 8]
+    contains the constants of representative candidates.
     """
     material, mode, _ = coefficient_arguments(paths)
     needed = np.zeros((tables.shape[1], len(Mode)), dtype=np.int64)
@@ -239,7 +240,7 @@ def table_intervals(paths: Paths, tables: NDArray[np.float64], tolerance: float)
 def _row_intervals(
     constants: NDArray[np.float64], mode: int, root: int, wavelength: float, tolerance: float
 ) -> int:
-    """Number of intervals that a row needs for its material's constants [8]."""
+    """Number of intervals that a row requires for its material's constants [8]."""
     for finest in _STAGES:
         errors = np.asarray(_errors_by_intervals(constants[None], mode, root, wavelength, finest))
         sufficient = np.flatnonzero(errors <= tolerance)
@@ -252,7 +253,7 @@ def _row_intervals(
 def _errors_by_intervals(
     table: jax.Array, mode: jax.Array, root: jax.Array, wavelength: jax.Array, finest: int
 ) -> jax.Array:
-    """Largest error of a row for `COARSEST` intervals, twice as many, and so on up to `finest`."""
+    """Largest error of a row for each number of intervals, which doubles from `COARSEST` to `finest`."""
     cosine = jnp.maximum((jnp.arange(2 * finest + 1) / (2 * finest)) ** root, _GRAZING)
     material = jnp.zeros(cosine.shape, dtype=jnp.int32)
     te, tm = coefficients_of_materials(

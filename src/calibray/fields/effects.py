@@ -1,7 +1,7 @@
 """Effects that are not properties of a material: they change the antenna fields of a program's paths.
 
-An effect has its own parameters. Everything that follows from the fields (path loss, delay spread, derivatives with
-respect to the materials) is evaluated on the changed program.
+An effect has its own parameters. All quantities that depend on the fields (path loss, delay spread, derivatives with
+respect to the materials) are evaluated on the changed program.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class RoughSurfaces:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class DisplacementLoss:
-    """Change of path loss by displacements of G groups of links along K axes: cubics between N knots.
+    """Change of path loss due to displacements of G groups of links along K axes, as cubics between N knots.
 
     Attributes:
         link: Link of every path [P].

@@ -1,7 +1,7 @@
 """Path loss of every link of a program, and its derivatives, for batches of candidates.
 
-With the slab formula, a batch is one compiled loop over its candidates: the data of one candidate stay in the core's
-L1 cache, and a smaller batch takes less time. Within the loop, the stages are materialized
+With the slab formula, one compiled loop evaluates the candidates of a batch one by one. The data of one candidate
+therefore stay in the core's L1 cache, and a smaller batch takes less time. Within the loop, the stages are materialized
 (`calibray.fields.arithmetic.materialize`), because XLA would otherwise fuse each stage into all its uses on the CPU and
 repeat it there.
 
@@ -53,11 +53,11 @@ WITHOUT_TABLES: Final = np.zeros((1, 1, 3))
 
 @jax_settings()
 def path_gains(paths: Paths, materials: Mapping[str, Material] | None = None) -> NDArray[np.complex128]:
-    """Path gains for any materials, equal to Sionna RT's `Paths.a` for the same materials.
+    """Path gains for given materials, equal to Sionna RT's `Paths.a` for the same materials.
 
     Args:
         paths: The path program.
-        materials: Constants by name; materials that are not named keep the constants of the trace.
+        materials: Material constants by name; the other materials keep the constants of the trace.
 
     Returns:
         Complex gains [P]; [P, R, T] if an antenna is dual-polarized.
@@ -78,11 +78,11 @@ def path_loss(
     combining: str = "power",
     bandwidth: float | None = None,
 ) -> NDArray[np.float64]:
-    """Path loss of every link for any materials.
+    """Path loss of every link for given materials.
 
     Args:
         paths: The path program.
-        materials: Constants by name; materials that are not named keep the constants of the trace.
+        materials: Material constants by name; the other materials keep the constants of the trace.
         combining: "power" sums the paths' powers (for a wide band, or many snapshots), "coherent" sums their fields at
             the carrier, and "band" averages the coherent power over `bandwidth`.
         bandwidth: Bandwidth [Hz], for "band".
@@ -113,7 +113,7 @@ def program_path_loss(program: GroupedProgram, table: jax.Array, combining: Comb
 def program_gains(program: GroupedProgram, table: jax.Array) -> Pair:
     """Gains of all paths in the order of the program, real and imaginary part [R, T, P], as one pure function.
 
-    `table` has the material constants [M, 8].
+    `table` contains the material constants [M, 8].
     """
     response = materialize(material_response(program, table), program.wavelength)
     return path_fields(program, split_by_step(program, response))
@@ -169,9 +169,9 @@ def path_losses_and_slopes(
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
     """Path loss as in `path_losses`, and its derivatives [count, L, M, columns], [dB] per unit.
 
-    The derivatives are with respect to the material constants in `columns` of the tables, and 0 for a link without a
-    path. The third result is the largest error of a tabulated coefficient by candidate, material and mode
-    [count, M, 3], or zeros without tables.
+    The derivatives are with respect to the material constants in `columns` of the tables. They are 0 for a link without
+    a path. The third result is the largest error of a tabulated coefficient by candidate, material and mode [count, M,
+    3], or zeros without tables.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
@@ -217,7 +217,10 @@ def path_losses_and_slopes_with_effects(
     combining: Combining = POWER,
     count: int | None = None,
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
-    """Path loss with effects, and its derivatives by constants [count, L, M, columns] and by effects [count, L, e]."""
+    """Path loss with effects, and its derivatives.
+
+    The derivatives are with respect to constants [count, L, M, columns] and to effect parameters [count, L, e].
+    """
     count = len(tables) if count is None else count
     answers = _slopes_with_effects(program, tables, effects, count, columns, combining)
     loss, slope, by_effect = (np.asarray(answer)[:count] for answer in answers)
@@ -257,9 +260,10 @@ def contract(
 ) -> jax.Array:
     """Derivatives of a quantity of every link with respect to material constants [L, M, columns].
 
-    Every interaction belongs to one material, so one tangent per column serves all materials at once: the time does not
-    grow with the number of materials. `slope` has the derivatives of the quantity with respect to the response at every
-    step; `derivatives` has those of the response with respect to the constants in each column.
+    Every interaction belongs to one material, so one tangent per column yields the derivatives for all materials. The
+    computing time therefore does not grow with the number of materials. `slope` contains the derivatives of the
+    quantity with respect to the response at every step. `derivatives` contains those of the response with respect to
+    the constants in each column.
     """
     if not derivatives:
         return jnp.zeros((program.num_links, num_materials, 0), program.wavelength.dtype)
@@ -298,7 +302,7 @@ def _loss_slope(power: jax.Array) -> jax.Array:
 def _by_path(by_field: list[AntennaFields], tangents: list[AntennaFields], blank: jax.Array) -> jax.Array:
     """Derivatives of the power of every path with respect to effect parameters [P, e], through the antenna fields.
 
-    `blank` is the result for no paths [0, e].
+    `blank` is the result without paths [0, e].
     """
     groups = [blank]
     for outer, inner in zip(by_field, tangents, strict=True):

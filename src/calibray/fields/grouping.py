@@ -44,7 +44,7 @@ class PathGroup:
 
 
 def exact_groups(paths: Paths) -> list[PathGroup]:
-    """Group paths with the same sequence of interactions; no group has a run."""
+    """Group paths with the same sequence of interactions, without runs."""
     number = _numbers(paths)
     groups = []
     for members in _equal(_sequence_codes(paths, number)):
@@ -58,8 +58,8 @@ def exact_groups(paths: Paths) -> list[PathGroup]:
 def padded_groups(paths: Paths) -> list[PathGroup]:
     """Group paths whose sequences are equal if each run of reflections and transmissions counts as one interaction.
 
-    Within a group, the path with the most reflections and transmissions comes first; each run has the length of the
-    longest one among the group's paths.
+    Within a group, the path with the most reflections and transmissions comes first; each run is as long as the longest
+    corresponding run in the group.
     """
     number, interaction = _numbers(paths), np.arange(paths.num_interactions)
     path = np.repeat(np.arange(paths.num_paths), np.diff(paths.first))

@@ -1,4 +1,4 @@
-"""How Calibray uses JAX: the settings under which it computes, its store of compiled programs, and their compilation.
+"""Calibray's use of JAX: settings, a store of compiled programs, and their compilation.
 
 Outside of Calibray's calls, the user's settings apply.
 
@@ -38,8 +38,8 @@ _users_cache: Any = None
 def jax_settings() -> Iterator[None]:
     """Compute in double precision and keep compiled programs; on exit, the user's JAX settings are restored.
 
-    Every function of `calibray.fields` that computes uses these settings. Enter this context yourself to differentiate
-    or compile code around one of the pure functions.
+    Every numerical function of `calibray.fields` uses these settings. Enter this context yourself to differentiate or
+    compile code around one of the pure functions.
 
     Raises:
         InputError: JAX finds no device to compute on.
@@ -78,10 +78,10 @@ def _check_device() -> None:
 
 @contextmanager
 def _cache_of_jax(programs: Any) -> Iterator[None]:
-    """Make the store JAX's cache on disk.
+    """Use the store as JAX's cache on disk.
 
-    JAX has one cache for all threads, but each thread has its own setting for the folder. The store therefore serves
-    only threads in which its own folder is set, so that the user's own programs are not kept.
+    JAX has one cache for all threads, but each thread has its own setting for the folder. The store is therefore used
+    only in threads whose setting is the store's folder, so that the user's own programs are not stored.
     """
     global _calls, _users_cache
     from jax._src import compilation_cache, config
@@ -137,7 +137,7 @@ def _kept_programs() -> Any:
 
 
 def _entry_name(key: str) -> str:
-    """Name of an entry. It depends on the processor, because compiled code may crash on a different one."""
+    """Name of an entry; it depends on the processor, because compiled code can crash on a different processor."""
     return hashlib.sha256(f"{key} {_processor()}".encode()).hexdigest()
 
 
@@ -156,7 +156,9 @@ WIDE: Final = {"xla_cpu_prefer_vector_width": 512}
 option has no effect. The results are the same."""
 
 _QUICK: Final = WIDE | {"xla_cpu_use_fusion_emitters": False}
-"""The same without XLA's emitters of fused loops, which compiles faster. The results differ by rounding."""
+"""The same options without XLA's emitters of fused loops, for faster compilation. The results differ by rounding
+errors.
+"""
 
 
 def compiled(
@@ -164,8 +166,8 @@ def compiled(
 ) -> Callable[..., Any]:
     """Compile a function like `jax.jit`; its first argument is a program or has one as the attribute `program`.
 
-    It is compiled anew for each value of the arguments at the positions `static_argnums`. Without a function, the
-    result is a decorator.
+    The function is compiled anew for each value of the arguments at the positions `static_argnums`. Without a function,
+    the result is a decorator.
     """
     if function is None:
         return lambda function: compiled(function, static_argnums=static_argnums)
@@ -182,7 +184,7 @@ def compiled(
 
 @cache
 def _xla_has_the_option() -> bool:
-    """Whether this version of XLA knows the option of `_QUICK`; XLA raises an error for unknown options."""
+    """Whether this version of XLA supports the options in `_QUICK`; XLA raises an error for unknown options."""
     try:
         jax.jit(lambda: 0, compiler_options=_QUICK)()
     except jax.errors.JaxRuntimeError:

@@ -1,7 +1,7 @@
 """Response of the materials: the coefficients of all interactions, and the amplitudes of diffuse reflection.
 
-`material_response` computes them for all groups together, in flat arrays or as tables. `split_by_step` gives each step
-of each group its own part.
+`material_response` computes them for all groups together, in flat arrays or as tables. `split_by_step` splits them into
+parts for each step of each group.
 
 The scattering patterns f_s of diffuse reflection follow Degli-Esposti et al., IEEE Trans. Antennas Propag. 55(1), 2007.
 """
@@ -36,7 +36,7 @@ GroupResponse = tuple[tuple[Coefficients, ...], tuple[tuple[jax.Array, jax.Array
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MaterialResponse:
-    """Everything that the fields need from the materials.
+    """The quantities of all interactions that depend on the materials.
 
     Attributes:
         coefficients: Transverse electric and magnetic coefficients, each (real, imaginary) [K]; or their tables.
@@ -82,7 +82,7 @@ def material_response(program: GroupedProgram, table: jax.Array) -> MaterialResp
 def response_and_derivatives(
     program: GroupedProgram, table: jax.Array, columns: tuple[int, ...]
 ) -> tuple[MaterialResponse, tuple[MaterialResponse, ...]]:
-    """Response of the materials; its derivatives by the constants in `columns` of each interaction's own material."""
+    """The response, and its derivatives with respect to the constants in `columns` of each interaction's material."""
     response, push = jax.linearize(partial(material_response, program), table)
     permittivity, conductivity = FIELD_COLUMN["relative_permittivity"], FIELD_COLUMN["conductivity"]
     derivatives = {
@@ -120,7 +120,7 @@ def _by_conductivity(program: GroupedProgram, by_permittivity: MaterialResponse)
 def split_by_step(
     program: GroupedProgram, response: MaterialResponse, blank: float = 1.0
 ) -> tuple[GroupResponse, ...]:
-    """The response, or its derivatives, split into the parts for each step of each group, group by group.
+    """The response, or its derivatives, split into parts for each step of each group.
 
     Reverse passes differentiate with respect to these parts. Otherwise, each part would need a pass over the complete
     flat arrays. `blank` is the value of a coefficient at empty positions: 1, or 0 for derivatives.
@@ -164,7 +164,7 @@ def _unpacked(
 ) -> jax.Array:
     """The coefficients of one step of a group, with `blank` at positions that are not stored.
 
-    Each line is read past its end, and the excess is replaced, which needs no separate pass.
+    Each line is read past its end, and the excess is replaced, so no separate pass is necessary.
     """
     parts, size = [], shape[-1]
     for length in reversed(lines):  # the last line is stored first
@@ -219,9 +219,9 @@ def _normalization(alpha: jax.Array, diffuse: DiffuseArguments) -> jax.Array:
 def _whole_normalizations() -> NDArray[np.float64]:
     """Coefficients of F_alpha for alpha = 0 .. LARGEST_EXPONENT [terms, alpha].
 
-    F_alpha = 2^-alpha sum_j binom(alpha, j) I_j. I_j is 2 pi / (j + 1) for even j; for odd j it is multiplied by
-    cos theta sum_{w <= (j - 1) / 2} binom(2w, w) (sin^2 theta / 4)^w. The result has the coefficients of
-    cos theta sin^2w theta, highest power first, then the constant.
+    F_alpha = 2^-alpha sum_j binom(alpha, j) I_j. I_j is 2 pi / (j + 1) for even j; for odd j it is multiplied by cos
+    theta sum_{w <= (j - 1) / 2} binom(2w, w) (sin^2 theta / 4)^w. The result contains the coefficients of cos theta
+    sin^2w theta, highest power first, then the constant.
     """
     alpha = np.arange(LARGEST_EXPONENT + 1)
     j, w = alpha[:, None], np.arange(LARGEST_EXPONENT // 2)[::-1, None]

@@ -1,10 +1,11 @@
 """Observables of links other than path loss, as a receiver measures them, with derivatives.
 
-Each is a power-weighted statistic of the paths that a receiver resolves in a link. A receiver of limited bandwidth
-resolves taps instead of paths: samples of its power delay profile, in which the pulse of each path is spread over a few
-taps. It detects neither taps far below the strongest tap nor taps below its noise floor. A logistic function of the
-level in dB, `SOFT_DB` wide, replaces each of these hard limits, so that derivatives are exact. It changes the weight of
-taps within about 2 dB of a limit. `docs/measurements/observables.md` shows the error of the smooth limit.
+Each observable is a power-weighted statistic of the paths that a receiver resolves in a link. A receiver of limited
+bandwidth resolves taps instead of paths: samples of its power delay profile, in which the pulse of each path is spread
+over a few taps. It detects neither taps far below the strongest tap nor taps below its noise floor. A logistic function
+of the level in dB, `SOFT_DB` wide, replaces each of these hard limits, so that derivatives are exact. The function
+changes the weight of taps within about 2 dB of a limit. `docs/measurements/observables.md` shows the error of the
+smooth limit.
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ class Taps:
     def of(cls, delay: NDArray[np.float64], link: NDArray[np.integer], bandwidth: float) -> Taps:
         """The taps of paths with delays [P], [s], in links [P], at a bandwidth [Hz].
 
-        Taps are 1 / bandwidth apart. At this spacing, sampling preserves the power, mean delay and mean square delay
-        of the profile, wherever a path lies between two taps.
+        Taps are 1 / bandwidth apart. At this spacing, sampling preserves the power, mean delay and mean square delay of
+        the profile, regardless of the position of a path between two taps.
         """
         # The two taps at or before the path, and the two after it.
         number = np.floor(delay * bandwidth).astype(np.int64)[:, None] + np.arange(TAPS) - TAPS // 2 + 1
@@ -262,7 +263,7 @@ def _seen(power: jax.Array, link: jax.Array, num_links: int, wanted: Statistic) 
 def _share(
     weight: jax.Array, value: jax.Array, link: jax.Array, num_links: int, wanted: Statistic
 ) -> jax.Array:
-    """Share of each link's weight with values in the bin [L], [dB]; not below the negative dynamic range."""
+    """Share of each link's weight with values in the bin [L], [dB]; at least about the negative dynamic range."""
     low, high = wanted.bin
     share = link_mean(weight, ((value >= low) & (value < high)).astype(weight.dtype), link, num_links)
     range_db = kinds.SHARE_RANGE_DB if wanted.dynamic_range_db is None else wanted.dynamic_range_db
@@ -273,7 +274,7 @@ def _share(
 def _flight(
     weight: jax.Array, seen: jax.Array, delay: jax.Array, link: jax.Array, num_links: int, wanted: Statistic
 ) -> jax.Array:
-    """Time of flight of every link [L], [s]: the mean of all paths, or of one path and those not resolved from it."""
+    """Time of flight of every link [L], [s]: mean over all paths, or over one path and those not resolved from it."""
     if wanted.path == "mean":
         return link_mean(weight, delay, link, num_links)
     if wanted.path == "first":

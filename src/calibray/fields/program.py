@@ -33,11 +33,13 @@ from calibray.fields.slab import Mode
 from calibray.paths import Kind, Paths
 
 LARGE: Final = 50_000
-"""Number of interactions above which a program is large: not padded with tables, and milliseconds per candidate."""
+"""Number of interactions above which a program is large; with tables, large programs are not padded."""
 
 SMALL: Final = 300
-"""Largest number of coefficients in a small program. With 120, path loss and derivatives compile in 2.3 s instead of
-3.4 s, and a candidate takes up to 20 us longer; with 960, it takes 135 us longer (`docs/measurements/speed.md`)."""
+"""Largest number of coefficients in a small program. With 120 coefficients, path loss and derivatives compile in 2.3 s
+instead of 3.4 s, and a candidate takes up to 20 us longer. With 960 coefficients, a candidate takes 135 us longer
+(`docs/measurements/speed.md`).
+"""
 
 
 @jax.tree_util.register_dataclass
@@ -46,7 +48,8 @@ class Group:
     """Paths with the same sequence of interactions: n paths, T transmit and R receive ports.
 
     Attributes:
-        tx: Transmit field, real and imaginary part [2, T, 2, n]; only the real part if all are real [1, T, 2, n].
+        tx: Transmit field, real and imaginary part [2, T, 2, n]; only the real part if all fields are real [1, T, 2,
+            n].
         rx: Receive field times A lambda / 4 pi, in the same form [2 or 1, R, 2, n].
         rotation: Per step, (cos, sin) of the rotation into the interaction's frame [2, n]; [k, 2, n] for a run of k.
         turn: Per step, (cos, sin) from the frame of incidence into the basis (theta, phi) [2, n], or None.
@@ -104,8 +107,10 @@ class DiffuseArguments:
         solid_angle: Solid angle of the ray tube, divided by its sampling probability [D], [sr].
         cos_scattered: Cosine of the angle between the scattered direction and the normal [D].
         cos_incidence: Cosine of the angle of incidence [D]; empty if every material is Lambertian.
-        cos_specular: Cosine of the angle between the scattered and specular directions [D]; empty in the same case.
-        cos_backward: Cosine of the angle between scattered direction and direction to the source [D]; empty likewise.
+        cos_specular: Cosine of the angle between the scattered and specular directions [D]; empty if `cos_incidence`
+            is.
+        cos_backward: Cosine of the angle between the scattered direction and the direction to the source [D]; empty if
+            `cos_incidence` is.
         patterns: Scattering pattern of every material.
     """
 
@@ -127,7 +132,7 @@ class GroupedProgram:
         groups: The paths, grouped by sequence of interactions.
         by_link: Segments of the paths by link.
         link: Link of every path, in the order of the groups [P]; None if only powers are summed.
-        delay: Delay of every path, in the order of the groups [P], [s]; None in the same case.
+        delay: Delay of every path, in the order of the groups [P], [s]; None if only powers are summed.
         wavelength: Wavelength [m].
         coefficients: Arguments of the slab formula, or positions in tables.
         diffuse: Arguments of the scattering patterns.
@@ -154,7 +159,7 @@ class GroupedProgram:
         """Link [P] and delay [P], [s] of every path, in the order of the groups.
 
         Raises:
-            InputError: The program was laid out without them.
+            InputError: The program was laid out without links and delays.
         """
         if self.link is None or self.delay is None:
             raise InputError("the program was laid out for sums of powers only; lay it out with phases=True")
@@ -162,7 +167,7 @@ class GroupedProgram:
 
     @property
     def is_small(self) -> bool:
-        """Whether it takes so little time to evaluate that the time of its compilation matters more."""
+        """Whether evaluating the program takes so little time that its compilation time matters more."""
         source = self.coefficients
         return isinstance(source, FormulaArguments) and len(source.material) <= SMALL
 
@@ -184,11 +189,11 @@ class Layout:
 def layout(
     paths: Paths, dtype: type = np.float64, intervals: Intervals | None = None, phases: bool = True
 ) -> Layout:
-    """Lay a path program out for evaluation in a given precision on JAX's default device.
+    """Lay out a path program for evaluation in a given precision on JAX's default device.
 
-    With `intervals`, one number or one by material and mode [M, 3], the coefficients are tabulated by angle of
-    incidence; None evaluates the slab formula at every interaction. With `phases`, links and delays of the paths are
-    kept. Without `phases`, only sums of powers can be computed.
+    With `intervals`, one number or one for each material and mode [M, 3], the coefficients are tabulated by angle of
+    incidence. If it is None, the slab formula is evaluated at every interaction. With `phases`, the links and delays of
+    the paths are stored. Without `phases`, only sums of powers can be computed.
     """
     # Use jax.device_put: jnp.asarray compiles a program for every shape, which takes 15 ms each.
     padded = intervals is None or paths.num_interactions <= LARGE

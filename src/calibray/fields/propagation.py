@@ -1,7 +1,8 @@
 """Path loss of links: the chain of Jones matrices between the antennas of every path, and the sum over paths.
 
 - Reflection and transmission: a real rotation into the frame of incidence, then the diagonal (c_te, c_tm).
-- Diffuse reflection: not linear in the field, because its amplitude follows the specularly reflected field.
+- Diffuse reflection: not linear in the field, because its amplitude depends on the magnitude of the specularly
+  reflected field.
 - Diffraction: affine in the reflection coefficients of the wedge's two faces, J = C_0 + sum_k R_k C_k.
 """
 
@@ -140,13 +141,13 @@ def _diffract(te: Pair, tm: Pair, coefficients: tuple[Pair, ...], form: jax.Arra
 
 
 COMBINING: Final = ("power", "coherent", "band")
-"""Names of the ways of combining paths."""
+"""Names of the methods of combining paths."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Combining:
-    """How the paths of a link combine.
+    """Method of combining the paths of a link.
 
     Attributes:
         kind: "power": sum |a|^2; "coherent": |sum a e^{-j 2 pi f tau}|^2; "band": the average of the coherent power
@@ -161,7 +162,7 @@ class Combining:
     def make(
         cls, kind: str, link: NDArray[np.integer], delay: NDArray[np.float64], bandwidth: float | None = None
     ) -> Combining:
-        """Check and prepare a way of combining paths: "power", "coherent", or "band" with a bandwidth [Hz].
+        """Check and prepare a method of combining paths: "power", "coherent", or "band" with a bandwidth [Hz].
 
         `link` [P] must be non-decreasing; `delay` is [P], [s].
 
@@ -182,14 +183,15 @@ def _band_nodes(
 ) -> NDArray[np.float64]:
     """Gauss-Legendre nodes and weights over a band [2, q], with enough nodes for the largest delay span in any link.
 
-    The average of |H|^2 over the band contains oscillations e^{j 2 pi f (tau_i - tau_j)}. A rule with n nodes
-    integrates them to machine precision if n exceeds about ten plus a quarter of their phase change over the band.
+    The average of |H|^2 over the band contains oscillations e^{j 2 pi f (tau_i - tau_j)}. A quadrature rule with n
+    nodes integrates them to machine precision if n exceeds about ten plus a quarter of their phase change over the
+    band.
 
     Raises:
         InputError: The bandwidth is not positive.
     """
     if bandwidth is None or not (np.isfinite(bandwidth) and bandwidth > 0):
-        raise InputError(f'combining = "band": bandwidth = {bandwidth}: must be a positive number of Hz')
+        raise InputError(f'combining = "band": bandwidth = {bandwidth} must be a positive number of Hz')
     spread = 0.0
     if len(link):
         start = np.flatnonzero(np.diff(link, prepend=-1))
