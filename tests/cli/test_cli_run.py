@@ -298,7 +298,7 @@ def test_antennas_inside_buildings_are_listed_unless_most_are_inside(folder, ran
     )
     indoors = render(*result_tables.tables(changed(result, enclosed=EnclosedAntennas.of(row, most, most))))
     assert re.search(
-        r"receiver inside a building +11 +as for most receivers: assumed to be an indoor scene\n", indoors
+        r"receiver inside a building +11 +like most receivers: the scene is assumed to be indoors\n", indoors
     )
     assert changed(result, enclosed=EnclosedAntennas.of(row, none, few)).counts["rows_with_enclosed_rx"] == [
         2,

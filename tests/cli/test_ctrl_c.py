@@ -146,6 +146,6 @@ def test_ctrl_c_prints_the_kept_calls_and_the_same_command_continues(monkeypatch
     again = CliRunner().invoke(app, words)
     assert again.exit_code == 0, again.stderr
     # The first call is the uncalibrated scene, which the method's budget of 8 does not count.
-    assert re.search(rf"answered by the ledger +{kept - 1}\n", again.stdout)
+    assert re.search(rf"found in the ledger +{kept - 1}\n", again.stdout)
     assert len(programs.calls(tmp_path)) == calls_before + 9 - kept
     assert "\x1b" not in again.stderr  # no terminal, no bars

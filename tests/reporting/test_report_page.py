@@ -348,7 +348,7 @@ def test_the_summary_says_whether_calibration_helped(result):
     assert "Set [holdout] blocks = 4, or run calibray validate" in answer(unjudged, HELP)
     # Each block would take a calibration, which `calibray validate` refuses on this engine.
     expensive = changed(unjudged, study=result.study.replace(engine="retrace"))
-    assert answer(expensive, HELP).endswith("new links best. Hold out links by [holdout] where.")
+    assert answer(expensive, HELP).endswith("new links best. Hold out links with [holdout] where.")
 
 
 def test_the_summary_says_which_parameters_are_identified(result):
@@ -365,7 +365,7 @@ def test_the_summary_says_which_parameters_are_identified(result):
     text = answer(outside, "How certain are the values?")
     assert f"Calibrated values outside their intervals: {unidentified}." in text
     # The values inside are many; none of them has to be more probable than the calibrated one.
-    assert "nearly all probable values are inside" in text
+    assert "nearly all probable values are inside the intervals" in text
     assert "more probable" not in text
     # One range, which does not contain the calibrated value, is ambiguous, too.
     one_range = changed(

@@ -264,7 +264,7 @@ def test_predictions_use_the_model_that_validation_chooses(tmp_path, noisy):
     law = run(tmp_path, table, holdout={"blocks": 3})
     assert law.prediction.model.name == Model.LOG_DISTANCE
     assert law.prediction.model.parameters is None
-    assert any("The blocks choose the model 'log-distance'" in remark for remark in law.remarks)
+    assert any("The chosen model is 'log-distance'" in remark for remark in law.remarks)
     told = law.predict_interval(planted.links())
     assert told.path_loss_db.to_numpy() == pytest.approx(30 + 35 * np.log10(distance), abs=1.0)
     assert told.path_loss_db.to_numpy() == pytest.approx(law.predict(planted.links()))

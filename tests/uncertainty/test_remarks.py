@@ -42,7 +42,7 @@ def test_values_outside_their_intervals_are_named_with_the_reason():
     assert NAMES[0] not in text
     assert "neighbouring links share part of their errors" in text
     assert f"{np.exp(3.0):.2g} times as probable" in text
-    assert "unless held-out links ([holdout]) choose another model" in text
+    assert "unless another model is chosen on held-out links ([holdout])" in text
     # With blocks held out already, that advice would be empty.
     assert "[holdout]" not in remarks(outside, holdout={"blocks": 3})[0]
     assert remarks(outside, holdout={"where": "rx_x > 0"})[0] == text

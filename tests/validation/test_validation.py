@@ -158,7 +158,7 @@ def test_a_calibrated_model_is_chosen_only_if_it_is_clearly_better():
     assert near.chosen == Model.INITIAL
     assert near.best == Model.KRIGING
     assert near.choice == (
-        "The blocks choose the model 'initial materials'. The model 'calibrated' is better on held-out blocks, but "
+        "The chosen model is 'initial materials'. The model 'calibrated' is better on held-out blocks, but "
         "by too little to be preferred."
     )
     assert near.choice in near.summary()[2]
@@ -183,20 +183,20 @@ def test_a_calibrated_model_is_chosen_only_if_it_is_clearly_better():
         }
     )
     assert clear.chosen == Model.CALIBRATED
-    assert clear.choice == "The blocks choose the model 'calibrated', the best on held-out blocks."
+    assert clear.choice == "The chosen model is 'calibrated', the best on held-out blocks."
 
 
 def test_the_log_distance_model_is_chosen_where_it_is_clearly_better():
     far = synthetic_validation({Model.INITIAL: 9.0, Model.CALIBRATED: 8.0, Model.LOG_DISTANCE: 2.0})
     assert far.chosen == Model.LOG_DISTANCE
-    assert far.choice == "The blocks choose the model 'log-distance', the best on held-out blocks."
+    assert far.choice == "The chosen model is 'log-distance', the best on held-out blocks."
     near = synthetic_validation(
         {Model.INITIAL: 9.0, Model.CALIBRATED: 2.1, Model.LOG_DISTANCE: 2.0}, count=40, seed=3
     )
     assert near.table.loc[Model.LOG_DISTANCE, "rmse_db"] < near.table.loc[Model.CALIBRATED, "rmse_db"]
     assert near.chosen == Model.CALIBRATED
     assert near.choice == (
-        "The blocks choose the model 'calibrated'. The model 'log-distance' is better on held-out blocks, but "
+        "The chosen model is 'calibrated'. The model 'log-distance' is better on held-out blocks, but "
         "by too little to be preferred."
     )
 
@@ -225,11 +225,12 @@ def test_the_average_of_the_chosen_model_and_a_second_one_predicts(best, partner
     assert validation.chosen == average
     assert validation.nested_rmse_db == pytest.approx(3.0, rel=0.1)
     assert (
-        f"The blocks choose the average of the models {str(best)!r} and {str(partner)!r}" in validation.choice
+        f"The chosen model is the average of the models {str(best)!r} and {str(partner)!r}"
+        in validation.choice
     )
     assert f"The model {str(best)!r} is preferred, as the best on held-out blocks." in validation.choice
     # Not a second sentence that names one model.
-    assert validation.choice.count("The blocks choose") == 1
+    assert validation.choice.count("The chosen model is") == 1
     assert set(validation.table.index) == {*map(str, size_db), str(average)}
 
 
@@ -237,7 +238,8 @@ def test_the_text_of_an_average_names_both_of_its_models():
     """Another model is the best, and is no part of the average."""
     text = choice_text(Model.OFFSETS, Model.CALIBRATED, Model.PRIOR)
     assert (
-        f"The blocks choose the average of the models {str(Model.OFFSETS)!r} and {str(Model.PRIOR)!r}" in text
+        f"The chosen model is the average of the models {str(Model.OFFSETS)!r} and {str(Model.PRIOR)!r}"
+        in text
     )
     # The difference can be significant, and the judgement then says that calibration helped.
     assert (

@@ -157,8 +157,7 @@ option has no effect. The results are the same."""
 
 _QUICK: Final = WIDE | {"xla_cpu_use_fusion_emitters": False}
 """The same options without XLA's emitters of fused loops, for faster compilation. The results differ by rounding
-errors.
-"""
+errors."""
 
 
 def compiled(

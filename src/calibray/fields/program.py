@@ -38,8 +38,7 @@ LARGE: Final = 50_000
 SMALL: Final = 300
 """Largest number of coefficients in a small program. With 120 coefficients, path loss and derivatives compile in 2.3 s
 instead of 3.4 s, and a candidate takes up to 20 us longer. With 960 coefficients, a candidate takes 135 us longer
-(`docs/measurements/speed.md`).
-"""
+(`docs/measurements/speed.md`)."""
 
 
 @jax.tree_util.register_dataclass

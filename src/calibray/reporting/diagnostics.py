@@ -21,10 +21,10 @@ from calibray.uncertainty.residual_correlation import variogram
 from calibray.validation.held_out_statistics import spatial_blocks
 
 CLASSES: Final = 6
-"""Largest number of distance classes, with about the same number of links each."""
+"""Largest number of distance classes; all classes contain about the same number of links."""
 
 MOST_UNKNOWNS: Final = 300
-"""Largest number of unknowns whose draws are compared pair by pair."""
+"""Largest number of unknowns for which the correlations of all pairs are computed."""
 
 
 STREETS: Final = 12
@@ -37,12 +37,13 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
     Returns:
         Tables by name, without those that cannot be computed. "distance", "depth" and "group": number of links, mean
         and standard deviation of the residuals [dB] on the calibration links; residuals are predicted minus measured in
-        the measured quantity. "obstruction" and "streets": the same by the length of the straight line below roofs, and
-        by neighbouring receivers. "missing_region": the rectangle whose extra loss would explain the largest part of
-        the residuals. "leverage": leverage and residual of every calibration link. "power": share of the links' power
-        by material and type of interaction. "trade_offs": correlation of the draws of each pair of unknowns.
+        the measured quantity. "obstruction" and "streets": the same, by the length of the straight line below roofs and
+        by groups of neighbouring receivers. "missing_region": the rectangle whose extra loss would explain the largest
+        part of the residuals. "leverage": leverage and residual of every calibration link. "power": share of the links'
+        power by material and type of interaction. "trade_offs": correlation of the draws of each pair of unknowns.
         "neighbours": semivariance of the residuals by distance between links, both ends counted. "moved": value of
-        every parameter before and after, with the change and the 95 % interval as shares of its range.
+        every parameter before and after calibration, with the change and the width of the 95 % interval as shares of
+        its range.
     """
     tables = {
         "distance": _by_distance(result),
@@ -149,7 +150,7 @@ def _by_street(result: Record) -> pd.DataFrame:
 
 
 def _missing_region(result: Record) -> pd.DataFrame:
-    """The rectangle of the remark on the calibrated model; without a remark, that of the prediction model."""
+    """The rectangle in the remark on the calibrated model; without a remark, the one found for the prediction model."""
     for remark in result.uncertainty.remarks:
         if remark.kind == RemarkKind.MISSING_REGION:
             return pd.DataFrame([{**remark.values, "significant": True}])
@@ -166,7 +167,7 @@ def _missing_region(result: Record) -> pd.DataFrame:
 
 @lru_cache(maxsize=4)
 def _searched(rows: bytes) -> MissingRegion | None:
-    """The region found from rows of both ends, excess loss and out of sight; cached, as a report needs it twice."""
+    """The region found from rows of both ends, excess loss and obstruction; cached, because a report uses it twice."""
     links = np.frombuffer(rows).reshape(-1, 8)
     return missing_region(links[:, :3], links[:, 3:6], links[:, 6], [links[:, 7]])
 

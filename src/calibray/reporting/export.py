@@ -30,14 +30,14 @@ FILES: Final = (
     "scene.xml", "load_scene.py", "calibration.json", "links.csv", "materials.csv", "materials.json", "materials.m",
 )  # fmt: skip
 VERIFIED_LINKS: Final = 3
-"""Number of links whose path loss is compared before an export is finished."""
+"""Number of links for which the path loss of the exported scene is verified."""
 
 SOLVER: Final = {"line_of_sight": "los", "samples": "samples_per_src"}
 """Settings that have a different name in Sionna RT's path solver."""
 
 MATLAB: Final = """function T = materials
 %MATERIALS Calibrated materials as a table, or as a structure in Octave.
-%   Constants apply at {frequency:.9g} Hz. lower and upper are the ends of 95 % intervals, NaN if unknown.
+%   Constants apply at {frequency:.9g} Hz. Columns _lower and _upper are the ends of 95 % intervals, NaN if unknown.
 %   For MATLAB's ray tracing: propagationModel("raytracing", "BuildingsMaterial", "custom", ...
 %     "BuildingsMaterialPermittivity", T.relative_permittivity(1), "BuildingsMaterialConductivity", T.conductivity(1))
 {columns}
@@ -56,12 +56,12 @@ def export(
     Args:
         result: The calibration.
         folder: Folder to write into; created if needed.
-        copy_meshes: Copy the meshes into the folder; otherwise the scene refers to the original files.
-        overwrite: Replace files that Calibray did not write.
+        copy_meshes: Copy the meshes into the folder; otherwise, the scene refers to the original files.
+        overwrite: Also replace files that Calibray did not write.
 
     Returns:
-        Names of the files in the folder. `wording.scene_alone_text` describes how far the scene alone is from the
-        predictions.
+        Names of the files in the folder. `wording.scene_alone_text` states the difference between the scene alone and
+        the predictions.
 
     Raises:
         InputError: The folder cannot be written, a file in it must not be replaced, the scene or the links can no
@@ -140,7 +140,7 @@ def matlab(materials: pd.DataFrame, frequency: float) -> str:
 
 
 def _rows(result: Record) -> Iterator[dict[str, Any]]:
-    """One row per material: the constants that predictions use, and interval and verdict of every calibrated one."""
+    """One row per material: its constants in predictions, and interval and verdict of each calibrated constant."""
     names = exported_names(result.scene_materials)
     for name, material in result.scene_materials.items():
         row: dict[str, Any] = {"material": name, "scene_name": names[name]}
@@ -166,7 +166,7 @@ def _rows(result: Record) -> Iterator[dict[str, Any]]:
 
 
 def _calibration(result: Record) -> dict[str, Any]:
-    """What the script needs in addition to the scene and the links."""
+    """Data that the script requires in addition to the scene and the links."""
     study = result.study
     tx, rx = study.antenna_pair
     names = exported_names(result.scene_materials)

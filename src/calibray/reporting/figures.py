@@ -1,4 +1,4 @@
-"""Figures of calibrations: the figures of the paper, and residuals."""
+"""Figures of calibrations: cost and convergence as in the paper, path loss, and residuals."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from calibray.support import figure_style as style
 from calibray.support.messages import shortened
 
 SYMBOLS: Final = 60
-"""Largest number of links that are drawn as symbols on a line."""
+"""Largest number of links that are drawn as symbols joined by a line."""
 
 FILE_ORDER: Final = 500
-"""Largest number of links that are drawn in the order of the study's file with held-out links shaded; more links are
-sorted."""
+"""Largest number of links that are drawn in the order of the study's file, with held-out links shaded. A larger number
+of links is sorted by measured path loss."""
 
 RASTERIZED: Final = 2000
-"""Largest number of points that are drawn as vectors; more points are rasterized."""
+"""Largest number of points that are drawn as vectors; a larger number is rasterized."""
 
 LONG: Final = 1000
 """Number of RT calls above which the axis is logarithmic, because the first calls reduce the RMSE most."""
 
 GROUPS: Final = 24
-"""Largest number of groups that are shown: those with the most links."""
+"""Largest number of groups shown; these are the groups with the most links."""
 
 
 @style.styled()
 def cumulative_cost(results: Mapping[str, Record]) -> Figure:
-    """Draw RT calls and time versus iterations (the paper's figure of cumulative cost)."""
+    """Draw RT calls and time versus iterations (the cumulative-cost figure of the paper)."""
     figure = Figure(figsize=(6.4, 4.2), dpi=150, layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
     for axes, column, y in zip(
@@ -54,7 +54,7 @@ def cumulative_cost(results: Mapping[str, Record]) -> Figure:
                 calls = result.history.groupby("iteration").size()
                 for first in calls[calls < calls.iloc[0]].index[:1]:
                     axes.axvline(
-                        first - 1, color=style.COLORS[method], ls="--", lw=1, label="surrogate takes over"
+                        first - 1, color=style.COLORS[method], ls="--", lw=1, label="start of the surrogate"
                     )
         axes.legend(frameon=False)
     if _unequal(results):
@@ -83,7 +83,7 @@ def convergence(results: Mapping[str, Record], optimum_db: float | None = None) 
 
 @style.styled()
 def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
-    """Draw the path loss of every link: measured, before and after calibration; all results have the same links."""
+    """Draw the measured path loss of every link, and the path loss modelled before and after calibration."""
     first = next(iter(results.values()))
     links = first.links
     few, many = len(links) <= SYMBOLS, len(links) > FILE_ORDER
@@ -165,7 +165,7 @@ def residual_by_group(survey: Survey) -> Figure:
 
 
 def result_figures(result: Record, links: Survey | None) -> dict[str, Figure]:
-    """All figures of a calibration by name; figures that need positions are absent without `links`."""
+    """All figures of a calibration by name; without `links`, the figures that require positions are omitted."""
     method = {result.study.method.name: result}
     figures = {
         "convergence": convergence(method),

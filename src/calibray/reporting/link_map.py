@@ -1,4 +1,4 @@
-"""Maps of links over the outlines of buildings: coloured by residual in the report, and as a file."""
+"""Maps of links over the outlines of buildings: in the report, coloured by residual, and as a separate file."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MOST_WALLS: Final = 20_000
 """Largest number of lines that are drawn for vertical faces, the longest first."""
 
 RAMP: Final = ("#1f5fa8", "#5b94cf", "#a9b4bd", "#e0953f", "#b34a00")
-"""Colours from negative to positive residuals; the ends are distinguishable with colour blindness."""
+"""Colours from negative to positive residuals; colour-blind readers can distinguish the two ends."""
 
 
 OUTLINED: Final = 400
@@ -150,7 +150,7 @@ def ramp_limit(value: NDArray[np.float64]) -> float:
 
 
 def _round(value: float, up: bool = False) -> float:
-    """The nearest of 1, 2, 5, 10, ... below a value, or above it."""
+    """The nearest number of the series 1, 2, 5, 10, ... below a value, or above it."""
     power = 10.0 ** np.floor(np.log10(value))
     steps = np.array([1.0, 2.0, 5.0, 10.0]) * power
     # A rounding error above a step must not lead to the next one.
@@ -208,7 +208,7 @@ def save_positions(
         tx: Transmitters [n, 3], [m]; repeated positions are drawn once.
         rx: Receivers [m, 3], [m].
         inputs: Files that are never replaced.
-        overwrite: Replace a file that Calibray did not write.
+        overwrite: Also replace a file that Calibray did not write.
 
     Raises:
         InputError: The file has an unknown suffix or must not be replaced, or the scene cannot be read.

@@ -1,4 +1,4 @@
-"""The links of a calibration in the form that the report shows: positions, groups and residuals."""
+"""The links of a calibration as shown in the report: positions, groups and residuals."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Survey:
 
     @property
     def residual_db(self) -> NDArray[np.float64]:
-        """Predicted minus measured, in the measured quantity [L], [dB]; NaN as described in `residual`."""
+        """Predicted minus measured value, in the measured quantity [L], [dB]; NaN as described in `residual`."""
         return residual(self.table, self.sign)
 
     @property
@@ -83,7 +83,7 @@ def measured_quantity(result: Record) -> Quantity:
 def in_measured_quantity(result: Record, name: str) -> NDArray[np.float64]:
     """Values of the links in the measured quantity [L], in its unit.
 
-    `name` selects them: "measured", "before", "after" or "predicted".
+    `name` selects the values: "measured", "before", "after" or "predicted".
     """
     path_loss_db, column = result.links[f"{name}_db"].to_numpy(float), _column(result)
     if column not in result.links:
@@ -102,9 +102,9 @@ def _column(result: Record) -> str:
 def residual(table: pd.DataFrame, sign: int) -> NDArray[np.float64]:
     """Predicted minus measured value of a result's links, in the measured quantity [L], [dB].
 
-    The sign is 1 if the quantity increases with path loss, otherwise -1. For links without a path, the fallback
-    predicts. NaN without a prediction, and for links near or below the noise floor: received ones have favourable
-    errors, and the others give only a bound.
+    The sign is 1 if the quantity increases with path loss, otherwise -1. The prediction for a link without a path is
+    that of the fallback. The residual is NaN without a prediction, and for links near or below the noise floor. Links
+    received near the floor have favourable errors; for the others, only a lower bound of path loss is known.
     """
     difference = table["predicted_db"].to_numpy(float) - table["measured_db"].to_numpy(float)
     return sign * np.where(np.isfinite(difference) & ~_faint(table), difference, np.nan)
@@ -115,7 +115,7 @@ def _faint(table: pd.DataFrame) -> NDArray[np.bool_]:
 
 
 def survey(result: Record) -> Survey | None:
-    """A calibration's links with their positions, from the result if it has them, otherwise from the measurements.
+    """A calibration's links with their positions, from the result if it contains them, otherwise from the measurements.
 
     None if the measurements cannot be read or have changed.
     """

@@ -1,7 +1,7 @@
 """The report of a calibration: a single HTML file that opens from disk and loads no other files.
 
-Names come from files and are not trusted: the template engine escapes text, `<`, `>` and `&` are escaped in embedded
-JSON, and a content security policy allows only the script whose checksum it names.
+Names come from files and are not trusted. The template engine escapes text; `<`, `>` and `&` are escaped in embedded
+JSON; and a content security policy allows only the script with the stated checksum.
 """
 
 from __future__ import annotations
@@ -45,32 +45,32 @@ from calibray.validation.validation import Validation, observables_table
 FILE: Final = "report.html"
 FIGURES: Final = "figures"
 WORST: Final = 10
-"""Number of links with the largest residuals that are listed."""
+"""Largest number of links in the table of the largest residuals."""
 
 CAPTIONS: Final = {
     "convergence": "RMSE of the best candidate so far versus RT calls (runs of the ray tracer over all links). It can "
     "rise if the objective is not the RMSE alone.",
     "cumulative-cost": "RT calls and time versus iterations of the method.",
-    "path-loss": "Path loss of every link: measured, before and after calibration.",
+    "path-loss": "Path loss of every link: measured, and modelled before and after calibration.",
     "residual-over-distance": "Residual (predicted minus measured) versus distance between the antennas.",
-    "possible-values": "Posterior of every parameter over its bounds. Wide line: 95 % interval. Dashed: value before "
-    "calibration. Solid: calibrated value.",
+    "possible-values": "Posterior of every parameter between its bounds. Wide line: 95 % interval. Dashed: value "
+    "before calibration. Solid: calibrated value.",
     "held-out-errors": "Cumulative distribution of the absolute errors of held-out links, by model. The best model is "
     "drawn in bold.",
     "held-out-blocks": "RMSE on each held-out block, by model.",
     "power": "Power by material and type of interaction: share of the links' power on paths that interact with the "
-    "material. A path counts for each of its interactions.",
+    "material. A path contributes to the share of each of its interactions.",
     "neighbours": "Semivariance of the residuals versus distance between links (both ends counted). Where it rises, "
     "neighbouring links share part of their errors.",
     "leverage": "Residual versus leverage. A link with a leverage near 1 determines an unknown almost alone, so its "
     "residual contains no information about its error.",
     "residual-by-depth": "Mean residual by the number of interactions of the strongest path, with two standard errors. "
     "Number of links in brackets.",
-    "observables": "Measured versus modelled values of further observables, link by link, without biases of devices. "
+    "observables": "Measured versus modelled values of further observables, link by link, without device biases. "
     "The line marks equal values.",
     "residual-by-direction": "Predicted minus measured path loss around each transmitter, by compass direction: points "
     "outside the black circle received more power than predicted. Orange: the stated pattern on the horizon, from its "
-    "maximum at the rim to 30 dB less at the centre.",
+    "maximum at the rim to 30 dB below the maximum at the centre.",
     "residual-by-group": "Residual by group: median, quartiles, and whiskers that contain 90 % of the links.",
 }
 
@@ -79,7 +79,7 @@ PICTURES: Final = tuple(f"{name}.{suffix}" for name in CAPTIONS for suffix in ("
 
 @dataclass(frozen=True)
 class PageData:
-    """What a page shows in addition to the result.
+    """Data of a page in addition to the result.
 
     Attributes:
         links: The links with positions; None if these are unknown.
@@ -107,11 +107,11 @@ def report(
     """Write the report of a calibration as one HTML file that opens from disk.
 
     Args:
-        result: The calibration; paths that it does not contain come from the cache or are traced.
-        file: File to write; an old one is replaced only once the new one is complete.
+        result: The calibration; paths that it does not contain are read from the cache or traced.
+        file: File to write; an existing file is replaced only when the new file is complete.
         figures: Folder for the figures as SVG and PNG, created if needed; figures of an earlier report are removed. If
             None, no separate figures are written.
-        overwrite: Replace files that Calibray did not write.
+        overwrite: Also replace files that Calibray did not write.
         progress: Called with the stage "tracing" after every launch.
 
     Raises:
@@ -140,7 +140,7 @@ def report(
 
 
 def collect(result: Record, progress: Progress | None = None) -> PageData:
-    """Collect what a page shows in addition to the result; unavailable items are listed and are not an error."""
+    """Collect the data of a page in addition to the result, and list the items that are not available."""
     study, missing = result.study, []
     links = survey(result)
     if links is not None and links.group is not None:
@@ -157,7 +157,7 @@ def collect(result: Record, progress: Progress | None = None) -> PageData:
     triangles = None if scene is None else read_triangles(scene)
     drawn = None
     if study.engine.external and result.paths is None:
-        missing.append(f"Paths: those of the engine {study.engine.name} are not stored.")
+        missing.append(f"Paths: the paths of the engine {study.engine.name} are not stored.")
     else:
         try:
             drawn = rays(result, progress)
@@ -222,12 +222,12 @@ def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
 
 
 def _title(study: Path) -> str:
-    """Name of a study: that of its folder if the file has the usual name."""
+    """Name of a study: the name of its folder if the file is called study.toml, otherwise the name of the file."""
     return (study.resolve().parent.name if study.stem == "study" else "") or study.stem
 
 
 def _breakable(name: str) -> Markup:
-    """A parameter's name, in which lines break only after the material."""
+    """A parameter's name that allows a line break only after the material."""
     material, dot, constant = name.rpartition(".")
     return escape(material) + dot + Markup("<wbr>") + escape(constant)
 

@@ -36,7 +36,7 @@ def heading(result: Record) -> str:
 
 
 def summary(result: Record) -> tuple[Table | str, ...]:
-    """What Python and notebooks display: heading, and tables of parameters, nuisances and accuracy."""
+    """Short form for Python and notebooks: heading, and tables of parameters, nuisances and accuracy."""
     parts = (parameters(result), nuisances(result), accuracy(result), observables(result))
     parts = (*parts, observables_table(result.accuracy.observables))
     return (f"{heading(result)}, {result.rt_calls:,} RT calls", *(table for table in parts if table.rows))
@@ -79,9 +79,9 @@ def _held_out(result: Record) -> tuple[str, str]:
 def suspicious_rows(
     without_path: Sequence[int], treatment: str, enclosed: EnclosedAntennas | None
 ) -> Iterator[tuple[str, str, str]]:
-    """Lines about links to check: what is counted, the number, and the rows with a remedy.
+    """Lines about links to check: label, number, and rows with a remedy.
 
-    The rows without a path are followed by their treatment. If `enclosed` is None, antennas were not checked.
+    `treatment` is appended to the rows without a path. If `enclosed` is None, antennas were not checked.
     """
     text = rows_text(without_path)
     yield "without a path", str(len(without_path)), text + treatment if text else ""
@@ -89,7 +89,7 @@ def suspicious_rows(
         return
     for end, rows in (("transmitter", enclosed.tx), ("receiver", enclosed.rx)):
         if enclosed.indoors:
-            remedy = "as for most receivers: assumed to be an indoor scene"
+            remedy = "like most receivers: the scene is assumed to be indoors"
         else:
             remedy = f"{rows_text(rows)}: check the positions"
         yield f"{end} inside a building", str(len(rows)), remedy if rows else ""
@@ -114,7 +114,7 @@ def parameters(result: Record) -> Table:
 
 
 def reasons(result: Record) -> Table:
-    """The reason for every verdict that has one."""
+    """The reasons for the verdicts."""
     rows = [
         (name, explanation_text(interval)) for name, interval in result.intervals.items() if interval.reason
     ]
@@ -181,7 +181,7 @@ def costs(result: Record) -> Table:
     cost = result.cost
     rows = [("RT calls", f"{cost.rt_calls:,}")]
     if cost.ledger_hits:
-        rows.append(("answered by the ledger", f"{cost.ledger_hits:,}"))
+        rows.append(("found in the ledger", f"{cost.ledger_hits:,}"))
     if result.study.engine.expensive and (failed := int((result.history.rmse_db == inf).sum())):
         rows.append(("failed, or a link lost its path", f"{failed:,}"))
     if cost.cheap_replays:
@@ -200,7 +200,7 @@ def costs(result: Record) -> Table:
 
 @dataclass(frozen=True)
 class Value:
-    """A parameter in the form of the report: text, and positions on a bar over its bounds.
+    """A parameter as shown in the report: text, and positions on a bar between its bounds.
 
     Attributes:
         name: Name of the parameter.
@@ -215,7 +215,7 @@ class Value:
         pieces: Ends of every piece of the interval on the bar, 0 to 1.
         reason: The reason for the verdict; empty if unknown.
         approximate: Whether the interval comes from an emulator of the engine.
-        predicted: The value that predictions use; empty if it is the calibrated one, or if predictions use no scene.
+        predicted: The value that predictions use; empty if it is the calibrated value, or if predictions use no scene.
     """
 
     name: str
@@ -239,7 +239,7 @@ class Value:
 
 
 def values(result: Record) -> list[Value]:
-    """The parameters of a calibration in the form of the report."""
+    """The parameters of a calibration as shown in the report."""
     entries, predicted = [], result.prediction.model.parameters
     for name, after in result.parameters.items():
         section, interval = result.study.parameters[name], result.intervals.get(name)

@@ -48,11 +48,11 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def findings(check: SceneCheck) -> list[Table]:
-    """The size of a scene with the verdict, and its defects if there are any."""
+    """The size of a scene with a verdict, and its defects, if any."""
     west, south, bottom, east, north, top = check.bounds
     errors = sum(finding.severity == "error" for finding in check.findings)
     warnings = sum(finding.severity == "warning" for finding in check.findings)
-    verdict = "cannot be used" if errors else "can be used, see the warnings" if warnings else "can be used"
+    verdict = "cannot be used" if errors else "can be used; see the warnings" if warnings else "can be used"
     size = Table(
         "",
         (Column(), Column()),
@@ -120,7 +120,7 @@ def overview(paths: Paths, row: NDArray[np.int64], enclosed: EnclosedAntennas | 
 
 
 def convergence(change: Convergence, row: NDArray[np.int64], tolerance_db: float) -> tuple[Table | str, ...]:
-    """How path loss changed in a trace with more samples: a summary, the links that changed most, and a verdict.
+    """Change of path loss in a trace with more samples: a summary, the links with the largest changes, and a verdict.
 
     Links are named by their rows in the source file [L]; `tolerance_db` is the largest acceptable change [dB].
     """
@@ -137,7 +137,7 @@ def last_round(settings: Mapping[str, object], tolerance_db: float) -> str:
     """
     rays, change = int(str(settings["rays"])), float(str(settings["last_round_db"]))
     if not rays:
-        return "Converged: only direct paths were searched, and these need no rays."
+        return "Converged: only direct paths were searched, which requires no rays."
     text = f"{rays:,} rays per position; the second half of them changed"
     tolerance = f"(fidelity.tolerance_db = {tolerance_db:g})"
     if change <= tolerance_db:

@@ -25,7 +25,7 @@ from calibray.validation.validation import Validation
 Kind = Literal["plain", "good", "caution"]
 
 RARE: Final = 0.05
-"""Share of links with paths that interact with a material, below which the advice is to measure more of them."""
+"""If a smaller share of the links has paths that interact with a material, the advice is to measure more such links."""
 
 LISTED_VALUES: Final = 6
 """Largest number of identified values that are listed."""
@@ -45,7 +45,7 @@ class Sentence:
     Attributes:
         heading: The question that the sentence answers; empty if it continues the previous answer.
         text: The answer.
-        kind: Whether it is neutral, good news, or a caution.
+        kind: Whether the answer is neutral, favourable, or a caution.
     """
 
     heading: str
@@ -88,7 +88,7 @@ def _fit(result: Record) -> Sentence:
     )
     if result.fit.nuisance_only_rmse_db is not None:
         text += (
-            f" The initial materials with fitted offsets or other nuisances give "
+            f" With the initial materials and fitted offsets or other nuisances, it is "
             f"{result.fit.nuisance_only_rmse_db:.2f} dB."
         )
     return Sentence("How well does it fit?", text)
@@ -104,11 +104,11 @@ def _held_out_accuracy(result: Record) -> Sentence:
         text = f"{block_sentence(validation)} The best model is {validation.best!r} with {best_db:.2f} dB."
         if validation.chosen != result.prediction.model.name:
             text += (
-                f" The blocks choose the model {str(validation.chosen)!r}, which predictions do not use yet: run the "
-                "study again with [holdout] blocks."
+                f" On the blocks, the model {str(validation.chosen)!r} is chosen, which predictions do not use yet. To "
+                "use it, run the study again with [holdout] blocks."
             )
     if judgement is None:
-        by_filter = f"{UNKNOWN_BEST} Hold out links by [holdout] where."
+        by_filter = f"{UNKNOWN_BEST} Hold out links with [holdout] where."
         return Sentence(heading, NOT_JUDGED if result.study.allows_blocks else by_filter, "caution")
     return Sentence(
         heading, f"{judgement_text(judgement)} {text}".strip(), "good" if judgement.helped else "caution"
@@ -121,7 +121,7 @@ def _certainty(result: Record) -> Iterator[Sentence]:
         yield Sentence(
             heading,
             f"Unknown: the engine {result.study.engine.name} gives no derivatives, so there are no intervals. "
-            "The values fit best among those that were tried; the true values may be far away.",
+            "The values fit best among those that were tried; the true values can be very different.",
             "caution",
         )
         return
@@ -151,7 +151,7 @@ def _certainty(result: Record) -> Iterator[Sentence]:
             yield Sentence(
                 "",
                 f"Calibrated values outside their intervals: {names}. They have the lowest RMSE, but nearly all "
-                "probable values are inside. Do not use them as constants of the materials.",
+                "probable values are inside the intervals. Do not use the calibrated values as material constants.",
                 "caution",
             )
 

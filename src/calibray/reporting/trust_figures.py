@@ -25,10 +25,10 @@ PARAMETERS: Final = 12
 """Largest number of parameters that are shown, the least certain first."""
 
 BARS: Final = 36
-"""Number of bars of the histogram over a parameter's bounds."""
+"""Number of bars in the histogram between a parameter's bounds."""
 
 ROWS: Final = 14
-"""Largest number of rows of the figure of power."""
+"""Largest number of rows in the power figure."""
 
 PANELS: Final = 6
 """Largest number of panels of a figure, one for each observable or each of the transmitters with the most links."""
@@ -38,7 +38,7 @@ DEEPEST_DB: Final = -30.0
 
 
 def trust_figures(result: Record) -> dict[str, Figure]:
-    """Draw the figures for which the calibration has data."""
+    """Draw the figures for which the calibration contains data."""
     tables, figures = diagnostics(result), {}
     if all(len(result.uncertainty.draws.get(name, ())) > 1 for name in result.parameters):
         figures["possible-values"] = possible_values(result)
@@ -56,7 +56,7 @@ def trust_figures(result: Record) -> dict[str, Figure]:
 
 @style.styled()
 def possible_values(result: Record) -> Figure:
-    """Draw the posterior of every parameter over its bounds, with its 95 % interval."""
+    """Draw the posterior of every parameter between its bounds, with its 95 % interval."""
     names = sorted(result.parameters, key=lambda name: -_spread(result, name))[:PARAMETERS]
     columns = min(3, len(names))
     rows = -(-len(names) // columns)
@@ -197,7 +197,7 @@ def by_depth(table: pd.DataFrame) -> Figure:
 
 
 def residuals_by_direction(result: Record) -> Figure | None:
-    """Draw the residuals of links versus the direction from their transmitter, with its pattern on the horizon.
+    """Draw the residuals of links versus direction from their transmitter, with its antenna pattern on the horizon.
 
     None if the study does not state the mounting of transmitters, or its links cannot be read.
     """
@@ -260,7 +260,7 @@ def _polar_figures(
 
 
 def _pattern_db(mounting: Mounting, link: int, bearing: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gain on the horizon of the antenna of one link, relative to its maximum on the horizon [n], [dB]."""
+    """Gain of one link's antenna on the horizon, relative to its maximum on the horizon [n], [dB]."""
     on_link = mounting.of_paths(np.full(len(bearing), link))
     pose = Pose(*on_link.pose)
     # On the horizon; azimuths are measured anticlockwise from the east, bearings clockwise from the north.

@@ -1,6 +1,7 @@
 """Data of the report's 3-D viewer: the scene and the strongest paths of every link, packed as text.
 
-Positions are rounded to a grid over the scene with 65,536 points in each direction: 3 cm apart in a scene of 2 km.
+Positions are rounded to a grid over the scene with 65,536 points in each direction, which are 3 cm apart in a scene of
+2 km.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ PER_LINK: Final = 12
 """Largest number of paths per link that are shown."""
 
 INTERACTIONS: Final = 400_000
-"""Largest number of interactions that are shown in total; in larger scenes, fewer paths per link are shown."""
+"""Largest total number of interactions that are shown; if there are more, fewer paths per link are shown."""
 
 TRIANGLES: Final = 250_000
 """Largest number of triangles that are drawn, the largest first."""
@@ -39,7 +40,7 @@ class Rays:
     Attributes:
         paths: The strongest paths of every link, strongest first.
         vertex: Interaction points of the paths [I, 3], [m].
-        gain_db: Power gain of the paths with the materials that exports write, without nuisances [P], [dB].
+        gain_db: Power gain of the paths with the exported materials, without nuisances [P], [dB].
         per_link: Largest number of paths per link.
         traced: Number of traced paths.
         links_by_material: Number of links with at least one traced path that interacts with the material, by material.
@@ -54,7 +55,7 @@ class Rays:
 
 
 def rays(result: Record, progress: Progress | None = None) -> Rays:
-    """Find the strongest paths of every link; those that the result lacks come from the cache or are traced.
+    """Find the strongest paths of every link; paths missing from the result are read from the cache or traced.
 
     Raises:
         InputError: The scene or the links of the study can no longer be used.
@@ -67,7 +68,7 @@ def rays(result: Record, progress: Progress | None = None) -> Rays:
 
 
 def strongest(paths: Paths, result: Record) -> Rays:
-    """Select the strongest paths of every link, with the materials that exports write."""
+    """Select the strongest paths of every link with the exported materials."""
     gain = path_gains(paths, result.scene_materials).reshape(paths.num_paths, -1)
     # Summed over receive ports and averaged over transmit ports, as in path loss.
     power = (np.abs(gain) ** 2).sum(axis=1) / paths.tx_field.shape[1]
@@ -120,7 +121,7 @@ def packed(
 ) -> dict[str, Any]:
     """Data that the viewer draws; arrays are little-endian integers in base64.
 
-    `materials` are those of the scene, in its order; triangles and rays are None if not available.
+    `materials` are the materials of the scene, in its order; triangles and rays are None if not available.
     """
     points = [survey.tx, survey.rx]
     if triangles is not None and len(triangles.face):

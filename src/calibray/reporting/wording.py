@@ -24,7 +24,7 @@ from calibray.uncertainty.verdicts import TRADE_OFF
 
 
 def prediction_text(record: Record) -> str:
-    """The model that predictions use, as one or two sentences."""
+    """The prediction model, described in one or two sentences."""
     model = record.prediction.model
     if model.parameters is None:
         source = _unused(record)
@@ -54,7 +54,7 @@ _AVERAGED: Final = {
 
 
 def _unused(record: Record) -> str:
-    """What a prediction model without materials ignores; the one with obstruction uses walls and roofs."""
+    """Inputs that a prediction model without materials lacks; the model with obstruction uses walls and roofs."""
     return "no materials" if record.prediction.model.name == Model.OBSTRUCTION else "no scene"
 
 
@@ -77,9 +77,9 @@ def group_text(record: Record, label: str) -> str:
 
 
 def scene_alone_text(record: Record) -> str:
-    """How far the exported scene alone is from the predictions.
+    """The difference between the exported scene alone and the predictions.
 
-    One or two sentences; empty if the scene alone reproduces the predictions.
+    The text has one or two sentences, and is empty if the scene alone reproduces the predictions.
     """
     links, model = record.links, record.prediction.model
     scene_db, predicted_db = (links[name].to_numpy(float) for name in ("scene_db", "predicted_db"))
@@ -91,7 +91,7 @@ def scene_alone_text(record: Record) -> str:
         ""
         if field is None
         else f" Within about {field.range_m:.3g} m of measured links, predictions also add the "
-        f"correlated part of their residuals ({field.shared_db:.2f} dB RMS), which no scene contains."
+        f"correlated part of their residuals ({field.shared_db:.2f} dB RMS), which a scene cannot contain."
     )
     if record.study.engine.external and model.parameters is not None:
         return (
@@ -119,14 +119,14 @@ def scene_alone_text(record: Record) -> str:
     rms = f"{rms_db:.2f} dB (RMS over {counted(len(difference), 'link')}; {spread_db:.2f} dB after subtracting {mean})"
     if model.parameters is None:
         return (
-            f"Predictions use the model {str(model.name)!r}, which uses {_unused(record)}. The exported scene has the "
-            f"calibrated materials; its path loss differs from the predictions by {rms}.{near}"
+            f"Predictions use the model {str(model.name)!r}, which uses {_unused(record)}. The exported scene contains "
+            f"the calibrated materials; its path loss differs from the predictions by {rms}.{near}"
         )
     return f"The exported scene alone differs from the predictions by {rms}: a scene cannot contain {cause}.{near}"
 
 
 def method_text(record: Record, name: str) -> str:
-    """The name of a method of a calibration, and what `auto` did."""
+    """The name of a calibration's method; for `auto` on an expensive engine, also the method that was used."""
     if name != AUTO or not record.study.engine.expensive:
         return label(name)
     if record.study.engine.exports_rays:
@@ -135,14 +135,14 @@ def method_text(record: Record, name: str) -> str:
 
 
 def sampling_text(record: Record) -> str:
-    """Reasons why the exported scene can give a path loss that differs from the reported one; empty without any."""
+    """Reasons why the path loss of the exported scene can differ from the reported one; empty if there are none."""
     trace, model = record.study.trace, record.prediction.model
     calibrated = model.parameters is None or model.parameters == record.parameters
     causes = []
     if trace.adaptive:
         causes.append(
             f"The exported script launches {type(trace).samples:,} rays, but a calibration with trace.samples "
-            '= "auto" adds as many as it needs.'
+            '= "auto" adds as many as necessary.'
         )
     # Paths that were traced again with the calibrated materials are those of the exported scene.
     sampled = record.study.engine.name == "replay" and (trace.refraction or trace.diffuse_reflection)
@@ -155,7 +155,7 @@ def sampling_text(record: Record) -> str:
 
 
 def held_out_text(record: Record) -> str:
-    """How many links were held out."""
+    """The number of held-out links, as text."""
     held_out = record.held_out
     if held_out is None:
         return f"{record.counts['held_out']:,} of them held out"
@@ -163,7 +163,7 @@ def held_out_text(record: Record) -> str:
 
 
 def block_sentence(held_out: HeldOutErrors) -> str:
-    """How many blocks were held out."""
+    """The number of held-out blocks, as a sentence."""
     return f"{len(held_out.labels)} blocks of links were held out in turn."
 
 
@@ -261,7 +261,7 @@ def _missing_region_text(table: pd.DataFrame) -> str:
     return (
         f"losses of {row['attenuation']:.2g} dB/m within x = {row['west']:.0f} to {row['east']:.0f} m, "
         f"y = {row['south']:.0f} to {row['north']:.0f} m would explain {percent(float(row['share']))} of the mean "
-        f"square of the residuals (chance alone {percent(float(row['chance']))})"
+        f"square of the residuals (by chance alone: {percent(float(row['chance']))})"
     )
 
 

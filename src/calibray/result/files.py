@@ -1,4 +1,4 @@
-"""Writes the files of a result, each complete or not at all, and reads and validates them."""
+"""Writing, reading and validation of the files of a result; each file is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -68,14 +68,14 @@ COLUMNS: Final = {"result-links.csv": LINKS, "result-history.csv": HISTORY}
 """Columns of each file and the NumPy kind of their values: integer, float or Boolean."""
 
 OPTIONAL: Final = ("leverage", "depth", "out_of_sight", "obstruction_m", "region_m")
-"""Optional columns of numbers."""
+"""Optional numeric columns."""
 
 FINITE: Final = ("measured_db", "log_distance_db", "best_db", "seconds")
 """Columns with only finite values; in other columns, the value of a link without a path can be infinite or empty."""
 
 
 class LinkCounts(Section):
-    """Numbers of links, for people who read the file; see `Record.counts`. `read` ignores this section."""
+    """Numbers of links, for human readers; see `Record.counts`. `read` ignores this section."""
 
     calibrated_on: Count
     held_out: Count
@@ -87,7 +87,7 @@ class LinkCounts(Section):
 class Stored(Section):
     """The content of `result.json`: the sections of a `Record`.
 
-    `study_from_here` is the path of the study file relative to the result's folder, because both may move together.
+    `study_from_here` is the path of the study file relative to the result's folder, so that both can be moved together.
     """
 
     version: Literal[1]
@@ -112,9 +112,9 @@ SECTIONS: Final = ("fit", "accuracy", "uncertainty", "nuisance", "prediction", "
 def content(
     record: Record, sentences: tuple[str, ...] = (), files: dict[str, str] | None = None
 ) -> dict[str, Any]:
-    """The content of `result.json`: everything in a result except its tables, plus its remarks as sentences.
+    """The content of `result.json`: all sections of a result except its tables, and its remarks as sentences.
 
-    `files` has the SHA-256 of the other files of the result, by name, if these are already written.
+    `files` contains the SHA-256 digests of the other files of the result, by name, if these are already written.
     """
     parts = {name: getattr(record, name) for name in SECTIONS}
     values = {name: TypeAdapter(type(part)).dump_python(part, mode="json") for name, part in parts.items()}
@@ -141,7 +141,7 @@ def write(
 
     Each file is written under a temporary name and then renamed, so every file is complete or absent. `result.json` is
     written last and contains the digests of the other files: if the run is killed before that, `read` rejects the
-    mixture of two runs. `sentences` and the figures in `validation` are for people; `read` ignores them.
+    mixture of two runs. `sentences` and the figures in `validation` are for human readers; `read` ignores them.
 
     Raises:
         InputError: The folder cannot be written, or a file there must not be replaced.
@@ -170,7 +170,7 @@ def write(
         write_text(target / RESULT_FILE, json.dumps(stored, indent=2) + "\n")
     except OSError as error:
         raise InputError(
-            f"output folder {target}: cannot be written ({error.strerror}); name another"
+            f"output folder {target}: cannot be written ({error.strerror}); choose another folder"
         ) from None
 
 
@@ -212,7 +212,7 @@ def _check_one_run(folder: Path, digests: dict[str, str], allow_edits: bool) -> 
             )
         if not allow_edits:
             raise InputError(
-                f"{file}: differs from the file that {RESULT_FILE} was written with; run the study again, or give "
+                f"{file}: has changed since {RESULT_FILE} was written; run the study again, or give "
                 "--allow-changed-inputs (allow_changed_inputs=True)"
             )
 
@@ -308,7 +308,7 @@ def check_same_study(study: Study, folder: Path) -> None:
 
 
 def write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figures: dict[str, Any]) -> None:
-    """Write the held-out errors of a study to a folder; the figures are for people who read the file.
+    """Write the held-out errors of a study to a folder; the figures are for human readers.
 
     Raises:
         InputError: The folder contains a result of another study or of different links, or an unreadable result.
@@ -319,8 +319,8 @@ def write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figure
         if not _same(held_out.measured_db, measured_db):
             raise InputError(
                 f"{folder}: its result has different links ({len(measured_db)}, but the validation has "
-                f"{len(held_out.measured_db)}); give another folder, or run the study again, and set [holdout] by if "
-                "--by separates rows of one link"
+                f"{len(held_out.measured_db)}); give another folder, or run the study again. If --by separates "
+                "rows of one link, also set [holdout] by"
             )
     _write_validation(held_out, study, folder, figures)
 
@@ -348,7 +348,7 @@ def _rounded(values: NDArray[np.float64]) -> list[float | None]:
 
 
 def _problem_digest(study: Study) -> str:
-    """SHA-256 of a study without its hold-out, and without method, seed and engine, which `run` may change."""
+    """SHA-256 digest of a study without its hold-out, and without method, seed and engine, which `run` can change."""
     content = {
         key: value for key, value in study.content().items() if key not in ("method", "engine", "holdout")
     }

@@ -34,7 +34,7 @@ WITHOUT_MATERIALS: Final = (Model.LOG_DISTANCE, Model.OBSTRUCTION)
 """Models that use no paths; the second one uses the walls and roofs of the scene."""
 
 BASELINES: Final = (Model.INITIAL, *WITHOUT_MATERIALS, Model.KRIGING)
-"""Models that calibrate no material."""
+"""Models without calibrated materials."""
 
 FITTED: Final = (Model.CALIBRATED, Model.PRIOR, Model.OFFSETS)
 """Models that calibrate materials and can predict any link."""
@@ -44,8 +44,8 @@ AVERAGES: Final[dict[str, tuple[Model, Model]]] = {
     Model.AVERAGE_CALIBRATED: (Model.CALIBRATED, Model.PRIOR),
     Model.AVERAGE_OFFSETS: (Model.CALIBRATED, Model.OFFSETS),
 }
-"""The two models whose path loss each average combines. If an average is chosen, an exported scene has the materials of
-the first one."""
+"""The two models whose path losses are averaged. If an average is chosen, an exported scene contains the materials of
+the first model."""
 
 AVERAGE_OF: Final[dict[str, Model]] = {
     Model.INITIAL: Model.AVERAGE_INITIAL,
@@ -85,7 +85,8 @@ class HeldOutErrors:
         position: Positions of the end that moves [links, 3], [m]; see `moving_end`.
         measured_db: Measured path loss [links], [dB].
         level: Nominal coverage of the intervals.
-        observables: Errors of the further observables by name; empty in a loaded result, where `Accuracy` has them.
+        observables: Errors of the further observables by name; empty in a loaded result, where `Accuracy` contains
+            them.
     """
 
     labels: tuple[str, ...]
@@ -99,7 +100,7 @@ class HeldOutErrors:
 
 @dataclass(frozen=True)
 class Judgement:
-    """Comparison of the calibrated model with its best baseline, on links to which neither was fitted.
+    """Comparison of the calibrated model with the best baseline, on links to which neither was fitted.
 
     Attributes:
         links: Number of links.
@@ -132,10 +133,10 @@ class Judgement:
 
 
 NO_PATH: Final = "no path"
-"""Beginning of the column `basis` of predictions for links without a path."""
+"""Beginning of the text in the column `basis` of predictions for links without a path."""
 
 NEW_GROUP: Final = "group without measurements"
-"""Part of the column `basis` of predictions for links whose offset is the mean of the measured groups."""
+"""Part of the text in the column `basis` of predictions for links whose offset is the mean of the measured groups."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,8 @@ class FittedTerm:
         name: Name of the term.
         by: Column of the term: "constant", "log_distance", or a column of the links' table.
         per: Groups of the term: "offset" for the groups of the study's offset, "transmitter", a column, or "" for none.
-        coefficients: Coefficient by group, [dB] per unit of the column; other groups get the mean of these.
+        coefficients: Coefficient by group, [dB] per unit of the column; for other groups, the mean of these
+            coefficients is used.
         centre: Value that is subtracted from the column.
         spread_db: Standard deviation between the groups of a random effect, [dB] per unit of the column; if None, the
             standard deviation of the coefficients is used.
@@ -169,7 +171,7 @@ class BlockErrors:
         between_db: Standard deviation of the error that the links of a new block have in common [dB].
         blocks: Number of blocks.
         reach_m: 90 % quantile of the distance from a held-out link to the nearest calibration link [m].
-        groups_db: RMS contribution to these errors by the random effects of groups that occur in one block only [dB].
+        groups_db: RMS contribution to these errors from the random effects of groups that occur in only one block [dB].
         out_of_sight: RMS error of links out of sight divided by that of all links; at least 1.
     """
 
@@ -193,7 +195,7 @@ class PredictionModel:
         basis: Description of the links on which these residuals were computed.
         links: Number of these links, or degrees of freedom if they are calibration links.
         sizes_db: Absolute held-out residuals, ascending [dB]; 400 quantiles if there are more than 400 residuals.
-        blocks: Standard deviations of these residuals at two levels; None if no links or too few were held out.
+        blocks: Standard deviations of these residuals at two levels; None if too few links were held out.
         averaged: Second set of parameter values, if path loss is the average over two sets; otherwise None.
     """
 

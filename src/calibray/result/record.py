@@ -38,7 +38,7 @@ class ObservableFit:
     """Accuracy of the calibrated model for a further observable, on the calibration links.
 
     Attributes:
-        kind: What was measured.
+        kind: Kind of the observable.
         unit: Unit of the observable.
         links: Number of calibration links with a value.
         rmse: RMSE of the calibrated model.
@@ -68,7 +68,7 @@ class Fit:
         parameters: Calibrated values by parameter, in the units of the parameters.
         initial_parameters: Values before calibration.
         materials: All materials of the scene at the study's carrier, with the calibrated values.
-        laws: Coefficients itu_a to itu_d of ITU-R P.2040 by material, for laws with a coefficient among the parameters.
+        laws: Coefficients itu_a to itu_d of ITU-R P.2040 by material, for laws with a calibrated coefficient.
         rmse_db: RMSE over the calibration links (paper eq. 1) [dB].
         initial_rmse_db: RMSE with the initial materials and no nuisance [dB].
         nuisance_only_rmse_db: RMSE with the initial materials and fitted nuisances [dB]; None without nuisances.
@@ -76,7 +76,8 @@ class Fit:
         retrace_gap_db: Largest change of a calibration link's path loss when the scene is traced again with the
             calibrated materials [dB]; None if the paths do not depend on the materials.
         power_shares: Share of the links' power by material and kind of interaction; "line of sight" for paths without
-            interaction. The shares can add up to more than 1, because a path counts for each of its interactions.
+            interaction. The shares can add up to more than 1, because a path contributes to the share of each of its
+            interactions.
         observables: Accuracy for the further observables by name.
     """
 
@@ -116,11 +117,11 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """How reliable the calibrated values are.
+    """Reliability of the calibrated values.
 
     Attributes:
         intervals: 95 % interval and verdict by parameter.
-        draws: Draws from the posterior by parameter, constant and nuisance coefficient; empty if none could be made.
+        draws: Draws from the posterior by parameter, constant and nuisance coefficient; empty if there are none.
         constants_db: Constants that the scene fixes and that vary in the draws, each with the change in path loss per
             standard deviation of the constant [dB].
         noise: Posterior weights of the noise models and of an undeclared offset.
@@ -182,13 +183,13 @@ class Cost:
     """Number of RT calls and replays, and the time taken.
 
     Attributes:
-        rt_calls: RT calls of the method, including those answered by the ledger.
-        ledger_hits: RT calls that the ledger answered.
+        rt_calls: RT calls of the method, including those found in the ledger.
+        ledger_hits: RT calls that were found in the ledger.
         seconds: Time taken by the method, excluding tracing [s].
         trace_seconds: Time taken by tracing and loading before the search [s].
         uncertainty_replays: Number of replays for intervals and draws.
         uncertainty_seconds: Time taken by intervals and draws [s].
-        cheap_replays: Number of replays of the cheap model; none of them is an RT call.
+        cheap_replays: Number of replays of the cheap model, which are not RT calls.
         cheap_seconds: Time taken by the replays of the cheap model [s].
         total_seconds: Time taken by the whole calibration, with validation [s]; 0 if unknown.
     """
@@ -235,8 +236,8 @@ class Record:
         links: One row per link: row in the source file; path loss [dB] as measured, before and after calibration, by
             the log-distance model, by the prediction model (by the fallback for links without a path), and by the scene
             of the prediction model alone; has_path; held_out; change in path loss when traced again [dB]; positions
-            tx_x to rx_z [m]. Where they apply: group, frequency [Hz], path loss with the nuisances alone [dB], values
-            in the measured quantity, leverage, depth, and whether the link is censored or near the noise floor.
+            tx_x to rx_z [m]. If applicable: group, frequency [Hz], path loss with the nuisances alone [dB], values in
+            the measured quantity, leverage, depth, and whether the link is censored or near the noise floor.
         history: One row per RT call: number, iteration, RMSE, best so far, seconds since the start.
         held_out: Held-out errors of every model, if blocks were held out in turn; None otherwise.
         scene: The scene as it was read; None in a loaded result.
@@ -279,12 +280,12 @@ class Record:
 
     @property
     def scene_materials(self) -> dict[str, Material]:
-        """The materials that exports write: those of the prediction model, or the calibrated ones if it has none."""
+        """The exported materials: those of the prediction model, or the calibrated ones if it uses no scene."""
         return self.materials if self.prediction.materials is None else self.prediction.materials
 
     @property
     def scene_laws(self) -> dict[str, dict[str, float]]:
-        """Coefficients of ITU-R P.2040 by material, as in `Fit.laws`, that give the constants of `scene_materials`."""
+        """Coefficients of ITU-R P.2040 by material, as in `Fit.laws`, for the constants of `scene_materials`."""
         # The values of the prediction model may differ from the calibrated ones.
         values = self.prediction.model.parameters or {}
         return {
@@ -309,14 +310,14 @@ class Record:
 
     @property
     def rt_calls(self) -> int:
-        """RT calls of the method, including those answered by the ledger."""
+        """RT calls of the method, including those found in the ledger."""
         return self.cost.rt_calls
 
     @property
     def counts(self) -> dict[str, Any]:
         """Numbers of links, and rows with possible problems.
 
-        Held-out links count only if the hold-out RMSE includes them.
+        Held-out links are counted only if the hold-out RMSE includes them.
         """
         has_path = self.links["has_path"].to_numpy(bool)
         held_out = self.links["held_out"].to_numpy(bool)

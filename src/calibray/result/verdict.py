@@ -1,4 +1,4 @@
-"""Verdicts: what the measurements show about one parameter, as data. `wording` turns them into sentences."""
+"""Verdicts on parameters, as data; `wording` converts them to sentences."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from enum import StrEnum
 from typing import Final
 
 CONFIDENCE: Final = 0.95
-"""Probability of the intervals that a result reports."""
+"""Probability of the intervals in a result."""
 
 
 class Verdict(StrEnum):
-    """What the measurements show about a parameter."""
+    """The verdict on a parameter."""
 
     IDENTIFIED = "identified"
     WEAKLY_IDENTIFIED = "weakly identified"
@@ -56,7 +56,7 @@ class Reason:
     Attributes:
         kind: The kind of reason.
         values: Numbers and names for the sentence; see `ReasonKind`.
-        ranges: Ranges or modes that the reason names, each with its weight last.
+        ranges: Ranges or modes in the sentence; the last number of each is its weight.
     """
 
     kind: ReasonKind
@@ -66,7 +66,7 @@ class Reason:
 
 @dataclass(frozen=True)
 class Interval:
-    """How well the links determine one parameter.
+    """The 95 % interval of one parameter, with its verdict.
 
     Attributes:
         standard_error: Standard error from the curvature of the sum of squares at the optimum, in the parameter's unit.
@@ -75,10 +75,11 @@ class Interval:
         verdict: The verdict on the parameter.
         pieces: Lower and upper end of every piece, ascending, if the interval was computed from draws.
         reason: The reason for the verdict.
-        approximate: Whether the interval comes from an emulator, because the engine gives no derivatives.
-        seen: Pieces of the 95 % interval for the buildings that the links' paths meet; predictions use these. Empty if
-            they equal the pieces for the mean over all buildings of this material.
-        without: Share of the width that would remain if a cause were ruled out, by cause; only for causes that matter.
+        approximate: Whether the interval comes from an emulator, because the engine provides no derivatives.
+        seen: Pieces of the 95 % interval for the buildings on the links' paths; predictions use these buildings. Empty
+            if they equal the pieces for the mean over all buildings of this material.
+        without: Share of the width that would remain if a cause were ruled out, by cause; only for causes with a
+            noticeable effect.
     """
 
     standard_error: float

@@ -14,7 +14,7 @@ MOST_ODDS: Final = 1000.0
 """Largest odds that are reported as a number."""
 
 CLEAR_ODDS: Final = 2.0
-"""Odds below which two candidates count as about equally probable: log densities of draws of one Gaussian
+"""Odds below which two candidates are considered about equally probable. The log densities of draws of one Gaussian
 parameter have a standard deviation of sqrt(1/2), nearly ln 2."""
 
 SHOWN_PIECES: Final = 3
@@ -24,7 +24,7 @@ SHOWN_GROUPS: Final = 4
 """Largest number of groups that a remark lists."""
 
 UNKNOWN_BEST: Final = (
-    "No errors on held-out links are known, so nothing shows which model predicts new links best."
+    "No errors on held-out links are known, so it is unknown which model predicts new links best."
 )
 NOT_JUDGED: Final = f"{UNKNOWN_BEST} Set [holdout] blocks = 4, or run calibray validate."
 
@@ -42,7 +42,10 @@ def reason_text(reason: Reason | None) -> str:
 
 
 def explanation_text(interval: Interval) -> str:
-    """The reason for a verdict, and what would narrow the interval: clauses without a full stop; empty if none."""
+    """The reason for a verdict, and the assumptions that would narrow the interval.
+
+    The text consists of clauses without a full stop. It is empty if there are none.
+    """
     clauses = [reason_text(interval.reason)]
     if interval.seen:
         ends = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in interval.seen[:SHOWN_PIECES])
@@ -56,11 +59,11 @@ def explanation_text(interval: Interval) -> str:
 
 
 _STATEMENTS: Final = {
-    Cause.BUILDINGS: "if all buildings were known to be equal (noise.heterogeneity = 0),",
+    Cause.BUILDINGS: "if all buildings were known to be identical (noise.heterogeneity = 0),",
     Cause.CORRELATION: "if errors of neighbouring links were known to be independent (noise.range_m = 0),",
     Cause.MISSING_PATHS: "if errors were known not to be larger out of sight (noise.range_m = 0),",
     Cause.HEAVY_TAILS: "if errors were known to be Gaussian (noise.kind = 'gaussian'),",
-    Cause.OFFSET: "if there were known to be no offset ([offset] with narrow bounds),",
+    Cause.OFFSET: "if the offset were known to be zero ([offset] with narrow bounds),",
     Cause.CONSTANTS: "if the scene's other constants were exact (noise.constants_spread = 0), at most",
 }
 
@@ -73,7 +76,7 @@ def _width(values: dict[str, Any], ranges: tuple[tuple[float, ...], ...]) -> str
     text = f"90 % of the posterior covers {percent(values['share'])} of {_range(values)}"
     if ranges:
         others = ", ".join(
-            f"{low:.4g} to {high:.4g} ({percent(weight)} of it)" for low, high, weight in ranges
+            f"{low:.4g} to {high:.4g} ({percent(weight)} of the posterior)" for low, high, weight in ranges
         )
         text += f"; the 95 % interval also includes {others}"
     return text
@@ -88,8 +91,8 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
     ReasonKind.WIDTH: _width,
     ReasonKind.SEPARATE_RANGES: _separate,
     ReasonKind.SEEN_BUILDINGS: lambda values, _: (
-        f"for the measured buildings the value is known to {percent(values['share'])} of {_range(values)}; other "
-        "buildings of this material may differ"
+        f"for the measured buildings, the value is known to within {percent(values['share'])} of {_range(values)}; "
+        "other buildings of this material may differ"
     ),
     ReasonKind.AT_BOUND: lambda values, _: (
         f"the interval reaches the {values['side']} bound: the links only show that the value is "
@@ -103,7 +106,7 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
     ),
     ReasonKind.CONFOUNDED: lambda values, _: (
         f"path loss changes by up to {values['change_db']:.1f} dB over the range, but other unknowns can compensate: "
-        "an offset, or errors that links share"
+        "an offset, or errors shared by links"
     ),
     ReasonKind.NOISE: lambda values, _: (
         f"path loss changes by up to {values['change_db']:.1f} dB over the range, too little compared with noise of "
@@ -127,7 +130,7 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
 
 
 def remark_text(remark: Remark) -> str:
-    """A warning or advice."""
+    """The text of a remark."""
     return _REMARKS[remark.kind](remark.values)
 
 
@@ -161,11 +164,11 @@ def _richer_paths(values: dict[str, Any]) -> str:
 
 
 _CAUSES: Final = {
-    "correlated": "neighbouring links share part of their errors, so that they count less than independent links",
-    "out_of_sight": "weak links out of sight count less if the scene lacks paths to them",
-    "student-t": "outliers count less if noise has heavy tails",
-    "heterogeneous": "links that depend on single buildings count less if buildings differ",
-    "gaussian": "their noise model differs from the one that RMSE assumes",
+    "correlated": "neighbouring links share part of their errors, so they have less weight than independent links",
+    "out_of_sight": "weak links out of sight have less weight if the scene lacks paths to them",
+    "student-t": "outliers have less weight if the noise has heavy tails",
+    "heterogeneous": "links that depend on single buildings have less weight if buildings differ",
+    "gaussian": "their noise model differs from the one that the RMSE assumes",
 }
 
 
@@ -184,27 +187,27 @@ def _outside_interval(values: dict[str, Any]) -> str:
     if odds < CLEAR_ODDS:
         text = (
             f"The candidate with the lowest RMSE is outside an interval: {'; '.join(low for low, _ in parameters)}. No "
-            "other candidate is clearly more probable, but few candidates near it fit as well; most that do are in the "
-            "intervals."
+            "other candidate is clearly more probable, but few candidates near it fit equally well; most candidates "
+            "that do are inside the intervals."
         )
     else:
         times = f"more than {MOST_ODDS:,.0f}" if odds >= 0.999 * MOST_ODDS else f"{odds:.2g}"
         text = (
             f"The candidate with the lowest RMSE is not the most probable one: {'; '.join(map(''.join, parameters))}. "
-            "RMSE treats the noise of all links as independent; the intervals do not, because "
+            "The RMSE treats the noise of all links as independent; the intervals do not, because "
             f"{_CAUSES[values['cause']]}. The most probable values are {times} times as probable."
         )
-    text += " Do not use the values with the lowest RMSE as constants of the materials."
+    text += " Do not use the values with the lowest RMSE as material constants."
     if values["blocks"]:
         return text + " Held-out blocks show which model predicts best."
     return (
-        f"{text} Predictions use the values with the lowest RMSE unless held-out links ([holdout]) choose another "
-        "model."
+        f"{text} Predictions use the values with the lowest RMSE unless another model is chosen on held-out links "
+        "([holdout])."
     )
 
 
 def _approximate_intervals(values: dict[str, Any]) -> str:
-    replay = ", with the corrected replay of its scene" if values["replay"] else ""
+    replay = ", combined with the corrected replay of its scene" if values["replay"] else ""
     return (
         f"The intervals are approximate: the engine {values['engine']!r} gives no derivatives, so an emulator was "
         f"fitted to {values['calls']} of its calls{replay}. In cross-validation, its RMS error is "
@@ -225,17 +228,18 @@ def _conflict(values: dict[str, Any]) -> str:
         )
     return (
         f"Path loss and {observables} require parameter values that differ by {values['standard_errors']:.1f} standard "
-        f"errors: {answers}. Check units, the receiver's range and the scene; the common fit explains neither."
+        f"errors: {answers}. Check units, the receiver's range and the scene; the common fit explains neither of them."
     )
 
 
 def _unreached_links(values: dict[str, Any]) -> str:
     trials, sample = zip(values["switches"], values["reached"], strict=True), values["sample"]
-    reached = ", ".join(f"{switch} gives {count:.0f} of them a path" for switch, count in trials)
+    reached = ", ".join(f"{count:.0f} have a path with {switch}" for switch, count in trials)
     text = f"{values['links']:,} of {values['of']:,} links have no path, so no material is fitted to them."
     if max(values["reached"], default=0.0) == 0:
         return (
-            f"{text} No setting of [trace] gives any of {sample} sampled links a path: check their positions."
+            f"{text} No tested setting of [trace] finds a path for any of {sample} sampled links: check the "
+            "positions of the links."
         )
     return f"{text} Of {sample} sampled links, {reached}: change these keys of [trace] in the study."
 
@@ -261,8 +265,8 @@ def _ray_mapping(values: dict[str, Any]) -> str:
     if any(name not in values for name in ("misfit_db", "gap_db", "remaining_db", "moved_db")):
         return (
             f"The model does not represent the program: some of its {values['calls']} calls have no path, or no link "
-            "with a path, in common. The optimum may be missed, and intervals are approximate. Check why paths "
-            "of the program appear or vanish with the materials, or choose a method that needs no rays."
+            "with a path, in common. The optimum may be missed, and intervals are approximate. Check why the program's "
+            "paths appear or disappear when the materials change, or choose a method that requires no rays."
         )
     assumed = zip(values["names"], values["values"], strict=True)
     constants = ", ".join(f"{name} {value:.3g}" for name, value in assumed)
@@ -279,9 +283,10 @@ def _ray_mapping(values: dict[str, Any]) -> str:
     else:
         optimum = "the optimum is probably reached" if values["reached"] else "the optimum may be missed"
         text = (
-            f"The model does not represent the program. {text}. A replay that agrees with the program at the best call "
-            f"replaces it. Its minimum is {values['remaining_db']:.3f} dB below that call, where path loss differs by "
-            f"{values['moved_db']:.3f} dB: {optimum}, and intervals are approximate."
+            f"The model does not represent the program. {text}. The model is replaced by a replay that agrees with the "
+            f"program at the best call. The minimum of this replay is {values['remaining_db']:.3f} dB below that call, "
+            f"and path loss differs by {values['moved_db']:.3f} dB between the two: {optimum}, and intervals are "
+            "approximate."
         )
     if values["changed"]:
         text += (
@@ -297,9 +302,9 @@ def _missing_region(values: dict[str, Any]) -> str:
         f"Losses of {values['attenuation']:.2g} dB/m within x = {values['west']:.0f} to {values['east']:.0f} m, "
         f"y = {values['south']:.0f} to {values['north']:.0f} m, up to z = {values['height']:.0f} m, on the straight "
         f"line of {values['links']} links, would explain {percent(values['share'])} of the mean square of the "
-        f"residuals (chance alone {percent(values['chance'])}). The materials may compensate for part of these losses, "
-        "and the verdicts assume that nothing is missing there. Check whether there are trees, or furniture indoors, "
-        "and state them under [regions]; a wrong antenna direction can have the same effect."
+        f"residuals (by chance alone: {percent(values['chance'])}). The materials may compensate for part of these "
+        "losses, and the verdicts assume that nothing is missing there. Check whether there are trees, or furniture "
+        "indoors, and state them under [regions]; a wrong antenna direction can have the same effect."
     )
 
 
@@ -310,12 +315,12 @@ def _differing_groups(values: dict[str, Any]) -> str:
         for label, difference, error in rows[:SHOWN_GROUPS]
     )
     more = f"; and {len(rows) - SHOWN_GROUPS} more" if len(rows) > SHOWN_GROUPS else ""
-    others = f" The same holds for the columns {', '.join(values['others'])}." if values["others"] else ""
+    others = f" The same applies to the columns {', '.join(values['others'])}." if values["others"] else ""
     per = ", ".join(f'"{name}"' for name in values["per"])
     return (
-        f"Residuals of links in the same place depend on the column {values['column']!r} more than chance explains. "
+        f"Residuals of neighbouring links depend on the column {values['column']!r} more than expected by chance. "
         f"Measured minus modelled path loss, compared with neighbouring links: {groups}{more}.{others} If the column "
-        f"names devices, antennas, carriers or days, give each an offset: [offset] per = "
+        f"contains devices, antennas, carriers or days, fit an offset for each: [offset] per = "
         f"{f'[{per}]' if len(values['per']) > 1 else per}."
     )
 
@@ -353,8 +358,8 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.RICHER_PATHS: _richer_paths,
     RemarkKind.MISSED_OPTIMUM: lambda values: (
         f"The method missed the optimum: posterior draws reach an RMSE of {values['draws_db']:.2f} dB, but the "
-        f"method reached {values['found_db']:.2f} dB. The intervals are around the optimum: use the "
-        "method 'auto', or give the method a larger budget."
+        f"method reached {values['found_db']:.2f} dB. The intervals describe the optimum, not the values that were "
+        "found. Use the method 'auto', or a larger budget."
     ),
     RemarkKind.OUTSIDE_INTERVAL: _outside_interval,
     RemarkKind.FEW_DRAWS: lambda values: (
@@ -383,7 +388,7 @@ _BASELINES: Final[dict[str, str]] = {
 
 
 def judgement_text(judgement: Judgement) -> str:
-    """Whether calibration improved on the best baseline on held-out links, by how much, and with what certainty."""
+    """Improvement of calibration over the best baseline on held-out links, with its certainty."""
     error = f"RMSE {judgement.rmse_db:.2f} dB on {counted(judgement.links, 'held-out link')}"
     certainty = "no bootstrap error: one cluster of links"
     if judgement.error_db is not None:
@@ -397,15 +402,15 @@ def judgement_text(judgement: Judgement) -> str:
 
 
 def choice_text(chosen: str, best: str, partner: str | None = None) -> str:
-    """Which model is chosen on held-out blocks, and why.
+    """The model chosen on held-out blocks, and the reason for the choice.
 
-    `best` has the lowest RMSE there of the models that can predict any link. `partner` is the model with which the
-    chosen one is averaged.
+    `best` has the lowest RMSE there among the models that can predict any link. `partner` is the model with which the
+    chosen model is averaged.
     """
     if partner is None:
-        used, preferred = f"The blocks choose the model {str(chosen)!r}", ""
+        used, preferred = f"The chosen model is {str(chosen)!r}", ""
     else:
-        used = f"The blocks choose the average of the models {str(chosen)!r} and {str(partner)!r}"
+        used = f"The chosen model is the average of the models {str(chosen)!r} and {str(partner)!r}"
         preferred = (
             f", because the best model on a few blocks is often not the best elsewhere. The model {str(chosen)!r} is "
             "preferred"

@@ -2,8 +2,8 @@
 
 Usage: python load_scene.py [ROW ...]
 
-ROW is the row of a link in the measured table; without any row, all links are computed. This script needs Sionna RT and
-the other files of this folder, but not Calibray.
+ROW is the row of a link in the measured table; without any row, all links are computed. This script requires Sionna RT
+and the other files of this folder, but not Calibray.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def path_losses(scene: rt.Scene, tx: list[float], receivers: list[list[float]]) 
 
 
 def received(gain: np.ndarray, delay: np.ndarray) -> float:
-    """Power gain of path gains [receive ports, transmit ports, paths] with delays [s], combined as in the study."""
+    """Power gain from path gains [receive ports, transmit ports, paths] and delays [s], combined as in the study."""
     if CALIBRATION["combining"] == "power" or not len(delay):
         return float((np.abs(gain) ** 2).sum() / gain.shape[1])
     offset, weight = np.zeros(1), np.ones(1)
@@ -106,7 +106,7 @@ def main() -> None:
         links = list(csv.DictReader(file))
     wanted = set(sys.argv[1:])
     if absent := wanted - {link["row"] for link in links}:
-        sys.exit(f"links.csv has no row {', '.join(sorted(absent))}: give rows of its column row")
+        sys.exit(f"links.csv has no row {', '.join(sorted(absent))}: use values of its column row")
     links = [link for link in links if not wanted or link["row"] in wanted]
     carrier = CALIBRATION["frequency_hz"]
     for link in [link for link in links if float(link.get("frequency") or carrier) != carrier]:
