@@ -212,7 +212,7 @@ def test_what_an_editor_changed_in_the_study_is_shown_and_not_undone(walked):
 
 @pytest.mark.parametrize(
     ("kind", "message"),
-    [("plan", "must be a number of metres"), ("osm", "must be empty: the map states the heights")],
+    [("plan", "must be a number of metres"), ("osm", "must be empty: the map contains the heights")],
 )
 def test_a_height_that_a_scene_would_not_use_is_refused(walked, kind, message):
     _, _, browser, address = walked

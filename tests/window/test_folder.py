@@ -182,7 +182,7 @@ def test_places_are_at_their_height_above_the_ground(tmp_path):
     assert table["rx_z"].to_numpy() == pytest.approx([11.5, 21.5])
     assert (table["tx_z"] == 30.0).all()
     assert (table["sector"] == "north").all()
-    with pytest.raises(InputError, match="heights above the ground need a scene"):
+    with pytest.raises(InputError, match="heights above the ground require a scene"):
         write_links(Desk(StudyFolder(tmp_path)), "place.csv", site, np.array([1.0]), np.array([1.0]), 1.5)
 
 

@@ -1,6 +1,7 @@
 """The demo: a coastal high-rise district like the one in the paper, and a simulated measurement campaign.
 
-`coastal_district/` contains its files, which `python benchmarks/demo_campaign.py FOLDER` regenerates in the repository.
+The folder `coastal_district/` contains its files. In the repository, `python benchmarks/demo_campaign.py FOLDER`
+regenerates them.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
 """The window: a local web page for a study's folder, for people who do not use a terminal.
 
-It runs the commands of the command line as separate processes and shows the files that they read and write.
+The page runs the commands of the command line as separate processes, and shows the files that they read and write.
 """

@@ -1,4 +1,4 @@
-"""State that the steps of the window share: the study's folder, its commands, selections, and the scene in 2-D and 3-D.
+"""State shared by the steps of the window: the study's folder, its commands, selections, and the scene in 2-D and 3-D.
 
 The window uses only the files in the folder that the command line reads and writes.
 
@@ -46,13 +46,14 @@ TABLES: Final = (*SUFFIXES, ".xlsx", ".parquet")
 MESHES: Final = (".ply", ".obj")
 PARTS: Final = (".shx", ".dbf", ".prj", ".cpg", ".tif", ".tiff", ".gpx", ".xml", ".json")
 PLACE, CANDIDATES, SUGGESTED = "place.csv", "candidates.csv", "suggested.csv"
-"""Tables that the window writes: the place to predict, candidate places to measure, and the suggested places."""
+"""Tables that the window writes: the position to predict, candidate positions for measurements, and suggested
+positions."""
 
 PREDICTED: Final = "-predicted.csv"
 """Suffix of the names of predicted tables."""
 
 LARGEST: Final = 2**30
-"""Largest size of an uploaded file [bytes]; larger files must be put into the folder."""
+"""Largest size of an uploaded file [bytes]; larger files must be copied into the folder by other means."""
 
 Control = TypeVar("Control", bound=ValueElement)
 
@@ -145,7 +146,7 @@ class StudyFolder:
             return {}
 
     def valid_content(self) -> dict[str, Any]:
-        """The sections of the study file, with values of the types that a study requires; empty if it is not valid."""
+        """The sections of the study file; empty if the file is not a valid study."""
         content = self.content()
         try:
             Study.from_content(content, self.study_file)
@@ -251,7 +252,7 @@ class Desk:
     Attributes:
         folder: The study's folder.
         scene: Path of the chosen scene, relative to the folder.
-        point: The chosen place, x and y [m].
+        point: The chosen position, x and y [m].
         area: The chosen area: west, south, east, north [m].
         sites: Transmitters of the measured links, as listed by `sites`.
         findings: Warnings about suspicious links.
@@ -287,12 +288,12 @@ class Desk:
         self.show_again[ui.context.client.id]()
 
     def mark(self) -> None:
-        """Show the chosen place and area on the map of this tab."""
+        """Show the chosen position and area on the map of this tab."""
         area = dict(zip(("west", "south", "east", "north"), self.area, strict=True)) if self.area else None
         ui.run_javascript(f"plan.mark({json.dumps(self.point)}, {json.dumps(area)})")
 
     def keep(self, control: Control) -> Control:
-        """Restore in a control the value entered before its step was redrawn, if it is still an option."""
+        """Restore the value that was entered in a control before its step was redrawn, if it is still an option."""
         name = control.text if isinstance(control, ui.switch) else str(control.props["label"])
         if name in self.entered and self.entered[name] in getattr(control, "options", [self.entered[name]]):
             control.set_value(self.entered[name])
@@ -300,7 +301,7 @@ class Desk:
         return control
 
     def edit(self, step: str, write: Callable[[dict[str, Any]], None]) -> None:
-        """Register the function with which a step of this tab writes its values when the study is saved."""
+        """Register the function that writes the values of a step of this tab when the study is saved."""
         self.edits[ui.context.client.id, step] = write
 
     async def save(self) -> None:
@@ -326,7 +327,7 @@ class Desk:
 def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
     """The map of the study, or of a scene in the folder if there is no study.
 
-    It contains `west`, `north` [m] and `scale` [1/m] of the outlines; `buildings` and `walls` as SVG path data;
+    The map contains `west`, `north` [m] and `scale` [1/m] of the outlines; `buildings` and `walls` as SVG path data;
     `links`, each with x, y [m], path loss [dB] and 1 if suspicious, else 0; `transmitters`, x, y, z [m]; and `sites`.
 
     Raises:
@@ -358,9 +359,9 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
 
 
 def sites(study: Study, links: Measurements) -> list[dict[str, Any]]:
-    """The transmitters of the links, once for each group and carrier frequency, as a mast may carry several sectors.
+    """The transmitters of the links, once per group and carrier frequency, because a mast can carry several sectors.
 
-    Each has a `name`, a position `tx` [m], and the values of the `columns` that a prediction needs, such as azimuth.
+    Each has a `name`, a position `tx` [m], and the values of the `columns` that a prediction requires, such as azimuth.
     """
     names = [study.links.transmitter, *study.offset_groups, study.links.frequency]
     key = list(dict.fromkeys(name for name in names if name is not None and name in links.frame))
@@ -383,7 +384,7 @@ def sites(study: Study, links: Measurements) -> list[dict[str, Any]]:
 
 
 def opened(folder: StudyFolder, scene: str | None) -> tuple[str | None, Study | None]:
-    """The scene to show, and the study if there is one: the study's scene, or else the chosen scene.
+    """The scene to show (the study's scene, or else the chosen scene), and the study, if there is one.
 
     Raises:
         InputError: The study cannot be read.
@@ -416,7 +417,7 @@ def grid_above_ground(
     """
     source, study = opened(folder, scene)
     if source is None:
-        raise InputError("heights above the ground need a scene: make or add one first")
+        raise InputError("heights above the ground require a scene: make or add one first")
     _, triangles = _geometry(source, study)
     # Computed as in a coverage map, so that a place has the same height in both.
     z = ground_heights(triangles, x, y) + height

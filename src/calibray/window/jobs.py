@@ -35,7 +35,7 @@ WIDTH: Final = "80"
 """Number of characters per line in a command's tables."""
 
 TAIL: Final = 16_384
-"""Number of bytes shown from the end of a log, which fill a few screens."""
+"""Number of bytes shown from the end of a log, enough for a few screens."""
 
 
 _LINE: Final = re.compile(
@@ -202,7 +202,7 @@ class Stage:
         share: Completed fraction, 0 to 1; None if unknown.
         seconds: Elapsed time [s].
         left: Remaining time [s]; None if unknown.
-        best: Best value so far, such as "best RMSE 3.10 dB"; empty if the log states none.
+        best: Best value so far, such as "best RMSE 3.10 dB"; empty if the log contains none.
     """
 
     name: str
@@ -213,7 +213,7 @@ class Stage:
 
 
 def stages(log: str) -> list[Stage]:
-    r"""The stages that a log shows, in order; stages that take less than a few seconds print no progress line.
+    r"""The stages in a log, in order; stages of less than a few seconds print no progress line and are missing.
 
     Example:
         >>> stages("tracing 3/4, 75 %, 1/s, 3 s, about 1 s left\nWritten to result")
@@ -231,7 +231,7 @@ def stages(log: str) -> list[Stage]:
 
 
 def main() -> None:
-    """Run the command whose words follow the exit-status file in the arguments, unless it is stopped before then."""
+    """Run the command that follows the exit-status file in the arguments, unless it is stopped before it starts."""
     stopped: list[int] = []
     # A handler, unlike SIG_IGN, is not inherited by the command.
     signal.signal(signal.SIGINT, lambda number, _: stopped.append(number))

@@ -60,7 +60,7 @@ def build(desk: Desk) -> None:
 
 
 def _show_map(desk: Desk, activity: Callable[[], None]) -> ui.label:
-    """Draw the map with its buttons, and the last command; return the label of the chosen place or area."""
+    """Draw the map with its buttons, and the last command; return the label of the chosen position or area."""
 
     def clear_area() -> None:
         desk.area = None
@@ -90,7 +90,7 @@ def _show_map(desk: Desk, activity: Callable[[], None]) -> ui.label:
 
 
 def _answer_map(desk: Desk, place: ui.label) -> None:
-    """Handle what the map's script reports: choices of the user, and data that it has loaded."""
+    """Handle the events of the map's script: choices of the user, and loaded data."""
 
     def picked(event: events.GenericEventArguments) -> None:
         # Adding 0 removes the sign of a negative zero.
@@ -126,7 +126,7 @@ def _follow_changes(
     """Redraw steps when the files in the folder or the running command have changed."""
 
     def contents() -> dict[str, object]:
-        """The content of the steps with text fields, which are redrawn only if it changes."""
+        """The content of the steps with text fields, which are redrawn only if this content changes."""
         text, files = desk.folder.text(), desk.folder.files((*MAPS, ".tif", ".tiff"))
         return {
             "Map or plan": (text, files, desk.folder.scenes(), desk.scene),
@@ -234,7 +234,7 @@ class Camera:
     distance: float = 1.9 * RADIUS
 
     def move(self, turn: float = 0.0, rise: float = 0.0, factor: float = 1.0) -> None:
-        """Turn and raise the camera and scale its distance; it never looks straight down, where up is undefined."""
+        """Turn and raise the camera, and scale its distance; it cannot look straight down, where up is undefined."""
         self.azimuth += turn
         self.elevation = float(np.clip(self.elevation + rise, 0.05, 1.5))
         self.distance = float(np.clip(self.distance * factor, 0.1 * RADIUS, 10 * RADIUS))

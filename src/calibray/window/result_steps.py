@@ -130,7 +130,7 @@ def _table(desk: Desk, names: list[str]) -> None:
 
 
 def _facts_table(names: list[str], rows: dict[str, dict[str, str]]) -> None:
-    """Draw rows of texts, with one column per result; differences from the first result are bold."""
+    """Draw rows of text, with one column per result; differences from the first result are bold."""
     with ui.element("div").classes("scrolled").props("tabindex=0"), ui.element("table").classes("facts"):
         with ui.element("tr"):
             for text in ("", *names):
@@ -236,7 +236,7 @@ def changes(studies: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
 
 
 def predictive_errors(folder: Path) -> tuple[str, HeldOutErrors] | None:
-    """The model that a result's predictions use, and its held-out errors; None if this model was not validated.
+    """The prediction model of a result, and its held-out errors; None if this model was not validated.
 
     Raises:
         InputError: The result or its validation cannot be read, or they belong to different studies.
@@ -247,7 +247,7 @@ def predictive_errors(folder: Path) -> tuple[str, HeldOutErrors] | None:
 
 
 def better(first: str, second: str, folder: Path) -> str:
-    """A sentence that states which of two results in a folder predicts held-out blocks better, and how certainly.
+    """A sentence that states which of two results in a folder predicts held-out blocks better, and with what certainty.
 
     Raises:
         InputError: Both are the same result, or a result or its validation cannot be read.
@@ -256,11 +256,11 @@ def better(first: str, second: str, folder: Path) -> str:
         raise InputError(f"{first}: chosen twice; choose two results")
     results = {name: predictive_errors(folder / name) for name in (first, second)}
     if missing := [name for name, errors in results.items() if errors is None]:
-        return f"{' and '.join(missing)}: not validated, so nothing shows which result predicts better. Validate both."
+        return f"{' and '.join(missing)}: not validated, so it is unknown which result predicts better. Validate both."
     (model, one), (other_model, other) = (errors for errors in results.values() if errors is not None)
     same = [(one.position, other.position), (one.measured_db, other.measured_db)]
     if not all(np.array_equal(*pair) for pair in same):
-        return f"{first} and {second} were validated on different links, so nothing shows which is better."
+        return f"{first} and {second} were validated on different links, so they cannot be compared."
     judged = (one.block >= 0) & (other.block >= 0)
     if not judged.any():
         return f"{first} and {second} have no held-out link in common. Validate both with the same blocks."
@@ -276,19 +276,19 @@ def better(first: str, second: str, folder: Path) -> str:
     blocks = len(np.unique(one.block[judged]))
     verb = "predicts" if judgement.helped else "does not predict significantly"
     return (
-        f"{best} {verb} better than {worst}: RMSE {judgement.rmse_db:.2f} against "
+        f"{best} {verb} better than {worst}: RMSE {judgement.rmse_db:.2f} versus "
         f"{judgement.baseline_rmse_db:.2f} dB on {counted(judgement.links, 'held-out link')} (difference "
         f"{judgement.gain_db:.2f} dB{certainty}); lower in {lower} of {blocks} blocks of {first}."
     )
 
 
 MOST_CANDIDATES: Final = 2000
-"""Largest number of candidate places; each one is traced."""
+"""Largest number of candidate positions; each one is traced."""
 
 
 @ui.refreshable
 def show_prediction(desk: Desk) -> None:
-    """Draw the step for predictions: at a place, over an area, suggested places to measure, and export."""
+    """Draw the step for predictions at a position or over an area, suggested measurement positions, and export."""
     names = desk.folder.results()
     if not names:
         ui.label("Calibrate first.").classes("quiet")
@@ -374,7 +374,7 @@ def show_prediction(desk: Desk) -> None:
 def write_links(
     desk: Desk, file: str, site: dict[str, Any], x: NDArray[np.float64], y: NDArray[np.float64], height: float
 ) -> None:
-    """Write a table of links from a transmitter to a grid of places x, y at a height above the ground, all [m].
+    """Write a table of links from a transmitter to a grid of positions x, y at a height above the ground, all [m].
 
     The links have the transmitter's groups, carrier and antenna direction.
 
@@ -417,7 +417,8 @@ def _predicted(desk: Desk) -> None:
 def predicted_text(row: pd.Series) -> str:
     """A sentence with the predicted value of the measured quantity.
 
-    If received power was measured and the transmitted power is unknown, the path loss includes this unknown power.
+    If received power was measured but the transmitted power is unknown, the sentence states a path loss that includes
+    this unknown power.
     """
     value, lower, upper, name, unit = "path_loss_db", "lower_db", "upper_db", "path loss", "dB"
     for key, quantity in QUANTITIES.items():

@@ -1,4 +1,4 @@
-"""The server of the window, which only this machine can reach and a guard protects."""
+"""The server of the window. Only this machine can reach it, and a guard refuses unauthorized requests."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ class Guard:
         if ".." in path.split("/") or "\\" in path or not path.isprintable():
             return "the path is outside the window's pages"
         if headers.get(b"host") not in self._hosts:
-            return "the request names another host"
+            return "the request is for another host"
         origins = {b"http://" + host for host in self._hosts}
         if b"origin" in headers and headers[b"origin"] not in origins:
             return "the request comes from another origin"

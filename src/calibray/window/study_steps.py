@@ -21,7 +21,7 @@ from calibray.window.desk import LARGEST, MAPS, STUDY, Desk, StudyFolder, filled
 
 ITU: Final = [name for name in ITU_MATERIALS[DEFAULT_REVISION] if name != "vacuum"]
 COMMANDS: Final = {".osm": "osm", ".pbf": "osm", ".csv": "plan", ".dxf": "plan"}
-"""The command that converts a file to a scene, by file extension; other files may be footprints or plans."""
+"""The command that converts a file to a scene, by file extension; other files can be footprints or plans."""
 
 
 def upload(desk: Desk, label: str) -> None:
@@ -37,7 +37,7 @@ def upload(desk: Desk, label: str) -> None:
         desk.refresh()
 
     def refuse() -> None:
-        ui.notify(f"Larger than {LARGEST // 2**30} GiB: put the file into the folder.", type="negative")
+        ui.notify(f"Larger than {LARGEST // 2**30} GiB: copy the file into the folder.", type="negative")
 
     button = ui.button(label).props("outline")
     ui.label("Or drop files here:").classes("quiet")
@@ -88,7 +88,9 @@ def show_scene(desk: Desk) -> None:
                     and not (kind.value == "plan" and _is_number(height.value))
                 ):
                     means = (
-                        "a number of metres" if kind.value == "plan" else "empty: the map states the heights"
+                        "a number of metres"
+                        if kind.value == "plan"
+                        else "empty: the map contains the heights"
                     )
                     raise InputError(f"Height {height.value}: must be {means}")
                 if kind.value == "plan":
@@ -114,7 +116,9 @@ def show_scene(desk: Desk) -> None:
     scenes = desk.folder.scenes()
     if of_study := desk.folder.valid_content().get("scene", {}).get("file", ""):
         ui.label(f"Scene of the study: {of_study}")
-        ui.label("To change it, use Measurements: the section scene, or Draft again.").classes("quiet")
+        ui.label("To change it, edit the section scene under Measurements, or select Draft again.").classes(
+            "quiet"
+        )
         return
     if desk.scene not in scenes:
         desk.scene = scenes[0] if scenes else None
@@ -140,7 +144,7 @@ def _is_number(text: str | None) -> bool:
 
 
 SECTIONS = ("scene", "links", "antennas", "trace", "offset")
-"""Sections whose assumptions the step for measurements shows; parameters have their own step."""
+"""Sections with assumptions that the step for measurements lists; parameters have a separate step."""
 
 
 @ui.refreshable
@@ -268,9 +272,9 @@ def _columns(desk: Desk, content: dict[str, Any]) -> list[str]:
 
 
 def likely_tables(folder: StudyFolder, tables: Sequence[str]) -> tuple[str, str]:
-    """The tables that most likely contain the links and their transmitters, by columns first, then by names.
+    """The tables that most likely contain the links and their transmitters, judged by columns, then by names.
 
-    The second is empty if no table looks like a table of transmitters.
+    The second name is empty if no table looks like a table of transmitters.
     """
     content = {name: _content(folder.path / name, (folder.path / name).stat().st_mtime_ns) for name in tables}
     named = {name for name in tables if any(word in name.lower() for word in SITES)}
@@ -311,7 +315,7 @@ def _content(file: Path, changed: int) -> str:
 
 @ui.refreshable
 def show_parameters(desk: Desk) -> None:
-    """Draw the step for parameters: which parameters are calibrated, and their bounds and priors."""
+    """Draw the step for parameters: the choice of calibrated parameters, and their bounds and priors."""
     parameters = desk.folder.valid_content().get("parameters")
     if not isinstance(parameters, dict):
         ui.label("Draft the study first.").classes("quiet")
