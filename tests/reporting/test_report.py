@@ -75,7 +75,7 @@ def test_the_result_of_an_external_program_names_its_method_its_failures_and_its
     assert ("failed, or a link lost its path", "2") in result_tables.costs(
         replace(result, history=history)
     ).rows
-    assert "Predictions at new links and maps call the program" in scene_alone_text(result)
+    assert "Predictions and maps call the program" in scene_alone_text(result)
     assert "differs from the predictions" in scene_alone_text(shown.result())
 
 

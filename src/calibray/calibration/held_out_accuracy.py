@@ -1,4 +1,4 @@
-"""Accuracy on links held out by a filter or in blocks, the prediction model chosen there, and its fallback.
+"""Accuracy on links held out by a filter or in blocks, choice of the prediction model, and its fallback.
 
 The fallback is a log-distance model with the study's nuisances. It is fitted to the calibration links, like the
 log-distance baseline in validation. Links without a path are behind obstacles, so their path loss usually exceeds the
@@ -72,7 +72,7 @@ def held_out_rmse(problem: Problem, model: NDArray[np.float64], mask: NDArray[np
 def on_held_out_links(
     problem: Problem, trail: Trail, models: Models
 ) -> tuple[Accuracy, str, HeldOutResiduals]:
-    """Accuracy on the links that a filter holds out, the prediction model chosen there, and its residuals."""
+    """Accuracy on links held out by a filter, the name of the chosen prediction model, and its residuals."""
     objective, links = problem.objective, problem.setup.links
     fitted = bool(objective.nuisance.terms)
     reached = np.isfinite(problem.before) & np.isfinite(trail.best_modelled)
@@ -113,7 +113,7 @@ def _compared(problem: Problem, models: Models) -> dict[str, NDArray[np.float64]
 def _choice(
     problem: Problem, trail: Trail, modelled: dict[str, NDArray[np.float64]], judged: NDArray[np.bool_]
 ) -> tuple[str, HeldOutResiduals]:
-    """The prediction model chosen on held-out links, and its residuals; with too few links, the calibrated model.
+    """Name of the model chosen on held-out links, and its residuals; with too few links, the calibrated model.
 
     `modelled` contains the path loss of the compared models. It is empty if no held-out link can be judged.
     """
@@ -170,7 +170,7 @@ def log_distance_errors(
 def on_blocks(
     validation: Validation, problem: Problem, initial_db: float | None, fitted: bool
 ) -> tuple[Accuracy, str, HeldOutResiduals]:
-    """Accuracy on blocks held out in turn, the prediction model chosen there, and its residuals."""
+    """Accuracy on blocks held out in turn, the name of the chosen prediction model, and its residuals."""
     rmse = validation.table["rmse_db"]
     name, judged = validation.chosen, validation.judged
     levels = validation.levels(name, problem.setup.links)

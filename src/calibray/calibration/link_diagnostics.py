@@ -39,7 +39,8 @@ from calibray.uncertainty.missing_region import missing_region
 from calibray.validation.held_out_statistics import CLUSTER_LINKS, MOST_CLUSTERS, spatial_blocks
 
 DENSE: Final = 20_000_000
-"""Largest number of entries in the nuisances' design matrix for which leverage is computed; it then takes 160 MB."""
+"""Largest number of entries in the nuisances' design matrix for which leverage is computed. A matrix of this size takes
+160 MB."""
 
 DIRECT: Final = "line of sight"
 """Name of the power share of paths without interactions."""
@@ -121,8 +122,8 @@ def leverage(jacobian: NDArray[np.float64], design: NDArray[np.float64]) -> NDAr
 
     Leverage is the diagonal of the projection onto two sets of columns: the derivatives of the residuals, with the
     nuisance eliminated [m, d], and the columns of the nuisance, scaled like the residuals [m, q]. It is 0 for a link
-    without influence and 1 for a link that alone determines an unknown. Its sum is the number of unknowns that all
-    rows, including those of priors, determine.
+    without influence and 1 for a link that alone determines an unknown. Its sum over all rows, including those of
+    priors, is the number of unknowns that the rows determine.
 
     Example:
         >>> leverage(np.array([[1.0], [1.0], [0.0]]), np.zeros((3, 0))).round(2).tolist()
@@ -182,7 +183,8 @@ FEWEST_CLUSTERS: Final = 8
 """Smallest number of clusters with links inside and outside a group."""
 
 MIXED: Final = 0.5
-"""Smallest share of the variance of membership that lies within clusters; with less, the group is just a location."""
+"""Smallest share of the variance of membership that lies within clusters; with a smaller share, the group is a
+location."""
 
 SIGNIFICANCE: Final = 0.01
 """Probability of a false remark about any group of any column, or about any antenna direction."""
@@ -216,10 +218,10 @@ def differing_groups(
 ) -> list[Difference]:
     """Find groups of links, such as those of one device, whose residuals differ significantly from those of neighbours.
 
-    Only neighbouring links of one transmitter are compared: residuals and membership are taken relative to their means
-    over clusters of such links. A column that is constant over a neighbourhood, such as the name of a street, therefore
-    shows no difference, and errors that neighbours share cancel. Each cluster counts as one observation of the
-    difference, so that correlated errors within a cluster are not treated as independent (K.-Y. Liang, S. L. Zeger,
+    Only neighbouring links of one transmitter are compared: residuals and group membership are taken relative to their
+    means over clusters of such links. A column that is constant over a neighbourhood, such as the name of a street,
+    therefore shows no difference, and errors that neighbours share cancel. Each cluster counts as one observation of
+    the difference, so that correlated errors within a cluster are not treated as independent (K.-Y. Liang, S. L. Zeger,
     Biometrika 73, 1986). The most significant group comes first.
 
     Args:
@@ -261,7 +263,8 @@ def differing_groups(
 
 
 SHARE: Final = 0.02
-"""Smallest share of links without a path for which other tracer settings are tried; less hardly changes the fit."""
+"""Smallest share of links without a path for which other tracer settings are tried; fewer links hardly change the fit.
+"""
 
 FEWEST: Final = 5
 """Smallest number of links without a path for which other tracer settings are tried."""

@@ -40,7 +40,7 @@ class Result(Record):
 
     @classmethod
     def load(cls, folder: str | Path, *, allow_changed_inputs: bool = False) -> Result:
-        """Read a folder that `save` wrote; with `allow_changed_inputs`, even if its files were changed since.
+        """Read a result that `save` wrote; with `allow_changed_inputs`, also a result with edited files.
 
         Raises:
             InputError: The folder contains no result, or the result is from another version, damaged or edited.
@@ -69,8 +69,8 @@ class Result(Record):
     def save(self, folder: str | Path, overwrite: bool = False) -> None:
         """Write `result.json`, `result-links.csv`, `result-history.csv` and the calibrated `result-scene.xml`.
 
-        After a validation, it also writes `result-validation.json`. Every file is written completely or not at all. The
-        folder is created if absent; `overwrite` also replaces files that Calibray did not write.
+        After a validation, `result-validation.json` is also written. Every file is written completely or not at all.
+        The folder is created if absent; `overwrite` also replaces files that Calibray did not write.
 
         Raises:
             InputError: The folder cannot be written, or a file there must not be replaced.
@@ -85,7 +85,7 @@ class Result(Record):
         *,
         allow_changed_inputs: bool = False,
     ) -> NDArray[np.float64]:
-        """Predict path loss at new links.
+        """Predict the path loss of new links.
 
         Args:
             links: The links, or a table of links. Its columns are tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], or the
@@ -113,10 +113,10 @@ class Result(Record):
         *,
         allow_changed_inputs: bool = False,
     ) -> pd.DataFrame:
-        """Predict path loss at new links, with an interval for a measurement there.
+        """Predict the path loss of new links, with an interval for a measurement of each link.
 
         Args:
-            links: The links, or a table, as for `predict`; their groups need no measurements.
+            links: The links, or a table, as for `predict`; groups without measurements are allowed.
             level: Probability that a measurement lies in the interval.
             progress: Called with the stage "tracing" after every launch.
             allow_changed_inputs: Predict even if a file of the scene or an antenna has changed since the calibration.

@@ -1,8 +1,8 @@
 """Delays, angles and power delay profiles of links, for any materials.
 
-All are computed from the powers of a link's paths, so they depend on the materials as smoothly as path loss does.
-`statistics` and `delay_profile` are pure JAX; with `calibray.fields.path_powers` they can be differentiated with
-respect to the materials, within `calibray.fields.jax_settings`.
+These quantities are computed from the powers of a link's paths, so they depend on the materials as smoothly as path
+loss does. `statistics` and `delay_profile` are pure JAX; with `calibray.fields.path_powers` they can be differentiated
+with respect to the materials, within `calibray.fields.jax_settings`.
 """
 
 from __future__ import annotations

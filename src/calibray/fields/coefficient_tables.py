@@ -88,8 +88,8 @@ class CoefficientTables:
 
     Attributes:
         values: Coefficients of cubic polynomials in the fraction, from every node to the next [N + 4, 16]. Powers are
-            in ascending order, each with the real and imaginary part for the transverse electric coefficient, then for
-            the transverse magnetic coefficient. At the last four nodes, both coefficients are 1.
+            in ascending order, each with the real and imaginary parts of the transverse electric coefficient, then
+            those of the transverse magnetic coefficient. At the last four nodes, both coefficients are 1.
     """
 
     values: jax.Array

@@ -163,7 +163,7 @@ errors."""
 def compiled(
     function: Callable[..., Any] | None = None, *, static_argnums: int | tuple[int, ...] = ()
 ) -> Callable[..., Any]:
-    """Compile a function like `jax.jit`; its first argument is a program or has one as the attribute `program`.
+    """Compile a function as `jax.jit` does; its first argument is a program or has an attribute `program`.
 
     The function is compiled anew for each value of the arguments at the positions `static_argnums`. Without a function,
     the result is a decorator.

@@ -51,9 +51,9 @@ class Group:
             n].
         rx: Receive field times A lambda / 4 pi, in the same form [2 or 1, R, 2, n].
         rotation: Per step, (cos, sin) of the rotation into the interaction's frame [2, n]; [k, 2, n] for a run of k.
-        turn: Per step, (cos, sin) from the frame of incidence into the basis (theta, phi) [2, n], or None.
-        wedge: Per step, the matrices C_0 .. C_4, real and imaginary part [2, 5, 2, 2, n], or None.
-        signature: One letter for each step, see `calibray.fields.grouping`.
+        turn: Per step, (cos, sin) from the frame of incidence into the basis (theta, phi) [2, n]; None for other steps.
+        wedge: Per step, the matrices C_0 .. C_4, real and imaginary part [2, 5, 2, 2, n]; None for other steps.
+        signature: One letter for each step; see `calibray.fields.grouping`.
         size: Number of paths n.
     """
 

@@ -36,14 +36,14 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
 
     Returns:
         Tables by name, without those that cannot be computed. "distance", "depth" and "group": number of links, mean
-        and standard deviation of the residuals [dB] on the calibration links; residuals are predicted minus measured in
-        the measured quantity. "obstruction" and "streets": the same, by the length of the straight line below roofs and
-        by groups of neighbouring receivers. "missing_region": the rectangle whose extra loss would explain the largest
-        part of the residuals. "leverage": leverage and residual of every calibration link. "power": share of the links'
-        power by material and type of interaction. "trade_offs": correlation of the draws of each pair of unknowns.
-        "neighbours": semivariance of the residuals by distance between links, both ends counted. "moved": value of
-        every parameter before and after calibration, with the change and the width of the 95 % interval as shares of
-        its range.
+        and standard deviation of the residuals [dB] on the calibration links; residuals are predicted minus measured
+        values of the measured quantity. "obstruction" and "streets": the same, by the length of the straight line below
+        roofs and by groups of neighbouring receivers. "missing_region": the rectangle whose extra loss would explain
+        the largest part of the residuals. "leverage": leverage and residual of every calibration link. "power": share
+        of the links' power by material and type of interaction. "trade_offs": correlation of the draws of each pair of
+        unknowns. "neighbours": semivariance of the residuals by distance between links, both ends counted. "moved":
+        value of every parameter before and after calibration, with the change and the width of the 95 % interval as
+        shares of its range.
     """
     tables = {
         "distance": _by_distance(result),
@@ -62,7 +62,7 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
 
 
 def calibration_links(result: Record) -> tuple[pd.DataFrame, NDArray[np.float64]]:
-    """The links that the calibration used, and their residuals in the measured quantity [dB]."""
+    """The links used in the calibration, and their residuals in the measured quantity [dB]."""
     residuals, links = residual(result.links, measured_quantity(result).sign), result.links
     used = links["has_path"].to_numpy(bool) | (result.study.objective.no_path == "censor")
     mask = used & np.isfinite(residuals) & ~links["held_out"].to_numpy(bool)

@@ -98,7 +98,7 @@ def export(
         _verify(scene, result, target / "scene.xml", links)
     except OSError as error:
         raise InputError(
-            f"output folder {target}: cannot be written ({error.strerror}); choose another"
+            f"output folder {target}: cannot be written ({error.strerror}); choose another folder"
         ) from None
     return FILES
 

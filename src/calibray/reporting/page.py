@@ -79,7 +79,7 @@ PICTURES: Final = tuple(f"{name}.{suffix}" for name in CAPTIONS for suffix in ("
 
 @dataclass(frozen=True)
 class PageData:
-    """Data of a page in addition to the result.
+    """The data shown on a page in addition to the result.
 
     Attributes:
         links: The links with positions; None if these are unknown.
@@ -227,7 +227,7 @@ def _title(study: Path) -> str:
 
 
 def _breakable(name: str) -> Markup:
-    """A parameter's name that allows a line break only after the material."""
+    """A parameter's name as HTML, with a line break allowed only after the material."""
     material, dot, constant = name.rpartition(".")
     return escape(material) + dot + Markup("<wbr>") + escape(constant)
 

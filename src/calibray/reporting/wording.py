@@ -95,7 +95,7 @@ def scene_alone_text(record: Record) -> str:
     )
     if record.study.engine.external and model.parameters is not None:
         return (
-            "Predictions at new links and maps call the program. The exported scene contains only the materials: "
+            "Predictions and maps call the program. The exported scene contains only the materials: "
             f"another ray tracer gives a different path loss if its antennas or physics differ.{near}"
         )
     if rms_db < 0.05:

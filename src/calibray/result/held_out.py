@@ -76,7 +76,7 @@ class ObservableErrors:
 
 @dataclass(frozen=True, eq=False)
 class HeldOutErrors:
-    """Residuals of several models on the same links, with each link predicted without its block.
+    """Residuals of several models on the same links, where each link is predicted by models fitted without its block.
 
     Attributes:
         labels: Names of the blocks.

@@ -45,7 +45,7 @@ class ObservableFit:
         initial_rmse: RMSE with the initial materials.
         mean_rmse: RMSE of a baseline that predicts the mean value for every link.
         error: Standard deviation of the error of a value, stated or estimated.
-        biases: Bias by group; the group "" means all links.
+        biases: Bias by group; the group "" contains all links.
         bias_errors: Standard error of each bias, including the uncertainty of the parameters.
     """
 
@@ -103,7 +103,7 @@ class Accuracy:
         initial_holdout_rmse_db: RMSE with the initial materials and no nuisance [dB].
         nuisance_only_holdout_rmse_db: RMSE with the initial materials and fitted nuisances [dB].
         log_distance_holdout_rmse_db: RMSE of the log-distance model fitted to the calibration links [dB].
-        judgement: Comparison of the calibrated model with its best baseline.
+        judgement: Comparison of the calibrated model with the best baseline.
         observables: Errors of the further observables by name.
     """
 
@@ -145,7 +145,7 @@ class Nuisance:
 
     Attributes:
         coefficients: Coefficient by term and group, [dB] per unit of the term's column; the offset is the term
-            "offset", and the group "" means all links.
+            "offset", and the group "" contains all links.
         centres: Value that is subtracted from the term's column, by term.
         groups_without_path: Groups without an offset, because none of their calibration links has a path.
     """
@@ -162,10 +162,11 @@ class Nuisance:
 
 @dataclass(frozen=True)
 class Prediction:
-    """The model that predictions, maps, exports and the report use.
+    """The model used for predictions, maps, exports and the report.
 
     Attributes:
-        model: The prediction model: chosen by errors on held-out links, or the calibrated model if there are too few.
+        model: The prediction model: chosen by errors on held-out links, or the calibrated model if too few links are
+            held out.
         materials: All materials of the scene at the study's carrier, with the values of the model's parameters; None if
             the model uses no scene.
         residual_field: The spatially correlated part of the residuals; None if the residuals are uncorrelated.
@@ -188,7 +189,7 @@ class Cost:
         seconds: Time taken by the method, excluding tracing [s].
         trace_seconds: Time taken by tracing and loading before the search [s].
         uncertainty_replays: Number of replays for intervals and draws.
-        uncertainty_seconds: Time taken by intervals and draws [s].
+        uncertainty_seconds: Time taken to compute intervals and draws [s].
         cheap_replays: Number of replays of the cheap model, which are not RT calls.
         cheap_seconds: Time taken by the replays of the cheap model [s].
         total_seconds: Time taken by the whole calibration, with validation [s]; 0 if unknown.
@@ -225,7 +226,7 @@ class Record:
     """The data of a finished calibration. This class is abstract; `calibration.result.Result` is the final class.
 
     Attributes:
-        study: The study, with the method, seed and engine that ran.
+        study: The study, with the method, seed and engine that were used.
         fit: The candidate with the lowest RMSE.
         accuracy: Accuracy on held-out links.
         uncertainty: Intervals, draws and warnings.

@@ -24,7 +24,7 @@ SHOWN_GROUPS: Final = 4
 """Largest number of groups that a remark lists."""
 
 UNKNOWN_BEST: Final = (
-    "No errors on held-out links are known, so it is unknown which model predicts new links best."
+    "There are no errors on held-out links, so it is unknown which model predicts new links best."
 )
 NOT_JUDGED: Final = f"{UNKNOWN_BEST} Set [holdout] blocks = 4, or run calibray validate."
 
