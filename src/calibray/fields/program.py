@@ -47,8 +47,7 @@ class Group:
     """Paths with the same sequence of interactions: n paths, T transmit and R receive ports.
 
     Attributes:
-        tx: Transmit field, real and imaginary part [2, T, 2, n]; only the real part if all fields are real [1, T, 2,
-            n].
+        tx: Transmit field, real and imaginary part [2, T, 2, n]; only the real part if all are real [1, T, 2, n].
         rx: Receive field times A lambda / 4 pi, in the same form [2 or 1, R, 2, n].
         rotation: Per step, (cos, sin) of the rotation into the interaction's frame [2, n]; [k, 2, n] for a run of k.
         turn: Per step, (cos, sin) from the frame of incidence into the basis (theta, phi) [2, n]; None for other steps.
@@ -106,10 +105,9 @@ class DiffuseArguments:
         solid_angle: Solid angle of the ray tube, divided by its sampling probability [D], [sr].
         cos_scattered: Cosine of the angle between the scattered direction and the normal [D].
         cos_incidence: Cosine of the angle of incidence [D]; empty if every material is Lambertian.
-        cos_specular: Cosine of the angle between the scattered and specular directions [D]; empty if `cos_incidence`
-            is.
-        cos_backward: Cosine of the angle between the scattered direction and the direction to the source [D]; empty if
-            `cos_incidence` is.
+        cos_specular: Cosine of the angle between the scattered and specular directions [D]; empty as `cos_incidence`.
+        cos_backward: Cosine of the angle between the scattered direction and the direction to the source [D]; empty as
+            `cos_incidence`.
         patterns: Scattering pattern of every material.
     """
 

@@ -191,7 +191,7 @@ def _band_nodes(
         InputError: The bandwidth is not positive.
     """
     if bandwidth is None or not (np.isfinite(bandwidth) and bandwidth > 0):
-        raise InputError(f'combining = "band": bandwidth = {bandwidth} must be a positive number of Hz')
+        raise InputError(f'combining = "band": bandwidth = {bandwidth}, must be a positive number of Hz')
     spread = 0.0
     if len(link):
         start = np.flatnonzero(np.diff(link, prepend=-1))

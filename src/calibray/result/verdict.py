@@ -76,7 +76,7 @@ class Interval:
         pieces: Lower and upper end of every piece, ascending, if the interval was computed from draws.
         reason: The reason for the verdict.
         approximate: Whether the interval comes from an emulator, because the engine provides no derivatives.
-        seen: Pieces of the 95 % interval for the buildings on the links' paths; predictions use these buildings. Empty
+        seen: Pieces of the 95 % interval for the buildings on the links' paths alone, which apply to predictions. Empty
             if they equal the pieces for the mean over all buildings of this material.
         without: Share of the width that would remain if a cause were ruled out, by cause; only for causes with a
             noticeable effect.
