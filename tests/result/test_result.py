@@ -352,7 +352,7 @@ def test_a_validation_of_a_finished_result_changes_no_prediction_and_no_sentence
     text = " ".join([*(part.text for part in summary(validated)), *map(str, validated.validation.summary())])
     assert "Predictions and maps use the model 'calibrated'" in text
     assert "predictions use the model 'initial materials'" not in text.lower()
-    assert "'initial materials', which predictions do not use yet" in text
+    assert "'initial materials' is chosen, but predictions do not use it yet" in text
     unjudged = replace(result.uncertainty, remarks=(Remark(RemarkKind.NOT_JUDGED),))
     assert NOT_JUDGED in replace(result, uncertainty=unjudged).remarks
     assert NOT_JUDGED not in replace(validated, uncertainty=unjudged).remarks

@@ -104,8 +104,8 @@ def _held_out_accuracy(result: Record) -> Sentence:
         text = f"{block_sentence(validation)} The best model is {validation.best!r} with {best_db:.2f} dB."
         if validation.chosen != result.prediction.model.name:
             text += (
-                f" On the blocks, the model {str(validation.chosen)!r} is chosen, which predictions do not use yet. To "
-                "use it, run the study again with [holdout] blocks."
+                f" On the blocks, the model {str(validation.chosen)!r} is chosen, but predictions do not use it yet. "
+                "To use it, run the study again with [holdout] blocks."
             )
     if judgement is None:
         by_filter = f"{UNKNOWN_BEST} Hold out links with [holdout] where."
@@ -165,8 +165,8 @@ def _advice(result: Record, links_by_material: Mapping[str, int] | None) -> Iter
     sentences = []
     if result.uncertainty.draws and (unidentified or _by_verdict(result, Verdict.AMBIGUOUS)):
         sentences.append(
-            "calibray suggest DIR CANDIDATES ranks candidate positions by how much a measurement there is expected to "
-            "narrow the intervals."
+            "calibray suggest DIR CANDIDATES ranks candidate positions by the expected effect of a measurement there "
+            "on the widths of the intervals."
         )
     if materials and links_by_material is None:
         sentences.append(f"Links whose strongest paths interact with {_list(materials)}.")
@@ -177,7 +177,7 @@ def _advice(result: Record, links_by_material: Mapping[str, int] | None) -> Iter
 
 
 def _coverage(count: int, total: int) -> str:
-    """Advice about a material that is not identifiable, from the links with paths that interact with it."""
+    """Advice about a material that is not identifiable, based on the links with paths that interact with it."""
     if count == 0:
         return (
             "no path of any link interacts with it, so these links cannot identify it; measure where paths do"

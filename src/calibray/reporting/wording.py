@@ -43,7 +43,7 @@ def prediction_text(record: Record) -> str:
     if fallback is None:
         return text
     error = "" if fallback.residual_db is None else f", with an error of {fallback.residual_db:.1f} dB (RMS)"
-    return f"{text} For links without a path, predictions use the log-distance model{error}, and are marked."
+    return f"{text} Predictions for links without a path use the log-distance model{error}. They are marked."
 
 
 _AVERAGED: Final = {
@@ -54,7 +54,7 @@ _AVERAGED: Final = {
 
 
 def _unused(record: Record) -> str:
-    """Inputs that a prediction model without materials lacks; the model with obstruction uses walls and roofs."""
+    """Unused inputs of a prediction model without materials; the model with obstruction uses walls and roofs."""
     return "no materials" if record.prediction.model.name == Model.OBSTRUCTION else "no scene"
 
 

@@ -54,7 +54,7 @@ def load() -> rt.Scene:
 
 
 def path_losses(scene: rt.Scene, tx: list[float], receivers: list[list[float]]) -> list[float]:
-    """Path loss [dB] from one point to several [m], without offset; infinite without a path."""
+    """Path loss [dB] from one position to several [m], without offset; infinite without a path."""
     for name in list(scene.transmitters) + list(scene.receivers):
         scene.remove(name)
     antennas = CALIBRATION["antennas"]
@@ -106,7 +106,7 @@ def main() -> None:
         links = list(csv.DictReader(file))
     wanted = set(sys.argv[1:])
     if absent := wanted - {link["row"] for link in links}:
-        sys.exit(f"links.csv has no row {', '.join(sorted(absent))}: use values of its column row")
+        sys.exit(f"links.csv has no row {', '.join(sorted(absent))}: use values of the column 'row'")
     links = [link for link in links if not wanted or link["row"] in wanted]
     carrier = CALIBRATION["frequency_hz"]
     for link in [link for link in links if float(link.get("frequency") or carrier) != carrier]:
