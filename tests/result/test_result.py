@@ -331,7 +331,9 @@ def test_an_edited_table_is_refused_even_without_signatures(folder):
     (folder / SIGNATURES).unlink()
     file = folder / "result-links.csv"
     file.write_text(file.read_text().replace(",True,", ",False,", 1))
-    with pytest.raises(InputError, match=r"has changed since result\.json was written.*--allow-changed-inputs"):
+    with pytest.raises(
+        InputError, match=r"has changed since result\.json was written.*--allow-changed-inputs"
+    ):
         Result.load(folder)
     assert Result.load(folder, allow_changed_inputs=True) is not None
 
