@@ -124,7 +124,7 @@ class Diagnosis:
 
 
 def examine() -> Diagnosis:
-    """Check this machine, which takes a few seconds; an unusable machine raises no exception."""
+    """Check this machine, which takes a few seconds; no exception is raised if the machine is unusable."""
     variant = llvm.mitsuba_variant()
     return Diagnosis(
         versions=versions(),

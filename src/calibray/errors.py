@@ -10,7 +10,7 @@ length."""
 
 
 def _bounded(message: str) -> str:
-    """Shorten an overlong message: keep its start, and its end, which states the remedy."""
+    """Shorten an overlong message to its start and its end; the end states the remedy."""
     if len(message) <= LONGEST_MESSAGE:
         return message
     return f"{message[: LONGEST_MESSAGE - 1000]} ... {message[-900:]}"

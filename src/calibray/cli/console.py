@@ -48,7 +48,7 @@ def echo(text: str, err: bool = False, nl: bool = True) -> None:
 
 @cache
 def print_costs() -> None:
-    """Print the costs of predictions to stderr before they start."""
+    """Print the cost of each prediction to stderr before it starts."""
     import logging
 
     class Echo(logging.Handler):

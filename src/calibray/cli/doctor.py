@@ -121,7 +121,7 @@ def ledger(
     ] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """List or export the RT calls of a ledger, or remove failed ones."""
+    """List or export the RT calls of a ledger, or remove failed calls."""
     from contextlib import closing
 
     from calibray.engines import open_ledger

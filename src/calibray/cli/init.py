@@ -15,11 +15,11 @@ from calibray.support.messages import command, counted
 
 @dataclass(frozen=True)
 class Known:
-    """Options for values that the table of links lacks."""
+    """Options for values that are missing from the table of links."""
 
     transmitters: Annotated[Path | None, option("FILE", "Table of transmitter positions.")] = None
     track: Annotated[
-        Path | None, option("FILE", "GPX track that gives the position of each row at its time.")
+        Path | None, option("FILE", "GPX track from which the position of each row is taken at its time.")
     ] = None
     antennas: Annotated[Path | None, option("DIR", "Folder of MSI files named after the antennas.")] = None
     tx: Annotated[str | None, option("X,Y,Z", "Transmitter position in the scene frame [m].")] = None
@@ -111,7 +111,7 @@ def _position(text: str) -> list[float]:
 
 
 def schema() -> None:
-    """Print the JSON schema of study files, which editors use to complete and check them."""
+    """Print the JSON schema of study files, which editors use for completion and checks."""
     from calibray.study.draft import schema_text
 
     echo(schema_text(), nl=False)

@@ -50,8 +50,7 @@ def predict(
         typer.Argument(
             metavar="LINKS",
             help="CSV or Parquet file with the position columns of the study, or tx_x, tx_y, tx_z, rx_x, rx_y, rx_z "
-            "[m]; if the study's offset has a group column or its links a frequency column, the file needs these "
-            "columns too.",
+            "[m]. The file also needs the study's columns for the group of the offset and for the frequency, if any.",
             show_default=False,
         ),
     ],

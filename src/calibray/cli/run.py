@@ -125,7 +125,7 @@ def run(
 
 
 def _kept_text(out: Path) -> str:
-    """Text on the results that an interrupted run has kept, and on how to continue."""
+    """Message that states which results an interrupted run has kept, and how to continue."""
     from contextlib import closing, suppress
 
     from calibray.engines import open_ledger
@@ -199,7 +199,7 @@ def trace(
         bool,
         typer.Option(
             "--check",
-            help="Trace again with twice the samples and another seed, and show the changes. If the samples are "
+            help="Trace again with twice the samples and a different seed, and show the changes. If the samples are "
             "'auto', show the changes caused by the last round of rays.",
         ),
     ] = False,
@@ -207,7 +207,7 @@ def trace(
     pool: Pool,
     overwrite: Overwrite = False,
 ) -> None:
-    """Trace the links of a study and store the paths, or check whether there are enough rays."""
+    """Trace the links of a study and store the paths, or check whether the number of rays is sufficient."""
     with progress_bars(log()) as progress:
         from calibray.engines import open_workers
         from calibray.engines.cluster.chunks import stated_chunk_size, trace_in_chunks

@@ -54,12 +54,12 @@ class MapOptions:
         str,
         option(
             "ITU[:M]",
-            "Material of the roofs. 'wall' makes one mesh of roofs and walls, so that eaves diffract.",
+            "Material of the roofs. 'wall' combines roofs and walls in one mesh, so that eaves diffract.",
         ),
     ] = "concrete:0.3"
     ground: Annotated[str, option("ITU[:M]", "Material of the ground.")] = "concrete:1.0"
     window_share: Annotated[
-        float, option("SHARE", "Share of every wall that windows cover, at least 0 and below 1.")
+        float, option("SHARE", "Share of every wall that is covered by windows, at least 0 and below 1.")
     ] = 0.0
     storey: Annotated[
         float,
@@ -118,7 +118,11 @@ class ColumnOptions:
         ),
     ] = None
     bottom: Annotated[
-        str, option("COLUMN", "Column with the heights of the undersides above the ground, or a number [m].")
+        str,
+        option(
+            "COLUMN",
+            "Column with the heights of the buildings' undersides above the ground, or a number [m].",
+        ),
     ] = "0"
     levels: Annotated[str | None, option("COLUMN", "Column with the numbers of storeys.")] = None
     name: Annotated[str | None, option("COLUMN", "Column with the names.")] = None

@@ -5,7 +5,7 @@ and therefore no diffraction.
 
 Mitsuba does not validate mesh files. If a vertex index is out of range, the process crashes or a reflection is missing
 without a message; rays never hit faces with NaN vertices. `read_mesh` refuses such files. Integer coordinates are
-valid, but with them Mitsuba loses all reflections from the mesh, so the tracer reads a floating-point copy.
+valid, but cause Mitsuba to lose all reflections from the mesh, so the tracer reads a floating-point copy.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ _FRAME_COMMENT: Final = "calibray frame "
 
 
 def plain_name(name: str) -> str:
-    """Convert a name to a name for files and objects, which contains only letters, digits, `_` and `-`."""
+    """Convert a name to a plain name for files and objects, with only letters, digits, `_` and `-`."""
     return re.sub(r"[^0-9A-Za-z_-]+", "_", name)
 
 
@@ -201,7 +201,7 @@ def shape_mesh(shape: ElementTree.Element, path: Path) -> Mesh | None:
     named = shape.find("string[@name='filename']")
     if named is None:
         if kind in ("obj", "ply"):
-            raise InputError(f"{path}: shape {name!r} names no file; give it a filename")
+            raise InputError(f"{path}: shape {name!r} has no filename; add one")
         return None
     filename = named.get("value", "")
     mesh = path.parent / filename
@@ -262,7 +262,7 @@ def keep_traced_elements(root: ElementTree.Element, path: Path) -> None:
                 if "$" in value:
                     raise InputError(
                         f"{path}: {key} = {shortened(repr(value))} in {owner} is a parameter of the scene, which "
-                        "Calibray does not fill in; write the value"
+                        "Calibray does not replace; write its value"
                     )
 
 

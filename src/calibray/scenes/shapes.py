@@ -128,7 +128,7 @@ def transform_matrix(shape: ElementTree.Element, path: Path) -> NDArray[np.float
     """Compute the transform of a shape in double precision, as a matrix for homogeneous coordinates [4, 4].
 
     Raises:
-        InputError: An element is not a translate, scale, rotate or matrix, or has the wrong number of values.
+        InputError: An element is none of translate, scale, rotate and matrix, or has the wrong number of values.
     """
     matrix = np.eye(4)
     for step in shape.findall("transform/*"):

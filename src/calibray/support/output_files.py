@@ -256,7 +256,7 @@ def file_digest(file: Path) -> str:
 
 @contextmanager
 def replacing(path: Path, signed: bool = True) -> Iterator[Path]:
-    """Write a file under a temporary name, and sign it and move it into place once it is complete.
+    """Write a file under a temporary name; once it is complete, it is signed and moved into place.
 
     Files with their own seal need not be signed. Yields the temporary file, which is empty and in the same folder; it
     is removed if writing fails.

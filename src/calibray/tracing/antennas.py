@@ -200,7 +200,7 @@ NEW: Final = "new transmitters"
 
 
 def concerned(names: NDArray[np.str_], label: str, own: Collection[str]) -> NDArray[np.bool_]:
-    """Mask of the transmitters that a parameter of transmitter `label` affects; those in `own` have their own."""
+    """Mask of the transmitters affected by a parameter of transmitter `label`; those in `own` have their own."""
     if label == EVERY:
         return np.ones(len(names), dtype=bool)
     return ~np.isin(names, list(own)) if label == NEW else names == label
@@ -260,7 +260,7 @@ class Mounting:
 
 
 def mount(paths: Paths, mountings: Mapping[str, Mounting]) -> Paths:
-    """In the fields of paths, replace isotropic vertical antennas by the antennas mounted at "tx" or "rx".
+    """In the fields of paths, replace isotropic vertical antennas with the antennas mounted at "tx" or "rx".
 
     The fields at ends without a mounting are unchanged.
     """

@@ -99,8 +99,9 @@ def check(
         path_loss: Function that returns the path loss of every link [L], [dB].
 
     Raises:
-        InputError: `before` contains other links, or its rays were added in rounds; the last round is then the check.
-        EngineError: The paths exceed what the tracer can store.
+        InputError: `before` contains other links, or its rays were added in rounds. In the latter case, the last round
+            is the check.
+        EngineError: There are more paths than the tracer can store.
     """
     if settings.samples == "auto":
         raise InputError(

@@ -1,6 +1,6 @@
 """Measured antenna patterns: the gain of an antenna on a grid of directions, from a CSV file or an MSI file.
 
-Between grid points, the gain is interpolated bilinearly in decibels, also across the end of the azimuth axis. In
+Between grid points, the gain is interpolated bilinearly in decibels, including across the ends of the azimuth axis. In
 decibels, main lobes are nearly parabolas (as in 3GPP TR 38.901, Table 7.3-1), so the error is smallest where the
 antenna radiates most. Nulls that are narrower than the grid spacing become shallower.
 
@@ -161,7 +161,9 @@ def _cut_in_range(place: str, name: str, value: float) -> float:
     low, high = CUT_RANGES[name]
     if not low <= value <= high:
         remedy: Any = (
-            "attenuations are positive, below the gain" if name == "attenuation" else "check the unit"
+            "attenuations are positive and relative to the gain"
+            if name == "attenuation"
+            else "check the unit"
         )
         raise InputError(f"{place}: {name} {value:g} must be {low:g} to {high:g}; {remedy}")
     return value

@@ -4,8 +4,8 @@ Without CUDA, Dr.Jit compiles its kernels with the newest libLLVM that it finds,
 whole process. The choice is therefore made here, before Dr.Jit is imported. Every library is opened in a separate
 process, and `DRJIT_LIBLLVM_PATH` is set to the best library.
 
-`python -m calibray.tracing.llvm` prints the library that the ray tracer will use. If there is none, it prints the
-command that installs one, and exits with status 2.
+`python -m calibray.tracing.llvm` prints the Mitsuba variant and the library that the ray tracer will use. If no library
+is usable, it prints how to install one and exits with status 2.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def version_in_name(path: str) -> tuple[int, ...]:
 
 
 def judge(path: str, reported: tuple[int, ...]) -> Llvm:
-    """Decide whether Dr.Jit can use a library that opens; `reported` is the library's version, empty if unreported."""
+    """Decide whether Dr.Jit can use an opened library; `reported` is the version that it reports, or empty."""
     version = reported or version_in_name(path)
     if not reported and (not version or version[0] >= 16):
         return Llvm(path, (), "it reports no LLVM version, unlike every libLLVM since version 16")

@@ -185,7 +185,7 @@ class Antenna:
 
 
 def as_antenna(value: Antenna | Mapping[str, object] | None) -> Antenna:
-    """Make an antenna from an antenna, a mapping of its attributes, or None for the default.
+    """Make an antenna from a mapping of its attributes or from None (the default); an antenna is returned unchanged.
 
     Raises:
         InputError: A key or value is unknown.

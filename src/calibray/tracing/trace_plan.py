@@ -149,7 +149,7 @@ def starts_at_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64], settin
 
 
 def plan_trace(source: NDArray[np.float64], settings: TraceSettings, lanes: int, buffer: int) -> TracePlan:
-    """Split a trace into launches; `source` is the end that sends the rays, for every link [L, 3], [m].
+    """Split a trace into launches; `source` is the position of the end of each link that sends the rays [L, 3], [m].
 
     A launch can have up to `lanes` rays x interactions x receivers; its buffer initially has room for `buffer` paths.
     """
@@ -199,7 +199,7 @@ def pad_receivers(position: NDArray[np.float64], lanes_per_receiver: int) -> NDA
     """Repeat the last receiver [n, 3], so that few different numbers of receivers occur in launches.
 
     The tracer compiles its code for each number of receivers, which takes 1 to 3 s. The number is increased to a power
-    of two, or a multiple of the largest power of two for which a launch is small.
+    of two, or to a multiple of the largest power of two for which a launch is small.
 
     Example:
         >>> [len(pad_receivers(np.zeros((n, 3)), 1_000_000)) for n in (1, 2, 3, 4, 5, 6)]

@@ -82,7 +82,7 @@ def split_overlaps(
 
 
 def _overlay(polygons: NDArray[Any]) -> tuple[list[Any], NDArray[np.bool_]]:
-    """The pieces into which the polygons' borders divide the ground, and which polygon covers which [n, pieces]."""
+    """Pieces of ground between the polygons' borders, and whether each polygon covers each piece [n, pieces]."""
     shapely = library("shapely", "scenes")
     borders = shapely.union_all(shapely.boundary(polygons), grid_size=GRID)
     pieces = shapely.get_parts(shapely.polygonize([borders]))
@@ -96,7 +96,7 @@ def _overlay(polygons: NDArray[Any]) -> tuple[list[Any], NDArray[np.bool_]]:
 
 
 def _stack(stands: list[Interval]) -> tuple[Interval, ...]:
-    """Resolve overlaps in height: the overlap belongs to the building with the higher top."""
+    """Resolve overlaps in height: an overlap is assigned to the building with the higher top."""
     stack: list[Interval] = []
     for bottom, top, owner in sorted(stands, key=lambda stand: (-stand[1], stand[0], stand[2])):
         free = [(bottom, top, owner)]
@@ -138,7 +138,7 @@ class Windows:
     both ends, each wedge at a corner of the building consists of one material.
 
     Attributes:
-        share: Fraction of each wall that windows cover, at least 0 and less than 1 [1].
+        share: Fraction of each wall that is covered by windows, at least 0 and less than 1 [1].
         module: Approximate distance between the centres of adjacent windows [m].
 
     Raises:

@@ -97,14 +97,14 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
             contain lines, polylines or outlines; the columns thickness, bottom and height are optional. Similar names
             are recognized, and a unit of length in a name, as in `width_cm`, applies to that column. The file can also
             be a DXF, GeoJSON or other vector file in the plan's coordinates. Its attributes must have exactly these
-            names, with or without a unit. Without an attribute type, the DXF layer is the type. Points and texts in
-            vector files are ignored.
+            names, with or without a unit. If there is no attribute type, the DXF layer is used as the type. Points and
+            texts in vector files are ignored.
         height: Height of the top of segments without a height [m].
         unit: The plan's unit of length [m], such as 0.001 for millimetres; if None, the unit stated in a DXF file, or
             metres.
 
     Returns:
-        The segments in file order; a polyline or outline gives one segment per side.
+        The segments in file order; a polyline or outline becomes one segment per side.
 
     Raises:
         InputError: The file or a column is missing or malformed, or a segment has no length, height or thickness.

@@ -47,7 +47,7 @@ TYPES: Final = {
 """Materials of types that are not named after ITU-R P.2040 materials."""
 
 LIDS: Final = ("floor", "ceiling")
-"""Level sheets over the whole area of a plan."""
+"""Horizontal sheets over the whole area of a plan."""
 
 WALL_THICKNESS: Final = 0.12
 """Thickness of a wall made of an ITU material if the plan states no thickness [m]."""
@@ -76,7 +76,7 @@ def make_plan_scene(
 
     Walls that cross or meet share corners, and the end of a wall at the face of another wall is extended to the other
     wall's centre line. Between its own bottom and top, a door or window replaces the wall on which it is drawn; the
-    wall continues above and below. The same applies to any shorter line on a longer one, such as a door of a type with
+    wall continues above and below. The same applies to any shorter line on a longer one, such as a door whose type has
     a different name.
 
     Args:
@@ -171,7 +171,7 @@ def _separation(sheets: Sequence[Segment]) -> float | None:
 
 
 def _extend_to_walls(sheets: Sequence[Segment]) -> list[Segment]:
-    """Move the ends of sheets to the centre line of the wall that they meet."""
+    """Move the ends of sheets to the centre lines of the walls that they meet."""
     extended = list(sheets)
     for index, sheet in enumerate(extended):
         start, end = np.array(sheet.start), np.array(sheet.end)
@@ -260,6 +260,6 @@ def _enclosed(pieces: Pieces) -> Any:
 
 
 def _lid(outline: Any, height: float) -> NDArray[np.int64]:
-    """A level sheet over an area, counter-clockwise when seen from above [F, 3, 3], [mm]."""
+    """A horizontal sheet over an area, counter-clockwise when seen from above [F, 3, 3], [mm]."""
     flat, _ = triangulate(library("shapely", "scenes").get_parts(outline))
     return np.concatenate([flat, np.full((len(flat), 3, 1), to_millimetres(height))], axis=2)

@@ -117,8 +117,8 @@ class Footprints:
         top: Height of the top of each building above the ground [n], [m].
         name: Name of each building [n].
         height_from: Source of each top [n].
-        part: Whether each outline is a part of a building; parts take precedence over the outline of the whole building
-            [n].
+        part: Whether each outline is a part of a building [n]; parts take precedence over the outline of the whole
+            building.
         repairs: Number of outlines that were changed or left out, by reason.
     """
 
@@ -207,7 +207,7 @@ def _check_extent(polygons: NDArray[Any], names: Sequence[str]) -> None:
         problem = f"is {size[furthest] / 1000:,.0f} km wide"
     raise InputError(
         f"building {names[furthest]!r} {problem}, but scenes may be at most {WIDEST / 1000:g} km wide; remove it, or "
-        "cut out the area that you need (if the map crosses 180 degrees of longitude, an area on one side of it)"
+        "cut out the area that you need (on one side of 180 degrees of longitude, if the map crosses it)"
     )
 
 
@@ -311,8 +311,8 @@ def read_footprints(
         path: A GeoJSON file, Shapefile, GeoPackage, FlatGeobuf file or Esri geodatabase that states its coordinate
             reference system.
         height: Column with the heights of the buildings above the ground, in metres or the unit in its name
-            (`height_ft`), or one height for all [m]. Text that is both a number and the name of a column is read as the
-            name. None if `columns` names a column with the numbers of storeys.
+            (`height_ft`), or one height for all [m]. Text that is both a number and the name of a column is interpreted
+            as the name. None if `columns` names a column with the numbers of storeys.
         columns: Additional columns.
         layer: Layer of the file, if it has more than one.
         frame: The scene's frame; by default a local frame centred on the footprints.

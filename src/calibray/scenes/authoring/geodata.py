@@ -31,7 +31,7 @@ RASTER_DRIVER: Final = "GTiff"
 """GDAL's driver for rasters: GeoTIFF, including cloud-optimized files."""
 
 VECTOR_FORMATS: Final = "GeoJSON, a Shapefile, a GeoPackage, a FlatGeobuf file or an Esri geodatabase"
-"""Supported formats of vector files, for messages."""
+"""Supported formats of vector files, as named in messages."""
 
 MOST_CELLS: Final = 25_000_000
 """Largest number of cells that are read from a height model; filling gaps needs about 40 bytes per cell."""
@@ -173,7 +173,7 @@ def _read_with_gdal(path: Path, layer: str | None, driver: str) -> Features:
 
 
 def _read_geojson(path: Path) -> Features:
-    """Read GeoJSON (RFC 7946, with the earlier member `crs`) without GDAL, which would also try other drivers."""
+    """Read GeoJSON (RFC 7946, with the obsolete member `crs`) without GDAL, which would also try other drivers."""
     shapely = library("shapely", "scenes")
     _check_text_size(path, "GeoJSON")
     try:

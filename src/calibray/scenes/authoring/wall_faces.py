@@ -27,7 +27,7 @@ _SAME: Final = ("kind", "bottom", "top", "thickness")  # attributes that sheets 
 
 @dataclass(frozen=True)
 class MergedPlan:
-    """The sheets of a plan, and how its lines were used.
+    """The sheets of a plan, and a report on the use of its lines.
 
     Attributes:
         sheets: One sheet for each wall, door and window.
@@ -127,7 +127,7 @@ def _types_drawn_as_faces(segments: Sequence[Segment], pairs: Sequence[tuple[int
 
 
 def _face_distance(one: Segment, other: Segment) -> float | None:
-    """Distance between two lines that can be the faces of one wall [m]; otherwise None."""
+    """Distance between two lines if they can be the faces of one wall [m]; otherwise None."""
     if (one.kind, one.bottom, one.top) != (other.kind, other.bottom, other.top):
         return None
     if abs(one.direction @ other.direction) < _PARALLEL:

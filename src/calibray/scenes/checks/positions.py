@@ -141,7 +141,7 @@ class SceneSurfaces:
         return lowest
 
     def lowest_surface(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Like `ground_height`, but returns +inf where the scene has no surface."""
+        """Height of the lowest surface, as in `ground_height`, but +inf where the scene has no surface."""
         position = np.column_stack([np.asarray(x, dtype=float), np.asarray(y, dtype=float)])
         index, height = self._surfaces(position)
         lowest = np.full(len(position), np.inf)
@@ -258,7 +258,7 @@ def locate(triangles: Triangles, points: NDArray[np.float64]) -> NDArray[np.str_
     """The location of each point [n, 3], [m]: `BEYOND`, `UNDER` or `INSIDE`; empty in the open.
 
     A point is inside a building if an upward vertical ray crosses an odd number of surfaces, as it does inside any
-    closed body. The surfaces in `Triangles.ground` are ground.
+    closed body. The ground consists of the triangles marked in `Triangles.ground`.
     """
     if not len(triangles.face):
         return np.full(len(points), "")

@@ -122,7 +122,7 @@ def apply_materials(scene: object, materials: Mapping[str, Material], frequency:
 def _checked(scene: object) -> Any:
     if not isinstance(scene, rt.Scene):
         raise InputError(
-            f"scene is a {type(scene).__name__}; must be a scene of sionna.rt, as load_scene returns"
+            f"scene is a {type(scene).__name__}; must be a scene of sionna.rt, as returned by load_scene"
         )
     return scene
 
