@@ -359,7 +359,7 @@ def test_what_has_no_effect_on_radio_waves_does_not_reach_the_tracer(tmp_path: P
         ('"ply"', '"sphere"', "shape 'mesh-floor' is a 'sphere', must be one of cube, obj, ply"),
         ('"ply"', '"shapegroup"', "is a 'shapegroup', must be one of"),
         ('type="ply"', "", "is a '', must be one of"),
-        ('<string name="filename" value="meshes/floor.ply"/>', "", "shape 'mesh-floor' names no file"),
+        ('<string name="filename" value="meshes/floor.ply"/>', "", "shape 'mesh-floor' has no filename"),
         ("floor.ply", "f" * 5000 + ".ply", r"mesh 'meshes/ff.*\.\.\..*' of shape 'mesh-floor' does not exist"),
         ("floor.ply", "", "mesh 'meshes/' of shape 'mesh-floor' does not exist"),
         ("floor.ply", "&#0;", "is not well-formed XML"),

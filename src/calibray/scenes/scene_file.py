@@ -262,7 +262,7 @@ def keep_traced_elements(root: ElementTree.Element, path: Path) -> None:
                 if "$" in value:
                     raise InputError(
                         f"{path}: {key} = {shortened(repr(value))} in {owner} is a parameter of the scene, which "
-                        "Calibray does not replace; write its value"
+                        "Calibray does not substitute; write its value"
                     )
 
 
