@@ -347,7 +347,7 @@ def test_a_nuisance_of_other_links_is_refused():
     with pytest.raises(InputError, match="the nuisance has 7 links, must have 30"):
         make_objective(links, everything, everything, nuisance=Nuisance(7))
     term = make_term(links, "offset", prior=3.0)
-    with pytest.raises(InputError, match="a prior needs noise_db"):
+    with pytest.raises(InputError, match="a prior requires noise_db"):
         make_objective(links, everything, everything, nuisance=Nuisance(LINKS, (term,)))
 
 

@@ -241,7 +241,7 @@ def make_cheap_replay(
 ) -> CheapReplay:
     """Trace a problem's scene for a cheap model if its method uses one; report the reason if this fails.
 
-    If `scene`, another study of the same links, is given, it is traced instead. The stage of `progress` is "tracing".
+    If given, `scene` is another study of the same links, which is traced instead. The stage of `progress` is "tracing".
     """
     setup = problem.setup
     section = setup.study.method
@@ -258,7 +258,7 @@ def make_cheap_replay(
         reason = " ".join(str(error).split())
         return CheapReplay(None, _no_model(f"the scene cannot be traced here ({reason})"))
     if not model.known.any():
-        return CheapReplay(None, _no_model("no link has a path in the trace of the scene"))
+        return CheapReplay(None, _no_model("no link has a path in the traced scene"))
     return CheapReplay(model)
 
 
@@ -269,7 +269,7 @@ def _no_model(cause: str) -> Remark:
 def with_constants(
     parameters: Parameters, materials: dict[str, Material], one_carrier: bool = True
 ) -> Parameters:
-    """Append the material constants that are not calibrated to the parameters, on a logarithmic scale.
+    """Extend the parameters by the material constants that are not calibrated, on a logarithmic scale.
 
     If the links have several carriers, constants that depend on frequency stay fixed.
     """

@@ -38,10 +38,11 @@ preceding columns. Rounding leaves about 1e-16 per column."""
 
 PRIOR: Final = 1e-6
 """Weight of the prior on a linearly dependent column, relative to its squared norm. In 600 random problems with bounds,
-three sums of squares are then 3e-5 to 4e-4 above the minimum. With 1e-7, the coefficients lose a digit."""
+three sums of squares are then 3e-5 to 4e-4 above the minimum. With 1e-7, the coefficients lose one digit of
+accuracy."""
 
 ROUNDING: Final = 1e-11
-"""Tolerance for rounding errors of bound violations and gradients in double precision, relative to the size of the
+"""Tolerance for bound violations and gradients due to rounding in double precision, relative to the size of the
 right-hand side."""
 
 PATIENCE: Final = 3
@@ -65,7 +66,7 @@ class Elimination:
         order: Index in the design of each column of `normal` [q].
         lower: Lower bounds [q].
         upper: Upper bounds [q].
-        separable: Whether each link has at most one column.
+        separable: Whether each link has an entry in at most one column.
         determined: Mask of the columns that the links determine [q]. Among linearly dependent columns, those of the
             finest grouping count as determined.
     """
@@ -173,7 +174,7 @@ class Arrowhead:
     """The matrix N of the quadratic form x.N.x / 2 - side.x, scaled to a unit diagonal, with q = g b + p rows.
 
     Attributes:
-        scale: Square roots of the diagonal before scaling, 1 where it is 0 [q].
+        scale: Square roots of the diagonal before scaling; 1 where the diagonal is 0 [q].
         blocks: The g diagonal blocks [g, b, b].
         border: Products of the block columns with the p border columns [g, b, p].
         corner: Products of the border columns with each other [p, p].

@@ -53,8 +53,8 @@ class Term:
         bounds: Lower and upper bound of every coefficient, [dB] per unit of the column.
         prior: Standard deviation of the coefficients' Gaussian prior around zero, in the unit of the bounds; +inf if
             flat.
-        centre: Value subtracted from the column: the mean of log10(distance / 1 m) over the links for which the term
-            was made, otherwise 0.
+        centre: Value subtracted from the column: for "log_distance", the mean of log10(distance / 1 m) over the links
+            for which the term was made; otherwise 0.
         around: For the deviations of a random effect, the name of the term with their mean; otherwise "".
     """
 
@@ -76,7 +76,7 @@ class Term:
     def at(self, links: Measurements, labels: ArrayLike | None = None) -> Term:
         """The term with the same columns at other links, for prediction.
 
-        A link whose group label [n] is unknown belongs to no group. A term without groups takes no labels.
+        A link whose group label [n] is unknown belongs to no group. For a term without groups, no labels are given.
 
         Raises:
             InputError: The links' table lacks the column, or the labels do not match the term.

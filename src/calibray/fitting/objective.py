@@ -378,7 +378,7 @@ def make_objective(
             f"{links.source}: the nuisance has {nuisance.num_links} links, must have {len(links)}"
         )
     if noise_db is None and np.isfinite(nuisance.prior).any():
-        raise InputError("nuisance: a prior needs noise_db, the standard deviation of a link's error [dB]")
+        raise InputError("nuisance: a prior requires noise_db, the standard deviation of a link's error [dB]")
     return Objective(
         measured=links.path_loss_db,
         weight=np.where(counted, links.weight, 0.0),

@@ -126,7 +126,7 @@ def _determines_as_much(problem: Problem, selected: Objective) -> bool:
 
 
 def _warn_of_bias(problem: Problem, selected: Objective, faint: NDArray[np.bool_]) -> None:
-    """Warn of the bias if links near the noise floor are kept because the others determine fewer unknowns."""
+    """Warn about the bias if links near the noise floor are kept because the others determine fewer unknowns."""
     determined = selected.determined if (selected.weight > 0).any() else np.zeros(1, dtype=bool)
     lost = np.flatnonzero(problem.objective.determined & ~determined)
     names = ", ".join(problem.objective.nuisance.columns[column] for column in lost[:MAX_LISTED])
@@ -370,6 +370,6 @@ def estimate_spreads(problem: Problem, progress: Progress | None = None) -> Prob
 
 
 def with_preliminary_fits(problem: Problem, progress: Progress | None = None) -> Problem:
-    """The problem that is calibrated: without links near the noise floor, with estimated noise and spreads."""
+    """The problem to calibrate, without links near the noise floor and with estimated noise and spreads."""
     problem = estimate_noise(leave_out_near_floor(problem, progress), progress)
     return estimate_spreads(problem, progress)

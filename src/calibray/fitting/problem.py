@@ -207,7 +207,7 @@ class Problem:
         """Like `evaluate`, for methods that use only squares and products of the residuals.
 
         If the engine divides the links into chunks, each chunk returns sums, and d + 1 compressed residuals represent
-        those of all links. Otherwise the residuals are the full ones.
+        those of all links. Otherwise the residuals are not compressed.
         """
         if self._chunks is None:
             return self.evaluate(points, derivatives)

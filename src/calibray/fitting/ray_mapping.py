@@ -122,7 +122,7 @@ class RayMap:
 
     @property
     def understood(self) -> bool:
-        """Whether, in addition, the model explains all calls and the calls share their strong paths.
+        """Whether the optimum is reached, the model explains all calls, and the calls share their strong paths.
 
         Its replay then represents the engine at other candidates as well.
         """

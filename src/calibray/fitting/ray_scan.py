@@ -1,15 +1,15 @@
 """Scans of one material's constants, and of antennas, for starting points of a fit to ratios of path powers.
 
-A slab resonates: the power of a ray varies with thickness with a period of half a wavelength, so a local search can end
-in a wrong minimum. A scan evaluates a fine grid of thicknesses up to the depth where the wave has decayed, for several
-conductivities, with several polarizations at both ends. It uses only paths that consist of reflections and
-transmissions.
+A slab resonates: the power of a ray varies periodically with the thickness, and the period is half a wavelength. A
+local search can therefore end in a wrong minimum. A scan evaluates a fine grid of thicknesses up to the depth where the
+wave has decayed, for several conductivities, with several polarizations at both ends. It uses only paths that consist
+of reflections and transmissions.
 
-An antenna receives almost nothing from a direction orthogonal to its polarization. Every path near such a null adds a
-minimum of the misfit. These minima are about 0.02 rad apart, so a local search from upright antennas ends in a wrong
-minimum. With the materials fixed, the gain of a path is bilinear in the polarizations of both ends. A scan therefore
-evaluates a grid of slants and tilts of one end, with the other end first as fitted and then upright. Local searches
-over all angles start from the best points of this grid.
+An antenna receives almost no power from a direction in which the wave is orthogonal to its polarization. Every path
+near such a null adds a minimum of the misfit. These minima are about 0.02 rad apart, so a local search from upright
+antennas ends in a wrong minimum. With the materials fixed, the gain of a path is bilinear in the polarizations of both
+ends. A scan therefore evaluates a grid of slants and tilts of one end, with the other end first as fitted and then
+upright. Local searches over all angles start from the best points of this grid.
 """
 
 from __future__ import annotations

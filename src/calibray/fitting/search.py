@@ -48,7 +48,7 @@ def check_method(name: str) -> None:
 
 
 def choose(problem: Problem, model: CheapModel | None = None) -> Optimizer:
-    """Make the optimizer that a study names; "auto" chooses the best one for its engine.
+    """Make the optimizer that a study names; "auto" chooses the best optimizer for its engine.
 
     Raises:
         InputError: The method needs derivatives that the engine does not provide, or its options cannot be used.
@@ -113,7 +113,7 @@ SEARCHES: Final = 64
 """Number of local searches for further minima if the method kept only its best one."""
 
 BASINS: Final = 24
-"""Largest number of known minima that serve as starting points for a changed problem."""
+"""Largest number of known minima that are used as starting points for a changed problem."""
 
 RELEVANT: Final = 20.0
 """Largest excess of the sum of squares at a relevant minimum over that at the lowest one, in noise variances. It
@@ -236,7 +236,7 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
     trail.rt_calls = engine.calls - calls + trail.ledger_hits
     if not np.isfinite(trail.best_rmse_db):
         raise InputError(
-            "every candidate lost the path of some link; exclude those links or use no_path = 'censor'"
+            "every candidate loses the path of at least one link; exclude such links or use no_path = 'censor'"
         )
     trail.minima = optimizer.minima
     if not len(trail.best_modelled):

@@ -50,7 +50,7 @@ class _Task:
 
 
 def batch_size(setup: Setup, workers: Workers | None) -> int:
-    """Number of links to predict together, so that memory use does not grow with the number of links."""
+    """Number of links to predict together; it keeps memory use independent of the total number of links."""
     if workers is not None:
         return CHUNKS_PER_BATCH * _chunk_size(setup)
     return DIFFUSE_BATCH if setup.study.trace.diffuse_reflection else BATCH

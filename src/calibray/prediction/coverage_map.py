@@ -65,11 +65,11 @@ def coverage_map(
         height: Height of the receivers above the ground or, where there is no ground, above the scene's lowest point
             [m].
         cell: Width of the cells [m]; the receivers are at their centres.
-        bounds: West, south, east and north bounds of the area [4], [m]; those of the scene if None.
+        bounds: West, south, east and north bounds of the area [4], [m]; if None, those of the scene.
         level: Probability that the interval contains a measurement; None for no interval.
         power_dbm: Transmitted power for a map of received power [dBm]; if None, the map shows path loss. After a
             calibration on RSRP, the default is 0, because the offset contains the power.
-        samples: Number of rays; that of the study if None. Too few rays miss paths, and the time taken is proportional
+        samples: Number of rays; if None, that of the study. Too few rays miss paths, and the time taken is proportional
             to the number of rays. "auto" adds rays until path loss has converged, which takes less time than a large
             number of rays from the start.
         columns: Values of the study's columns of groups, carriers or nuisances for this transmitter, by column name.

@@ -20,7 +20,7 @@ Atkinson and V. V. Fedorov, The design of experiments for discriminating between
 with an expectation over the true value (G. E. P. Box and W. J. Hill, Discrimination among mechanistic models,
 Technometrics 9, 1967).
 
-Candidates are chosen one at a time. Part of their errors is common, caused by an unknown offset or by common clutter.
+Candidates are chosen one at a time. Part of their errors is common because of an unknown offset or shared clutter.
 Conditioning after each choice removes this part, so a second measurement at the same point adds less information.
 """
 
@@ -50,7 +50,7 @@ EXCESS_DEVIATION: Final = 3.0
 """Standard deviation of the excess due to the noise of the candidates' measurements, in noise variances."""
 
 BATCH: Final = 4_000_000
-"""Largest number of values per batch (draws times values times candidates), which limits the memory."""
+"""Largest number of values per batch (draws times values times candidates), which limits memory use."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -142,7 +142,7 @@ def _spelled(
 
 
 def _as_number(label: str) -> str:
-    """A label, possibly of several columns, as it is read if these columns contain only numbers."""
+    """A label, possibly composed of several columns, as it is read if these columns contain only numbers."""
     parts = []
     for part in label.split(" "):
         try:
@@ -206,7 +206,7 @@ def traced_materials(result: Record, materials: dict[str, Material] | None) -> d
     """The materials for the trace if the paths depend on them; otherwise None, because one trace is valid for all.
 
     The tracer's sampling depends on the materials only with refraction or diffuse reflection. The powers of a program's
-    rays always depend on them.
+    rays always depend on the materials.
     """
     trace, rays = result.study.trace, result.study.engine.exports_rays
     return materials if trace.refraction or trace.diffuse_reflection or rays else None
@@ -358,7 +358,7 @@ def _replay(
     """The engine for opened links, with the values of the prediction model and of every draw; None without a scene.
 
     A program that returns path loss is called for the values of the prediction model, because the replay of another ray
-    tracer has different antennas and physics. The replay gives the change in path loss for each draw.
+    tracer has different antennas and physics. The replay provides the change in path loss for each draw.
     """
     prediction, names = result.prediction, setup.parameters.names
     if prediction.model.parameters is None:

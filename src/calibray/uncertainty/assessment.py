@@ -374,7 +374,7 @@ more."""
 def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     """Replace the rows that repeat a link by their mean; the problem is unchanged if no row repeats a link.
 
-    Rows at one position share the error of the link. If they were treated as independent, intervals would be too narrow
+    Rows at the same position share the link's error. If they were treated as independent, intervals would be too narrow
     by a factor of the square root of the number of rows. The scatter of the rows contains no information about the
     shared error. If the rows agree closely, a noise model with one variance for scatter and shared error would
     underestimate the shared error.
@@ -429,7 +429,7 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
 def _means(
     values: NDArray[np.float64], counted: NDArray[np.int64], first: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Values [L] in which the first row of each link has the mean of the link's known values; NaN if none is known.
+    """Values [L] with the mean of each link's known values in the link's first row; NaN if no value is known.
 
     For each of the m rows with weight, `first` is the index of the first row of the same link [m].
     """

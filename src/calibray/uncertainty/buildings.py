@@ -133,7 +133,7 @@ class SplitReplay(Split):
 @final
 @dataclass(frozen=True, eq=False)
 class SplitChunks(Split):
-    """A split replay of links in chunks. Every worker splits the replays of its chunks and keeps them.
+    """A split replay of links in chunks. Every worker splits the replays of its chunks and keeps the results.
 
     Attributes:
         engine: The chunks.

@@ -1,6 +1,6 @@
 """Emulators of an engine without derivatives, made from its calls.
 
-Intervals need thousands of evaluations, and calls are expensive. A Gaussian process for the path loss of every link
+Intervals require thousands of evaluations, and calls are expensive. A Gaussian process for the path loss of every link
 interpolates the calls (`multifidelity/discrepancy.py`). The mean of the process is the corrected replay of the study's
 scene if it is available and not misleading, and otherwise a constant. The uncertainty of the process must widen the
 intervals. We therefore draw functions from the process, use each function as an engine, and pool the resulting

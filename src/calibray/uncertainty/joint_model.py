@@ -118,7 +118,7 @@ Gaps = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
 @dataclass(frozen=True, eq=False)
 class JointModel:
-    """The joint model. Points are in the unit cube of its parameters.
+    """The joint model. Points are in the unit cube of the model's parameters.
 
     Attributes:
         study: The study's d parameters.

@@ -204,8 +204,8 @@ class Tail(NamedTuple):
     Attributes:
         log_density: Its log density as a function of the squared errors.
         weight: Minus the derivative of the log density with respect to half the square; 1 for a Gaussian.
-        location: Fisher information of an error about its mean, a number or [n].
-        size: Fisher information of an error about the logarithm of its scale, a number or [n].
+        location: Fisher information of an error about its mean; a number or an array [n].
+        size: Fisher information of an error about the logarithm of its scale; a number or an array [n].
         by_weights: Whether to update the scale with the sum of the weights instead of the number of links, which
             converges faster.
         select: Returns the distributions of the gaps with given indices.

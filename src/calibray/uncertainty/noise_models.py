@@ -104,7 +104,8 @@ LEVELS: Final = (5.0, 15.0, 25.0)
 districts with twins that lack refraction, the missing power is 2 to 35 dB below the power in sight."""
 
 COMMON: Final = 0.5
-"""Share of the variance of errors out of sight that all links have in common: missing paths can only add power."""
+"""Share of the variance of errors out of sight that all links have in common, because missing paths can only add
+power."""
 
 # Kinds of noise; "student-t" includes Gaussian noise with gross errors.
 GAUSSIAN, CORRELATED, OUT_OF_SIGHT, HEAVY = "gaussian", "correlated", "out_of_sight", "student-t"

@@ -140,7 +140,7 @@ class Moves:
         return population
 
     def _move_points(self, population: Population, lengths: Lengths) -> tuple[Population, Lengths]:
-        """Move along the difference of two other members; a third of the moves take the full difference."""
+        """Move along the difference of two other members; a third of the moves use the full difference."""
         random = self.random
         count, width = population.point.shape
         shift = random.choice(np.arange(1, count), 2, replace=False)

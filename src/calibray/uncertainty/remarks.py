@@ -2,7 +2,7 @@
 
 Path loss and further observables may contradict each other by more than their errors explain, so that they require
 different parameters. The parameters are fitted to path loss alone, to the further observables alone, and to both. The
-increase in both sums of squares from the separate fits to the common one, divided by the variances of the errors and by
+increase in both sums of squares from the separate fits to the common fit, divided by the variances of the errors and by
 the number of parameters, follows an F distribution if one set of parameters explains all data. It is also possible that
 no parameter values explain an observable, as if it were measured in a different scene. Measured values are therefore
 regressed on modelled values. The slope is 1 if the model is right, and near 0 if the two are unrelated.
@@ -51,7 +51,9 @@ alone, these residuals are divided by this factor. All fits can then use the sam
 
 
 def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...]:
-    """Compare the parameters that path loss requires with those that further observables require; `minima` are [k, d].
+    """Compare the parameters that path loss requires with those that further observables require.
+
+    The minima of the problem [k, d] are starting points of the fits.
 
     Returns:
         Remarks that state both fits and the size of the conflict in standard errors; empty if there is no conflict.

@@ -4,8 +4,8 @@ A population is drawn from the prior, and tracks the prior times a power of the 
 Del Moral, A. Doucet and A. Jasra, J. Royal Statistical Society B 68, 2006). Each step raises the power until half of
 the population is effective, resamples the population, and moves its members (`population_moves.py`).
 
-We start with two independent populations, and double their number while the two halves of the populations disagree and
-the budget allows it. If they agree, each population is weighted by its estimate of the evidence, which is unbiased.
+We start with two independent populations, and double their number as long as the two halves of the populations disagree
+and the budget allows it. If they agree, each population is weighted by its estimate of the evidence, which is unbiased.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ SIZE: Final = (64, 256)
 """Smallest and largest number of members of a population."""
 
 BUDGET: Final = 1_100_000_000
-"""Number of interactions that all populations may evaluate together. With a budget that is smaller by 10 %, the draws
+"""Number of interactions that all populations together may evaluate. With a budget that is smaller by 10 %, the draws
 in Auckland correspond to 392 to 422 independent draws (`benchmarks/certainty_cost.py --seeds 3`)."""
 
 EVALUATIONS: Final = 100
-"""Approximate number of evaluations per member: steps times moves."""
+"""Approximate number of evaluations per member: the number of steps times the number of moves per step."""
 
 POPULATIONS: Final = (2, 4, 8)
 """Numbers of independent populations, increased while their two halves disagree. If several interference fringes of
@@ -55,7 +55,7 @@ EFFECTIVE: Final = 0.5
 """Share of the population that stays effective when a step raises the power."""
 
 MAX_STEPS: Final = 60
-"""Largest number of steps, the last of which raises the power to 1; most posteriors need 8 to 20."""
+"""Largest number of steps, the last of which raises the power to 1; most posteriors require 8 to 20 steps."""
 
 APART: Final = 0.2
 """Largest distance between the distribution functions of a parameter in independent populations that agree. Two sets of

@@ -4,8 +4,8 @@ A credible set is the smallest set that contains a given share of the posterior.
 fit the data. Gaussian kernels with locally adapted widths smooth the density of the weighted draws (B. W. Silverman,
 Density Estimation for Statistics and Data Analysis, 1986, section 5.2); they are mirrored at the bounds.
 
-If the posterior cannot be sampled, linear theory replaces it: intervals and covariances from the curvature of the sum
-of squares at the optimum.
+If the posterior cannot be sampled, linear theory is used instead: intervals and covariances follow from the curvature
+of the sum of squares at the optimum.
 """
 
 from __future__ import annotations
@@ -149,14 +149,14 @@ districts, 90 % sets then contain 0.88 to 0.90 of a reference posterior. The set
 0.90, and those for window glass have 2.0 pieces (`benchmarks/simulation_based.py --reference`)."""
 
 LEAST_SHARE: Final = 0.005
-"""Smallest share of the posterior in a piece; smaller shares count as chance."""
+"""Smallest share of the posterior in a piece; smaller shares are attributed to chance."""
 
 REACH: Final = 8.5
 """Number of kernel widths beyond which the tail of a Gaussian is zero in double precision."""
 
 LEAST_GAP: Final = 0.03
-"""A gap between pieces counts as chance if it is narrower than this share of the range and than the wider piece. Pieces
-that all lie within this share of the range are merged: for a user, they are one value."""
+"""A gap between pieces is attributed to chance if it is narrower than both this share of the range and the wider piece.
+Pieces that all lie within this share of the range are merged, because they represent one value to a user."""
 
 
 Modelled = Callable[[NDArray[np.float64]], NDArray[np.float64]]

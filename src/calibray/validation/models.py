@@ -3,10 +3,10 @@
 The baselines are the log-distance model, the same model with the obstruction of the direct line, and kriging.
 
 The variants are the study's own model, the initial materials, the model with a prior around the initial values, and the
-model with this prior and offsets per transmitter and out of sight. An engineer would try these models by hand. The best
-variant differs between campaigns, so held-out links decide (`validate.py`). Both offsets have a prior around zero,
-which keeps them small where the links do not require them. A single variant with both offsets is therefore sufficient.
-Further variants make the choice worse (docs/measurements/predictions.md).
+model with this prior and offsets per transmitter and out of sight. These are the models that an engineer would try by
+hand. The best variant differs between campaigns, so the choice is based on held-out links (`validate.py`). Both offsets
+have a prior around zero, which keeps them small where the links do not require them. A single variant with both offsets
+is therefore sufficient. Further variants make the choice worse (docs/measurements/predictions.md).
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def obstructed(links: Measurements, objective: Objective, known_db: NDArray[np.f
 
 
 def _free_name(by: str, terms: Sequence[Term]) -> str:
-    """A name for a term of the column `by` that no other term has."""
+    """A name that no other term has, for a term of the column `by`."""
     names = {term.name for term in terms}
     plain = by.replace("_", " ") if by in (OUT_OF_SIGHT, WALLS) else by
     return next(name for name in (plain, f"{plain} of all", f"{plain} of all links") if name not in names)
@@ -225,7 +225,8 @@ MOST_NEW_STARTS: Final = 128
 """Largest number of starting points if no minimum is known."""
 
 TOLERANCE: Final = 1e-6
-"""Relative decrease of the mean square below which a search has converged; predictions then change by less."""
+"""Relative decrease of the mean square below which a search has converged; further iterations change predictions by
+less."""
 
 NO_MINIMA: Final[Mapping[Model, NDArray[np.float64]]] = {}
 
